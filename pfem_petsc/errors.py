@@ -1,0 +1,32 @@
+"""The errors that end a run, each with the exit status that the command line returns for it."""
+
+from __future__ import annotations
+
+__all__ = ["EarlyStop", "InputError", "PfemError", "SimulationFailure"]
+
+
+class PfemError(Exception):
+    """A run cannot go on, and the message says why to the user.
+
+    The message names what is wrong, where (file and key, or step, node and bar), the value, and the way out.
+    """
+
+    exit_status = 1
+
+
+class InputError(PfemError):
+    """Invalid input, found before the first step: case, mesh, restart file, option, unwritable output."""
+
+    exit_status = 2
+
+
+class SimulationFailure(PfemError):
+    """The simulation failed on its way: no convergence, collapsed bar, instability, disk full."""
+
+    exit_status = 3
+
+
+class EarlyStop(PfemError):
+    """The run stopped early on request (signal or time limit), with a checkpoint written."""
+
+    exit_status = 4

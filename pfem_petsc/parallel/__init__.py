@@ -1,0 +1,1 @@
+"""What all ranks do together: agreeing on errors, moving arrays between numberings."""

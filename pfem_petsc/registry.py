@@ -1,0 +1,38 @@
+"""Find the classes that case files name: one class in one module, and the module's name is the case file's name."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import pkgutil
+from types import ModuleType
+
+from .errors import InputError
+
+__all__ = ["choices", "lookup", "nearest"]
+
+
+def choices(package: str) -> list[str]:
+    """Names on offer in a package: its modules, without importing any (``base`` and private ones excluded)."""
+    path = importlib.import_module(package).__path__
+    return sorted(m.name for m in pkgutil.iter_modules(path) if not m.name.startswith("_") and m.name != "base")
+
+
+def nearest(name: str, known: list[str]) -> str:
+    """Hint for a misspelt name: ``", did you mean 'x'?"``, or the known names where none is near."""
+    match = difflib.get_close_matches(str(name), known, n=1, cutoff=0.6)
+    return f", did you mean '{match[0]}'?" if match else f"; known: {', '.join(known)}"
+
+
+def lookup(package: str, name: str, where: str) -> ModuleType:
+    """Import the module ``name`` of a package.
+
+    Raises
+    ------
+    InputError
+        When there is no such module; the message names the key ``where`` and the nearest known name.
+    """
+    known = choices(package)
+    if name not in known:
+        raise InputError(f"{where}: unknown value {name!r}{nearest(name, known)}")
+    return importlib.import_module(f"{package}.{name}")

@@ -1,0 +1,279 @@
+"""What a run says while it goes: a summary, a bar or lines, messages, and the same in ``log.txt``."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING, Self, TextIO
+
+from ..parallel.agreement import agreed
+from .log import LogFile
+from .units import duration, engineering
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
+__all__ = ["Progress"]
+
+FIRST_LINE = 2.0  # seconds until the first line, and between the first ones
+LAST_LINE = 10.0  # seconds between lines, at most
+BAR_REFRESH = 0.1  # seconds between two drawings of the bar
+
+# Open MPI gives rank 0 a pseudo-terminal, so that isatty() alone would draw a bar into mpirun's line-wise forwarding.
+_LAUNCHERS = ("OMPI_COMM_WORLD_SIZE", "PMI_RANK", "PMIX_RANK", "SLURM_PROCID")
+
+
+def _is_terminal(stream: TextIO) -> bool:
+    launched = any(name in os.environ for name in _LAUNCHERS)
+    return stream.isatty() and not launched and os.environ.get("TERM", "dumb") != "dumb"
+
+
+def _speed(rate: float) -> str:
+    return f"{rate:,.0f} steps/s" if rate >= 10 else f"{rate:.2g} steps/s"
+
+
+class Progress:
+    """Report of a run. Rank 0 writes; on the other ranks every call returns at once.
+
+    On a terminal a bar is drawn; elsewhere (files, pipes, under ``mpirun``) a line is printed after 2 s and then at
+    intervals that stretch to 10 s. ``log.txt`` gets the lines in any case, each with date and level; an existing log
+    is continued.  Between two reports :meth:`update` costs a few additions and one look at the clock.
+
+    A log that cannot be opened at the start is an :class:`~pfem_petsc.errors.InputError` on all ranks (the
+    constructor is collective); for one that is lost on the way see :class:`~pfem_petsc.output.log.LogFile`. A reader
+    of stdout that goes away (``| head``) is noted in the log, and the run goes on.
+
+    Parameters
+    ----------
+    title : what the bar and the log are headed with
+    n_steps : number of the last step, None where unknown (then progress is measured by time)
+    end_time : [s]
+    quiet : nothing on stdout; the log is written nevertheless, and warnings still go to stderr
+    log_path : file of the log, None for no log
+    start_step, start_time : where a restarted run begins; rates and remaining time count from there
+    stream, clock : stdout and the wall clock [s], to be replaced in tests
+    """
+
+    def __init__(
+        self,
+        comm: MPI.Comm,
+        title: str,
+        n_steps: int | None,
+        end_time: float,
+        quiet: bool = False,
+        log_path: Path | str | None = None,
+        *,
+        start_step: int = 0,
+        start_time: float = 0.0,
+        stream: TextIO | None = None,
+        clock: Callable[[], float] = perf_counter,
+    ) -> None:
+        self._root = comm.rank == 0
+        self._title, self._n_steps, self._end_time = title, n_steps, end_time
+        self._stream = None if quiet else (stream or sys.stdout)
+        self._bar = self._bar_task = self._log = None
+        self._clock = clock
+        with agreed(comm):
+            if self._root and log_path is not None:
+                self._log = LogFile(log_path)
+        self._begin = clock()
+        self._start = (start_step, start_time)
+        self._newton = self._linear = 0
+        self._last = (start_step, start_time, 0.0, 0, None)
+        self._marked = (self._begin, start_step, start_time, 0, 0)  # state at the last line, for rates and means
+        self._rate: tuple[float, float] | None = None  # steps and simulated seconds a second of wall time
+        self._interval = FIRST_LINE
+        self._next_line = self._due = self._begin + FIRST_LINE
+        self._closed = False
+        if self._root and self._stream is not None and _is_terminal(self._stream):
+            self._start_bar()
+            self._due = self._begin + BAR_REFRESH
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
+        self.close("done" if kind is None else "stopped")
+
+    def summary(self, entries: dict[str, str]) -> None:
+        """Print the start-up block: label and text of each entry, in a column."""
+        if not self._root:
+            return
+        width = max((len(label) for label in entries), default=0)
+        for line in [self._title, *(f"  {label:<{width}}  {text}" for label, text in entries.items())]:
+            self._write(line)
+
+    def update(
+        self,
+        step: int,
+        time: float,
+        dt: float,
+        newton: int = 0,
+        linear: int = 0,
+        contacts: int = 0,
+        energy_drift: float | None = None,
+    ) -> None:
+        """Take note of a finished step; report it when a report is due.
+
+        Parameters
+        ----------
+        step, time, dt : number of the step, its time and its length [s]
+        newton, linear : Newton and linear-solver iterations of this step
+        contacts : nodes in contact now
+        energy_drift : balance error of the energies relative to their scale, None where not known
+        """
+        if not self._root:
+            return
+        self._newton += newton
+        self._linear += linear
+        self._last = (step, time, dt, contacts, energy_drift)
+        now = self._clock()
+        if now >= self._due:
+            self._report(now)
+
+    def message(self, text: str, level: str = "INFO") -> None:
+        """Print a text between the reports and log it with its level."""
+        if self._root:
+            for line in text.splitlines():
+                self._write(line, level)
+
+    def warning(self, text: str) -> None:
+        """Log a warning and print it on stderr (above the bar, where there is one), also when quiet."""
+        if not self._root:
+            return
+        self._log_line(text, "WARNING")
+        if self._bar is not None:
+            self._bar.console.print(f"warning: {text}", style="yellow", markup=False, highlight=False)
+        else:
+            print(f"warning: {text}", file=sys.stderr, flush=True)
+
+    def close(self, outcome: str = "done") -> None:
+        """Print the state at the end, the wall time and the speed; a second call does nothing."""
+        if not self._root or self._closed:
+            return
+        self._closed = True
+        now = self._clock()
+        step, time, *_ = self._last
+        if self._bar is not None:
+            self._draw_bar()
+            self._bar.stop()
+            self._bar = None
+        if step > self._marked[1]:
+            self._write(self._line(now))
+        wall, steps = now - self._begin, step - self._start[0]
+        text = f"{outcome}: {steps:,} steps in {duration(wall)}"
+        if steps and wall > 0:
+            text += f" ({_speed(steps / wall)})"
+        text += f", t = {engineering(time, 's')}"
+        if self._newton:
+            text += f", {self._newton:,} Newton and {self._linear:,} linear iterations"
+        self._write(text)
+        if self._log is not None:
+            self._log.close()
+
+    def _report(self, now: float) -> None:
+        if now >= self._next_line:
+            line = self._line(now)
+            if self._bar is None:
+                self._write(line)
+            else:
+                self._log_line(line, "INFO")
+            self._marked = (now, *self._last[:2], self._newton, self._linear)
+            self._interval = min(LAST_LINE, 1.25 * self._interval)
+            self._next_line = now + self._interval
+        if self._bar is not None:
+            self._draw_bar()
+        self._due = self._next_line if self._bar is None else min(self._next_line, now + BAR_REFRESH)
+
+    def _measure(self, now: float) -> float:
+        """Update the smoothed rates from the last line on; give the remaining wall time [s] (inf where unknown)."""
+        wall = now - self._marked[0]
+        step, time, *_ = self._last
+        if wall > 0 and step > self._marked[1]:
+            new = ((step - self._marked[1]) / wall, (time - self._marked[2]) / wall)
+            # the first interval holds compilation and caches: half of it is forgotten with each line
+            self._rate = new if self._rate is None else tuple(0.5 * a + 0.5 * b for a, b in zip(self._rate, new))
+        if self._rate is None:
+            return float("inf")
+        left, rate = (self._end_time - time, self._rate[1])
+        if self._n_steps is not None:
+            left, rate = (self._n_steps - step, self._rate[0])
+        return max(left, 0.0) / rate if rate > 0 else float("inf")
+
+    def _done(self) -> float:
+        """Fraction of the run that is done."""
+        step, time, *_ = self._last
+        if self._n_steps:
+            return min(1.0, step / self._n_steps)
+        return min(1.0, time / self._end_time) if self._end_time > 0 else 1.0
+
+    def _counters(self) -> list[str]:
+        """Iterations a step since the last line, contacts and drift; what does not occur is left out."""
+        step, _, _, contacts, drift = self._last
+        steps = max(1, step - self._marked[1])
+        newton, linear = self._newton - self._marked[3], self._linear - self._marked[4]
+        parts = [f"Newton {newton / steps:.1f}/step"] if newton else []
+        parts += [f"CG {linear / steps:.1f}/step"] if linear else []
+        parts += [f"contacts {contacts:,}"]
+        return parts + ([f"energy drift {drift:+.1e}"] if drift is not None else [])
+
+    def _line(self, now: float) -> str:
+        step, time, dt, *_ = self._last
+        remaining = self._measure(now)
+        total = f"/{self._n_steps}" if self._n_steps is not None else ""
+        width = len(str(self._n_steps)) if self._n_steps is not None else 8
+        parts = [f"step {step:>{width}}{total} {100 * self._done():3.0f} %"]
+        parts += [f"t = {engineering(time, 's')}", f"dt = {engineering(dt, 's', 3)}", *self._counters()]
+        parts += [_speed(self._rate[0])] if self._rate is not None else []
+        return "  ".join([*parts, f"ETA {duration(remaining)}"])
+
+    def _start_bar(self) -> None:
+        # only a terminal pays for loading rich
+        from rich.console import Console
+        from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+        from rich.progress import Progress as Bar
+
+        columns = (
+            BarColumn(bar_width=20),
+            TaskProgressColumn(),
+            TextColumn("{task.fields[state]}", markup=False),
+            TimeElapsedColumn(),
+            TextColumn("ETA"),
+            TimeRemainingColumn(),
+        )
+        # no refresh thread: it would take time from the solver whenever it liked
+        self._bar = Bar(*columns, console=Console(file=self._stream), auto_refresh=False)
+        self._bar_task = self._bar.add_task(self._title, total=1.0, state="")
+        self._bar.start()
+
+    def _draw_bar(self) -> None:
+        step, time, _, contacts, _ = self._last
+        total = f"/{self._n_steps}" if self._n_steps is not None else ""
+        # must fit into 80 columns; the lines of the log have the rest
+        state = f"{step}{total}  t = {engineering(time, 's')}" + (f"  contacts {contacts:,}" if contacts else "")
+        self._bar.update(self._bar_task, completed=self._done(), state=state)
+        self._bar.refresh()
+
+    def _write(self, text: str, level: str = "INFO") -> None:
+        """A line on stdout (above the bar, where there is one) and in the log."""
+        self._log_line(text, level)
+        if self._stream is None:
+            return
+        try:
+            if self._bar is not None:
+                self._bar.console.print(text, markup=False, highlight=False)
+            else:
+                print(text, file=self._stream, flush=True)
+        except BrokenPipeError:
+            if self._stream is sys.stdout:
+                # what Python itself flushes at exit must find an open end
+                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            self._stream = None
+            self._log_line("nobody reads stdout any more: the run goes on and reports here only", "WARNING")
+
+    def _log_line(self, text: str, level: str) -> None:
+        if self._log is not None:
+            self._log.write(text, level)

@@ -1,0 +1,76 @@
+"""Units of fields and history columns, and numbers with engineering prefixes, shared by log, curves and pictures."""
+
+from __future__ import annotations
+
+import math
+
+__all__ = ["PREFIXES", "duration", "engineering", "prefix_for", "unit_of"]
+
+PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G", 12: "T"}
+
+_UNITS = {
+    "time": "s",
+    "displacement": "m",
+    "position": "m",
+    "centre_of_mass": "m",
+    "velocity": "m/s",
+    "acceleration": "m/s²",
+    "contact_force": "N",
+    "force": "N",
+    "reaction": "N",
+    "axial_force": "N",
+    "stress": "Pa",
+    "temperature": "K",
+    "kinetic_energy": "J",
+    "elastic_energy": "J",
+    "external_work": "J",
+    "contact_work": "J",
+    "momentum": "kg m/s",
+    "angular_momentum": "kg m²/s",
+}
+
+
+def unit_of(name: str) -> str:
+    """SI unit of a field or history column (``"wall/floor/force"`` -> ``"N"``); empty for pure numbers."""
+    last = name.rsplit("/", 1)[-1]
+    return "J" if last.endswith(("_energy", "_dissipation", "_work")) else _UNITS.get(last, "")
+
+
+def prefix_for(magnitude: float, unit: str) -> tuple[float, str]:
+    """Factor and unit that bring a magnitude into 1 .. 1000: ``(0.0024, "s")`` -> ``(1e3, "ms")``.
+
+    Powers (``m²``), temperatures and pure numbers keep their unit, because a prefix would be read wrongly there;
+    so does zero and all that is not finite. Kilograms have their prefix already.
+    """
+    plain = unit in ("s", "m", "m/s", "m/s²", "N", "Pa", "J")
+    if not plain or not math.isfinite(magnitude) or magnitude == 0.0:
+        return 1.0, unit
+    # a hair of tolerance, so that 999.9999999 ms reads 1 s
+    power = 3 * math.floor(math.log10(abs(magnitude) * (1 + 1e-9)) / 3)
+    if unit in ("m/s", "m/s²", "m") and power > 0:
+        power = min(power, 3) if unit != "m/s²" else 0
+    power = max(-12, min(12, power))
+    return 10.0**-power, PREFIXES[power] + unit
+
+
+def engineering(value: float, unit: str, digits: int = 4) -> str:
+    """Text of a value with a fitting prefix: ``engineering(2.4e-6, "s")`` -> ``"2.400 µs"``."""
+    factor, name = prefix_for(value, unit)
+    scaled = value * factor
+    if scaled == 0.0 or not math.isfinite(scaled):
+        return f"{scaled:.0f} {name}".rstrip()
+    decimals = digits - 1 - math.floor(math.log10(abs(scaled)) + 1e-12)
+    if not 0 <= decimals <= digits + 2:
+        return f"{scaled:.{digits - 1}e} {name}".rstrip()
+    return f"{scaled:.{decimals}f} {name}".rstrip()
+
+
+def duration(seconds: float) -> str:
+    """Wall time for people: ``"0.42 s"``, ``"12.3 s"``, ``"3:07"``, ``"2:05:41"``."""
+    if not math.isfinite(seconds):
+        return "?"
+    if seconds < 60:
+        return f"{seconds:.2f} s" if seconds < 10 else f"{seconds:.1f} s"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"

@@ -1,0 +1,1 @@
+"""Meshes made by rule: one module each, named as in case files."""

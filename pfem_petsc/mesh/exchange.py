@@ -1,0 +1,159 @@
+"""Rows of arrays sent to the ranks that want them, and values brought from owners to ghosts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from mpi4py import MPI
+
+__all__ = ["GhostExchange", "Router"]
+
+# Tags of the ghost messages start here; the number of columns is added, so that exchanges of different width may be
+# under way at the same time.
+_TAG = 7100
+
+
+class Router:
+    """Rows sent to stated ranks, and answers brought back in the rows' own order. Collective.
+
+    Parameters
+    ----------
+    comm : MPI.Comm
+    ranks : (n,) int
+        The rank that each row goes to.
+    """
+
+    def __init__(self, comm: MPI.Comm, ranks: np.ndarray) -> None:
+        self._comm = comm
+        # 16-bit ranks are sorted by radix, several times faster than wider ones.
+        if comm.size <= np.iinfo(np.uint16).max:
+            ranks = ranks.astype(np.uint16)
+        self._order = np.argsort(ranks, kind="stable")
+        self._counts = np.bincount(ranks, minlength=comm.size)
+        self._arriving = np.empty_like(self._counts)
+        comm.Alltoall(self._counts, self._arriving)
+        self.n_received = int(self._arriving.sum())
+
+    def send(self, rows: np.ndarray) -> np.ndarray:
+        """Send row i to its rank. Returns the rows that arrive, in the order of sending ranks and their rows."""
+        return self._exchange(rows[self._order], self._counts, self._arriving)
+
+    def reply(self, rows: np.ndarray) -> np.ndarray:
+        """Send back one row for each row received, in that order. Returns them in the order of the rows sent."""
+        returned = self._exchange(np.ascontiguousarray(rows), self._arriving, self._counts)
+        result = np.empty_like(returned)
+        result[self._order] = returned
+        return result
+
+    def _exchange(self, rows: np.ndarray, leaving: np.ndarray, arriving: np.ndarray) -> np.ndarray:
+        received = np.empty((int(arriving.sum()), *rows.shape[1:]), rows.dtype)
+        # One item is one row, so that the counts stay far from the limit of MPI's 32-bit integers.
+        row = MPI.BYTE.Create_contiguous(rows.dtype.itemsize * int(np.prod(rows.shape[1:], dtype=np.int64))).Commit()
+        try:
+            self._comm.Alltoallv([rows, (leaving, _starts(leaving)), row], [received, (arriving, _starts(arriving)), row])
+        finally:
+            row.Free()
+        return received
+
+
+def _starts(counts: np.ndarray) -> np.ndarray:
+    return np.concatenate([[0], np.cumsum(counts)[:-1]])
+
+
+@dataclass
+class _Buffers:
+    """Persistent requests of one width, with the rows they send and receive."""
+
+    leaving: np.ndarray
+    arriving: np.ndarray
+    requests: list[MPI.Prequest]
+
+
+class GhostExchange:
+    """Brings owned rows to the ranks that hold them as ghosts. Collective to make, then point to point.
+
+    Buffers and persistent requests are made at the first call of a width (columns a row) and kept.
+
+    Parameters
+    ----------
+    comm : MPI.Comm
+    starts : (size + 1,) int
+        First number owned by each rank, and the end.
+    ghosts : (n_ghosts,) int
+        Numbers of this rank's ghosts, ascending, so that those of one owner are neighbours.
+    """
+
+    def __init__(self, comm: MPI.Comm, starts: np.ndarray, ghosts: np.ndarray) -> None:
+        self._comm = comm
+        self._n_owned = int(starts[comm.rank + 1] - starts[comm.rank])
+        self._n_ghosts = len(ghosts)
+        owners = np.searchsorted(starts, ghosts, side="right") - 1
+        router = Router(comm, owners)
+        asked = router.send(np.asarray(ghosts, dtype=np.int64))
+        self._rows = (asked - starts[comm.rank]).astype(np.intp)
+        self._leaving = _neighbours(router._arriving)
+        self._arriving = _neighbours(router._counts)
+        self._buffers: dict[int, _Buffers] = {}
+        self._busy: set[int] = set()
+
+    @property
+    def n_neighbours(self) -> int:
+        """Ranks that send rows to this one or receive rows from it."""
+        return len({rank for rank, _, _ in self._leaving} | {rank for rank, _, _ in self._arriving})
+
+    def begin(self, array: np.ndarray) -> None:
+        """Start to bring the owned rows of ``array`` (n_local, k) float64 to their ghosts elsewhere."""
+        if not self._leaving and not self._arriving:
+            return
+        width = array.size // array.shape[0]
+        buffers = self._buffers.get(width)
+        if buffers is None:
+            buffers = self._prepare(array, width)
+        if width in self._busy:
+            raise RuntimeError(f"an update of ghosts with {width} columns is already under way: end it first")
+        self._busy.add(width)
+        # mode="clip": with the default, numpy fills a temporary array first. The rows are known to be in range.
+        np.take(array.reshape(-1, width), self._rows, axis=0, out=buffers.leaving, mode="clip")
+        MPI.Prequest.Startall(buffers.requests)
+
+    def end(self, array: np.ndarray) -> None:
+        """Wait for what :meth:`begin` started, and fill the ghost rows of ``array``."""
+        if not self._leaving and not self._arriving:
+            return
+        width = array.size // array.shape[0]
+        buffers = self._buffers[width]
+        MPI.Request.Waitall(buffers.requests)
+        self._busy.discard(width)
+        array.reshape(-1, width)[self._n_owned :] = buffers.arriving
+
+    def update(self, array: np.ndarray) -> None:
+        """Bring the owned rows of ``array`` (n_local, k) float64 to their ghosts elsewhere."""
+        self.begin(array)
+        self.end(array)
+
+    def close(self) -> None:
+        """Free the requests; no update may be under way."""
+        for buffers in self._buffers.values():
+            for request in buffers.requests:
+                request.Free()
+        self._buffers.clear()
+
+    def _prepare(self, array: np.ndarray, width: int) -> _Buffers:
+        if array.dtype != np.float64 or not array.flags.c_contiguous or len(array) != self._n_owned + self._n_ghosts:
+            raise ValueError(
+                f"ghosts are updated in C-contiguous float64 arrays of {self._n_owned + self._n_ghosts} rows, "
+                f"not in {array.dtype} {array.shape}"
+            )
+        leaving = np.empty((len(self._rows), width))
+        arriving = np.empty((self._n_ghosts, width))
+        requests = [self._comm.Recv_init(arriving[a:b], rank, _TAG + width) for rank, a, b in self._arriving]
+        requests += [self._comm.Send_init(leaving[a:b], rank, _TAG + width) for rank, a, b in self._leaving]
+        self._buffers[width] = _Buffers(leaving, arriving, requests)
+        return self._buffers[width]
+
+
+def _neighbours(counts: np.ndarray) -> list[tuple[int, int, int]]:
+    """(rank, first row, end of rows) of every rank with a count, for rows in the order of ranks."""
+    ends = np.cumsum(counts)
+    return [(int(rank), int(ends[rank] - counts[rank]), int(ends[rank])) for rank in np.flatnonzero(counts)]

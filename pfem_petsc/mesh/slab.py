@@ -1,0 +1,78 @@
+"""The part of a mesh that a rank holds before the mesh is distributed: contiguous ranges of its nodes and bars."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ..errors import InputError
+
+__all__ = ["MeshSlab", "check_size", "index_type", "slab_of", "slab_range"]
+
+
+@dataclass
+class MeshSlab:
+    """One rank's contiguous ranges of the nodes and bars of a mesh, in the mesh's own numbering (from 0).
+
+    Ranges are those of :func:`slab_range`. ``structured`` is True for a mesh made by rule, which is sound by
+    construction: the checks and the graph partitioner are not worth their time there.
+    """
+
+    n_nodes: int
+    """Nodes of the whole mesh."""
+    n_bars: int
+    """Bars of the whole mesh."""
+    first_node: int
+    points: np.ndarray
+    """(nodes here, 3) float64 [m]."""
+    first_bar: int
+    bars: np.ndarray
+    """(bars here, 2) int32 or int64: the ends as mesh numbers of nodes, anywhere in the mesh."""
+    node_groups: dict[str, np.ndarray] = field(default_factory=dict)
+    """Members (int64 mesh numbers) within this rank's nodes; the same names in the same order on all ranks."""
+    bar_groups: dict[str, np.ndarray] = field(default_factory=dict)
+    """Members (int64 mesh numbers) within this rank's bars; the same names in the same order on all ranks."""
+    source: str = "mesh"
+    """For messages: the file or the generator."""
+    structured: bool = False
+    warnings: list[str] = field(default_factory=list)
+    """What the reader left out, for the log (rank 0)."""
+
+
+def slab_range(n: int, rank: int, size: int) -> tuple[int, int]:
+    """First and one past the last of ``n`` things that a rank holds when they are dealt out evenly in order."""
+    share, rest = divmod(n, size)
+    first = rank * share + min(rank, rest)
+    return first, first + share + (rank < rest)
+
+
+def slab_of(numbers: np.ndarray, n: int, size: int) -> np.ndarray:
+    """The rank (int64) whose :func:`slab_range` of ``n`` holds each number."""
+    share, rest = divmod(n, size)
+    split = rest * (share + 1)
+    numbers = np.asarray(numbers, dtype=np.int64)
+    return np.where(numbers < split, numbers // (share + 1), rest + (numbers - split) // max(share, 1))
+
+
+def index_type(n: int) -> type[np.signedinteger]:
+    """The smaller of int32 and int64 that numbers ``n`` things."""
+    return np.int32 if n <= np.iinfo(np.int32).max else np.int64
+
+
+def check_size(n_nodes: int, where: str) -> None:
+    """Refuse a mesh whose unknowns PETSc cannot number, before anything is allocated for it.
+
+    Raises
+    ------
+    InputError
+        When three unknowns a node do not fit in PETSc's integers.
+    """
+    from petsc4py import PETSc
+
+    limit = int(np.iinfo(PETSc.IntType).max)
+    if 3 * n_nodes > limit:
+        raise InputError(
+            f"{where}: {n_nodes:,} nodes have {3 * n_nodes:,} unknowns, more than this PETSc can number ({limit:,}): "
+            "make the mesh smaller, or use a PETSc configured with 64-bit indices"
+        )

@@ -1,0 +1,245 @@
+"""The report of a run: lines, quiet mode, log file, and nothing formatted when nothing is due."""
+
+from __future__ import annotations
+
+import io
+import itertools
+import shutil
+
+import pytest
+from mpi4py import MPI
+
+from pfem_petsc.errors import InputError
+from pfem_petsc.output import progress as module
+from pfem_petsc.output.progress import Progress
+from pfem_petsc.output.units import duration, engineering, unit_of
+
+COMM = MPI.COMM_SELF
+
+
+class Clock:
+    """A clock that goes when told to."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+class OtherRank:
+    """What a rank other than 0 of a communicator looks like to code that does not communicate after set-up."""
+
+    rank, size = 1, 2
+
+    def allreduce(self, value, op=None):
+        return self.size
+
+
+def run(steps: int, wall_per_step: float, **options) -> str:
+    clock, stream = Clock(), io.StringIO()
+    progress = Progress(COMM, "Rod", options.pop("n_steps", steps), 1e-3 * steps, stream=stream, clock=clock, **options)
+    progress.summary({"nodes": "21", "critical step": "2.0 µs"})
+    for step in range(1, steps + 1):
+        clock.now += wall_per_step
+        progress.update(step, 1e-3 * step, 1e-3, newton=2, linear=30, contacts=3, energy_drift=-1.5e-6)
+    progress.close()
+    return stream.getvalue()
+
+
+def test_summary_and_final_line():
+    lines = run(10, 0.01).splitlines()
+    assert lines[0] == "Rod"
+    assert lines[1] == "  nodes          21"
+    assert lines[2] == "  critical step  2.0 µs"
+    assert lines[-1] == "done: 10 steps in 0.10 s (100 steps/s), t = 10.00 ms, 20 Newton and 300 linear iterations"
+
+
+def test_line_says_where_the_run_is():
+    lines = [line for line in run(100, 0.125).splitlines() if line.startswith("step")]
+    first = lines[0]
+    assert first.split()[1] == "16/100" and " 16 %" in first
+    assert "t = 16.00 ms" in first and "dt = 1.00 ms" in first
+    assert "Newton 2.0/step" in first and "CG 30.0/step" in first
+    assert "contacts 3" in first and "energy drift -1.5e-06" in first
+    assert "8 steps/s" in first and "ETA 10.5 s" in first
+    assert "100 %" in lines[-1] and "ETA 0.00 s" in lines[-1]
+
+
+def test_unknown_number_of_steps_is_measured_by_time():
+    first = next(line for line in run(100, 0.125, n_steps=None).splitlines() if line.startswith("step"))
+    assert " 16 %" in first and "ETA 10.5 s" in first and "/100" not in first
+
+
+def test_intervals_stretch_from_two_to_ten_seconds(tmp_path):
+    lines = [line for line in run(1000, 0.1).splitlines() if line.startswith("step")]
+    at = [0.1 * int(line.split("/")[0].split()[-1]) for line in lines]
+    gaps = [b - a for a, b in itertools.pairwise(at)]
+    assert at[0] == pytest.approx(2.0, abs=0.11)
+    assert gaps[0] == pytest.approx(2.5, abs=0.11)
+    assert max(gaps) == pytest.approx(10.0, abs=0.11)
+    assert len(lines) < 20
+
+
+def test_restart_counts_its_own_steps():
+    clock, stream = Clock(), io.StringIO()
+    progress = Progress(COMM, "Rod", 100, 1.0, stream=stream, clock=clock, start_step=50, start_time=0.5)
+    for step in range(51, 101):
+        clock.now += 0.125
+        progress.update(step, 0.01 * step, 0.01)
+    progress.close()
+    assert "done: 50 steps in 6.25 s (8 steps/s)" in stream.getvalue()
+    assert "66/100" in stream.getvalue() and "ETA 4.25 s" in stream.getvalue()
+
+
+def test_quiet_writes_the_log_only(tmp_path, capsys):
+    log = tmp_path / "results" / "log.txt"
+    assert run(100, 0.125, quiet=True, log_path=log) == ""
+    assert capsys.readouterr().out == ""
+    text = log.read_text()
+    assert "nodes          21" in text and "step  16/100" in text and "done: 100 steps" in text
+
+
+def test_log_has_date_and_level_and_is_continued(tmp_path, capsys):
+    log = tmp_path / "log.txt"
+    for _ in range(2):
+        with Progress(COMM, "Rod", 1, 1.0, log_path=log, stream=io.StringIO()) as progress:
+            progress.message("checkpoint written")
+            progress.warning("node 3 is fast")
+    lines = log.read_text().splitlines()
+    assert sum("done" in line for line in lines) == 2
+    date, time, level, *text = lines[1].split()
+    assert (len(date), len(time), level, " ".join(text)) == (10, 8, "WARNING", "node 3 is fast")
+    assert lines[0].split()[2:] == ["INFO", "checkpoint", "written"]
+    captured = capsys.readouterr()
+    assert captured.out == "" and captured.err.count("warning: node 3 is fast") == 2
+
+
+def test_failure_is_not_called_done():
+    stream = io.StringIO()
+    with pytest.raises(ValueError, match="boom"), Progress(COMM, "Rod", 5, 1.0, stream=stream):
+        raise ValueError("boom")
+    assert "stopped: 0 steps" in stream.getvalue() and "done" not in stream.getvalue()
+
+
+def test_nothing_is_formatted_when_nothing_is_due(monkeypatch):
+    calls = []
+    original = module.engineering
+    monkeypatch.setattr(module, "engineering", lambda *a: calls.append(a) or original(*a))
+    clock, stream = Clock(), io.StringIO()
+    progress = Progress(COMM, "Rod", 10**6, 1.0, stream=stream, clock=clock)
+    for step in range(1, 10001):
+        progress.update(step, 1e-6 * step, 1e-6, 1, 10, 0, 0.0)
+    assert calls == [] and stream.getvalue() == ""
+    clock.now += 2.0
+    progress.update(10001, 0.010001, 1e-6, 1, 10, 0, 0.0)
+    assert len(calls) >= 2 and stream.getvalue().count("\n") == 1
+    assert "Newton 1.0/step" in stream.getvalue()  # the silent steps are counted
+
+
+def test_other_ranks_say_nothing(tmp_path, capsys):
+    stream, clock = io.StringIO(), Clock()
+    progress = Progress(OtherRank(), "Rod", 10, 1.0, stream=stream, clock=clock, log_path=tmp_path / "log.txt")
+    progress.summary({"nodes": "21"})
+    clock.now += 60
+    progress.update(1, 0.1, 0.1)
+    progress.message("text")
+    progress.warning("text")
+    progress.close()
+    assert stream.getvalue() == "" and not (tmp_path / "log.txt").exists()
+    assert capsys.readouterr() == ("", "")
+
+
+def test_unwritable_log_is_refused_on_all_ranks(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match=r"log\.txt.*choose another output folder"):
+        Progress(MPI.COMM_WORLD, "Rod", 10, 1.0, log_path=tmp_path / "file" / "log.txt", stream=io.StringIO())
+
+
+def test_lost_log_is_said_once_and_the_run_goes_on(tmp_path, capsys):
+    folder = tmp_path / "results"
+    stream = io.StringIO()
+    progress = Progress(COMM, "Rod", 10, 1.0, log_path=folder / "log.txt", stream=stream)
+    shutil.rmtree(folder)
+    progress.message("one")
+    progress.message("two")
+    progress.close()
+    error = capsys.readouterr().err
+    assert error.count("the log cannot be written any more") == 1
+    assert "one" in stream.getvalue() and "two" in stream.getvalue() and "done" in stream.getvalue()
+
+
+def test_removed_log_is_begun_again(tmp_path):
+    log = tmp_path / "log.txt"
+    progress = Progress(COMM, "Rod", 10, 1.0, log_path=log, stream=io.StringIO())
+    log.unlink()
+    progress.message("still here")
+    assert "still here" in log.read_text()
+
+
+class Gone(io.StringIO):
+    def write(self, text):
+        raise BrokenPipeError
+
+
+def test_reader_of_stdout_that_leaves_does_not_stop_the_run(tmp_path):
+    log = tmp_path / "log.txt"
+    progress = Progress(COMM, "Rod", 10, 1.0, log_path=log, stream=Gone())
+    progress.message("one")
+    progress.message("two")
+    progress.close()
+    assert "nobody reads stdout" in log.read_text() and "two" in log.read_text()
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_bar_on_a_terminal_and_lines_under_a_launcher(monkeypatch):
+    for name in ("OMPI_COMM_WORLD_SIZE", "PMI_RANK", "PMIX_RANK", "SLURM_PROCID"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "100")
+    assert _drawn_by_bar()
+    monkeypatch.setenv("OMPI_COMM_WORLD_SIZE", "2")
+    assert not _drawn_by_bar()
+
+
+def _drawn_by_bar() -> bool:
+    stream, clock = Terminal(), Clock()
+    with Progress(COMM, "Rod", 10, 1.0, stream=stream, clock=clock) as progress:
+        for step in range(1, 11):
+            clock.now += 0.2
+            progress.update(step, 0.1 * step, 0.1, contacts=4)
+        progress.message("[brackets] stay")
+    text = stream.getvalue()
+    assert "[brackets] stay" in text and "done: 10 steps" in text
+    return "5/10  t = 500.0 ms  contacts 4" in text
+
+
+def test_engineering_prefixes():
+    assert engineering(2.4e-6, "s") == "2.400 µs"
+    assert engineering(2.1e11, "Pa") == "210.0 GPa"
+    assert engineering(-3.21e4, "N") == "-32.10 kN"
+    assert engineering(0.0, "J") == "0 J"
+    assert engineering(1e-3, "s") == "1.000 ms"
+    assert engineering(12.5, "K") == "12.50 K"
+    assert engineering(float("nan"), "s") == "nan s"
+
+
+def test_durations():
+    assert [duration(s) for s in (0.421, 12.34, 187, 7541, float("inf"))] == [
+        "0.42 s",
+        "12.3 s",
+        "3:07",
+        "2:05:41",
+        "?",
+    ]
+
+
+def test_units():
+    assert unit_of("wall/floor/force") == "N"
+    assert unit_of("probe/tip/velocity") == "m/s"
+    assert unit_of("numerical_dissipation") == unit_of("contact_work") == unit_of("kinetic_energy") == "J"
+    assert unit_of("newton_iterations") == unit_of("plastic_strain") == ""

@@ -1,0 +1,1 @@
+"""The positional bar element, its materials, mass, loads and supports."""

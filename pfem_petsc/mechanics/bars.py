@@ -1,0 +1,191 @@
+"""All bars of a rank: blocks of one section each, evaluated by the compiled loops of their material."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import NamedTuple
+
+import numpy as np
+
+from ..errors import InputError
+from .compiled import kernel
+from .kernels import make_kernels
+from .materials import elastic, elastoplastic
+from .strain import MEASURES
+
+__all__ = ["BarBlock", "Bars", "StrainEnergy"]
+
+
+class StrainEnergy(NamedTuple):
+    """Sums over the bars counted on this rank [J], and the first bar that collapsed (local index, -1: none)."""
+
+    elastic: float
+    plastic_heat: float
+    hardening: float
+    failed: int
+
+
+@dataclass(frozen=True)
+class BarBlock:
+    """Local bars [start, stop) of one section, of which [start, counted) are counted on this rank."""
+
+    section: str
+    start: int
+    counted: int
+    stop: int
+    area: float
+    density: float
+    damping: float
+    thermal_expansion: float
+    measure: int
+    parameters: np.ndarray
+    history: np.ndarray
+    kernels: SimpleNamespace
+
+
+@kernel
+def _rest_lengths(points, bars, rest):
+    for k in range(len(bars)):
+        a = bars[k, 0]
+        b = bars[k, 1]
+        dx = points[b, 0] - points[a, 0]
+        dy = points[b, 1] - points[a, 1]
+        dz = points[b, 2] - points[a, 2]
+        rest[k] = (dx * dx + dy * dy + dz * dz) ** 0.5
+
+
+class Bars:
+    """Internal forces, tangents and energies of the bars of this rank.
+
+    Attributes
+    ----------
+    ends : (b, 2) int32, local node indices of each bar
+    rest : (b,) float64, rest lengths [m]
+    thermal : (b,) thermal strains, or (0,) where no temperature acts
+    blocks : bars by section
+    """
+
+    def __init__(self, mesh, case) -> None:
+        self.mesh = mesh
+        self.ends = mesh.bars
+        self.rest = np.empty(len(mesh.bars))
+        _rest_lengths(mesh.points, mesh.bars, self.rest)
+        self.thermal = np.empty(0)
+        names = list(case.section)
+        self.blocks: list[BarBlock] = []
+        for block in mesh.blocks:
+            section = case.section[names[block.section]]
+            material = case.material[section.material]
+            law = elastic if material.yield_stress is None else elastoplastic
+            count = block.stop - block.start
+            self.blocks.append(
+                BarBlock(
+                    section=names[block.section],
+                    start=block.start,
+                    counted=block.counted,
+                    stop=block.stop,
+                    area=section.area,
+                    density=material.density,
+                    damping=material.damping,
+                    thermal_expansion=material.thermal_expansion,
+                    measure=MEASURES[material.strain],
+                    parameters=law.pack(material),
+                    history=np.zeros((count, law.HISTORY)),
+                    kernels=make_kernels(law.response),
+                )
+            )
+
+    def _arguments(self, x: np.ndarray, block: BarBlock) -> tuple:
+        return (x, self.ends, self.rest, self.thermal, block.parameters, block.area, block.measure, block.history)
+
+    def forces(self, x: np.ndarray, f: np.ndarray, commit: bool) -> StrainEnergy:
+        """Internal forces ``f`` (local nodes, 3) [N] at positions ``x``; valid for owned nodes. Keeps the plastic state
+        reached only where ``commit``."""
+        f[:] = 0.0
+        elastic_energy = heat = hardening = 0.0
+        failed = -1
+        for block in self.blocks:
+            u, q, w, at = block.kernels.forces(
+                *self._arguments(x, block), block.start, block.counted, block.stop, commit, f
+            )
+            elastic_energy += u
+            heat += q
+            hardening += w
+            if failed < 0:
+                failed = at
+        return StrainEnergy(elastic_energy, heat, hardening, failed)
+
+    def tangents(self, x: np.ndarray, weight: float, inertia: list[float], pattern, values: np.ndarray) -> None:
+        """Add ``weight`` K_t(x) and the consistent inertia (a coefficient per block) to a matrix's values."""
+        for block, m in zip(self.blocks, inertia, strict=True):
+            block.kernels.tangents(
+                *self._arguments(x, block), block.start, block.stop, m, weight, pattern.ptr, pattern.slots, values
+            )
+
+    def product(self, x: np.ndarray, u: np.ndarray, out: np.ndarray) -> None:
+        """``out`` = K_t(x) u for local arrays (nodes, 3); valid for owned nodes."""
+        out[:] = 0.0
+        for block in self.blocks:
+            block.kernels.product(*self._arguments(x, block), block.start, block.stop, u, out)
+
+    def fields(self, x: np.ndarray) -> dict[str, np.ndarray]:
+        """Per local bar: ``strain``, ``stress`` [Pa], ``axial_force`` [N], ``plastic_strain``."""
+        out = {name: np.zeros(len(self.ends)) for name in ("strain", "stress", "axial_force", "plastic_strain")}
+        for block in self.blocks:
+            block.kernels.fields(
+                *self._arguments(x, block),
+                block.start,
+                block.stop,
+                out["strain"],
+                out["stress"],
+                out["axial_force"],
+            )
+            if block.history.shape[1]:
+                out["plastic_strain"][block.start : block.stop] = block.history[:, 0]
+        return out
+
+    @property
+    def plastic(self) -> bool:
+        """Whether any bar of this rank can yield."""
+        return any(block.history.shape[1] for block in self.blocks)
+
+
+def section_of_bars(case, slab) -> np.ndarray:
+    """Section index (m,) int32 of each bar of a slab: the section that names its group, else the default one.
+
+    Raises
+    ------
+    InputError
+        Where a section names a group that the mesh lacks, or a bar has two sections or none.
+    """
+    from ..registry import nearest
+
+    chosen = np.full(len(slab.bars), -1, dtype=np.int32)
+    for index, (name, section) in enumerate(case.section.items()):
+        if section.bars is None:
+            continue
+        if section.bars not in slab.bar_groups:
+            hint = nearest(section.bars, sorted(slab.bar_groups)) if slab.bar_groups else "; the mesh has no bar groups"
+            raise InputError(
+                f"{case.source}: section.{name}.bars = {section.bars!r}: no such bar group in {slab.source}{hint}"
+            )
+        members = slab.bar_groups[section.bars] - slab.first_bar
+        taken = members[chosen[members] >= 0]
+        if len(taken):
+            other = list(case.section)[chosen[taken[0]]]
+            raise InputError(
+                f"{case.source}: section.{name}.bars: bar {taken[0] + slab.first_bar} already belongs to section "
+                f"{other!r}; give each bar one section"
+            )
+        chosen[members] = index
+    default = [i for i, section in enumerate(case.section.values()) if section.bars is None]
+    if default:
+        chosen[chosen < 0] = default[0]
+    bare = np.flatnonzero(chosen < 0)
+    if len(bare):
+        raise InputError(
+            f"{case.source}: section: bar {bare[0] + slab.first_bar} of {slab.source} (and {len(bare) - 1} more here) has "
+            "no section; add a section without 'bars' as the default"
+        )
+    return chosen

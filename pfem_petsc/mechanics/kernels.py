@@ -1,0 +1,165 @@
+"""Loops over bars, made once for each material law.
+
+Bar from node a to node b with d = x_b - x_a, l = |d|, n = d/l (Greco & Coda's positional bar; design equations):
+internal force on a is -N n, on b is +N n; the Hessian block is (dN/dl) n n^T + (N/l)(I - n n^T), added to the diagonal
+blocks of both ends and subtracted from the two blocks between them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import cache
+from types import SimpleNamespace
+
+from .compiled import kernel
+from .strain import strain_of
+
+__all__ = ["COLLAPSED_STRETCH", "make_kernels"]
+
+COLLAPSED_STRETCH = 1e-3  # a bar below this fraction of its rest length has been crushed: no truss model holds there
+
+
+@cache
+def make_kernels(response: Callable) -> SimpleNamespace:
+    """Kernels of a material law: ``forces``, ``tangents``, ``product``, ``fields``.
+
+    Common arguments: ``x`` (local nodes, 3) [m]; ``bars`` (b, 2) local ends; ``rest`` (b,) rest lengths [m]; ``thermal``
+    (b,) thermal strains, or (0,) for none; ``p`` the law's parameters; ``area`` [m2]; ``measure`` of
+    :mod:`~pfem_petsc.mechanics.strain`; ``history`` of the bars of this block, whose row is ``k - start``.
+    """
+
+    @kernel
+    def forces(x, bars, rest, thermal, p, area, measure, history, start, counted, stop, commit, f):
+        """Add internal forces to ``f``; sums over counted bars: elastic, heat, hardening [J]; first failed bar or -1."""
+        elastic = 0.0
+        heat = 0.0
+        hardening = 0.0
+        failed = -1
+        warm = len(thermal) > 0
+        for k in range(start, stop):
+            a = bars[k, 0]
+            b = bars[k, 1]
+            dx = x[b, 0] - x[a, 0]
+            dy = x[b, 1] - x[a, 1]
+            dz = x[b, 2] - x[a, 2]
+            length = math.sqrt(dx * dx + dy * dy + dz * dz)
+            stretch = length / rest[k]
+            if not (stretch > COLLAPSED_STRETCH):  # NaN fails this test too
+                if failed < 0:
+                    failed = k
+                if not commit:  # a trial position: the solver's norms must see that it is out of bounds
+                    f[a, 0] = math.nan
+                    f[b, 0] = math.nan
+                continue
+            strain, slope, _ = strain_of(measure, stretch)
+            if warm:
+                strain -= thermal[k]
+            stress, _, u, q, w = response(strain, p, history, k - start, commit)
+            if k < counted:
+                volume = area * rest[k]
+                elastic += volume * u
+                heat += volume * q
+                hardening += volume * w
+            c = area * stress * slope / length
+            f[a, 0] -= c * dx
+            f[a, 1] -= c * dy
+            f[a, 2] -= c * dz
+            f[b, 0] += c * dx
+            f[b, 1] += c * dy
+            f[b, 2] += c * dz
+        return elastic, heat, hardening, failed
+
+    @kernel
+    def stiffness(x, a, b, rest, strain_shift, p, area, measure, history, row):
+        """dN/dl [N/m], N/l [N/m] and n of one bar."""
+        dx = x[b, 0] - x[a, 0]
+        dy = x[b, 1] - x[a, 1]
+        dz = x[b, 2] - x[a, 2]
+        length = math.sqrt(dx * dx + dy * dy + dz * dz)
+        strain, slope, curvature = strain_of(measure, length / rest)
+        stress, modulus, _, _, _ = response(strain - strain_shift, p, history, row, False)
+        axial = area * (modulus * slope * slope + stress * curvature) / rest
+        geometric = area * stress * slope / length
+        return axial, geometric, dx / length, dy / length, dz / length
+
+    @kernel
+    def tangents(x, bars, rest, thermal, p, area, measure, history, start, stop, inertia, weight, ptr, slots, values):
+        """Add ``weight`` K_t, and ``inertia`` l0 (2 on the diagonal, 1 beside it), to the block rows of owned nodes.
+
+        ``slots`` (b, 4): index among all blocks of (a, a), (a, b), (b, b), (b, a), -1 where the row is not owned;
+        ``ptr`` (owned + 1,) first block of a row; ``values``: the matrix in scalar compressed rows.
+        """
+        warm = len(thermal) > 0
+        for k in range(start, stop):
+            a = bars[k, 0]
+            b = bars[k, 1]
+            shift = thermal[k] if warm else 0.0
+            axial, geometric, nx, ny, nz = stiffness(x, a, b, rest[k], shift, p, area, measure, history, k - start)
+            axial = weight * (axial - geometric)
+            geometric = weight * geometric
+            mass = inertia * rest[k]
+            for side in range(4):
+                slot = slots[k, side]
+                if slot < 0:
+                    continue
+                row = a if side < 2 else b
+                sign = 1.0 if side % 2 == 0 else -1.0
+                m = 2.0 * mass if side % 2 == 0 else mass
+                at = 6 * ptr[row] + 3 * slot
+                wide = 3 * (ptr[row + 1] - ptr[row])
+                c = sign * axial
+                d = sign * geometric + m
+                values[at] += c * nx * nx + d
+                values[at + 1] += c * nx * ny
+                values[at + 2] += c * nx * nz
+                at += wide
+                values[at] += c * ny * nx
+                values[at + 1] += c * ny * ny + d
+                values[at + 2] += c * ny * nz
+                at += wide
+                values[at] += c * nz * nx
+                values[at + 1] += c * nz * ny
+                values[at + 2] += c * nz * nz + d
+
+    @kernel
+    def product(x, bars, rest, thermal, p, area, measure, history, start, stop, u, out):
+        """Add K_t u to ``out``; both (local nodes, 3), ``u`` with ghosts."""
+        warm = len(thermal) > 0
+        for k in range(start, stop):
+            a = bars[k, 0]
+            b = bars[k, 1]
+            shift = thermal[k] if warm else 0.0
+            axial, geometric, nx, ny, nz = stiffness(x, a, b, rest[k], shift, p, area, measure, history, k - start)
+            dx = u[b, 0] - u[a, 0]
+            dy = u[b, 1] - u[a, 1]
+            dz = u[b, 2] - u[a, 2]
+            along = (axial - geometric) * (nx * dx + ny * dy + nz * dz)
+            fx = along * nx + geometric * dx
+            fy = along * ny + geometric * dy
+            fz = along * nz + geometric * dz
+            out[a, 0] -= fx
+            out[a, 1] -= fy
+            out[a, 2] -= fz
+            out[b, 0] += fx
+            out[b, 1] += fy
+            out[b, 2] += fz
+
+    @kernel
+    def fields(x, bars, rest, thermal, p, area, measure, history, start, stop, strain_out, stress_out, force_out):
+        """Total strain, stress [Pa] and axial force [N] of each bar."""
+        warm = len(thermal) > 0
+        for k in range(start, stop):
+            a = bars[k, 0]
+            b = bars[k, 1]
+            dx = x[b, 0] - x[a, 0]
+            dy = x[b, 1] - x[a, 1]
+            dz = x[b, 2] - x[a, 2]
+            strain, slope, _ = strain_of(measure, math.sqrt(dx * dx + dy * dy + dz * dz) / rest[k])
+            shift = thermal[k] if warm else 0.0
+            stress, _, _, _, _ = response(strain - shift, p, history, k - start, False)
+            strain_out[k] = strain
+            stress_out[k] = stress
+            force_out[k] = area * stress * slope
+
+    return SimpleNamespace(forces=forces, tangents=tangents, product=product, fields=fields)

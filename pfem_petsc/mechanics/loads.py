@@ -1,0 +1,46 @@
+"""External forces: nodal loads times a table over time, and gravity."""
+
+from __future__ import annotations
+
+import numpy as np
+
+__all__ = ["ExternalForce", "Table"]
+
+
+class Table:
+    """Piecewise linear in time, constant before the first and after the last entry."""
+
+    def __init__(self, rows) -> None:
+        rows = np.asarray(rows, dtype=np.float64)
+        self.times = np.ascontiguousarray(rows[:, 0])
+        self.values = np.ascontiguousarray(rows[:, 1:])
+
+    def __call__(self, time: float) -> np.ndarray:
+        """Values at a time, one per column."""
+        return np.array([np.interp(time, self.times, column) for column in self.values.T])
+
+
+class ExternalForce:
+    """Nodal external forces at any time.
+
+    Attributes
+    ----------
+    active : whether anything acts at all (on any rank, at any time)
+    """
+
+    def __init__(self, case, nodes: dict[str, np.ndarray], inertia) -> None:
+        self.loads = [
+            (nodes[load.node_set], np.array(load.force), Table(load.table) if load.table else None)
+            for load in case.load
+        ]
+        gravity = case.gravity.acceleration if case.gravity is not None else (0.0, 0.0, 0.0)
+        self.gravity = np.array(gravity, dtype=np.float64)
+        self.inertia = inertia
+        self.active = bool(case.load) or bool(self.gravity.any())
+
+    def at(self, time: float, out: np.ndarray) -> np.ndarray:
+        """``out`` (owned, 3) [N] at a time [s]."""
+        np.multiply(self.inertia.mass[:, None], self.gravity, out=out)
+        for indices, force, table in self.loads:
+            out[indices] += force * (table(time)[0] if table is not None else 1.0)
+        return out

@@ -1,0 +1,93 @@
+"""Mass and damping: lumped to the nodes, or consistent with the linear shape functions of the bar.
+
+Consistent mass of a bar: rho A l0 / 6 [[2, 1], [1, 2]] for each direction; its row sums are the lumped mass rho A l0 / 2.
+Damping is c_m per reference volume, distributed the same way.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .compiled import kernel
+
+__all__ = ["Inertia"]
+
+
+@kernel
+def _lump(bars, rest, start, stop, density, out):
+    for k in range(start, stop):
+        half = 0.5 * density * rest[k]
+        out[bars[k, 0]] += half
+        out[bars[k, 1]] += half
+
+
+@kernel
+def _consistent_product(bars, rest, start, stop, density, u, out):
+    for k in range(start, stop):
+        a = bars[k, 0]
+        b = bars[k, 1]
+        m = density * rest[k] / 6.0
+        for i in range(3):
+            out[a, i] += m * (2.0 * u[a, i] + u[b, i])
+            out[b, i] += m * (u[a, i] + 2.0 * u[b, i])
+
+
+class Inertia:
+    """Mass M [kg] and damping C [kg/s] of the nodes this rank owns.
+
+    Attributes
+    ----------
+    mass, damping : (owned,) lumped values; also the row sums of the consistent matrices
+    consistent : whether products use the consistent matrices
+    damped : whether any bar of the whole model has damping
+    """
+
+    def __init__(self, mesh, bars, consistent: bool) -> None:
+        self.mesh = mesh
+        self.bars = bars
+        self.consistent = consistent
+        mass = np.zeros(mesh.n_local)
+        damping = np.zeros(mesh.n_local)
+        for block in bars.blocks:
+            _lump(bars.ends, bars.rest, block.start, block.stop, block.density * block.area, mass)
+            if block.damping:
+                _lump(bars.ends, bars.rest, block.start, block.stop, block.damping * block.area, damping)
+        self.mass = mass[: mesh.n_owned].copy()
+        self.damping = damping[: mesh.n_owned].copy()
+        self.damped = bool(mesh.comm.allreduce(float(damping.sum())) > 0.0)
+        if consistent:
+            self._u = np.zeros((mesh.n_local, 3))
+            self._out = np.zeros((mesh.n_local, 3))
+
+    def mass_times(self, a: np.ndarray, out: np.ndarray) -> np.ndarray:
+        """``out`` = M a for owned nodes, both (owned, 3). Collective where the mass is consistent."""
+        return self._times(a, out, self.mass, lambda block: block.density)
+
+    def damping_times(self, v: np.ndarray, out: np.ndarray) -> np.ndarray:
+        """``out`` = C v for owned nodes, both (owned, 3). Collective where the mass is consistent."""
+        if not self.damped:
+            out[:] = 0.0
+            return out
+        return self._times(v, out, self.damping, lambda block: block.damping)
+
+    def _times(self, u, out, lumped, density):
+        if not self.consistent:
+            np.multiply(lumped[:, None], u, out=out)
+            return out
+        owned = self.mesh.n_owned
+        self._u[:owned] = u
+        self.mesh.update_ghosts(self._u)
+        self._out[:] = 0.0
+        for block in self.bars.blocks:
+            coefficient = density(block) * block.area
+            _consistent_product(
+                self.bars.ends, self.bars.rest, block.start, block.stop, coefficient, self._u, self._out
+            )
+        out[:] = self._out[:owned]
+        return out
+
+    def coefficients(self, alpha: float, eta: float) -> list[float]:
+        """Per block, (alpha rho + eta c_m) A / 6 [kg/(m s2)]: the consistent part of a Hessian; zeros where lumped."""
+        if not self.consistent:
+            return [0.0] * len(self.bars.blocks)
+        return [(alpha * b.density + eta * b.damping) * b.area / 6.0 for b in self.bars.blocks]

@@ -1,0 +1,50 @@
+#!/usr/bin/env bash
+# Sets up and runs all tests: serial, then those marked parallel on 2 and on 3 ranks.
+#
+# usage: scripts/test.sh [--build-petsc] [PYTEST ARGUMENTS...]
+# All three stages run whatever the others say; the status is 0 when all passed. TEST_LIMIT ends a stage [s].
+set -uo pipefail
+
+setup=()
+if [[ ${1:-} == --build-petsc ]]; then
+    setup+=("$1")
+    shift
+    export PFEM_VENV=${PFEM_VENV:-.venv-petsc}
+fi
+bash "$(dirname "${BASH_SOURCE[0]}")/setup.sh" "${setup[@]}" || exit
+source "$(dirname "${BASH_SOURCE[0]}")/environment.sh"
+cd "$root" || exit
+
+limit=${TEST_LIMIT:-600}
+log=$(mktemp)
+trap 'rm -f "$log"' EXIT
+status=0
+summary=""
+failures=""
+
+# stage NAME COMMAND...: one run of pytest, whose closing line is kept. No parallel test collected (5) is no failure
+# where pytest's own arguments choose the tests.
+stage() {
+    local name=$1 result line
+    shift
+    echo "== $name"
+    "$@" 2>&1 | tee "$log"
+    result=${PIPESTATUS[0]}
+    [[ $result == 5 && $selected == yes ]] && result=0
+    line=$(grep -E '^=+ .* in [0-9.]+s.* =+$' "$log" | tail -n 1)
+    if [[ $result == 0 ]]; then
+        summary="$name: passed"$'\n'"${line:-no closing line}"$'\n'"$summary"
+    else
+        failures="$failures$name: failed (status $result)"$'\n'"${line:-no closing line: ended after at most $limit s}"$'\n'
+        status=1
+    fi
+}
+
+selected=$([[ $# -gt 0 ]] && echo yes || echo no)
+stage "1 rank" timeout --kill-after=15 "$limit" "$python" -m pytest --durations=5 "$@"
+stage "2 ranks" on_ranks 2 "$limit" "$python" -m pytest "$@"
+stage "3 ranks" on_ranks 3 "$limit" "$python" -m pytest "$@"
+
+# The last line is a closing line of pytest: of the first stage, which runs every test, or of the last that failed.
+printf '\n%s%s' "$summary" "$failures"
+exit "$status"

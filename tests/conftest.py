@@ -1,0 +1,170 @@
+"""Tests on one rank and on several: ``mpirun -n 3 python -m pytest`` runs those marked ``parallel``.
+
+All ranks run the same tests in step. The outcome of each phase of a test (set-up, call, tear-down) is agreed on, so a
+failure on one rank is a failure everywhere, with that rank's report. A rank that waits for the others too long, as
+when one of them left a collective call early by an exception, says so and ends the run. Only rank 0 prints.
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from hypothesis import settings
+from mpi4py import MPI
+
+WORLD = MPI.COMM_WORLD
+AGREEMENT = WORLD.Dup() if WORLD.size > 1 else None
+PASSED, SKIPPED, FAILED = range(3)
+OUTCOME = {"passed": PASSED, "skipped": SKIPPED, "failed": FAILED}
+# Seconds that a rank waits for the others after a phase that passed, and after one that failed.
+PATIENCE = {PASSED: 280.0, SKIPPED: 60.0, FAILED: 30.0}
+
+# The same examples on every rank and in every run; compiled kernels make the first example slow.
+settings.register_profile("ranks", derandomize=True, deadline=None, database=None)
+settings.load_profile("ranks")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_configure(config: pytest.Config) -> None:
+    if AGREEMENT is not None:
+        # A folder of its own for each rank: pytest's numbered ones are claimed by several at once.
+        config.option.basetemp = tempfile.mkdtemp(prefix=f"pytest-rank{WORLD.rank}-")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_sessionstart(session: pytest.Session) -> None:
+    if WORLD.rank > 0:
+        terminal = session.config.pluginmanager.getplugin("terminalreporter")
+        terminal._tw._file = open(os.devnull, "w")  # noqa: SIM115 - open for as long as the process lives
+
+
+def pytest_report_header() -> str:
+    return f"ranks: {WORLD.size}"
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    if AGREEMENT is not None:
+        shutil.rmtree(config.option.basetemp, ignore_errors=True)
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if AGREEMENT is None:
+        return
+    serial = [item for item in items if item.get_closest_marker("parallel") is None]
+    if serial:
+        config.hook.pytest_deselected(items=serial)
+        items[:] = [item for item in items if item.get_closest_marker("parallel") is not None]
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    if AGREEMENT is None:
+        return
+    names = [item.nodeid for item in session.items]
+    wait_for_all("the collection of tests", PASSED, "")
+    everywhere = AGREEMENT.allgather((names, session.testsfailed))
+    if any(other != names for other, _ in everywhere):
+        pytest.exit("the ranks found different tests to run", returncode=1)
+    if any(failed for _, failed in everywhere) and not session.testsfailed:
+        pytest.exit("another rank could not collect the tests", returncode=1)
+
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) -> Iterator[None]:
+    report = yield
+    if AGREEMENT is None:
+        return report
+    mine = OUTCOME[report.outcome]
+    worst = wait_for_all(f"{item.nodeid} ({report.when})", mine, report.longreprtext)
+    if worst == FAILED:
+        texts = AGREEMENT.allgather(report.longreprtext if mine == FAILED else None)
+        failed = [rank for rank, text in enumerate(texts) if text is not None]
+        if mine != FAILED or failed != list(range(WORLD.size)):
+            report.outcome = "failed"
+            report.longrepr = "\n".join(f"--- rank {rank} of {WORLD.size}\n{texts[rank]}" for rank in failed)
+    elif worst == SKIPPED and mine == PASSED and report.when == "setup":
+        # Not run here either: the others would be missing from its collective calls.
+        report.outcome = "skipped"
+        report.longrepr = (str(item.path), 0, "Skipped: on another rank")
+    return report
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_runtest_logfinish(nodeid: str, location: tuple) -> None:
+    if AGREEMENT is None:
+        return
+    # PETSc destroys collectively, Python collects whenever it likes: bring the ranks in step between tests.
+    gc.collect()
+    petsc4py = sys.modules.get("petsc4py.PETSc")
+    if petsc4py is not None and hasattr(petsc4py, "garbage_cleanup"):
+        petsc4py.garbage_cleanup()
+
+
+def wait_for_all(what: str, outcome: int, text: str) -> int:
+    """Agree on the worst outcome of a phase over all ranks, or end the run when some rank never gets there."""
+    worst = bytearray([outcome])
+    request = AGREEMENT.Iallreduce(MPI.IN_PLACE, [worst, MPI.UNSIGNED_CHAR], op=MPI.MAX)
+    start = time.monotonic()
+    while not request.Test():
+        waited = time.monotonic() - start
+        if waited > PATIENCE[outcome]:
+            print(
+                f"\nrank {WORLD.rank} of {WORLD.size}: after {what} the other ranks were not there in {waited:.0f} s:"
+                f" they may be waiting for this one in a collective call.\n{text}",
+                file=sys.stderr,
+                flush=True,
+            )
+            AGREEMENT.Abort(1)
+        time.sleep(min(0.01, waited / 10))
+    return worst[0]
+
+
+@pytest.fixture
+def comm() -> MPI.Intracomm:
+    """All ranks of the run."""
+    return WORLD
+
+
+@pytest.fixture
+def shared_tmp_path() -> Iterator[Path]:
+    """One temporary folder for all ranks, removed after the test."""
+    folder = WORLD.bcast(tempfile.mkdtemp(prefix="pfem-test-") if WORLD.rank == 0 else None)
+    yield Path(folder)
+    WORLD.Barrier()
+    if WORLD.rank == 0:
+        shutil.rmtree(folder)
+
+
+@pytest.fixture
+def on_ranks() -> Callable[..., subprocess.CompletedProcess]:
+    """Run Python on several ranks, apart from this process: ``on_ranks(2, "-m", "pfem_petsc", "case.toml", cwd=...)``.
+
+    The result has ``returncode``, ``stdout`` and ``stderr``; ``timeout`` [s] ends all ranks with an exception.
+    """
+
+    def run(ranks: int, *arguments: str | Path, timeout: float = 120.0, **options) -> subprocess.CompletedProcess:
+        # This process may have started MPI: what that left in the environment would confuse another launch.
+        left = ("PMIX_", "PMI_", "OMPI_COMM_", "OMPI_MCA_orte_", "OMPI_MCA_ess_", "OMPI_UNIVERSE_", "OPAL_", "ORTE_")
+        environment = {name: value for name, value in os.environ.items() if not name.startswith(left)}
+        environment |= dict.fromkeys(
+            ("OMPI_ALLOW_RUN_AS_ROOT", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM", "OMPI_MCA_rmaps_base_oversubscribe"), "1"
+        )
+        environment |= {"OMP_NUM_THREADS": "1", "PRTE_MCA_rmaps_default_mapping_policy": ":oversubscribe"}
+        command = ["mpirun", "-n", str(ranks), sys.executable, *map(str, arguments)]
+        # timeout(1) ends mpirun politely, and mpirun its ranks; a killed mpirun would leave them behind.
+        command = ["timeout", "--kill-after=10", str(timeout), *command]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, **options)
+        if done.returncode in (124, 137):
+            raise TimeoutError(f"{' '.join(command)}\n{done.stdout}\n{done.stderr}")
+        return done
+
+    return run

@@ -1,0 +1,48 @@
+"""Meshes: generators, readers, checks, and their distribution over the ranks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
+    from .slab import MeshSlab
+
+__all__ = ["load_slab"]
+
+
+def load_slab(mesh: Any, comm: MPI.Comm) -> MeshSlab:
+    """Each rank's part of the mesh that a case asks for, checked. Collective.
+
+    Parameters
+    ----------
+    mesh : the ``[mesh]`` table of a case
+        With ``generator`` and ``parameters``, or ``file``: the suffix chooses the reader (``.msh``, ``.vtu``,
+        ``.vtkhdf``, ``.h5``).
+
+    Raises
+    ------
+    InputError
+        On all ranks, when the mesh cannot be made or read, or is not sound.
+    """
+    from ..parallel.agreement import agreed
+    from ..registry import lookup
+    from .checks import check_mesh
+
+    if mesh.generator is not None:
+        from ..errors import InputError
+
+        with agreed(comm):
+            generator = lookup("pfem_petsc.mesh.generators", mesh.generator, "mesh.generator")
+            try:
+                slab = generator.generate(mesh.parameters, comm.rank, comm.size)
+            except MemoryError:
+                raise InputError(f"mesh: the {mesh.generator} does not fit in this machine's memory") from None
+    else:
+        from .readers import read_slab
+
+        slab = read_slab(Path(mesh.file), comm)
+    check_mesh(slab, comm)
+    return slab

@@ -26,6 +26,10 @@ class Router:
 
     def __init__(self, comm: MPI.Comm, ranks: np.ndarray) -> None:
         self._comm = comm
+        if comm.size == 1:
+            self._counts = self._arriving = np.array([len(ranks)])
+            self.n_received = len(ranks)
+            return
         # 16-bit ranks are sorted by radix, several times faster than wider ones.
         if comm.size <= np.iinfo(np.uint16).max:
             ranks = ranks.astype(np.uint16)
@@ -36,11 +40,18 @@ class Router:
         self.n_received = int(self._arriving.sum())
 
     def send(self, rows: np.ndarray) -> np.ndarray:
-        """Send row i to its rank. Returns the rows that arrive, in the order of sending ranks and their rows."""
+        """Send row i to its rank. Returns the rows that arrive, in the order of sending ranks and their rows.
+
+        One rank alone gets its own array back, not a copy; so with :meth:`reply`.
+        """
+        if self._comm.size == 1:
+            return rows
         return self._exchange(rows[self._order], self._counts, self._arriving)
 
     def reply(self, rows: np.ndarray) -> np.ndarray:
         """Send back one row for each row received, in that order. Returns them in the order of the rows sent."""
+        if self._comm.size == 1:
+            return rows
         returned = self._exchange(np.ascontiguousarray(rows), self._arriving, self._counts)
         result = np.empty_like(returned)
         result[self._order] = returned

@@ -85,12 +85,9 @@ def _by_graph(slab: MeshSlab, comm: MPI.Comm) -> np.ndarray | None:
     """Partition the graph of nodes and bars by PT-Scotch; None where PETSc lacks it (the same on all ranks)."""
     from petsc4py import PETSc
 
-    rows, columns = _adjacency(slab, comm)
-    n = len(slab.points)
-    pattern = (rows, columns, np.ones(len(columns)))
-    graph = PETSc.Mat().createAIJ(((n, slab.n_nodes), (n, slab.n_nodes)), csr=pattern, comm=comm)
     tool = PETSc.MatPartitioning().create(comm)
     owners = PETSc.IS()
+    graph = PETSc.Mat()
     try:
         try:
             tool.setType("ptscotch")
@@ -98,6 +95,9 @@ def _by_graph(slab: MeshSlab, comm: MPI.Comm) -> np.ndarray | None:
             if error.ierr != 86:  # PETSC_ERR_UNKNOWN_TYPE
                 raise
             return None
+        rows, columns = _adjacency(slab, comm)
+        n = len(slab.points)
+        graph.createAIJ(((n, slab.n_nodes), (n, slab.n_nodes)), csr=(rows, columns, np.ones(len(columns))), comm=comm)
         tool.setAdjacency(graph)
         tool.apply(owners)
         return owners.indices.astype(np.int32)
@@ -111,9 +111,11 @@ def _adjacency(slab: MeshSlab, comm: MPI.Comm) -> tuple[np.ndarray, np.ndarray]:
     """Neighbours of every node of the slab, ascending, each once: row starts and columns."""
     from petsc4py import PETSc
 
-    pairs = np.concatenate([slab.bars, slab.bars[:, ::-1]]).astype(np.int64)
-    router = Router(comm, slab_of(pairs[:, 0], slab.n_nodes, comm.size))
-    pairs = np.unique(router.send(pairs), axis=0)
+    ends = np.concatenate([slab.bars, slab.bars[:, ::-1]]).astype(np.int64)
+    router = Router(comm, slab_of(ends[:, 0], slab.n_nodes, comm.size))
+    ends = router.send(ends)
+    pairs = np.unique((ends[:, 0] - slab.first_node) * slab.n_nodes + ends[:, 1])
+    node, neighbour = np.divmod(pairs, slab.n_nodes)
     rows = np.zeros(len(slab.points) + 1, PETSc.IntType)
-    rows[1:] = np.cumsum(np.bincount(pairs[:, 0] - slab.first_node, minlength=len(slab.points)))
-    return rows, pairs[:, 1].astype(PETSc.IntType)
+    rows[1:] = np.cumsum(np.bincount(node, minlength=len(slab.points)))
+    return rows, neighbour.astype(PETSc.IntType)

@@ -1,0 +1,45 @@
+"""Mesh files: the suffix chooses the reader."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
+    from ..slab import MeshSlab
+
+__all__ = ["SUFFIXES", "read_slab"]
+
+SUFFIXES = {".msh": "gmsh", ".vtu": "vtk", ".vtkhdf": "vtk", ".h5": "hdf5"}
+"""Reader module for each suffix; each has ``read(path, comm) -> MeshSlab``, collective."""
+
+
+def read_slab(path: Path, comm: MPI.Comm) -> MeshSlab:
+    """This rank's part of the mesh in a file. Collective.
+
+    Raises
+    ------
+    InputError
+        On all ranks, when there is no such file, no reader for its suffix, or its content is not a mesh of bars.
+    """
+    from ...errors import InputError
+    from ...parallel.agreement import on_root
+
+    on_root(comm, _check_file, path)
+    reader = SUFFIXES.get(path.suffix.lower())
+    if reader is None:
+        raise InputError(f"mesh.file: no reader for {path.name!r}; known suffixes: {', '.join(SUFFIXES)}")
+    return importlib.import_module(f"{__name__}.{reader}").read(path, comm)
+
+
+def _check_file(path: Path) -> None:
+    from ...errors import InputError
+
+    try:
+        with open(path, "rb"):
+            pass
+    except OSError as error:
+        raise InputError(f"mesh.file: cannot open {path}: {error.strerror}") from None

@@ -1,0 +1,135 @@
+"""Is a mesh one that can be simulated? Checked on slabs, before it is distributed."""
+
+from __future__ import annotations
+
+import numpy as np
+from mpi4py import MPI
+
+from ..errors import InputError
+from .exchange import Router
+from .slab import MeshSlab, slab_of
+
+__all__ = ["SHORT", "check_mesh"]
+
+SHORT = 1e-6
+"""Bars shorter than this fraction of the mean length are reported as suspicious."""
+
+_SHOWN = 5
+
+
+def check_mesh(slab: MeshSlab, comm: MPI.Comm) -> list[str]:
+    """Refuse a mesh that cannot be simulated. Collective.
+
+    Nodes and bars are named by their numbers in the mesh, from 0. A structured mesh is sound by construction and
+    not looked at.
+
+    Returns
+    -------
+    warnings : list of str
+        The slab's own and what looks wrong but can be simulated (bars far shorter than the others); equal on all
+        ranks.
+
+    Raises
+    ------
+    InputError
+        On all ranks: no nodes or bars, coordinates that are not finite, bar ends that do not exist, bars of zero
+        length, several bars between the same two nodes, nodes without bars.
+    """
+    warnings = comm.bcast(slab.warnings if comm.rank == 0 else None)
+    if slab.structured:
+        return warnings
+    if slab.n_nodes == 0 or slab.n_bars == 0:
+        raise InputError(f"{slab.source}: {slab.n_nodes} nodes and {slab.n_bars} bars: nothing to simulate")
+    _check_points(slab, comm)
+    _check_ends(slab, comm)
+    # The bars of a node meet at the rank whose slab holds it: there both ends of each bar are known to be used.
+    ends, place = np.unique(slab.bars, return_inverse=True)
+    asking = Router(comm, slab_of(ends, slab.n_nodes, comm.size))
+    asked = asking.send(ends) - slab.first_node
+    _check_bare_nodes(slab, comm, asked)
+    points = asking.reply(slab.points[asked])
+    warnings = warnings + _check_lengths(slab, comm, points, place.reshape(-1, 2))
+    del points, place, asking, asked, ends
+    _check_duplicates(slab, comm)
+    return warnings
+
+
+def _check_points(slab: MeshSlab, comm: MPI.Comm) -> None:
+    bad = np.flatnonzero(~np.isfinite(slab.points).all(axis=1))
+    lines = [f"node {slab.first_node + i} at ({', '.join(f'{x:g}' for x in slab.points[i])})" for i in bad[:_SHOWN]]
+    _refuse(slab, comm, lines, len(bad), "nodes have coordinates that are not finite numbers", "correct the mesh")
+
+
+def _check_ends(slab: MeshSlab, comm: MPI.Comm) -> None:
+    bad = np.flatnonzero(((slab.bars < 0) | (slab.bars >= slab.n_nodes)).any(axis=1))
+    lines = [_bar(slab, i) for i in bad[:_SHOWN]]
+    way_out = f"nodes are numbered from 0 to {slab.n_nodes - 1}"
+    _refuse(slab, comm, lines, len(bad), "bars have an end that does not exist", way_out)
+    bad = np.flatnonzero(slab.bars[:, 0] == slab.bars[:, 1])
+    lines = [_bar(slab, i) for i in bad[:_SHOWN]]
+    _refuse(slab, comm, lines, len(bad), "bars start and end at the same node", "remove them")
+
+
+def _check_bare_nodes(slab: MeshSlab, comm: MPI.Comm, used: np.ndarray) -> None:
+    bare = np.ones(len(slab.points), bool)
+    bare[used] = False
+    bad = np.flatnonzero(bare)
+    lines = [f"node {slab.first_node + i}" for i in bad[:_SHOWN]]
+    way_out = "remove them: a node without bars has neither mass nor stiffness"
+    _refuse(slab, comm, lines, len(bad), "nodes belong to no bar", way_out)
+
+
+def _check_lengths(slab: MeshSlab, comm: MPI.Comm, points: np.ndarray, ends: np.ndarray) -> list[str]:
+    with np.errstate(over="ignore"):
+        length = points[ends[:, 1]]
+        length -= points[ends[:, 0]]
+        length = np.sqrt(np.einsum("ij,ij->i", length, length))
+    bad = np.flatnonzero(~((length > 0.0) & (length < np.inf)))
+    lines = [f"{_bar(slab, i)}, length {length[i]:g}" for i in bad[:_SHOWN]]
+    way_out = "merge the nodes at its ends, or correct their positions"
+    _refuse(slab, comm, lines, len(bad), "bars have no length that can be computed with", way_out)
+    mean = comm.allreduce(float(length.sum())) / slab.n_bars
+    short = np.flatnonzero(length < SHORT * mean)
+    lines = [f"{_bar(slab, i)}, length {length[i]:g} m" for i in short[:_SHOWN]]
+    text = _sentence(comm, lines, len(short), f"bars are far shorter than the mean length {mean:g} m")
+    return [f"{slab.source}: {text}; the explicit time step shrinks with the shortest bar"] if text else []
+
+
+def _check_duplicates(slab: MeshSlab, comm: MPI.Comm) -> None:
+    """Bars between the same two nodes meet at the rank whose slab holds the lower end, and are neighbours there."""
+    key = slab.bars.min(axis=1).astype(np.int64)
+    router = Router(comm, slab_of(key, slab.n_nodes, comm.size))
+    key *= slab.n_nodes
+    key += slab.bars.max(axis=1)
+    key = router.send(key)
+    order = np.argsort(key, kind="stable")
+    key = key[order]
+    again = np.flatnonzero(key[1:] == key[:-1])
+    numbers = router.send(np.arange(slab.first_bar, slab.first_bar + len(slab.bars)))
+    pairs = sorted((int(numbers[order[i]]), int(numbers[order[i + 1]]), int(key[i])) for i in again[:1000])
+    lines = []
+    for one, other, ends in pairs[:_SHOWN]:
+        lines.append(f"bars {one} and {other} (nodes {ends // slab.n_nodes} and {ends % slab.n_nodes})")
+    what = "bars join the same two nodes as another bar"
+    _refuse(slab, comm, lines, len(again), what, "keep one of each, with the sum of the areas")
+
+
+def _bar(slab: MeshSlab, i: int) -> str:
+    return f"bar {slab.first_bar + i} (nodes {slab.bars[i, 0]} and {slab.bars[i, 1]})"
+
+
+def _sentence(comm: MPI.Comm, lines: list[str], count: int, what: str) -> str:
+    """What all ranks found together: the count, ``what``, and the first few; empty when nothing. Collective."""
+    total = comm.allreduce(count)
+    if total == 0:
+        return ""
+    found = [line for rank_lines in comm.allgather(lines) for line in rank_lines]
+    more = ", ..." if total > _SHOWN else ""
+    return f"{total} {what}: {', '.join(found[:_SHOWN])}{more}"
+
+
+def _refuse(slab: MeshSlab, comm: MPI.Comm, lines: list[str], count: int, what: str, way_out: str) -> None:
+    """Raise the same InputError on all ranks when any found something. Collective."""
+    text = _sentence(comm, lines, count, what)
+    if text:
+        raise InputError(f"{slab.source}: {text}; {way_out}")

@@ -1,0 +1,242 @@
+"""A mesh spread over the ranks: owned nodes and ghosts, the bars that touch owned nodes, and how ghosts are filled."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from mpi4py import MPI
+
+from .exchange import GhostExchange, Router
+from .ordering import bar_order, hilbert_keys, node_order
+from .partition import bounding_cube, partition
+from .slab import MeshSlab, index_type, slab_of
+
+__all__ = ["Block", "DistributedMesh", "distribute"]
+
+
+@dataclass(frozen=True)
+class Block:
+    """The local bars of one section: ``[start, counted)`` count here, ``[counted, stop)`` are evaluated here too.
+
+    A bar counts on the rank that owns its first end, so that sums over all ranks meet each bar once.
+    """
+
+    section: int
+    start: int
+    counted: int
+    stop: int
+
+
+class DistributedMesh:
+    """One rank's part of a distributed mesh; made by :func:`distribute`.
+
+    Local nodes are the owned ones, in PETSc order, then the ghosts: the other ends of bars that touch an owned node,
+    sorted by owner and PETSc number.
+    """
+
+    comm: MPI.Comm
+    n_nodes: int
+    """Nodes of the whole mesh."""
+    n_bars: int
+    """Bars of the whole mesh."""
+    n_owned: int
+    n_local: int
+    first_node: int
+    """First PETSc number owned: the PETSc number of an owned node is this plus its local index."""
+    node_ids: np.ndarray
+    """(n_local,) int64: mesh numbers."""
+    ghost_numbers: np.ndarray
+    """(n_ghost,) int64: PETSc numbers of the ghosts."""
+    points: np.ndarray
+    """(n_local, 3) float64 [m]: reference positions."""
+    bars: np.ndarray
+    """(b, 2) int32: local ends, in the mesh's own order of ends."""
+    bar_ids: np.ndarray
+    """(b,) int64: mesh numbers."""
+    blocks: list[Block]
+    """By section, ascending; only sections that have bars here."""
+    node_groups: dict[str, np.ndarray]
+    """int32 local indices of owned members, ascending."""
+    bar_groups: dict[str, np.ndarray]
+    """int32 local bar indices, ascending."""
+    partitioner: str
+    """What decided ownership, for the log."""
+
+    _exchange: GhostExchange
+
+    @property
+    def n_neighbours(self) -> int:
+        """Ranks that this one exchanges ghosts with."""
+        return self._exchange.n_neighbours
+
+    def update_ghosts(self, array: np.ndarray) -> None:
+        """Fill the ghost rows of ``array`` (n_local, k) float64, C-contiguous, with the owners' values. Collective."""
+        self._exchange.update(array)
+
+    def begin_update(self, array: np.ndarray) -> None:
+        """Start :meth:`update_ghosts`; owned rows must not change, nor ghosts be read, before :meth:`end_update`."""
+        self._exchange.begin(array)
+
+    def end_update(self, array: np.ndarray) -> None:
+        """Finish what :meth:`begin_update` started on the same array."""
+        self._exchange.end(array)
+
+    def close(self) -> None:
+        """Free the message requests (optional at the end of a program)."""
+        self._exchange.close()
+
+
+def distribute(
+    slab: MeshSlab, bar_section: np.ndarray, comm: MPI.Comm, partitioner: str = "auto"
+) -> DistributedMesh:
+    """Spread a mesh over the ranks. Collective; no rank ever holds the whole mesh.
+
+    Parameters
+    ----------
+    slab : MeshSlab
+        This rank's contiguous part; may be given up after.
+    bar_section : (bars of the slab,) int32
+        Section of each bar.
+    comm : MPI.Comm
+    partitioner : str
+        ``"auto"``, ``"ptscotch"`` or ``"coordinates"``; see :func:`~pfem_petsc.mesh.partition.partition`.
+
+    Returns
+    -------
+    DistributedMesh
+        The same for the same mesh, number of ranks and partitioner.
+    """
+    mesh = DistributedMesh()
+    mesh.comm = comm
+    mesh.n_nodes, mesh.n_bars = slab.n_nodes, slab.n_bars
+    bar_section = np.asarray(bar_section, dtype=np.int32)
+    if comm.size == 1:
+        mesh.partitioner = partition(slab, comm, partitioner)[1]
+        _alone(mesh, slab, bar_section)
+    else:
+        owners, mesh.partitioner = partition(slab, comm, partitioner)
+        _among_ranks(mesh, slab, bar_section, owners)
+    return mesh
+
+
+def _alone(mesh: DistributedMesh, slab: MeshSlab, section: np.ndarray) -> None:
+    """One rank: reorder nodes and bars, with as few temporary arrays of the size of the mesh as can be."""
+    order = node_order(hilbert_keys(slab.points, *bounding_cube(slab.points, mesh.comm)))
+    place = np.empty(len(order), np.int32)
+    place[order] = np.arange(len(order), dtype=np.int32)
+    mesh.n_owned = mesh.n_local = slab.n_nodes
+    mesh.first_node = 0
+    mesh.node_ids = order.astype(np.int64, copy=False)
+    mesh.ghost_numbers = np.empty(0, np.int64)
+    mesh.points = slab.points[order]
+    mesh._exchange = GhostExchange(mesh.comm, np.array([0, slab.n_nodes]), mesh.ghost_numbers)
+    mesh.node_groups = {name: np.sort(place[members]) for name, members in slab.node_groups.items()}
+    groups = {name: _membership(members, len(slab.bars)) for name, members in slab.bar_groups.items()}
+    _arrange_bars(mesh, place[slab.bars], None, section, groups)
+
+
+def _among_ranks(mesh: DistributedMesh, slab: MeshSlab, section: np.ndarray, owners: np.ndarray) -> None:
+    """Several ranks: nodes go to their owners and are numbered there, then bars go to the owners of their ends."""
+    comm = mesh.comm
+    low, extent = bounding_cube(slab.points, comm)
+
+    to_owner = Router(comm, owners)
+    ids = to_owner.send(np.arange(slab.first_node, slab.first_node + len(slab.points)))
+    points = to_owner.send(slab.points)
+    order = node_order(hilbert_keys(points, low, extent), ids)
+    n_owned = len(ids)
+    starts = np.concatenate([[0], np.cumsum(comm.allgather(n_owned))]).astype(np.int64)
+    numbers = np.empty(n_owned, np.int64)
+    numbers[order] = np.arange(starts[comm.rank], starts[comm.rank + 1])
+    # The directory: PETSc numbers (and with `starts` the owners) of the slab's nodes, kept where the slab is.
+    directory = to_owner.reply(numbers)
+
+    bars, bar_ids, section, groups = _fetch_bars(slab, section, directory, starts, comm)
+
+    first, last = starts[comm.rank], starts[comm.rank + 1]
+    elsewhere = bars[(bars < first) | (bars >= last)]
+    ghosts = np.unique(elsewhere)
+    ends = (bars - first).astype(np.int32)
+    ends[(bars < first) | (bars >= last)] = n_owned + np.searchsorted(ghosts, elsewhere)
+    del bars, elsewhere
+
+    mesh.n_owned, mesh.n_local, mesh.first_node = n_owned, n_owned + len(ghosts), int(first)
+    mesh.ghost_numbers = ghosts.astype(np.int64)
+    mesh._exchange = GhostExchange(comm, starts, mesh.ghost_numbers)
+    mesh.points = np.empty((mesh.n_local, 3))
+    mesh.points[:n_owned] = points[order]
+    mesh.update_ghosts(mesh.points)
+    # Mesh numbers are far below 2^53, so they travel unharmed as floating-point numbers.
+    travelling = np.empty((mesh.n_local, 1))
+    travelling[:n_owned, 0] = ids[order]
+    mesh.update_ghosts(travelling)
+    mesh.node_ids = travelling[:, 0].astype(np.int64)
+
+    _arrange_bars(mesh, ends, bar_ids, section, groups)
+    mesh.node_groups = {}
+    for name, members in slab.node_groups.items():
+        member_numbers = directory[members - slab.first_node]
+        arrived = Router(comm, _owner(member_numbers, starts)).send(member_numbers)
+        mesh.node_groups[name] = np.sort(arrived - first).astype(np.int32)
+
+
+def _fetch_bars(
+    slab: MeshSlab, section: np.ndarray, directory: np.ndarray, starts: np.ndarray, comm: MPI.Comm
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+    """Ends (PETSc numbers), mesh numbers, sections and membership of groups of the bars that touch an owned node."""
+    wanted, place = np.unique(slab.bars, return_inverse=True)
+    asking = Router(comm, slab_of(wanted, slab.n_nodes, comm.size))
+    asked = asking.send(wanted.astype(np.int64)) - slab.first_node
+    numbers = asking.reply(directory[asked]).astype(index_type(slab.n_nodes))
+    numbers = numbers[place.reshape(-1, 2)]
+    del wanted, place, asking, asked
+
+    owner = _owner(numbers, starts)
+    both = np.flatnonzero(owner[:, 0] != owner[:, 1])
+    bar = np.concatenate([np.arange(len(numbers)), both])
+    to_owners = Router(comm, np.concatenate([owner[:, 0], owner[both, 1]]))
+    groups = {}
+    for name, members in slab.bar_groups.items():
+        groups[name] = to_owners.send(_membership(members - slab.first_bar, len(slab.bars))[bar])
+    return to_owners.send(numbers[bar]), to_owners.send(bar + slab.first_bar), to_owners.send(section[bar]), groups
+
+
+def _arrange_bars(
+    mesh: DistributedMesh,
+    ends: np.ndarray,
+    bar_ids: np.ndarray | None,
+    section: np.ndarray,
+    groups: dict[str, np.ndarray],
+) -> None:
+    """Sort the local bars by section, counted ones first, then for locality; ``bar_ids`` None: they are 0, 1, ..."""
+    borrowed = ends[:, 0] >= mesh.n_owned
+    kind = None
+    if borrowed.any() or (len(section) and section.min() != section.max()) or section[:1].any():
+        kind = 2 * section
+        kind += borrowed
+    del borrowed
+    order = bar_order(ends, kind, mesh.n_local)
+    mesh.bars = ends[order]
+    mesh.bar_ids = order.astype(np.int64, copy=False) if bar_ids is None else bar_ids[order]
+    mesh.bar_groups = {name: np.flatnonzero(mask[order]).astype(np.int32) for name, mask in groups.items()}
+    counts = np.bincount(kind) if kind is not None else np.array([len(ends)])
+    counts = np.append(counts, np.zeros(len(counts) % 2, counts.dtype)).reshape(-1, 2)
+    mesh.blocks = []
+    start = 0
+    for number, (counted, others) in enumerate(counts.tolist()):
+        if counted + others:
+            mesh.blocks.append(Block(number, start, start + counted, start + counted + others))
+            start += counted + others
+
+
+def _membership(members: np.ndarray, n: int) -> np.ndarray:
+    """(n,) bool: True for the members."""
+    mask = np.zeros(n, bool)
+    mask[members] = True
+    return mask
+
+
+def _owner(numbers: np.ndarray, starts: np.ndarray) -> np.ndarray:
+    """Rank that owns each PETSc number."""
+    return np.searchsorted(starts, numbers, side="right") - 1

@@ -31,7 +31,9 @@ class StrictModel(BaseModel):
     An integer is taken where a float is expected; a string or a boolean never stands for a number.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True)
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True
+    )
 
 
 def _tuple_from_list(value: Any) -> Any:
@@ -45,8 +47,8 @@ listed = BeforeValidator(_tuple_from_list)
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 PositiveFloat = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 NonNegativeFloat = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
-PositiveInt = Annotated[int, Field(gt=0)]
-NonNegativeInt = Annotated[int, Field(ge=0)]
+PositiveInt = Annotated[int, Field(gt=0, lt=2**63)]
+NonNegativeInt = Annotated[int, Field(ge=0, lt=2**63)]
 Vector3 = Annotated[tuple[Finite, Finite, Finite], listed]
 PositiveInts3 = Annotated[tuple[PositiveInt, PositiveInt, PositiveInt], listed]
 Name = Annotated[str, Field(min_length=1, pattern=r"^[^/\x00-\x1f]+$")]

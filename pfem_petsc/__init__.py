@@ -1,0 +1,33 @@
+"""Dynamics of large trusses that fly, hit things, buckle and yield: positional finite elements on PETSc over MPI.
+
+``from pfem_petsc import Case, Simulation, open_result``; nothing heavy is imported before one of them is used.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .case.schema import Case
+    from .output.result import open_result
+    from .simulation import Simulation
+
+__all__ = ["Case", "Simulation", "__version__", "open_result"]
+
+__version__ = "0.1.0"
+
+_HOMES = {"Case": ".case.schema", "Simulation": ".simulation", "open_result": ".output.result"}
+
+
+def __getattr__(name: str) -> Any:
+    """Import an exported name when it is first used."""
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(_HOMES[name], __name__), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

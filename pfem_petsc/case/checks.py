@@ -1,0 +1,82 @@
+"""Checks of a case across its tables: every name that is used exists, and names are unique."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from ..registry import nearest
+from .problems import Problems
+from .tables import CELL_FIELDS, POINT_FIELDS
+
+__all__ = ["check_names"]
+
+
+def check_names(case: Mapping[str, Any], data: Mapping[str, Any], problems: Problems) -> None:
+    """Note every name that leads nowhere or is there twice.
+
+    Parameters
+    ----------
+    case : the validated tables by name (refused ones left out)
+    data : the case as read: names that are there but whose table was refused are not reported again
+    problems : takes what is wrong
+    """
+    materials, sections, node_sets = (_names(data, key) for key in ("material", "section", "node_set"))
+    for key, names in (("material", materials), ("section", sections)):
+        if not names and isinstance(data.get(key, {}), Mapping):
+            problems.add((), f"no [{key}.NAME] is given: a case has at least one {key}")
+    for name, section in case["section"].items():
+        problems.refer(("section", name, "material"), section.material, materials, "material")
+    default = [name for name, section in case["section"].items() if section.bars is None]
+    if len(default) > 1:
+        problems.add(
+            ("section", default[1]), f"both this section and {default[0]} name no bars; only one can be the default"
+        )
+    _unique("section", [(name, s.bars) for name, s in case["section"].items()], problems)
+
+    on = [entry for entry in case["initial"] if entry.node_set is not None]
+    for key, entries in (("support", case["support"]), ("load", case["load"]), ("wall", case["wall"])):
+        for i, entry in enumerate(entries):
+            _node_set((key, i), entry, node_sets, problems)
+    for i, entry in enumerate(on):
+        _node_set(("initial", "on", i), entry, node_sets, problems)
+    _distinct(("wall",), case["wall"], "wall", problems)
+
+    output = case["output"]
+    if output is not None:
+        for i, probe in enumerate(output.probe):
+            _node_set(("output", "probe", i), probe, node_sets, problems)
+        _distinct(("output", "probe"), output.probe, "probe", problems)
+        for i, name in enumerate(output.fields or ()):
+            known = [*POINT_FIELDS, *CELL_FIELDS]
+            if name not in known:
+                problems.add(("output", "fields", i), f"there is no field of this name{nearest(name, known)}", name)
+            elif name in output.fields[:i]:
+                problems.add(("output", "fields", i), "this field is there twice", name)
+
+
+def _names(data: Mapping[str, Any], key: str) -> list[str]:
+    table = data.get(key, {})
+    return [str(name) for name in table] if isinstance(table, Mapping) else []
+
+
+def _node_set(path: tuple[str | int, ...], entry: Any, known: list[str], problems: Problems) -> None:
+    if entry.node_set is not None:
+        problems.refer((*path, "node_set"), entry.node_set, known, "node set")
+
+
+def _distinct(path: tuple[str | int, ...], entries: Any, what: str, problems: Problems) -> None:
+    names = [entry.name for entry in entries]
+    for i, name in enumerate(names):
+        if name in names[:i]:
+            problems.add((*path, i, "name"), f"another {what} has this name", name)
+
+
+def _unique(key: str, named_bars: list[tuple[str, str | None]], problems: Problems) -> None:
+    """One bar group belongs to one section."""
+    seen: dict[str, str] = {}
+    for name, bars in named_bars:
+        if bars is not None and bars in seen:
+            problems.add((key, name, "bars"), f"section {seen[bars]} has these bars already", bars)
+        elif bars is not None:
+            seen[bars] = name

@@ -1,0 +1,97 @@
+"""Values set over those of the case file: ``time.step=1e-5``, ``wall.0.point=[1.0, 0.0, 0.0]``."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Iterable
+from typing import Any
+
+from ..errors import InputError
+
+__all__ = ["apply_overrides"]
+
+LISTS = {("load",), ("support",), ("temperature",), ("wall",), ("initial", "on"), ("output", "probe")}
+"""Keys under which a missing value is made as a list of tables."""
+
+_PART = re.compile(r"""(?:"((?:[^"\\]|\\.)*)"|([^.\[\]"]+))|\[(\d+)\]""")
+
+
+def apply_overrides(data: dict[str, Any], overrides: Iterable[str]) -> list[tuple[str | int, ...]]:
+    """Set ``key=value`` texts in a case's tables, in place; missing tables are made.
+
+    Parameters
+    ----------
+    data : the case as nested tables
+    overrides : texts ``path=value``; the value is TOML, or else taken as a text as it stands
+
+    Returns
+    -------
+    The paths that were set.
+
+    Raises
+    ------
+    InputError
+        When a text has no ``=``, or its path leads through a value that is no table, or beyond a list's end.
+    """
+    paths = []
+    for text in overrides:
+        key, equals, value = text.partition("=")
+        parts = _split(key.strip())
+        if not equals or parts is None:
+            raise InputError(f"--set {text}: expected KEY=VALUE, like time.step=1e-5 or wall.0.point=[1.0, 0.0, 0.0]")
+        paths.append(_put(data, parts, _value(value.strip()), f"--set {text}"))
+    return paths
+
+
+def _value(text: str) -> Any:
+    try:
+        read = tomllib.loads(f"value = {text}")
+    except (tomllib.TOMLDecodeError, RecursionError):
+        return text
+    return read["value"] if len(read) == 1 else text
+
+
+def _split(key: str) -> list[str] | None:
+    """Parts of a dotted path, indices in brackets included; None where it is malformed."""
+    parts, position = [], 0
+    while position < len(key):
+        match = _PART.match(key, position)
+        if match is None:
+            return None
+        quoted, bare, index = match.groups()
+        parts.append(next(p.strip() for p in (quoted, bare, index) if p is not None))
+        position = match.end()
+        if position < len(key) and key[position] == ".":
+            position += 1
+            if position == len(key):
+                return None
+        elif position < len(key) and key[position] != "[":
+            return None
+    return parts if parts and all(parts) else None
+
+
+def _put(data: dict[str, Any], parts: list[str], value: Any, where: str) -> tuple[str | int, ...]:
+    path: tuple[str | int, ...] = ()
+    here: Any = data
+    for k, part in enumerate(parts):
+        last = k == len(parts) - 1
+        if isinstance(here, list):
+            if not part.isdigit() or int(part) > len(here):
+                raise InputError(f"{where}: {part!r} is not one of the places of this list: 0 to {len(here)}")
+            key: str | int = int(part)
+            if key == len(here):
+                here.append({})
+        elif isinstance(here, dict):
+            key = part
+            names = tuple(p for p in (*path, part) if isinstance(p, str))
+            if key not in here:
+                here[key] = [] if names in LISTS else {}
+        else:
+            raise InputError(f"{where}: {'.'.join(map(str, path))} is a value, not a table")
+        path = (*path, key)
+        if last:
+            here[key] = value
+        else:
+            here = here[key]
+    return path

@@ -1,0 +1,184 @@
+"""Collect everything that is wrong with a case, and say it in one message: file, key, value, what is expected."""
+
+from __future__ import annotations
+
+import re
+import types
+import typing
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, TypeVar
+
+from pydantic import ValidationError
+from pydantic.fields import FieldInfo
+
+from ..errors import InputError
+from ..registry import nearest
+from .base import StrictModel
+from .toml import value_text
+
+__all__ = ["Path", "Problems", "key_text"]
+
+Path = tuple[str | int, ...]
+"""Where a value is in the case: keys of tables and indices of lists."""
+
+M = TypeVar("M", bound=StrictModel)
+
+MOST = 10
+"""Problems that one message lists; the rest is counted."""
+
+SI_HINT = "expected a number in SI units, without quotes and unit"
+
+
+def key_text(path: Path) -> str:
+    """Key path as users write it: ``wall[0].normal``."""
+    text = ""
+    for part in path:
+        if isinstance(part, int):
+            text += f"[{part}]"
+        else:
+            text += ("." if text else "") + (part if re.fullmatch(r"[\w-]+", part) else value_text(part))
+    return text
+
+
+class Problems:
+    """The list of problems of one case.
+
+    Parameters
+    ----------
+    source : file or name of the case, for the message
+    overridden : key paths that were set on the command line: the message says so where one of them is wrong
+    """
+
+    def __init__(self, source: str, overridden: Iterable[Path] = ()) -> None:
+        self.source = source
+        self.overridden = list(overridden)
+        self.lines: list[str] = []
+
+    def add(self, path: Path, message: str, value: Any = None) -> None:
+        """Note a problem; ``value`` is shown where given."""
+        key = key_text(path)
+        shown = f"{key} = {_short(value)}" if value is not None else key
+        origin = " (given by --set)" if any(path[: len(p)] == p for p in self.overridden) else ""
+        line = f"{self.source}: {shown}{origin}: {message}" if key else f"{self.source}: {message}"
+        if line not in self.lines:
+            self.lines.append(line)
+
+    def refer(self, path: Path, name: str, known: Sequence[str], what: str) -> None:
+        """Note a problem where ``name`` is not one of the ``known`` names of a ``what``."""
+        if name not in known:
+            hint = nearest(name, list(known)) if known else "; the case defines none"
+            self.add(path, f"there is no {what} of this name{hint}", name)
+
+    def raise_if_any(self) -> None:
+        """Raise one :class:`InputError` with every problem on its own line."""
+        if not self.lines:
+            return
+        lines = self.lines[:MOST]
+        if len(self.lines) > MOST:
+            lines.append(f"{self.source}: ... and {len(self.lines) - MOST} more")
+        raise InputError("\n".join(lines))
+
+    def read(self, model: type[M], data: Any, path: Path, *, known: Sequence[str] = (), taker: str = "") -> M | None:
+        """Validate a table; None, with the problems noted, where it is refused.
+
+        Parameters
+        ----------
+        model : what the table may hold
+        data : the table as read
+        path : where it is
+        known : keys of the same table that are not the model's own (for hints)
+        taker : name of the scheme, generator or wall that takes these keys, named where one is unknown
+        """
+        if not isinstance(data, Mapping):
+            self.add(path, "expected a table", data)
+            return None
+        try:
+            return model.model_validate(dict(data))
+        except InputError as error:
+            self.add(path, str(error))
+        except ValidationError as error:
+            for item in error.errors(include_url=False):
+                self._describe(model, item, path, known, taker)
+        return None
+
+    def _describe(self, model: type[StrictModel], item: Any, path: Path, known: Sequence[str], taker: str) -> None:
+        where: Path = (*path, *item["loc"])
+        kind, value, context = item["type"], item["input"], item.get("ctx", {})
+        field = model.model_fields.get(str(item["loc"][0])) if item["loc"] else None
+        about = f" ({field.description.strip().rstrip('.')})" if field is not None and field.description else ""
+        if kind == "extra_forbidden":
+            self.add(where, _unknown_key(str(item["loc"][-1]), list(model.model_fields), known, taker))
+        elif kind == "missing" and len(item["loc"]) == 1:
+            self.add(where, f"this key is missing{about}")
+        elif kind in ("missing", "too_long", "too_short") and isinstance(value, list | tuple):
+            whole = where[:-1] if kind == "missing" else where
+            self.add(whole, f"expected {_shape(field)}, got {len(value)} value{'s' * (len(value) != 1)}{about}", value)
+        elif kind in ("value_error", "assertion_error"):
+            self.add(where, str(context["error"]), None if isinstance(value, Mapping) else value)
+        else:
+            self.add(where, _expected(kind, value, context, field) + about, value)
+
+
+def _short(value: Any, most: int = 60) -> str:
+    text = value_text(value)
+    return text if len(text) <= most else f"{text[: most - 4]} ..."
+
+
+def _unknown_key(key: str, own: list[str], shared: Sequence[str], taker: str) -> str:
+    if not taker:
+        return f"unknown key{nearest(key, own)}"
+    takes = f"{taker} takes {', '.join(own) if own else 'no parameters'}"
+    hint = nearest(key, [*own, *shared])
+    return f"unknown key; {takes}" + (hint if hint.startswith(", did") else "")
+
+
+def _plain(annotation: Any) -> Any:
+    """A type without ``Annotated`` and ``None``."""
+    while True:
+        if typing.get_origin(annotation) is typing.Annotated:
+            annotation = typing.get_args(annotation)[0]
+        elif typing.get_origin(annotation) in (typing.Union, types.UnionType):
+            annotation = next(a for a in typing.get_args(annotation) if a is not type(None))
+        else:
+            return annotation
+
+
+def _shape(field: FieldInfo | None) -> str:
+    """What a list field holds, from its type: ``a list of 3 numbers``."""
+    annotation = _plain(field.annotation) if field is not None else None
+    arguments = typing.get_args(annotation)
+    if typing.get_origin(annotation) is not tuple or not arguments:
+        return "a list"
+    words = {float: "numbers", int: "integers", str: "texts"}.get(_plain(arguments[0]), "lists")
+    return f"a list of {words}" if arguments[-1] is Ellipsis else f"a list of {len(arguments)} {words}"
+
+
+_SIMPLE = {
+    "float_type": "expected a number",
+    "int_type": "expected an integer",
+    "string_type": "expected a text in quotes",
+    "bool_type": "expected true or false",
+    "finite_number": "expected a finite number",
+    "string_too_short": "expected a text that is not empty",
+    "string_pattern_mismatch": "expected a name without slashes and control characters",
+}
+_BOUNDS = {"greater_than": ">", "greater_than_equal": ">=", "less_than": "<", "less_than_equal": "<="}
+
+
+def _expected(kind: str, value: Any, context: Mapping[str, Any], field: FieldInfo | None) -> str:
+    if kind in ("float_type", "int_type") and isinstance(value, str):
+        return SI_HINT
+    if kind == "float_type" and isinstance(value, int) and not isinstance(value, bool):
+        return "expected a number that fits in double precision"
+    if kind in _SIMPLE:
+        return _SIMPLE[kind]
+    if kind in _BOUNDS:
+        (bound,) = (v for k, v in context.items() if k in ("gt", "ge", "lt", "le"))
+        return f"expected a value {_BOUNDS[kind]} {bound:g}"
+    if kind == "literal_error":
+        choices = re.findall(r"'([^']*)'", context["expected"]) or [str(context["expected"]).lower()]
+        hint = nearest(value, choices) if isinstance(value, str) else f"; known: {', '.join(choices)}"
+        return "unknown value" + hint
+    if kind in ("tuple_type", "list_type"):
+        return f"expected {_shape(field)}" + (", in SI units without quotes and unit" if isinstance(value, str) else "")
+    return f"refused ({kind.replace('_', ' ')})"

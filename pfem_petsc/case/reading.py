@@ -1,0 +1,221 @@
+"""From the nested tables of a case file to checked models."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+from ..errors import InputError
+from ..registry import lookup, nearest
+from . import tables as t
+from .base import StrictModel
+from .problems import Path as KeyPath
+from .problems import Problems
+
+__all__ = ["KEYS", "parse_toml", "read_tables"]
+
+GENERATORS = "pfem_petsc.mesh.generators"
+INTEGRATORS = "pfem_petsc.integrators"
+WALLS = "pfem_petsc.contact.walls"
+
+M = TypeVar("M", bound=StrictModel)
+
+KEYS = [
+    *("title", "mesh", "node_set", "material", "section", "initial", "support"),
+    *("load", "gravity", "temperature", "wall", "time", "output", "solver"),
+]
+"""Keys of a case file at its top."""
+
+
+def parse_toml(text: str, source: str) -> dict[str, Any]:
+    """TOML text to nested tables.
+
+    Raises
+    ------
+    InputError
+        On a syntax error; the message names line and column.
+    """
+    try:
+        return tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{source}: this is not valid TOML: {error}") from error
+    except RecursionError as error:
+        raise InputError(f"{source}: this is not a case: its lists or tables are nested too deep") from error
+
+
+def read_tables(data: Mapping[str, Any], folder: Path, problems: Problems) -> dict[str, Any]:
+    """Validate every table of a case; what is refused is noted in ``problems`` and left out or None.
+
+    Parameters
+    ----------
+    data : the case as nested tables
+    folder : what the mesh file is relative to
+    problems : takes what is wrong
+
+    Returns
+    -------
+    The attributes of a :class:`~pfem_petsc.case.schema.Case` by name, ``title`` included where there is one.
+    """
+    for key in data:
+        if key not in KEYS:
+            problems.add((key,), f"unknown key{nearest(key, KEYS)}")
+    title = data.get("title")
+    if title is not None and not isinstance(title, str):
+        problems.add(("title",), "expected a text in quotes", title)
+    return {
+        "title": title,
+        "mesh": _mesh(data, folder, problems),
+        "node_set": _named(t.NodeSet, data, "node_set", problems),
+        "material": _named(t.Material, data, "material", problems),
+        "section": _named(t.Section, data, "section", problems),
+        "initial": _initial(data, problems),
+        "support": _listed(t.Support, data.get("support"), ("support",), problems),
+        "load": _listed(t.Load, data.get("load"), ("load",), problems),
+        "gravity": problems.read(t.Gravity, data["gravity"], ("gravity",)) if "gravity" in data else None,
+        "temperature": _listed(t.Temperature, data.get("temperature"), ("temperature",), problems),
+        "wall": _walls(data.get("wall"), problems),
+        "time": _time(data, problems),
+        "output": _output(data.get("output", {}), problems),
+        "solver": problems.read(t.Solver, data.get("solver", {}), ("solver",)),
+    }
+
+
+def _rows(data: Any, path: KeyPath, problems: Problems) -> Sequence[Any]:
+    """The items of an optional list of tables."""
+    if data is None:
+        return ()
+    if not isinstance(data, list | tuple):
+        problems.add(path, f"expected a list of tables, each under a heading [[{'.'.join(map(str, path))}]]", data)
+        return ()
+    return data
+
+
+def _listed(model: type[M], data: Any, path: KeyPath, problems: Problems) -> list[M]:
+    read = [problems.read(model, row, (*path, i)) for i, row in enumerate(_rows(data, path, problems))]
+    return [row for row in read if row is not None]
+
+
+def _named(model: type[M], data: Mapping[str, Any], key: str, problems: Problems) -> dict[str, M]:
+    """Tables that users name, like [material.steel], in the file's order."""
+    table = data.get(key, {})
+    if not isinstance(table, Mapping):
+        problems.add((key,), f"expected tables, each under a heading [{key}.NAME]", table)
+        return {}
+    read = {str(name): problems.read(model, row, (key, str(name))) for name, row in table.items()}
+    return {name: row for name, row in read.items() if row is not None}
+
+
+def _required(data: Mapping[str, Any], key: str, problems: Problems) -> Mapping[str, Any] | None:
+    if key not in data:
+        problems.add((), f"the table [{key}] is missing")
+    elif not isinstance(data[key], Mapping):
+        problems.add((key,), "expected a table", data[key])
+    else:
+        return data[key]
+    return None
+
+
+def _split(model: type[StrictModel], table: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The keys of a model, and the others."""
+    own = {k: v for k, v in table.items() if k in model.model_fields}
+    return own, {k: v for k, v in table.items() if k not in model.model_fields}
+
+
+def _parameters_model(package: str, name: Any, path: KeyPath, problems: Problems) -> type[StrictModel] | None:
+    """The ``Parameters`` of a module found by name."""
+    try:
+        return lookup(package, name, "").Parameters
+    except InputError as error:
+        problems.add(path, str(error).partition(": ")[2].replace(f"unknown value {name!r}", "unknown value"), name)
+    except AttributeError:
+        problems.add(path, f"{package}.{name} has no Parameters: it is not meant for case files", name)
+    return None
+
+
+def _mesh(data: Mapping[str, Any], folder: Path, problems: Problems) -> t.Mesh | None:
+    table = _required(data, "mesh", problems)
+    if table is None:
+        return None
+    own, others = _split(t.MeshKeys, table)
+    keys = problems.read(t.MeshKeys, own, ("mesh",))
+    if keys is None:
+        return None
+    if keys.file is not None:
+        for key in others:
+            problems.add(("mesh", key), "unknown key; a mesh from a file takes no other keys")
+        return t.Mesh(file=Path(folder, keys.file).resolve())
+    model = _parameters_model(GENERATORS, keys.generator, ("mesh", "generator"), problems)
+    if model is None:
+        return None
+    taker = f"generator {keys.generator}"
+    parameters = problems.read(model, others, ("mesh",), known=["generator", "file"], taker=taker)
+    return None if parameters is None else t.Mesh(generator=keys.generator, parameters=parameters)
+
+
+def _initial(data: Mapping[str, Any], problems: Problems) -> list[t.Initial]:
+    table = data.get("initial", {})
+    if not isinstance(table, Mapping):
+        problems.add(("initial",), "expected a table", table)
+        return []
+    everywhere = {k: v for k, v in table.items() if k != "on"}
+    entries = []
+    if "node_set" in everywhere:
+        problems.add(("initial", "node_set"), "a node set's own velocity goes under a heading [[initial.on]]")
+    elif everywhere:
+        entries.append(problems.read(t.Initial, everywhere, ("initial",), known=["on"]))
+    for i, row in enumerate(_rows(table.get("on"), ("initial", "on"), problems)):
+        entry = problems.read(t.Initial, row, ("initial", "on", i))
+        if entry is not None and entry.node_set is None:
+            problems.add(("initial", "on", i, "node_set"), "this key is missing: name of a node set")
+        entries.append(entry)
+    return [entry for entry in entries if entry is not None]
+
+
+def _walls(data: Any, problems: Problems) -> list[StrictModel]:
+    walls = []
+    for i, row in enumerate(_rows(data, ("wall",), problems)):
+        path: KeyPath = ("wall", i)
+        if not isinstance(row, Mapping):
+            problems.add(path, "expected a table", row)
+            continue
+        if "type" not in row:
+            problems.add((*path, "type"), "this key is missing: the kind of wall")
+            continue
+        model = _parameters_model(WALLS, row["type"], (*path, "type"), problems)
+        if model is not None:
+            named = {"name": f"wall{i + 1}", **row}
+            walls.append(problems.read(model, named, path, taker=f"a wall of type {row['type']}"))
+    return [wall for wall in walls if wall is not None]
+
+
+def _time(data: Mapping[str, Any], problems: Problems) -> t.Time | None:
+    table = _required(data, "time", problems)
+    if table is None:
+        return None
+    own, others = _split(t.TimeKeys, table)
+    keys = problems.read(t.TimeKeys, own, ("time",))
+    name = own.get("integrator")
+    if not isinstance(name, str):
+        return None
+    model = _parameters_model(INTEGRATORS, name, ("time", "integrator"), problems)
+    if model is None:
+        return None
+    scheme = problems.read(model, others, ("time",), known=list(t.TimeKeys.model_fields), taker=name)
+    automatic = keys is not None and keys.step == "auto"
+    if automatic and not lookup(INTEGRATORS, name, "time.integrator").Scheme.explicit:
+        message = f"only explicit schemes can choose their step, and {name} is implicit: give it in seconds"
+        problems.add(("time", "step"), message, "auto")
+    if keys is None or scheme is None:
+        return None
+    return t.Time(**keys.model_dump(), scheme=scheme)
+
+
+def _output(data: Any, problems: Problems) -> t.Output | None:
+    if not isinstance(data, Mapping):
+        problems.add(("output",), "expected a table", data)
+        return None
+    probes = _listed(t.Probe, data.get("probe"), ("output", "probe"), problems)
+    keys = problems.read(t.OutputKeys, {k: v for k, v in data.items() if k != "probe"}, ("output",))
+    return None if keys is None else t.Output(**keys.model_dump(), probe=tuple(probes))

@@ -1,0 +1,161 @@
+"""A case: everything that a simulation is told, read from a TOML file and checked before any work is done."""
+
+from __future__ import annotations
+
+import copy
+import difflib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+
+from ..errors import InputError
+from .builtin import built_in_cases, built_in_path
+from .checks import check_names
+from .overrides import apply_overrides
+from .problems import Problems
+from .reading import KEYS, parse_toml, read_tables
+from .toml import table_text
+
+__all__ = ["Case"]
+
+
+class Case:
+    """A checked case. Made by :meth:`load`, :meth:`from_toml` or :meth:`from_dict`; not to be changed afterwards.
+
+    Attributes
+    ----------
+    title : title of the case
+    name : stem of the case file, or name of the built-in case
+    source : file of the case as given, for messages
+    folder : what the case's relative file names start from
+    mesh : :class:`~pfem_petsc.case.tables.Mesh`: generator with parameters, or file
+    node_set, material, section : tables by name, in the file's order
+    initial, support, load, temperature, wall : lists of tables
+    gravity : :class:`~pfem_petsc.case.tables.Gravity` or None
+    time, output, solver : tables
+
+    Notes
+    -----
+    ``Case.load`` is the constructor, ``case.load`` the list of loads: an instance's attribute hides the classmethod.
+    """
+
+    def __init__(self, attributes: Mapping[str, Any], *, name: str, source: str, folder: Path) -> None:
+        for key in KEYS:
+            self.__dict__[key] = attributes[key]
+        self.__dict__.update(name=name, source=source, folder=Path(folder))
+
+    def __setattr__(self, key: str, value: Any) -> None:
+        raise AttributeError(f"a case is not changed after it was checked; give {key} to Case.load as an override")
+
+    def __eq__(self, other: object) -> bool:
+        """Same content; name, source and folder aside."""
+        return isinstance(other, Case) and self.to_dict() == other.to_dict()
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __repr__(self) -> str:
+        return f"<Case {self.name}: {self.title}>"
+
+    @classmethod
+    def load(cls, path_or_name: str | Path, overrides: Iterable[str] = ()) -> Case:
+        """Read a case file, or a built-in case by its name.
+
+        Parameters
+        ----------
+        path_or_name : TOML file, or name of a built-in case
+        overrides : texts like ``"time.step=1e-5"``, set over the file's values
+
+        Raises
+        ------
+        InputError
+            Names every key that is wrong.
+        """
+        path = built_in_path(str(path_or_name)) or Path(path_or_name)
+        return cls.from_toml(_read_text(path), path.parent, name=path.stem, source=str(path), overrides=overrides)
+
+    @classmethod
+    def from_toml(
+        cls,
+        text: str,
+        folder: str | Path = ".",
+        *,
+        name: str = "case",
+        source: str = "case",
+        overrides: Iterable[str] = (),
+    ) -> Case:
+        """Read the text of a case; see :meth:`load`. ``folder`` is what its mesh file is relative to."""
+        return cls.from_dict(parse_toml(text, source), name=name, source=source, folder=folder, overrides=overrides)
+
+    @classmethod
+    def from_dict(
+        cls,
+        data: Mapping[str, Any],
+        *,
+        name: str | None = None,
+        source: str = "case",
+        folder: str | Path = ".",
+        overrides: Iterable[str] = (),
+    ) -> Case:
+        """Check a case given as nested tables with the keys of the case file; see :meth:`load`."""
+        data = copy.deepcopy(dict(data))
+        problems = Problems(source, apply_overrides(data, overrides))
+        attributes = read_tables(data, Path(folder), problems)
+        check_names(attributes, data, problems)
+        problems.raise_if_any()
+        name = Path(source).stem if name is None else name
+        attributes["title"] = name if attributes["title"] is None else attributes["title"]
+        return cls(attributes, name=name, source=source, folder=Path(folder))
+
+    def to_dict(self) -> dict[str, Any]:
+        """The case as nested tables with the keys of the case file, every default explicit, absent ones left out."""
+        everywhere = [entry for entry in self.initial if entry.node_set is None]
+        initial = _table(everywhere[0]) if everywhere else {}
+        on = [_table(entry) for entry in self.initial if entry.node_set is not None]
+        time = _table(self.time)
+        mesh = _table(self.mesh)
+        data = {
+            "title": self.title,
+            "mesh": {**mesh, **_table(self.mesh.parameters)},
+            "node_set": {name: _table(entry) for name, entry in self.node_set.items()},
+            "material": {name: _table(entry) for name, entry in self.material.items()},
+            "section": {name: _table(entry) for name, entry in self.section.items()},
+            "initial": {**initial, "on": on} if on else initial,
+            "support": [_table(entry) for entry in self.support],
+            "load": [_table(entry) for entry in self.load],
+            "gravity": _table(self.gravity),
+            "temperature": [_table(entry) for entry in self.temperature],
+            "wall": [_table(entry) for entry in self.wall],
+            "time": {**time, **_table(self.time.scheme)},
+            "output": _table(self.output),
+            "solver": _table(self.solver),
+        }
+        if not self.output.probe:
+            del data["output"]["probe"]
+        return {key: value for key, value in data.items() if value not in ({}, [])}
+
+    def to_toml(self) -> str:
+        """The resolved case, every default explicit, as text that :meth:`from_toml` reads back equal."""
+        return table_text(self.to_dict())
+
+
+def _table(model: BaseModel | None) -> dict[str, Any]:
+    if model is None:
+        return {}
+    data = model.model_dump(exclude_none=True, exclude={"scheme", "parameters"})
+    return {key: str(value) if isinstance(value, Path) else value for key, value in data.items()}
+
+
+def _read_text(path: Path) -> str:
+    try:
+        return path.read_bytes().decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: a case file is TOML text in UTF-8, but byte {error.start} is not") from error
+    except FileNotFoundError as error:
+        names = built_in_cases()
+        near = difflib.get_close_matches(str(path), names, n=1)
+        hint = f"did you mean '{near[0]}'?" if near else f"the built-in cases are {', '.join(names)}"
+        raise InputError(f"{path}: there is no such case file or built-in case; {hint}") from error
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: this case file cannot be read: {error}") from error

@@ -1,0 +1,346 @@
+"""The tables of a case file, each as a model of its keys (SI units)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, InstanceOf, field_validator, model_validator
+
+from .base import (
+    Finite,
+    Name,
+    NonNegativeFloat,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    StrictModel,
+    Vector3,
+    listed,
+)
+
+__all__ = [
+    "CELL_FIELDS",
+    "POINT_FIELDS",
+    "Gravity",
+    "Initial",
+    "Load",
+    "Material",
+    "Mesh",
+    "MeshKeys",
+    "NodeSet",
+    "Output",
+    "OutputKeys",
+    "Probe",
+    "Section",
+    "Solver",
+    "Support",
+    "Temperature",
+    "Time",
+    "TimeKeys",
+]
+
+POINT_FIELDS = ("displacement", "velocity", "acceleration", "contact_force")
+CELL_FIELDS = ("strain", "stress", "axial_force", "plastic_strain", "temperature")
+
+Row2 = Annotated[tuple[Finite, Finite], listed]
+Row4 = Annotated[tuple[Finite, Finite, Finite, Finite], listed]
+Table2 = Annotated[tuple[Row2, ...], listed]
+Table4 = Annotated[tuple[Row4, ...], listed]
+Indices = Annotated[tuple[NonNegativeInt, ...], listed]
+
+
+def _increasing(rows: Sequence[Sequence[float]] | None) -> None:
+    """Refuse a table over time that is empty or whose times do not increase."""
+    if rows is None:
+        return
+    if not rows:
+        raise ValueError("expected at least one row")
+    for k in range(1, len(rows)):
+        if rows[k][0] <= rows[k - 1][0]:
+            raise ValueError(f"times must increase, but row {k} has t = {rows[k][0]!r} after {rows[k - 1][0]!r}")
+
+
+class MeshKeys(StrictModel):
+    """The keys of [mesh] that are not a generator's own."""
+
+    generator: Name | None = None
+    """name of a mesh generator"""
+    file: Annotated[str, Field(min_length=1)] | None = None
+    """mesh file, relative to the case file"""
+
+    @model_validator(mode="after")
+    def _exactly_one(self) -> MeshKeys:
+        if (self.generator is None) == (self.file is None):
+            raise ValueError("expected exactly one of the keys generator, file")
+        return self
+
+
+class Mesh(StrictModel):
+    """Where the mesh comes from: a generator with its parameters, or a file."""
+
+    generator: str | None = None
+    file: Path | None = None
+    parameters: InstanceOf[StrictModel] | None = None
+
+
+class NodeSet(StrictModel):
+    """Nodes named once; exactly one key says which."""
+
+    nearest: Vector3 | None = None
+    """a point [m]: the one node nearest to it"""
+    box: Annotated[tuple[Vector3, Vector3], listed] | None = None
+    """lower and upper corner [m]: the nodes inside, faces included"""
+    group: str | None = None
+    """a node group of the mesh"""
+    indices: Indices | None = None
+    """node numbers of the mesh, from 0"""
+    all: Literal[True] | None = None
+    """true: every node"""
+
+    @field_validator("box")
+    @classmethod
+    def _ordered(cls, box: tuple[Vector3, Vector3] | None) -> tuple[Vector3, Vector3] | None:
+        if box is not None:
+            for axis, low, high in zip("xyz", *box, strict=True):
+                if low > high:
+                    raise ValueError(f"the first corner must be the lower one, but {axis} is {low!r} and then {high!r}")
+        return box
+
+    @field_validator("indices")
+    @classmethod
+    def _distinct(cls, indices: tuple[int, ...] | None) -> tuple[int, ...] | None:
+        if indices is not None and not indices:
+            raise ValueError("expected at least one node number")
+        if indices is not None and len(set(indices)) < len(indices):
+            raise ValueError("a node number is there twice")
+        return indices
+
+    @model_validator(mode="after")
+    def _exactly_one(self) -> NodeSet:
+        given = [k for k in type(self).model_fields if getattr(self, k) is not None]
+        if len(given) != 1:
+            found = f"got {' and '.join(given)}" if given else "got none"
+            raise ValueError(f"expected exactly one of the keys {', '.join(type(self).model_fields)}, {found}")
+        return self
+
+
+class Material(StrictModel):
+    """Elastic or elasto-plastic bar material with mixed linear hardening."""
+
+    young_modulus: PositiveFloat
+    """Young's modulus [Pa]"""
+    density: PositiveFloat
+    """mass density [kg/m3]"""
+    yield_stress: PositiveFloat | None = None
+    """yield stress [Pa]; none: elastic"""
+    isotropic_hardening: NonNegativeFloat = 0.0
+    """isotropic hardening modulus K [Pa]"""
+    kinematic_hardening: NonNegativeFloat = 0.0
+    """kinematic hardening modulus H [Pa]"""
+    thermal_expansion: Finite = 0.0
+    """coefficient of thermal expansion [1/K]"""
+    damping: NonNegativeFloat = 0.0
+    """damping c_m proportional to mass density [kg/(m3 s)]"""
+    strain: Literal["engineering", "green", "logarithmic"] = "engineering"
+    """strain measure"""
+
+    @model_validator(mode="after")
+    def _hardening_needs_yield(self) -> Material:
+        for key in ("isotropic_hardening", "kinematic_hardening"):
+            if self.yield_stress is None and getattr(self, key) > 0.0:
+                raise ValueError(f"{key} = {getattr(self, key)!r} needs a yield_stress [Pa]")
+        return self
+
+
+class Section(StrictModel):
+    """Cross-section and material of bars."""
+
+    area: PositiveFloat
+    """cross-section area [m2]"""
+    material: str
+    """name of a material"""
+    bars: str | None = None
+    """bar group of the mesh; default: every bar that no other section names"""
+
+
+class Initial(StrictModel):
+    """Initial velocity v + w x (X - c) of a node set, or of every node where ``node_set`` is None."""
+
+    node_set: str | None = None
+    """name of a node set"""
+    velocity: Vector3 = (0.0, 0.0, 0.0)
+    """velocity v [m/s]"""
+    angular_velocity: Vector3 = (0.0, 0.0, 0.0)
+    """angular velocity w [rad/s]"""
+    centre: Vector3 | None = None
+    """centre c of the rotation [m]; default: the centre of mass"""
+
+    @model_validator(mode="after")
+    def _centre_turns(self) -> Initial:
+        if self.centre is not None and not any(self.angular_velocity):
+            raise ValueError("centre needs an angular_velocity [rad/s] other than zero")
+        return self
+
+
+class Support(StrictModel):
+    """Fixed or prescribed position components of a node set."""
+
+    node_set: str
+    """name of a node set"""
+    fix: str
+    """the fixed components: any of x, y, z"""
+    motion: Table4 | None = None
+    """rows [t, dx, dy, dz]: displacement from the start [s, m], linear between rows, constant outside"""
+    velocity: Vector3 | None = None
+    """constant velocity of the fixed components [m/s]"""
+
+    @field_validator("fix")
+    @classmethod
+    def _components(cls, fix: str) -> str:
+        if not fix or set(fix) - set("xyz") or len(set(fix)) < len(fix):
+            raise ValueError('expected any of the components x, y, z, each once, like "xz"')
+        return fix
+
+    @field_validator("motion")
+    @classmethod
+    def _motion_times(cls, motion: tuple[Any, ...] | None) -> tuple[Any, ...] | None:
+        _increasing(motion)
+        return motion
+
+    @model_validator(mode="after")
+    def _moves_what_it_fixes(self) -> Support:
+        if self.motion is not None and self.velocity is not None:
+            raise ValueError("expected at most one of the keys motion, velocity")
+        for k, axis in enumerate("xyz"):
+            rows = self.motion or ()
+            moves = any(row[1 + k] != 0.0 for row in rows) or (self.velocity is not None and self.velocity[k] != 0.0)
+            if moves and axis not in self.fix:
+                raise ValueError(f'{axis} is given a motion, but fix = "{self.fix}" leaves it free')
+        return self
+
+
+class Load(StrictModel):
+    """Force on each node of a node set."""
+
+    node_set: str
+    """name of a node set"""
+    force: Vector3
+    """force on each node of the set [N]"""
+    table: Table2 | None = None
+    """rows [t, factor] [s, -]: linear between rows, constant outside; default: factor 1"""
+
+    @field_validator("table")
+    @classmethod
+    def _table_times(cls, table: tuple[Any, ...] | None) -> tuple[Any, ...] | None:
+        _increasing(table)
+        return table
+
+
+class Gravity(StrictModel):
+    """Uniform acceleration of every mass."""
+
+    acceleration: Vector3
+    """acceleration [m/s2]"""
+
+
+class Temperature(StrictModel):
+    """Temperature above reference of bars."""
+
+    bars: str | None = None
+    """bar group of the mesh; default: every bar"""
+    value: Finite | None = None
+    """temperature above reference [K]"""
+    table: Table2 | None = None
+    """rows [t, temperature above reference] [s, K]: linear between rows, constant outside"""
+
+    @field_validator("table")
+    @classmethod
+    def _table_times(cls, table: tuple[Any, ...] | None) -> tuple[Any, ...] | None:
+        _increasing(table)
+        return table
+
+    @model_validator(mode="after")
+    def _exactly_one(self) -> Temperature:
+        if (self.value is None) == (self.table is None):
+            raise ValueError("expected exactly one of the keys value, table")
+        return self
+
+
+class TimeKeys(StrictModel):
+    """The keys of [time] that are not an integrator's own."""
+
+    integrator: str
+    """name of a time integration scheme"""
+    step: Any
+    """time step [s], or "auto" with an explicit scheme"""
+    end: PositiveFloat
+    """end time [s]"""
+    mass: Literal["lumped", "consistent"] = "lumped"
+    """mass matrix"""
+    safety: Annotated[float, Field(gt=0.0, le=1.0)] = 0.9
+    """factor on the critical step where step = "auto\""""
+
+    @field_validator("step")
+    @classmethod
+    def _step(cls, step: Any) -> float | str:
+        if step == "auto":
+            return "auto"
+        if isinstance(step, bool) or not isinstance(step, int | float):
+            raise ValueError('expected a number of seconds in SI units without quotes and unit, or "auto"')
+        if not (step > 0 and math.isfinite(step)):
+            raise ValueError('expected a finite number of seconds > 0, or "auto"')
+        return float(step)
+
+
+class Time(TimeKeys):
+    """The time integration: scheme, its parameters, step and end."""
+
+    scheme: InstanceOf[StrictModel]
+
+
+class Probe(StrictModel):
+    """A node set whose motion and reaction are recorded in the history."""
+
+    name: Name
+    """names the probe in the results"""
+    node_set: str
+    """name of a node set"""
+
+
+class OutputKeys(StrictModel):
+    """The keys of [output], probes aside."""
+
+    fields_every: NonNegativeInt = 10
+    """steps between field snapshots; 0: none but first and last"""
+    history_every: PositiveInt = 1
+    """steps between rows of the history"""
+    checkpoint_every: NonNegativeInt = 0
+    """steps between checkpoints; 0: none"""
+    fields: Annotated[tuple[str, ...], listed] | None = None
+    """names of the fields to write; default: all"""
+    precision: Literal["float64", "float32"] = "float64"
+    """precision of the fields in the result file"""
+
+
+class Output(OutputKeys):
+    """What is written, and how often."""
+
+    probe: tuple[Probe, ...] = ()
+
+
+class Solver(StrictModel):
+    """How the nonlinear and linear systems are solved."""
+
+    linear: Literal["auto", "cg", "gamg", "mumps"] = "auto"
+    """linear solver"""
+    operator: Literal["auto", "assembled", "matrix_free"] = "auto"
+    """form of the Hessian"""
+    rtol: Annotated[float, Field(gt=0.0, lt=1.0)] = 1e-9
+    """relative tolerance of the residual"""
+    atol: PositiveFloat | None = None
+    """absolute tolerance of the residual [N]; default: from the model's force scale"""
+    max_newton: PositiveInt = 50
+    """Newton iterations allowed in a step"""

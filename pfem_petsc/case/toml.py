@@ -1,0 +1,51 @@
+"""Write TOML: tables of numbers, texts, booleans, lists and tables, as case files hold them."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from typing import Any
+
+__all__ = ["table_text", "value_text"]
+
+
+def value_text(value: Any) -> str:
+    """A value on one line, so that a TOML reader gives it back equal."""
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007F")
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{_key(k)} = {value_text(v)}" for k, v in value.items()) + "}"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(value_text(v) for v in value) + "]"
+    return repr(value) if isinstance(value, int | float) else str(value)
+
+
+def table_text(table: Mapping[str, Any], path: str = "") -> str:
+    """A table as TOML lines: its values first, then its tables and lists of tables under their own headings."""
+    blocks = []
+    lines = [f"{_key(k)} = {value_text(v)}\n" for k, v in table.items() if not _is_nested(v)]
+    if lines:
+        blocks.append("".join(lines))
+    for key, value in table.items():
+        if not _is_nested(value):
+            continue
+        name = f"{path}{_key(key)}"
+        if isinstance(value, Mapping):
+            only_tables = bool(value) and all(_is_nested(v) for v in value.values())
+            blocks.append(("" if only_tables else f"[{name}]\n") + table_text(value, f"{name}."))
+        else:
+            blocks.extend(f"[[{name}]]\n" + table_text(item, f"{name}.") for item in value)
+    return "\n".join(blocks)
+
+
+def _is_nested(value: Any) -> bool:
+    """Whether a value gets a heading of its own: a table, or a list of tables (never an empty list)."""
+    many = isinstance(value, list | tuple) and len(value) > 0 and all(isinstance(v, Mapping) for v in value)
+    return isinstance(value, Mapping) or many
+
+
+def _key(key: str) -> str:
+    return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else value_text(key)

@@ -1,0 +1,233 @@
+#!/usr/bin/env bash
+# Brings a machine to a working virtual environment in the checkout. Does nothing where that is done already.
+#
+# usage: scripts/setup.sh [--build-petsc]
+#
+# Where PETSc comes from:
+#   - PETSC_DIR is set, or the active Python imports petsc4py: that PETSc, with that Python; nothing is installed outside
+#     the environment.
+#   - otherwise Debian's or Ubuntu's packages (as root or through sudo), one to two minutes;
+#   - --build-petsc: the newest release, built into an environment of its own, about ten minutes.
+#
+# PFEM_VENV   the environment; default .venv, with --build-petsc .venv-petsc
+set -euo pipefail
+
+build=no
+for argument in "$@"; do
+    case $argument in
+        --build-petsc) build=yes ;;
+        *) sed -n '2,/^set/{/^set/d;s/^# \{0,1\}//;p}' "$0"; exit "$([[ $argument == --help ]] && echo 0 || echo 2)" ;;
+    esac
+done
+if [[ $build == yes ]]; then
+    export PFEM_VENV=${PFEM_VENV:-.venv-petsc}
+fi
+source "$(dirname "${BASH_SOURCE[0]}")/environment.sh"
+source "$root/scripts/build_petsc.sh"
+cd "$root"
+
+say() { echo "setup: $*"; }
+fail() { echo "setup: $*" >&2; exit 1; }
+
+# The active Python, unless it is one of the environments that this script makes, or the distribution's own package.
+foreign_python() {
+    local candidate
+    candidate=$(command -v python3) || return 1
+    "$candidate" - "$root" <<'PYTHON' || return 1
+import os, sys
+root = sys.argv[1]
+if os.path.realpath(sys.prefix).startswith(os.path.realpath(root) + os.sep):
+    sys.exit(1)
+if not os.environ.get("PETSC_DIR"):
+    try:
+        import petsc4py
+    except ImportError:
+        sys.exit(1)
+    sys.exit(petsc4py.__file__.startswith("/usr/lib/"))
+PYTHON
+    echo "$candidate"
+}
+
+# What the environment was made from: it is up to date where this is unchanged.
+stamp() {
+    cat pyproject.toml scripts/setup.sh scripts/build_petsc.sh
+    foundation
+}
+
+foundation() { echo "$root $mode $base ${PETSC_DIR:-} ${PETSC_ARCH:-} ${PFEM_PETSC_VERSION:-}"; }
+
+# Packages of the distribution: those missing are installed.
+apt_install() {
+    local missing=() package as_root=()
+    for package in "$@"; do
+        dpkg-query -W -f '${Status}' "$package" 2>/dev/null | grep -q "ok installed" || missing+=("$package")
+    done
+    [[ ${#missing[@]} -eq 0 ]] && return
+    if [[ $(id -u) != 0 ]]; then
+        command -v sudo >/dev/null || fail "needs the packages ${missing[*]}: install them, or set PETSC_DIR"
+        as_root=(sudo)
+    fi
+    say "installing ${missing[*]}"
+    "${as_root[@]}" env DEBIAN_FRONTEND=noninteractive apt-get -qq -o DPkg::Lock::Timeout=300 \
+        install --yes --no-install-recommends "${missing[@]}" > "$log" 2>&1 || { tail -n 30 "$log" >&2; fail "apt-get failed"; }
+}
+
+apt_update() {
+    local as_root=()
+    [[ $(id -u) == 0 ]] || as_root=(sudo)
+    "${as_root[@]}" apt-get -qq -o DPkg::Lock::Timeout=300 update > "$log" 2>&1 || { tail -n 30 "$log" >&2; fail "apt-get update failed"; }
+}
+
+available() { apt-cache show "$1" >/dev/null 2>&1; }
+
+# Off-screen drawing needs OSMesa or EGL; newer distributions have the second alone.
+drawing_packages() {
+    if ldconfig -p | grep -qE 'libOSMesa|libEGL\.so'; then
+        return
+    elif available libosmesa6; then
+        echo libosmesa6
+    else
+        echo libegl1 libgl1-mesa-dri
+    fi
+}
+
+# python3-petsc4py-real3.18 and the like: the real, 32-bit-index build in its newest version.
+petsc_package() {
+    apt-cache --names-only search '^python3-petsc4py-real[0-9.]+$' | awk '{print $1}' | sort -V | tail -n 1
+}
+
+# An environment that stands on another Python or PETSc than asked for is made anew.
+make_venv() {
+    if ! "$python" -c "" 2>/dev/null || { [[ -f $venv/setup-done ]] && [[ $(tail -n 1 "$venv/setup-done") != "$(foundation)" ]]; }; then
+        say "making ${venv#"$root"/} with $1"
+        "$1" -m venv --clear "${@:2}" "$venv"
+    fi
+}
+
+site_packages() { "$python" -c "import sysconfig; print(sysconfig.get_path('purelib'))"; }
+
+# What pyproject.toml lists, but for the packages named: those come with MPI and PETSc.
+requirements() {
+    "$python" - "$@" <<'PYTHON'
+import re, sys, tomllib
+project = tomllib.load(open("pyproject.toml", "rb"))["project"]
+wanted = [*project["dependencies"], *(r for extra in project["optional-dependencies"].values() for r in extra)]
+print(*(r for r in wanted if re.match(r"[\w-]+", r)[0] not in sys.argv[1:]), sep="\n")
+PYTHON
+}
+
+pip_install() { "$python" -m pip install --quiet --disable-pip-version-check "$@"; }
+
+install_rest() {
+    local list
+    mapfile -t list < <(requirements petsc4py mpi4py h5py)
+    say "installing Python packages"
+    pip_install "$@" "${list[@]}"
+    pip_install --no-deps --editable .
+}
+
+# Compiled against NumPy 1, a package does not work with NumPy 2; the other way round it does.
+numpy_limit() { "$1" -c "import numpy; print('numpy<2' if numpy.__version__.startswith('1.') else 'numpy')"; }
+
+from_distribution() {
+    command -v apt-get >/dev/null || fail "no apt-get here: activate a Python with petsc4py, or set PETSC_DIR"
+    local package
+    # Lists of packages may be missing or out of date; they are fetched only when something is to be installed.
+    if ! { compgen -G '/usr/lib/petscdir/petsc*/*-real' >/dev/null && dpkg -s python3-h5py-mpi python3-venv >/dev/null 2>&1; }; then
+        apt_update
+    fi
+    package=$(petsc_package)
+    [[ -n $package ]] || fail "the distribution has no python3-petsc4py-real package: activate a Python with petsc4py," \
+        "set PETSC_DIR, or use --build-petsc"
+    apt_install "$package" python3-mpi4py python3-h5py-mpi openmpi-bin python3-venv libopenblas0-pthread $(drawing_packages)
+    /usr/bin/python3 -c "import sys; sys.exit(sys.version_info < (3, 11))" ||
+        fail "Python 3.11 or newer is needed, and this distribution has $(/usr/bin/python3 --version): newer" \
+            "distributions, conda or another Python with petsc4py work"
+    make_venv /usr/bin/python3 --system-site-packages
+    dpkg -L "$package" | grep '/dist-packages/petsc4py$' | xargs dirname > "$(site_packages)/petsc.pth"
+    install_rest "$(numpy_limit /usr/bin/python3)"
+}
+
+from_source() {
+    if command -v apt-get >/dev/null; then
+        apt_update
+        apt_install $build_packages $(drawing_packages)
+    fi
+    make_venv "$base"
+    build_petsc
+    install_rest numpy
+}
+
+# An environment on top of the active Python: it sees that one's packages, and adds what is missing.
+from_active() {
+    local folder
+    make_venv "$base" --system-site-packages
+    {
+        "$base" -c "import sysconfig; print(*sorted({sysconfig.get_path(p) for p in ('purelib', 'platlib')}), sep='\n')"
+        if [[ -n ${PETSC_DIR:-} ]]; then
+            for folder in "$PETSC_DIR/${PETSC_ARCH:-}/lib" "$PETSC_DIR/lib" "$PETSC_DIR/lib/python3/dist-packages"; do
+                if [[ -d $folder/petsc4py ]]; then echo "$folder"; fi
+            done
+        fi
+    } > "$(site_packages)/petsc.pth"
+    has() { "$python" -c "import $1" 2>/dev/null; }
+    has numpy || pip_install numpy
+    has mpi4py || pip_install mpi4py
+    if ! has petsc4py; then
+        local version
+        version=$(awk '$2 == "PETSC_VERSION_MAJOR" {a = $3} $2 == "PETSC_VERSION_MINOR" {b = $3} END {print a "." b}' \
+            "$PETSC_DIR/include/petscversion.h")
+        say "building petsc4py for the PETSc $version in $PETSC_DIR"
+        pip_install "petsc4py==$version.*"
+    fi
+    if ! has h5py; then
+        if [[ -n ${HDF5_DIR:-} ]]; then
+            say "building h5py on the HDF5 in $HDF5_DIR"
+            pip_install cython pkgconfig setuptools wheel
+            HDF5_MPI=ON CC=mpicc pip_install --no-build-isolation --no-deps --no-binary=h5py h5py
+        else
+            pip_install h5py
+        fi
+    fi
+    "$python" -c "import h5py, sys; sys.exit(not h5py.get_config().mpi)" ||
+        say "this h5py is not the parallel build: runs on one rank work, on several they do not." \
+            "Set HDF5_DIR to a parallel HDF5 and remove h5py from the active Python"
+    install_rest "$(numpy_limit "$python")"
+}
+
+# What a run needs, on two ranks: PETSc and mpi4py of one MPI.
+check() {
+    on_ranks 2 120 "$python" -c '
+from mpi4py import MPI
+import petsc4py; petsc4py.init()
+from petsc4py import PETSc
+import h5py, numba, numpy, pydantic, pyvista, rich, matplotlib, imageio_ffmpeg
+assert MPI.COMM_WORLD.size == PETSc.COMM_WORLD.size == 2, "PETSc and mpi4py do not share one MPI"
+assert PETSc.ScalarType is numpy.float64, "PETSc has complex or single-precision numbers: a real, double build is needed"
+if MPI.COMM_WORLD.rank == 0:
+    petsc = ".".join(map(str, PETSc.Sys.getVersion()))
+    print(f"setup: PETSc {petsc}, numpy {numpy.__version__}, h5py {h5py.__version__} (parallel: {h5py.get_config().mpi})")
+' || fail "the environment does not work"
+}
+
+log=$(mktemp)
+trap 'rm -f "$log"' EXIT
+if [[ $build == yes ]]; then
+    mode=build base=$(command -v /usr/bin/python3 || command -v python3)
+elif base=$(foreign_python); then
+    mode=active
+else
+    mode=distribution base=/usr/bin/python3
+fi
+if [[ -x $python && -f $venv/setup-done ]] && stamp | cmp -s - "$venv/setup-done" && "$python" -c "import mpi4py, h5py"; then
+    exit 0
+fi
+start=$SECONDS
+case $mode in
+    build) from_source ;;
+    active) say "using $base and its PETSc"; from_active ;;
+    distribution) from_distribution ;;
+esac
+check
+stamp > "$venv/setup-done"
+say "done in $((SECONDS - start)) s: ${venv#"$root"/}"

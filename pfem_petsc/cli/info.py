@@ -1,0 +1,83 @@
+"""Say what a result holds: case, versions, snapshots, history and energy balance."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING
+
+from .parser import PROGRAM, add_result
+
+if TYPE_CHECKING:
+    from ..output.result import Result
+
+RANKS = "one"
+
+EXAMPLE = f"""\
+example:
+  {PROGRAM} info results/rod_impact"""
+
+STORED = ("kinetic_energy", "elastic_energy")
+LOST = ("plastic_dissipation", "damping_dissipation", "numerical_dissipation")
+SUPPLIED = ("external_work", "contact_work")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the verb."""
+    add_result(parser)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print the summary of a result."""
+    from ..output.result import open_result
+
+    with open_result(arguments.result) as result:
+        print("\n".join(describe(result)))
+    return 0
+
+
+def describe(result: Result) -> list[str]:
+    """Lines about a result."""
+    from ..output.units import engineering
+
+    lines = [result.case.title]
+    rows = {"case": result.case.name, "mesh": f"{result.n_nodes:,} nodes, {result.n_bars:,} bars"}
+    rows.update({str(key).replace("_", " "): str(value) for key, value in result.attributes.items()})
+    times = result.times
+    span = f": {engineering(times[0], 's')} to {engineering(times[-1], 's')}" if len(times) else ""
+    rows["snapshots"] = f"{len(times)}{span}"
+    history = result.history
+    names = list(history)
+    count = len(history["time"]) if "time" in names else 0
+    if count:
+        time = history["time"]
+        rows["history"] = f"{count} rows: {engineering(time[0], 's')} to {engineering(time[-1], 's')}"
+    else:
+        rows["history"] = "0 rows"
+    width = max(map(len, rows))
+    lines += [f"  {label:{width}}  {text}" for label, text in rows.items()]
+    lines += ["history columns:", "  " + " ".join(names)]
+    if count:
+        lines += _energies(history, names)
+    return lines
+
+
+def _energies(history, names: list[str]) -> list[str]:  # noqa: ANN001 - any mapping of names to (rows,) arrays
+    """Energies [J] at start and end, and what their balance leaves over."""
+    from ..output.units import engineering
+
+    present = [name for name in (*STORED, *LOST, *SUPPLIED) if name in names]
+    if not present:
+        return []
+    width = max(map(len, (*present, "balance error")))
+    lines = [f"{'energy':{width + 2}}  {'start':>12}  {'end':>12}"]
+    change = {}
+    for name in present:
+        start, end = float(history[name][0]), float(history[name][-1])
+        change[name] = end - start
+        lines.append(f"  {name:{width}}  {engineering(start, 'J'):>12}  {engineering(end, 'J'):>12}")
+    error = sum(change.get(name, 0.0) for name in (*STORED, *LOST))
+    error -= sum(change.get(name, 0.0) for name in SUPPLIED)
+    scale = max(max(abs(float(history[name][k])) for name in present) for k in (0, -1))
+    relative = f" ({error / scale:.1e} of the largest)" if scale > 0.0 else ""
+    lines.append(f"  {'balance error':{width}}  {engineering(error, 'J'):>26}{relative}")
+    return lines

@@ -1,0 +1,136 @@
+"""Ranks on the command line: who prints, and how a failure on any of them ends all of them.
+
+Nothing here imports MPI before it is needed: ``--help``, ``list`` and refused options know their rank from the
+environment that the launcher made.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+import traceback
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from ..errors import EarlyStop, InputError, PfemError, SimulationFailure
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
+__all__ = ["collectively", "launched_rank", "on_first_rank", "refuse"]
+
+RANK_VARIABLES = ("OMPI_COMM_WORLD_RANK", "PMIX_RANK", "PMI_RANK", "SLURM_PROCID")
+
+GRACE = 5.0
+"""Seconds in which all ranks must report the same failure; after that the job is aborted."""
+
+
+def launched_rank() -> int | None:
+    """Rank of this process as its launcher says, None where it was started alone."""
+    for variable in RANK_VARIABLES:
+        value = os.environ.get(variable, "")
+        if value.isdigit():
+            return int(value)
+    return None
+
+
+def refuse(error: PfemError, debug: bool) -> int:
+    """Print an error that every rank has found by itself, once, and give its exit status."""
+    rank = launched_rank()
+    if not rank:
+        _print(error, debug)
+    if rank is not None:
+        # A launcher kills the other ranks as soon as one ends with an error: wait until it is printed.
+        from mpi4py import MPI
+
+        MPI.COMM_WORLD.Barrier()
+    return error.exit_status
+
+
+def on_first_rank(function: Callable[[], int], debug: bool, uses_mpi: bool) -> int:
+    """Run what needs one process; further ranks, where there are any, do nothing.
+
+    Parameters
+    ----------
+    function : gives the exit status
+    debug : whether a failure prints its traceback
+    uses_mpi : whether the function's imports may start MPI, which must then be started on every rank
+    """
+    rank = launched_rank()
+    if rank is not None and uses_mpi:
+        from mpi4py import MPI
+
+        rank = MPI.COMM_WORLD.rank
+    if rank:
+        return 0
+    try:
+        return function()
+    except BrokenPipeError:
+        # Who reads the output has seen enough (``list | head``); the interpreter must not flush into the closed pipe.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except (Exception, KeyboardInterrupt) as error:
+        return _print(error, debug)
+
+
+def collectively(function: Callable[[MPI.Comm], int], debug: bool) -> int:
+    """Run what all ranks do together, and give the exit status, the same on all.
+
+    Where all ranks fail, the lowest prints its message. Where only some do, the others may wait for them for ever:
+    each of the failed prints its message and ends the job.
+    """
+    from mpi4py import MPI
+
+    comm = MPI.COMM_WORLD
+    # Of its own, so that it matches whatever else the ranks are waiting in.
+    failures = comm.Dup()
+    try:
+        status = function(comm)
+    except (Exception, KeyboardInterrupt) as error:
+        if not _all_arrive(failures):
+            comm.Abort(_print(error, debug, f"rank {comm.rank}: "))
+        status = _print(error, debug) if comm.rank == 0 else None
+        status = failures.bcast(status, root=0)
+    failures.Free()
+    return status
+
+
+def _all_arrive(comm: MPI.Comm) -> bool:
+    """Whether every rank gets here within the grace time."""
+    request = comm.Ibarrier()
+    deadline = time.monotonic() + GRACE
+    while not request.Test():
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.005)
+    return True
+
+
+def _print(error: BaseException, debug: bool, who: str = "") -> int:
+    """Print one message for an error and give its exit status."""
+    status, text = _message(error)
+    if debug:
+        text = "".join(traceback.format_exception(error)) + text
+    sys.stdout.flush()
+    print(f"{who}{text}", file=sys.stderr, flush=True)
+    return status
+
+
+def _message(error: BaseException) -> tuple[int, str]:
+    if isinstance(error, EarlyStop):
+        return error.exit_status, f"stopped: {error}"
+    if isinstance(error, PfemError):
+        return error.exit_status, f"error: {error}"
+    if isinstance(error, KeyboardInterrupt):
+        return SimulationFailure.exit_status, "stopped: interrupted, nothing was saved on this account"
+    if isinstance(error, MemoryError):
+        return SimulationFailure.exit_status, f"error: out of memory: {error}; use more machines or a smaller mesh"
+    if isinstance(error, ModuleNotFoundError) and not str(error.name).startswith(__package__.partition(".")[0]):
+        return InputError.exit_status, f"error: {error}; scripts/setup.sh installs all that is needed"
+    detail = " ".join(str(error).split()) or "no message"
+
+    return (
+        SimulationFailure.exit_status,
+        f"internal error: {type(error).__name__}: {detail[:500]}; run with --debug to see where",
+    )

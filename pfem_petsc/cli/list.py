@@ -1,0 +1,53 @@
+"""List the built-in cases, integrators, mesh generators and walls."""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import importlib.util
+import tomllib
+from pathlib import Path
+
+from ..case.builtin import built_in_cases, built_in_path
+from ..registry import choices
+from .parser import PROGRAM
+
+RANKS = "one, without MPI"
+
+EXAMPLE = f"""\
+example:
+  {PROGRAM} list"""
+
+KINDS = {
+    "integrators": "pfem_petsc.integrators",
+    "mesh generators": "pfem_petsc.mesh.generators",
+    "walls": "pfem_petsc.contact.walls",
+}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the verb: none of its own."""
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Print the lists."""
+    sections = {"built-in cases": {name: _title(name) for name in built_in_cases()}}
+    for kind, package in KINDS.items():
+        sections[kind] = {name: _first_line(f"{package}.{name}") for name in choices(package)}
+    width = max(len(name) for lines in sections.values() for name in lines)
+    for kind, lines in sections.items():
+        print(f"{kind}:")
+        for name, text in lines.items():
+            print(f"  {name:{width}}  {text}")
+    return 0
+
+
+def _title(name: str) -> str:
+    return tomllib.loads(built_in_path(name).read_text(encoding="utf-8"))["title"]
+
+
+def _first_line(module: str) -> str:
+    """First line of a module's docstring, without running the module (some compile their kernels)."""
+    spec = importlib.util.find_spec(module)
+    text = ast.get_docstring(ast.parse(Path(spec.origin).read_text(encoding="utf-8"))) or ""
+    return text.partition("\n")[0]

@@ -1,0 +1,88 @@
+"""The command line: finds the verb, gives it to the ranks that run it, and turns errors into messages and status."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import importlib
+import io
+import sys
+from collections.abc import Sequence
+from types import ModuleType
+
+from ..errors import InputError
+from .launcher import collectively, launched_rank, on_first_rank, refuse
+from .parser import PROGRAM, Parser, add_debug
+
+__all__ = ["main"]
+
+VERBS = ("run", "list", "check", "info")
+"""Modules of this package: ``EXAMPLE``, ``RANKS``, ``add_arguments(parser)`` and ``run(arguments[, comm])``."""
+
+EXAMPLES = f"""\
+examples:
+  mpirun -n 2 {PROGRAM} rod_impact
+  {PROGRAM} list
+  {PROGRAM} check my_case.toml
+  mpirun -n 2 {PROGRAM} my_case.toml -o results/fine --set time.step=1e-5 -- -log_view
+  {PROGRAM} info results/rod_impact
+
+CASE alone means run. Everything after -- goes to PETSc. VERB --help tells more."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line and give its exit status.
+
+    Parameters
+    ----------
+    argv : arguments without the program's name; default: those of this process
+    """
+    words = list(sys.argv[1:] if argv is None else argv)
+    cut = words.index("--") if "--" in words else len(words)
+    own, petsc_options = words[:cut], words[cut + 1 :]
+    debug = "--debug" in own
+    try:
+        arguments, verb = _parse(own)
+        if petsc_options and verb.RANKS != "all":
+            raise InputError(f"{arguments.verb} takes no PETSc options: {' '.join(petsc_options)}")
+    except InputError as error:
+        return refuse(error, debug)
+    except SystemExit as done:  # --help and --version
+        return int(done.code or 0)
+    arguments.petsc_options = petsc_options
+    if verb.RANKS == "all":
+        return collectively(lambda comm: verb.run(arguments, comm), debug)
+    return on_first_rank(lambda: verb.run(arguments), debug, uses_mpi=verb.RANKS == "one")
+
+
+def _parse(words: list[str]) -> tuple[argparse.Namespace, ModuleType]:
+    parser, verbs = _parser()
+    if not words:
+        raise InputError(f"CASE or a verb is missing: {', '.join(VERBS)}; see {PROGRAM} --help")
+    if words[0] not in (*VERBS, "-h", "--help", "--version"):
+        words = ["run", *words]
+    # Help comes from one rank.
+    with contextlib.redirect_stdout(io.StringIO()) if launched_rank() else contextlib.nullcontext():
+        arguments = parser.parse_args(words)
+    return arguments, verbs[arguments.verb]
+
+
+def _parser() -> tuple[Parser, dict[str, ModuleType]]:
+    from .. import __version__
+
+    parser = Parser(
+        prog=PROGRAM,
+        description="Dynamics of large trusses that fly, hit things, buckle and yield.",
+        epilog=EXAMPLES,
+    )
+    parser.add_argument("--version", action="version", version=f"pfem_petsc {__version__}")
+    subparsers = parser.add_subparsers(dest="verb", metavar="VERB", required=True)
+    verbs = {name: importlib.import_module(f"{__package__}.{name}") for name in VERBS}
+    for name, module in verbs.items():
+        text = (module.__doc__ or "").strip()
+        sub = subparsers.add_parser(
+            name, help=text.partition("\n")[0], description=text, epilog=module.EXAMPLE, prog=f"{PROGRAM} {name}"
+        )
+        module.add_arguments(sub)
+        add_debug(sub)
+    return parser, verbs

@@ -1,0 +1,67 @@
+"""The parser of the command line; options that several verbs share."""
+
+from __future__ import annotations
+
+import argparse
+from typing import NoReturn
+
+from ..errors import InputError
+
+__all__ = ["Parser", "add_case", "add_debug", "add_result", "seconds"]
+
+PROGRAM = "python -m pfem_petsc"
+
+
+class Parser(argparse.ArgumentParser):
+    """Parser whose refusals are raised instead of printed, so that one rank can print them."""
+
+    def __init__(self, **settings: object) -> None:
+        settings.setdefault("formatter_class", argparse.RawDescriptionHelpFormatter)
+        super().__init__(allow_abbrev=False, **settings)  # type: ignore[arg-type]
+
+    def error(self, message: str) -> NoReturn:
+        """Raise the refusal as invalid input."""
+        hint = " (give it before --set and --restart)" if "required: CASE" in message else ""
+        raise InputError(f"{message}{hint}; see {self.prog} --help")
+
+
+def add_case(parser: argparse.ArgumentParser) -> None:
+    """CASE and --set."""
+    parser.add_argument("case", metavar="CASE", help="TOML file, or name of a built-in case (see list)")
+    parser.add_argument(
+        "--set",
+        dest="overrides",
+        metavar="KEY=VALUE",
+        nargs="+",
+        action="extend",
+        default=[],
+        help="set values over those of the case: time.step=1e-5 wall.0.point=[1,0,0]",
+    )
+
+
+def add_result(parser: argparse.ArgumentParser) -> None:
+    """RESULT."""
+    parser.add_argument("result", metavar="RESULT", help="result file, or its folder")
+
+
+def add_debug(parser: argparse.ArgumentParser) -> None:
+    """--debug, which every verb has."""
+    parser.add_argument("--debug", action="store_true", help="print the traceback of a failure")
+
+
+def seconds(text: str) -> float:
+    """A duration: ``90``, ``1:30`` or ``0:01:30``, in seconds.
+
+    Raises
+    ------
+    argparse.ArgumentTypeError
+        Where it is none, or not positive.
+    """
+    try:
+        parts = [float(part) for part in text.split(":")]
+    except ValueError:
+        parts = []
+    total = sum(part * 60.0**k for k, part in enumerate(reversed(parts)))
+    if not 1 <= len(parts) <= 3 or min(parts) < 0.0 or not 0.0 < total < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a duration: give seconds, or hours:minutes:seconds")
+    return total

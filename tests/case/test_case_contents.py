@@ -1,0 +1,238 @@
+"""A case as read: values, defaults, overrides, and the text that reads back equal."""
+
+import pickle
+import tomllib
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pfem_petsc.case.builtin import built_in_cases
+from pfem_petsc.case.overrides import apply_overrides
+from pfem_petsc.case.schema import Case
+from pfem_petsc.case.toml import table_text
+from pfem_petsc.errors import InputError
+
+
+def test_values_and_defaults(case_file):
+    case = Case.load(case_file)
+    assert (case.name, case.title, case.source, case.folder) == ("rod", "rod", str(case_file), case_file.parent)
+    assert (case.mesh.generator, case.mesh.file) == ("rod", None)
+    assert (case.mesh.parameters.length, case.mesh.parameters.elements) == (1.0, 4)
+    assert case.node_set["tip"].nearest == (1.0, 0.0, 0.0)
+    assert case.node_set["base"].indices == (0,)
+    steel = case.material["steel"]
+    assert (steel.young_modulus, steel.yield_stress, steel.damping, steel.strain) == (210e9, None, 0.0, "engineering")
+    assert (case.section["strut"].area, case.section["strut"].bars) == (1e-4, None)
+    assert case.initial == [] and case.temperature == [] and case.gravity is None
+    assert (case.support[0].fix, case.support[0].motion, case.support[0].velocity) == ("yz", None, None)
+    assert (case.load[0].force, case.load[0].table) == ((1.0, 0.0, 0.0), ((0.0, 0.0), (1.0, 1.0)))
+    wall = case.wall[0]
+    assert (wall.name, wall.type, wall.node_set, wall.point) == ("stop", "plane", None, (1.1, 0.0, 0.0))
+    assert (case.time.step, case.time.end, case.time.mass, case.time.safety) == (1e-6, 1e-3, "lumped", 0.9)
+    output = case.output
+    assert (output.fields_every, output.history_every, output.checkpoint_every) == (10, 1, 0)
+    assert (output.fields, output.precision, output.probe[0].name) == (None, "float64", "tip")
+    solver = case.solver
+    assert (solver.linear, solver.operator, solver.rtol, solver.atol, solver.max_newton) == (
+        ("auto", "auto", 1e-9, None, 50)
+    )
+
+
+def test_integer_is_a_number_but_stays_a_float(case_file):
+    case = Case.load(case_file, ["time.end=2", "wall.0.point=[2, 0, 0]"])
+    assert isinstance(case.time.end, float)
+    assert all(isinstance(x, float) for x in case.wall[0].point)
+
+
+def test_walls_are_named_by_place(case_file):
+    plain = "{type = 'plane', point = [2.0, 0.0, 0.0], normal = [-1.0, 0.0, 0.0]}"
+    case = Case.load(case_file, [f"wall.1={plain}", f"wall.2={plain}"])
+    assert [wall.name for wall in case.wall] == ["stop", "wall2", "wall3"]
+
+
+def test_initial_velocity_of_all_then_of_sets(case_file):
+    case = Case.load(
+        case_file,
+        ["initial.on.0={node_set = 'tip', velocity = [2.0, 0.0, 0.0]}", "initial.velocity=[1.0, 0.0, 0.0]"],
+    )
+    assert [(entry.node_set, entry.velocity[0]) for entry in case.initial] == [(None, 1.0), ("tip", 2.0)]
+    assert case.initial[1].centre is None
+
+
+def test_scheme_parameters(case_file):
+    default = Case.load(case_file, ["time.integrator=newmark"]).time.scheme
+    assert (default.beta, default.gamma) == (1.0, 1.5)
+    assert Case.load(case_file, ["time.integrator=newmark", "time.beta=0.25"]).time.scheme.beta == 0.25
+    assert Case.load(case_file, ["time.integrator=wilson"]).time.scheme.theta == 1.4
+    assert Case.load(case_file, ["time.integrator=chung_lee"]).time.scheme.beta == pytest.approx(28 / 27, rel=1e-15)
+    assert Case.load(case_file, ["time.step=auto"]).time.step == "auto"
+
+
+def test_mesh_file_is_relative_to_the_case(case_file, case_text):
+    case_file.write_text(case_text.replace('generator = "rod"\nlength = 1.0\nelements = 4', 'file = "../ring.msh"'))
+    case = Case.load(case_file)
+    assert case.mesh.file == (case_file.parent.parent / "ring.msh").resolve()
+    assert Case.from_toml(case.to_toml(), "/elsewhere") == case
+
+
+def test_case_does_not_change(case_file):
+    case = Case.load(case_file)
+    with pytest.raises(AttributeError, match="override"):
+        case.title = "other"
+    with pytest.raises(ValueError, match="frozen"):
+        case.time.end = 1.0
+
+
+def test_case_travels_between_ranks(case_file):
+    case = Case.load(case_file)
+    copy = pickle.loads(pickle.dumps(case))
+    assert copy == case
+    assert (copy.name, copy.folder) == (case.name, case.folder)
+
+
+def test_equality_sees_every_table(case_file):
+    case = Case.load(case_file)
+    for override in ("time.end=1.0", "wall.0.name=floor", "solver.rtol=1e-6", "title=other", "load.0.force=[2,0,0]"):
+        assert Case.load(case_file, [override]) != case
+
+
+@pytest.mark.parametrize("name", built_in_cases())
+def test_built_in_case_reads_back_equal(name):
+    case = Case.load(name)
+    assert case.name == name
+    assert case.title != name
+    assert Case.from_toml(case.to_toml(), case.folder) == case
+
+
+def test_byte_order_mark_is_no_part_of_a_case(case_file):
+    text = case_file.read_text()
+    case = Case.load(case_file)
+    case_file.write_bytes(b"\xef\xbb\xbf" + text.replace("\n", "\r\n").encode())
+    assert Case.load(case_file) == case
+
+
+NAMES = st.text(st.characters(exclude_categories=["Cs"]), max_size=8)
+NUMBERS = st.floats(allow_nan=False, allow_infinity=False) | st.integers(-(2**63), 2**63 - 1)
+VALUES = st.recursive(
+    NAMES | NUMBERS | st.booleans(),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(NAMES, inner, max_size=4),
+    max_leaves=20,
+)
+
+
+@given(st.dictionaries(NAMES, VALUES, max_size=5))
+def test_tables_read_back_equal(table):
+    read = tomllib.loads(table_text(table))
+    assert read == table
+    assert repr(read) == repr(tomllib.loads(table_text(read)))
+
+
+POSITIVE = st.floats(min_value=0.0, exclude_min=True, allow_infinity=False)
+FINITE = st.floats(allow_nan=False, allow_infinity=False)
+VECTORS = st.lists(FINITE, min_size=3, max_size=3)
+KEYS = st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=8)
+TIMES = st.lists(FINITE, min_size=1, max_size=5, unique=True).map(sorted)
+
+
+@st.composite
+def cases(draw):
+    node_sets = draw(st.dictionaries(KEYS, st.fixed_dictionaries({"nearest": VECTORS}), min_size=1, max_size=3))
+    materials = draw(
+        st.dictionaries(
+            KEYS,
+            st.fixed_dictionaries(
+                {"young_modulus": POSITIVE, "density": POSITIVE},
+                optional={"thermal_expansion": FINITE, "yield_stress": POSITIVE},
+            ),
+            min_size=1,
+            max_size=3,
+        )
+    )
+    names = st.sampled_from(list(node_sets))
+    load = st.fixed_dictionaries(
+        {"node_set": names, "force": VECTORS}, optional={"table": TIMES.map(lambda ts: [[t, 1.0] for t in ts])}
+    )
+    start = st.fixed_dictionaries({"node_set": names, "velocity": VECTORS})
+    return {
+        "title": draw(NAMES),
+        "mesh": {"generator": "rod", "length": draw(POSITIVE), "elements": draw(st.integers(1, 2**63 - 1))},
+        "node_set": node_sets,
+        "material": materials,
+        "section": {"s": {"area": draw(POSITIVE), "material": draw(st.sampled_from(list(materials)))}},
+        "initial": {"velocity": draw(VECTORS), "on": draw(st.lists(start, max_size=2))},
+        "load": draw(st.lists(load, max_size=2)),
+        "time": {"integrator": "newmark", "step": draw(POSITIVE), "end": draw(POSITIVE)},
+        "output": draw(st.fixed_dictionaries({}, optional={"fields": st.just([]) | st.just(["strain", "velocity"])})),
+    }
+
+
+@given(cases())
+def test_any_case_reads_back_equal(data):
+    case = Case.from_dict(data)
+    again = Case.from_toml(case.to_toml())
+    assert again == case
+    assert again.to_toml() == case.to_toml()
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("time.step=1e-5", {"time": {"step": 1e-5}}),
+        ("time.step = 1e-5 ", {"time": {"step": 1e-5}}),
+        ("time.integrator=newmark", {"time": {"integrator": "newmark"}}),
+        ('title="a = b"', {"title": "a = b"}),
+        ("title=a = b", {"title": "a = b"}),
+        ("title=", {"title": ""}),
+        ("title=1\nx = 2", {"title": "1\nx = 2"}),
+        ("wall.0.point=[1, 2.0, 3]", {"wall": [{"point": [1, 2.0, 3]}]}),
+        ("wall[0].name=a", {"wall": [{"name": "a"}]}),
+        ("output.probe.0.name=a", {"output": {"probe": [{"name": "a"}]}}),
+        ("node_set.0.all=true", {"node_set": {"0": {"all": True}}}),
+        ('node_set."a.b".all=true', {"node_set": {"a.b": {"all": True}}}),
+    ],
+)
+def test_override_makes_what_is_missing(text, expected):
+    data = {}
+    apply_overrides(data, [text])
+    assert data == expected
+
+
+def test_override_changes_only_its_key():
+    data = {"wall": [{"point": [1.0, 0.0, 0.0], "name": "a"}, {"name": "b"}]}
+    apply_overrides(data, ["wall.0.point.1=5.0", "wall.1.name=c", "wall.2.name=d"])
+    assert data == {"wall": [{"point": [1.0, 5.0, 0.0], "name": "a"}, {"name": "c"}, {"name": "d"}]}
+
+
+def test_given_tables_stay_as_they_are(case_text):
+    data = tomllib.loads(case_text)
+    assert Case.from_dict(data, overrides=["time.end=2.0"]).time.end == 2.0
+    assert data == tomllib.loads(case_text)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("time.step", "expected KEY=VALUE"),
+        ("=1", "expected KEY=VALUE"),
+        ("time..step=1", "expected KEY=VALUE"),
+        ("time.=1", "expected KEY=VALUE"),
+        ("wall[x].name=1", "expected KEY=VALUE"),
+        ("wall[0]name=1", "expected KEY=VALUE"),
+        ("wall.3.name=a", "'3' is not one of the places of this list: 0 to 1"),
+        ("wall.first.name=a", "'first' is not one of the places"),
+        ("time.step.unit=s", "time.step is a value, not a table"),
+    ],
+)
+def test_override_that_leads_nowhere(case_file, text, words):
+    with pytest.raises(InputError) as refused:
+        Case.load(case_file, [text])
+    assert str(refused.value).startswith(f"--set {text}: ")
+    assert words in str(refused.value)
+
+
+def test_default_title_is_the_name():
+    case = Case.load("rod_impact")
+    assert case.title == "Elastic rod against a rigid wall"
+    assert case.folder.samefile(Path(case.source).parent)

@@ -29,6 +29,12 @@ cd "$root"
 say() { echo "setup: $*"; }
 fail() { echo "setup: $*" >&2; exit 1; }
 
+# failed LOG: the end of what a command said.
+failed() {
+    tail -n 40 "$1" >&2
+    fail "failed${2:+: $2}; the end of its output is above"
+}
+
 # The active Python, unless it is one of the environments that this script makes, or the distribution's own package.
 foreign_python() {
     local candidate
@@ -69,13 +75,13 @@ apt_install() {
     fi
     say "installing ${missing[*]}"
     "${as_root[@]}" env DEBIAN_FRONTEND=noninteractive apt-get -qq -o DPkg::Lock::Timeout=300 \
-        install --yes --no-install-recommends "${missing[@]}" > "$log" 2>&1 || { tail -n 30 "$log" >&2; fail "apt-get failed"; }
+        install --yes --no-install-recommends "${missing[@]}" > "$log" 2>&1 || failed "$log" "apt-get install"
 }
 
 apt_update() {
     local as_root=()
     [[ $(id -u) == 0 ]] || as_root=(sudo)
-    "${as_root[@]}" apt-get -qq -o DPkg::Lock::Timeout=300 update > "$log" 2>&1 || { tail -n 30 "$log" >&2; fail "apt-get update failed"; }
+    "${as_root[@]}" apt-get -qq -o DPkg::Lock::Timeout=300 update > "$log" 2>&1 || failed "$log" "apt-get update"
 }
 
 available() { apt-cache show "$1" >/dev/null 2>&1; }
@@ -116,7 +122,9 @@ print(*(r for r in wanted if re.match(r"[\w-]+", r)[0] not in sys.argv[1:]), sep
 PYTHON
 }
 
-pip_install() { "$python" -m pip install --quiet --disable-pip-version-check "$@"; }
+pip_install() {
+    "$python" -m pip install --disable-pip-version-check "$@" > "$log" 2>&1 || failed "$log" "pip install $*"
+}
 
 install_rest() {
     local list

@@ -57,7 +57,9 @@ class NaturalOrder:
         self._slab_starts = np.cumsum(self._slab_counts) - self._slab_counts
 
         self._slab_rows = self._exchange(ids[self._owned_rows], to_slab=True) - self.first
-        once = len(self._slab_rows) == self.count and bool((np.bincount(self._slab_rows, minlength=self.count) == 1).all())
+        once = len(self._slab_rows) == self.count and bool(
+            (np.bincount(self._slab_rows, minlength=self.count) == 1).all()
+        )
         if not comm.allreduce(once, op=MPI.LAND):
             raise ValueError(f"the {self.n_global} mesh numbers are not owned exactly once each")
         self._alone = comm.size == 1

@@ -1,0 +1,261 @@
+"""HDF5 as all writers here use it: growing datasets, rows written by all ranks together, errors that reach the user."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import h5py
+import numpy as np
+from mpi4py import MPI
+
+from ..errors import InputError, SimulationFailure
+from ..parallel.agreement import agreed, on_root
+
+__all__ = [
+    "HDF5_ERRORS",
+    "chunk_rows",
+    "create_growing",
+    "create_new",
+    "fsync_all",
+    "grow",
+    "open_shared",
+    "release",
+    "require_parallel_hdf5",
+    "require_room",
+    "set_text",
+    "write_rows",
+    "writing",
+]
+
+# h5py turns errors of the HDF5 library into these, depending on the call: what a damaged file raises when read.
+HDF5_ERRORS = (OSError, RuntimeError, ValueError, KeyError)
+
+CHUNK_BYTES = 1 << 20
+# Seconds in which the other ranks must report on an operation that failed on this one.
+GRACE = 5.0
+
+
+def require_parallel_hdf5(comm: MPI.Comm) -> None:
+    """Refuse several ranks with an h5py that cannot write one file from all of them.
+
+    Raises
+    ------
+    InputError
+        On all ranks (the build may differ between machines).
+    """
+    with agreed(comm):
+        if comm.size > 1 and not h5py.get_config().mpi:
+            raise InputError(
+                f"h5py {h5py.__version__} ({h5py.__file__}) is a serial build, and {comm.size} ranks write one result "
+                "file together: install h5py built with MPI (Debian, Ubuntu: apt install python3-h5py-mpi; else "
+                "CC=mpicc HDF5_MPI=ON pip install --no-binary=h5py h5py), or run on one rank"
+            )
+
+
+def create_new(path: Path, comm: MPI.Comm, build, *arguments) -> None:
+    """Make an HDF5 file with its whole structure on rank 0, under a temporary name, then rename it to ``path``.
+
+    ``build(file, *arguments)`` fills it. Nobody sees the file under its own name before the structure is complete.
+    Serial creation makes the structure the same for any number of ranks, and an unwritable folder the same error on
+    all of them. Collective.
+
+    Raises
+    ------
+    InputError
+        On all ranks, when the folder cannot be written, or is not the same folder on all of them.
+    """
+
+    def create() -> None:
+        temporary = path.with_name(path.name + ".new")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with h5py.File(temporary, "w", locking=False) as file:
+                build(file, *arguments)
+            os.replace(temporary, path)
+        except OSError as error:
+            raise InputError(
+                f"{path}: cannot write there: {os.strerror(error.errno) if error.errno else error}; "
+                "choose another output folder (-o)"
+            ) from error
+
+    on_root(comm, create)
+    with agreed(comm):
+        # A network file system may take a moment to show a new file on other machines.
+        deadline = time.monotonic() + 5.0
+        while not path.exists():
+            if time.monotonic() > deadline:
+                raise InputError(
+                    f"{path}: made by rank 0, but rank {comm.rank} on {MPI.Get_processor_name()} does not see it: "
+                    "choose an output folder (-o) that all machines share"
+                )
+            time.sleep(0.1)
+
+
+def open_shared(path: Path, comm: MPI.Comm) -> h5py.File:
+    """Open an existing file for writing on all ranks; on one rank without locking, so that others may read it."""
+    if comm.size == 1:
+        return h5py.File(path, "r+", locking=False)
+    return h5py.File(path, "r+", driver="mpio", comm=comm)
+
+
+def chunk_rows(n_rows: int, row_bytes: int) -> int:
+    """Rows a chunk for blocks of ``n_rows`` rows: whole blocks up to 1 MiB, even parts of a block beyond.
+
+    Depends on the global size only, so that files from any number of ranks have the same chunks. A chunk that divides
+    the block is preferred, for then no chunk holds rows of two snapshots.
+    """
+    most = max(1, CHUNK_BYTES // row_bytes)
+    if n_rows <= most:
+        return max(1, n_rows)
+    parts = -(-n_rows // most)
+    for divisor in range(parts, 4 * parts):
+        if n_rows % divisor == 0:
+            return n_rows // divisor
+    return -(-n_rows // parts)
+
+
+def create_growing(
+    group: h5py.Group, name: str, row_shape: tuple[int, ...], dtype: np.dtype | type, rows_per_chunk: int
+) -> h5py.Dataset:
+    """An empty dataset (0, *row_shape) that grows by rows; parents are made. Collective where the file is."""
+    shape = (0, *row_shape)
+    space = h5py.h5s.create_simple(shape, (h5py.h5s.UNLIMITED, *row_shape))
+    properties = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+    properties.set_chunk((rows_per_chunk, *(max(1, extent) for extent in row_shape)))
+    # Ranks writing together need their chunks allocated when the dataset grows, also in a file made by one rank.
+    properties.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
+    *parents, leaf = name.split("/")
+    if parents:
+        group = group.require_group("/".join(parents))
+    made = h5py.h5d.create(
+        group.id, leaf.encode(), h5py.h5t.py_create(np.dtype(dtype), logical=True), space, properties
+    )
+    return h5py.Dataset(made)
+
+
+def grow(dataset: h5py.Dataset, n_rows: int) -> None:
+    """Set the number of rows. Collective where the file is."""
+    dataset.id.set_extent((n_rows, *dataset.shape[1:]))
+
+
+def write_rows(dataset: h5py.Dataset, first: int, rows: np.ndarray | None, collective: bool = False) -> None:
+    """Write rows (n, ...) from row ``first`` on; None or no rows: take part in a collective transfer with nothing."""
+    transfer = h5py.h5p.create(h5py.h5p.DATASET_XFER)
+    if collective:
+        transfer.set_dxpl_mpio(h5py.h5fd.MPIO_COLLECTIVE)
+    elif rows is None:
+        return
+    target = dataset.id.get_space()
+    if rows is None or rows.size == 0:
+        rows = np.empty((1,) * max(1, len(dataset.shape)), dtype=dataset.dtype)
+        source = h5py.h5s.create_simple(rows.shape)
+        source.select_none()
+        target.select_none()
+    else:
+        rows = np.ascontiguousarray(rows, dtype=dataset.dtype)
+        source = h5py.h5s.create_simple(rows.shape)
+        target.select_hyperslab((first,) + (0,) * (rows.ndim - 1), rows.shape)
+    dataset.id.write(source, target, rows, dxpl=transfer)
+
+
+def set_text(group: h5py.Group, name: str, text: str) -> None:
+    """Store a text as a dataset of fixed length (variable lengths cannot be written by several ranks), replacing it."""
+    if name in group:
+        del group[name]
+    raw = text.encode("utf-8")
+    group.create_dataset(name, data=np.array(raw, dtype=h5py.string_dtype("utf-8", max(1, len(raw)))))
+
+
+@contextmanager
+def writing(comm: MPI.Comm, path: Path) -> Iterator[None]:
+    """Around one operation of all ranks on an HDF5 file: an error on any becomes a SimulationFailure on all.
+
+    When an operation fails on one rank, HDF5 may keep the others waiting in it for ever. So the rank that failed waits
+    for their agreement a few seconds only, and then raises alone; whoever catches that ends the job. Collective.
+    """
+    failure: SimulationFailure | None = None
+    try:
+        yield
+    except (OSError, RuntimeError) as error:
+        failure = SimulationFailure(
+            f"{path}: writing failed on rank {comm.rank} ({_first_line(error)}): is the disk full, or the folder gone? "
+            "What was written before stays readable; continue with --restart when there is room"
+        )
+        failure.__cause__ = error
+    if comm.size > 1:
+        mine = np.array([comm.rank if failure is not None else comm.size])
+        first = np.empty_like(mine)
+        request = comm.Iallreduce(mine, first, op=MPI.MIN)
+        if failure is None:
+            request.Wait()
+        else:
+            deadline = time.monotonic() + GRACE
+            while not request.Test():
+                if time.monotonic() > deadline:
+                    raise failure
+                time.sleep(0.01)
+        if first[0] < comm.size:
+            raise comm.bcast(failure, root=int(first[0]))
+    elif failure is not None:
+        raise failure
+
+
+def release(file: h5py.File, comm: MPI.Comm) -> None:
+    """Let go of a file that can no longer be written.
+
+    HDF5 1.10 and later crash in a close, or at the end of the process, that cannot write what they still hold. So one
+    process lets them write it to memory. Several leave the file open: closing it together might never end.
+    """
+    if comm.size == 1 and file.id.valid:
+        nowhere = os.memfd_create("released")
+        os.dup2(nowhere, file.id.get_vfd_handle())
+        os.close(nowhere)
+        file.close()
+
+
+def require_room(comm: MPI.Comm, path: Path, n_bytes: int, target: Path | None = None) -> None:
+    """Stop before a write that would not fit, while the file is whole: a disk that runs full inside HDF5 may damage it.
+
+    Collective; the numbers of rank 0 count.
+
+    Raises
+    ------
+    SimulationFailure
+        On all ranks, when the file (or folder ``target``) is gone or fewer than ``n_bytes`` + 1 MiB are free.
+    """
+
+    def look() -> None:
+        try:
+            (target or path).stat()
+            free = shutil.disk_usage(path.parent).free
+        except OSError as error:
+            raise SimulationFailure(
+                f"{path}: gone or unreachable during the run ({os.strerror(error.errno)}); "
+                "do not move or remove the output folder of a run that is going on"
+            ) from error
+        if free < n_bytes + (1 << 20):
+            raise SimulationFailure(
+                f"{path}: disk full: {free / 1e6:.1f} MB are free and {n_bytes / 1e6:.1f} MB are to be written. What "
+                "was written before is complete; make room and continue with --restart, or write less (fields_every, "
+                "fields, precision in [output])"
+            )
+
+    on_root(comm, look)
+
+
+def fsync_all(path: Path) -> None:
+    """Bring a file, or the entries of a folder, onto the disk."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _first_line(error: BaseException) -> str:
+    return str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__

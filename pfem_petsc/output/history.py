@@ -1,0 +1,111 @@
+"""The history of a run: one row a recorded step, collected on rank 0 and written in blocks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from mpi4py import MPI
+
+from ..errors import InputError
+from .hdf5 import create_growing, grow, write_rows, writing
+
+__all__ = ["HistoryWriter", "create_history"]
+
+# Rows a chunk: small, so that a short run makes a small file (a whole chunk is allocated for the first row).
+ROWS_PER_CHUNK = 512
+CHUNK_BYTES = 1 << 16
+# Rows kept in memory before they are written; fewer where rows are wide.
+BUFFER_ROWS = 1024
+BUFFER_BYTES = 1 << 24
+
+
+def create_history(file: h5py.File, columns: Mapping[str, tuple[int, ...]], types: Mapping[str, Any]) -> None:
+    """Make ``/history`` with an empty dataset a column and the attribute ``rows``: how many rows are complete."""
+    group = file.create_group("history")
+    group.attrs["rows"] = np.int64(0)
+    for name, shape in columns.items():
+        dtype = np.dtype(types.get(name, np.float64))
+        per_chunk = CHUNK_BYTES // max(1, dtype.itemsize * int(np.prod(shape, dtype=np.int64)))
+        create_growing(group, name, tuple(shape), dtype, max(1, min(ROWS_PER_CHUNK, per_chunk)))
+
+
+class HistoryWriter:
+    """Appends rows to ``/history``.
+
+    Rank 0 holds the values and writes them; the file grows on all ranks together. The attribute ``rows`` follows
+    after a flush of the data, so that a reader, or a kill between, never meets a row that is not complete.
+
+    Parameters
+    ----------
+    file : h5py.File
+        Open for writing on all ranks, with the group made by :func:`create_history`.
+    comm : MPI.Comm
+    path : Path
+        Named in messages.
+    columns : mapping of column name to the shape of one row's value, () for a number
+
+    Raises
+    ------
+    InputError
+        When the file's columns are others (a run is continued with another case).
+    """
+
+    def __init__(self, file: h5py.File, comm: MPI.Comm, path: Path, columns: Mapping[str, tuple[int, ...]]) -> None:
+        self._file, self._comm, self._path = file, comm, path
+        group = file["history"]
+        self._datasets = {}
+        for name, shape in columns.items():
+            found = group.get(name)
+            if not isinstance(found, h5py.Dataset) or found.shape[1:] != tuple(shape):
+                has = f"rows of shape {found.shape[1:]}" if isinstance(found, h5py.Dataset) else "nothing"
+                raise InputError(
+                    f"{path}: history/{name}: the run records rows of shape {tuple(shape)}, the file has {has}: it was "
+                    "written with another case; restart with the same walls and probes, or write elsewhere (-o)"
+                )
+            self._datasets[name] = found
+        self._rows_attribute = h5py.h5a.open(group.id, b"rows")
+        self.n_rows = int(group.attrs["rows"])
+        row_bytes = sum(d.dtype.itemsize * int(np.prod(d.shape[1:], dtype=np.int64)) for d in self._datasets.values())
+        self._capacity = max(1, min(BUFFER_ROWS, BUFFER_BYTES // max(1, row_bytes)))
+        # What a write may take on disk: the rows, and a chunk begun in each column.
+        self.reserve_bytes = self._capacity * row_bytes + len(self._datasets) * CHUNK_BYTES
+        self.n_buffered = 0
+        self._buffers: dict[str, np.ndarray] = {}
+        if comm.rank == 0:
+            self._buffers = {n: np.empty((self._capacity, *d.shape[1:]), d.dtype) for n, d in self._datasets.items()}
+
+    @property
+    def full(self) -> bool:
+        """Whether the buffer must be written before the next row: the same answer on all ranks."""
+        return self.n_buffered == self._capacity
+
+    def append(self, row: Mapping[str, Any] | None) -> None:
+        """Take one row: rank 0 gives a value for each column, the others None. No communication."""
+        if self._comm.rank == 0:
+            if row is None or len(row) != len(self._buffers):
+                raise ValueError(f"a history row has the columns {sorted(self._buffers)}, got {sorted(row or {})}")
+            for name, buffer in self._buffers.items():
+                buffer[self.n_buffered] = row[name]
+        self.n_buffered += 1
+
+    def write(self) -> None:
+        """Write the buffered rows, not yet counted as complete: flush the file, then :meth:`commit`. Collective."""
+        if self.n_buffered == 0:
+            return
+        first, self.n_rows = self.n_rows, self.n_rows + self.n_buffered
+        with writing(self._comm, self._path):
+            for dataset in self._datasets.values():
+                grow(dataset, self.n_rows)
+        with writing(self._comm, self._path):
+            for name, buffer in self._buffers.items():
+                write_rows(self._datasets[name], first, buffer[: self.n_buffered])
+        self.n_buffered = 0
+
+    def commit(self) -> None:
+        """Count the rows written as complete; the file is flushed after it. Collective."""
+        with writing(self._comm, self._path):
+            self._rows_attribute.write(np.array(self.n_rows, dtype=np.int64))

@@ -1,0 +1,125 @@
+"""The groups and datasets of a result file, and which of its rows are complete."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import h5py
+import numpy as np
+
+from .hdf5 import chunk_rows, create_growing
+from .history import create_history
+from .provenance import write_case
+
+__all__ = [
+    "PER_STEP",
+    "complete_rows",
+    "complete_snapshots",
+    "create_field",
+    "create_result",
+    "dataset_names",
+    "field_datasets",
+]
+
+VTK_LINE = 3
+STEPS_PER_CHUNK = 256
+# What a snapshot adds to /VTKHDF/Steps besides its time.
+PER_STEP = ("PointOffsets", "CellDataRows", "CellOffsets", "ConnectivityIdOffsets", "PartOffsets", "NumberOfParts")
+
+
+def create_result(
+    file: h5py.File,
+    n_nodes: int,
+    n_bars: int,
+    columns: Mapping[str, tuple[int, ...]],
+    column_types: Mapping[str, Any],
+    case_text: str,
+    attributes: Mapping[str, Any],
+) -> None:
+    """Make the whole structure of a result file but its fields: VTKHDF 2.0 with no step yet, history, case.
+
+    The mesh is one part, whatever the number of ranks, and all steps use the same connectivity (offset 0).
+    """
+    vtk = file.create_group("VTKHDF")
+    vtk.attrs["Version"] = np.array([2, 0], dtype=np.int64)
+    # The reader wants a text of fixed length here.
+    kind = b"UnstructuredGrid"
+    vtk.attrs.create("Type", kind, dtype=h5py.string_dtype("ascii", len(kind)))
+    for name, value in (
+        ("NumberOfPoints", n_nodes),
+        ("NumberOfCells", n_bars),
+        ("NumberOfConnectivityIds", 2 * n_bars),
+    ):
+        vtk.create_dataset(name, data=np.array([value], dtype=np.int64))
+    vtk.create_dataset("Connectivity", shape=(2 * n_bars,), dtype=np.int64)
+    vtk.create_dataset("Offsets", shape=(n_bars + 1,), dtype=np.int64)
+    vtk.create_dataset("Types", data=np.full(n_bars, VTK_LINE, dtype=np.uint8))
+    create_growing(vtk, "Points", (3,), np.float64, chunk_rows(n_nodes, 24))
+    steps = vtk.create_group("Steps")
+    steps.attrs["NSteps"] = np.int64(0)
+    create_growing(steps, "Values", (), np.float64, STEPS_PER_CHUNK)
+    for name in PER_STEP:
+        # One column for the one kind of cell there is.
+        row_shape = (1,) if name in ("CellOffsets", "ConnectivityIdOffsets") else ()
+        create_growing(steps, name, row_shape, np.int64, STEPS_PER_CHUNK)
+    for group in ("PointData", "CellData"):
+        vtk.create_group(group)
+        steps.create_group(group + "Offsets")
+    snapshots = file.create_group("snapshots")
+    create_growing(snapshots, "step", (), np.int64, STEPS_PER_CHUNK)
+    create_growing(snapshots, "time", (), np.float64, STEPS_PER_CHUNK)
+    create_history(file, columns, column_types)
+    write_case(file, case_text, attributes)
+
+
+def create_field(vtk: h5py.Group, kind: str, name: str, row_shape: tuple[int, ...], dtype: np.dtype) -> h5py.Dataset:
+    """Make a field, ``kind`` "PointData" or "CellData". Collective where the file is.
+
+    All point fields start at the same row in a snapshot, as do all cell fields: their offsets are one dataset under
+    several names (hard links), so that they cannot disagree.
+    """
+    n_rows = int(vtk["NumberOfPoints" if kind == "PointData" else "NumberOfCells"][0])
+    row_bytes = dtype.itemsize * int(np.prod(row_shape, dtype=np.int64))
+    dataset = create_growing(vtk[kind], name, row_shape, dtype, chunk_rows(n_rows, row_bytes))
+    vtk["Steps"][kind + "Offsets"][name] = vtk["Steps"]["PointOffsets" if kind == "PointData" else "CellDataRows"]
+    return dataset
+
+
+def field_datasets(vtk: h5py.Group) -> dict[str, h5py.Dataset]:
+    """Points and fields with their rows a snapshot: {"Points": …, "PointData/velocity": …, "CellData/stress": …}."""
+    found = {"Points": vtk["Points"]}
+    for kind in ("PointData", "CellData"):
+        for name in vtk[kind]:
+            found[f"{kind}/{name}"] = vtk[kind][name]
+    return found
+
+
+def complete_snapshots(file: h5py.File) -> int:
+    """How many snapshots are complete: a run that was killed may have left parts of one more."""
+    vtk, steps = file["VTKHDF"], file["VTKHDF/Steps"]
+    lengths = [
+        int(steps.attrs["NSteps"]),
+        len(steps["Values"]),
+        len(file["snapshots/step"]),
+        len(file["snapshots/time"]),
+    ]
+    lengths += [len(steps[name]) for name in PER_STEP]
+    n_nodes, n_bars = int(vtk["NumberOfPoints"][0]), int(vtk["NumberOfCells"][0])
+    for name, dataset in field_datasets(vtk).items():
+        rows = n_bars if name.startswith("CellData") else n_nodes
+        lengths += [len(dataset) // rows] if rows else []
+    return min(lengths)
+
+
+def dataset_names(group: h5py.Group) -> list[str]:
+    """Names of all datasets in a group and its groups, relative to it: ["time", "wall/floor/force"]."""
+    names: list[str] = []
+    group.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None)
+    return names
+
+
+def complete_rows(file: h5py.File) -> int:
+    """How many rows of the history are complete."""
+    history = file["history"]
+    return min([int(history.attrs["rows"]), *(len(history[name]) for name in dataset_names(history))])

@@ -1,0 +1,111 @@
+"""Bring a result file back to what is complete in it, and to an earlier step for a restart."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from ..errors import InputError
+from .hdf5 import fsync_all, grow, write_rows
+from .layout import PER_STEP, complete_rows, complete_snapshots, dataset_names, field_datasets
+from .provenance import read_attributes, write_case
+
+__all__ = ["reopen", "repair"]
+
+
+def repair(path: Path | str, after_step: int | None = None) -> tuple[int, int]:
+    """Cut off what a killed run left incomplete, and everything later than step ``after_step``. One process.
+
+    Returns
+    -------
+    (int, int)
+        Snapshots and history rows that the file has now.
+
+    Raises
+    ------
+    InputError
+        When there is no such file, or it is not a readable result.
+    """
+    from .result import readable
+
+    path = Path(path)
+    with readable(path), h5py.File(path, "r+", locking=False) as file:
+        n_snapshots, n_rows = complete_snapshots(file), complete_rows(file)
+        vtk, steps, history = file["VTKHDF"], file["VTKHDF/Steps"], file["history"]
+        if after_step is not None:
+            n_snapshots = int(np.searchsorted(file["snapshots/step"][:n_snapshots], after_step, side="right"))
+            n_rows = int(np.searchsorted(history["step"][:n_rows], after_step, side="right"))
+        # VTK's reader crashes on more times than steps: the times go first.
+        if len(steps["Values"]) > n_snapshots:
+            grow(steps["Values"], n_snapshots)
+        write_rows(steps["Values"], 0, file["snapshots/time"][: len(steps["Values"])])
+        file.flush()
+        steps.attrs.modify("NSteps", np.int64(n_snapshots))
+        for name in PER_STEP:
+            grow(steps[name], n_snapshots)
+        for name in ("step", "time"):
+            grow(file["snapshots"][name], n_snapshots)
+        if n_snapshots == 0:
+            # The first snapshot makes the fields, perhaps not all of them were made.
+            for kind in ("PointData", "CellData"):
+                for name in list(vtk[kind]):
+                    del vtk[kind][name]
+                for name in list(steps[kind + "Offsets"]):
+                    del steps[kind + "Offsets"][name]
+        for name, dataset in field_datasets(vtk).items():
+            n = int(vtk["NumberOfCells" if name.startswith("CellData") else "NumberOfPoints"][0])
+            grow(dataset, n_snapshots * n)
+        for name in dataset_names(history):
+            grow(history[name], n_rows)
+        history.attrs.modify("rows", np.int64(n_rows))
+    fsync_all(path)
+    return n_snapshots, n_rows
+
+
+def reopen(
+    path: Path,
+    after_step: int,
+    sizes: tuple[int, int],
+    fields: Mapping[str, list[str]],
+    case_text: str,
+    attributes: Mapping[str, Any],
+) -> None:
+    """Prepare a result file to be continued after a step, with mesh and fields as before. One process.
+
+    Parameters
+    ----------
+    path : Path
+    after_step : int
+        What is later is dropped.
+    sizes : (int, int)
+        Nodes and bars of the case.
+    fields : mapping of "PointData" and "CellData" to sorted names
+    case_text, attributes
+        Replace what ``/case`` holds; the step is added to its ``restarts_after_step``.
+
+    Raises
+    ------
+    InputError
+        When the file is missing, damaged, or of another mesh or other fields.
+    """
+    n_snapshots, _ = repair(path, after_step)
+    with h5py.File(path, "r+", locking=False) as file:
+        vtk = file["VTKHDF"]
+        has = (int(vtk["NumberOfPoints"][0]), int(vtk["NumberOfCells"][0]))
+        if has != sizes:
+            raise InputError(
+                f"{path}: has {has[0]} nodes and {has[1]} bars, the case has {sizes[0]} and {sizes[1]}: it was written "
+                "with another mesh; restart the case it belongs to, or write elsewhere (-o)"
+            )
+        for kind, names in fields.items():
+            if n_snapshots and sorted(vtk[kind]) != names:
+                raise InputError(
+                    f"{path}: has the fields {', '.join(sorted(vtk[kind])) or 'none'} ({kind}), the case asks for "
+                    f"{', '.join(names) or 'none'}: keep [output] fields as it was, or write elsewhere (-o)"
+                )
+        earlier = list(read_attributes(file["case"]).get("restarts_after_step", []))
+        write_case(file, case_text, {**attributes, "restarts_after_step": [*earlier, after_step]})

@@ -1,0 +1,218 @@
+"""Read the results of a run, finished, going on or killed."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import h5py
+import numpy as np
+
+from ..errors import InputError
+from ..registry import nearest
+from .hdf5 import HDF5_ERRORS
+from .layout import complete_rows, complete_snapshots, dataset_names
+from .provenance import read_attributes
+
+if TYPE_CHECKING:
+    import pyvista
+
+    from ..case.schema import Case
+
+__all__ = ["History", "Result", "open_result", "readable"]
+
+RESULT_NAME = "result.vtkhdf"
+# A file that is being written may be caught between two states; how often, and after how many seconds, to look again.
+ATTEMPTS, PAUSE = 8, 0.15
+
+T = TypeVar("T")
+
+
+def open_result(path: Path | str) -> Result:
+    """Open a result file, or the one in a folder, for reading; also while the run goes on.
+
+    Raises
+    ------
+    InputError
+        When there is no such file, or it is not a readable result of pfem_petsc.
+    """
+    path = Path(path)
+    return Result(path / RESULT_NAME if path.is_dir() else path)
+
+
+@contextmanager
+def readable(path: Path) -> Iterator[None]:
+    """Around opening a result file: what is wrong with it as an InputError."""
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such result file; give a {RESULT_NAME} or the folder that holds one")
+    try:
+        yield
+    except HDF5_ERRORS as error:
+        if not h5py.is_hdf5(path):
+            raise InputError(f"{path}: not a result file: it is not HDF5, or cut off at its beginning") from error
+        reason = str(error).strip().splitlines()
+        raise InputError(
+            f"{path}: not a result of pfem_petsc, or damaged: {reason[0] if reason else type(error).__name__}"
+        ) from error
+
+
+class Result:
+    """The results of a run. Fields are in the mesh's own numbering; a snapshot that is not complete is not seen.
+
+    What there is, is found once, and again by :meth:`reload`. The file is open only during a read: HDF5 shows a file
+    that the process has open already as it was then, without what the run has written since.
+
+    Attributes
+    ----------
+    path : Path
+    times : (snapshots,) float64 [s]
+    steps : (snapshots,) int64
+        Numbers of the time steps.
+    n_nodes, n_bars : int
+    point_fields, cell_fields : list of str
+    case_text : str
+        The resolved case.
+    attributes : dict
+        Versions, ranks and options of the run.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.reload()
+
+    def reload(self) -> None:
+        """See what the run has written since."""
+        self._patiently(self._look)
+
+    def _look(self, file: h5py.File) -> None:
+        vtk = file["VTKHDF"]
+        n = complete_snapshots(file)
+        self.times: np.ndarray = file["snapshots/time"][:n]
+        self.steps: np.ndarray = file["snapshots/step"][:n]
+        self.n_nodes, self.n_bars = int(vtk["NumberOfPoints"][0]), int(vtk["NumberOfCells"][0])
+        self.point_fields, self.cell_fields = sorted(vtk["PointData"]), sorted(vtk["CellData"])
+        self.case_text: str = file["case/text"][()].decode()
+        self.attributes: dict[str, Any] = read_attributes(file["case"])
+        self._n_rows = complete_rows(file)
+        self._columns = dataset_names(file["history"])
+
+    @property
+    def history(self) -> History:
+        """The history's columns: ``result.history["wall/floor/force"]``, (rows, 3)."""
+        return History(self, self._columns, self._n_rows)
+
+    @property
+    def case(self) -> Case:
+        """The case, read from the text in the file."""
+        from ..case.schema import Case
+
+        return Case.from_toml(self.case_text, Path(self.attributes.get("case_folder", self.path.parent)))
+
+    @property
+    def bars(self) -> np.ndarray:
+        """Nodes at the ends of each bar: (bars, 2) int64."""
+        return self.read("VTKHDF/Connectivity", slice(None)).reshape(-1, 2)
+
+    def positions(self, i: int) -> np.ndarray:
+        """Positions at snapshot i (-1: the last): (nodes, 3) float64 [m]."""
+        return self._snapshot("VTKHDF/Points", i, self.n_nodes)
+
+    def field(self, name: str, i: int) -> np.ndarray:
+        """A field at snapshot i (-1: the last): (nodes, 3), (nodes,) or (bars,), SI units.
+
+        Raises
+        ------
+        InputError
+            When the file has no such field.
+        """
+        if name in self.point_fields:
+            return self._snapshot(f"VTKHDF/PointData/{name}", i, self.n_nodes)
+        if name in self.cell_fields:
+            return self._snapshot(f"VTKHDF/CellData/{name}", i, self.n_bars)
+        known = self.point_fields + self.cell_fields
+        raise InputError(f"{self.path}: has no field {name!r}{nearest(name, known)}")
+
+    def mesh(self, i: int) -> pyvista.UnstructuredGrid:
+        """Snapshot i (-1: the last) as a pyvista grid of lines with all its fields."""
+        import pyvista
+
+        cells = np.column_stack([np.full(self.n_bars, 2), self.bars]).ravel()
+        types = np.full(self.n_bars, pyvista.CellType.LINE, dtype=np.uint8)
+        grid = pyvista.UnstructuredGrid(cells, types, self.positions(i))
+        for name in self.point_fields:
+            grid.point_data[name] = self.field(name, i)
+        for name in self.cell_fields:
+            grid.cell_data[name] = self.field(name, i)
+        grid.field_data["TimeValue"] = [self.times[i]]
+        return grid
+
+    def _snapshot(self, name: str, i: int, n_rows: int) -> np.ndarray:
+        if not -len(self.times) <= i < len(self.times):
+            raise IndexError(f"{self.path}: snapshot {i} of {len(self.times)}")
+        first = (i % len(self.times)) * n_rows
+        return self.read(name, slice(first, first + n_rows))
+
+    def read(self, name: str, rows: slice) -> np.ndarray:
+        """Rows of a dataset, named by its path in the file."""
+        return self._patiently(lambda file: file[name][rows])
+
+    def _patiently(self, look: Callable[[h5py.File], T]) -> T:
+        with readable(self.path):
+            for left in reversed(range(ATTEMPTS)):
+                try:
+                    with h5py.File(self.path, "r", locking=False) as file:
+                        return look(file)
+                except HDF5_ERRORS:
+                    # A file that nobody is writing will not get better.
+                    if not left or time.time() - self.path.stat().st_mtime > 60.0:
+                        raise
+                    time.sleep(PAUSE)
+        raise AssertionError("unreachable")
+
+    def __enter__(self) -> Result:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Nothing to do: nothing is open."""
+
+    def __repr__(self) -> str:
+        return (
+            f"<Result {self.path}: {len(self.times)} snapshots of {self.n_nodes} nodes and {self.n_bars} bars, "
+            f"{self._n_rows} history rows>"
+        )
+
+
+class History(Mapping[str, np.ndarray]):
+    """Columns of the history by name, one row a recorded step: ``history["kinetic_energy"]``.
+
+    Names with slashes can be walked as well: ``history["wall"]["floor"]["force"]`` or ``history.wall.floor.force``.
+    """
+
+    def __init__(self, result: Result, columns: list[str], n_rows: int, prefix: str = "") -> None:
+        self.n_rows = n_rows
+        self._result, self._columns, self._prefix = result, columns, prefix
+        self._names = [name.removeprefix(prefix) for name in columns if name.startswith(prefix)]
+
+    def __getitem__(self, name: str) -> Any:
+        if name in self._names:
+            return self._result.read(f"history/{self._prefix}{name}", slice(0, self.n_rows))
+        if any(known.startswith(f"{name}/") for known in self._names):
+            return History(self._result, self._columns, self.n_rows, f"{self._prefix}{name}/")
+        raise KeyError(f"{self._result.path}: history has no {self._prefix}{name}{nearest(name, self._names)}")
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        try:
+            return self[name]
+        except KeyError as error:
+            raise AttributeError(str(error)) from None
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
+
+    def __len__(self) -> int:
+        return len(self._names)

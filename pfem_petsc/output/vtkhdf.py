@@ -1,0 +1,298 @@
+"""Results in one VTKHDF file, written by all ranks together and readable by ParaView, also while the run goes on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import h5py
+import numpy as np
+from mpi4py import MPI
+
+from ..errors import PfemError, SimulationFailure
+from ..parallel.agreement import agreed, on_root
+from ..parallel.natural import NaturalOrder
+from .hdf5 import (
+    create_new,
+    grow,
+    open_shared,
+    release,
+    require_parallel_hdf5,
+    require_room,
+    write_rows,
+    writing,
+)
+from .history import HistoryWriter
+from .layout import PER_STEP, create_field, create_result, field_datasets
+from .provenance import describe_run
+from .repair import reopen
+
+if TYPE_CHECKING:
+    from ..mesh.distribution import DistributedMesh
+
+__all__ = ["ResultWriter"]
+
+
+class ResultWriter:
+    """Writes snapshots and history of a run to one file: the same for any number of ranks.
+
+    ``/VTKHDF`` is a temporal UnstructuredGrid of lines in the mesh's own numbering: connectivity once, points (the
+    current positions) and fields a snapshot. A snapshot's data, offsets and count are flushed before its time is
+    written and flushed: VTK's reader crashes on a file with more times than steps, and a kill may come at any moment.
+    ``/history`` has a row a recorded step, ``/case`` what is needed to run the case again, ``/snapshots`` step and
+    time of each snapshot.
+
+    All methods are collective. After a :class:`SimulationFailure` the writer only closes.
+
+    Parameters
+    ----------
+    path : Path or str
+        The file; replaced when it exists, unless ``append_after_step`` is given. Missing folders are made.
+    comm : MPI.Comm
+    mesh : DistributedMesh
+    point_fields, cell_fields : sequences of str
+        Names given to each snapshot; the shape of their rows is taken from the first snapshot.
+    columns : mapping of history column ("wall/floor/force") to the shape of one row's value, () for a number
+    column_types : mapping of history column to type, float64 for those not in it
+    case_text : str
+        The resolved case.
+    attributes : mapping
+        Stored as attributes of ``/case``: numbers, texts, or anything JSON can hold.
+    precision : "float64" or "float32"
+        Of the fields. Points stay float64: strain from positions in single precision is noise.
+    append_after_step : int, optional
+        Continue an existing file: what is later than this step is dropped.
+
+    Raises
+    ------
+    InputError
+        On all ranks: unwritable folder, serial h5py on several ranks, a file to append to that is missing, damaged
+        or of another case.
+    """
+
+    def __init__(
+        self,
+        path: Path | str,
+        comm: MPI.Comm,
+        mesh: DistributedMesh,
+        *,
+        point_fields: Sequence[str],
+        cell_fields: Sequence[str],
+        columns: Mapping[str, tuple[int, ...]],
+        column_types: Mapping[str, Any],
+        case_text: str,
+        attributes: Mapping[str, Any],
+        precision: str = "float64",
+        append_after_step: int | None = None,
+    ) -> None:
+        require_parallel_hdf5(comm)
+        self.path, self.comm = Path(path), comm
+        self.n_nodes, self.n_bars = int(mesh.n_nodes), int(mesh.n_bars)
+        self._precision = np.dtype(precision)
+        # Bars evaluated on two ranks are written by the one that counts them.
+        self.counted = np.concatenate(
+            [np.arange(block.start, block.counted) for block in mesh.blocks] or [np.empty(0, dtype=np.int64)]
+        ).astype(np.int64)
+        self.node_order = NaturalOrder(comm, mesh.node_ids[: mesh.n_owned], self.n_nodes)
+        self.bar_order = NaturalOrder(comm, mesh.bar_ids[self.counted], self.n_bars)
+        self._fields = {"PointData": sorted(point_fields), "CellData": sorted(cell_fields)}
+        self._file: h5py.File | None = None
+        # No more can be written; the file itself is damaged.
+        self._failed = self._broken = False
+
+        described = describe_run(comm, attributes)
+        sizes = (self.n_nodes, self.n_bars)
+        if append_after_step is None:
+            create_new(self.path, comm, create_result, *sizes, columns, column_types, case_text, described)
+        else:
+            on_root(comm, reopen, self.path, append_after_step, sizes, self._fields, case_text, described)
+        with writing(comm, self.path):
+            self._file = open_shared(self.path, comm)
+        vtk, steps = self._file["VTKHDF"], self._file["VTKHDF/Steps"]
+        self._per_step = {name: steps[name] for name in PER_STEP}
+        self._times = steps["Values"]
+        self._marks = {name: self._file["snapshots"][name] for name in ("step", "time")}
+        self._n_steps = h5py.h5a.open(steps.id, b"NSteps")
+        self.n_snapshots = int(steps.attrs["NSteps"])
+        # Points and fields; made with the first snapshot, which knows the shapes.
+        self._data = field_datasets(vtk) if self.n_snapshots else {}
+        with agreed(comm):
+            self._history = HistoryWriter(self._file, comm, self.path, columns)
+        if append_after_step is None:
+            with self._whole_or_failed():
+                self._write_connectivity(mesh)
+
+    def write_snapshot(
+        self,
+        time: float,
+        step: int,
+        points: np.ndarray,
+        point_data: Mapping[str, np.ndarray],
+        cell_data: Mapping[str, np.ndarray],
+    ) -> None:
+        """Append a snapshot, and the history rows so far.
+
+        Parameters
+        ----------
+        time : float
+            [s]
+        step : int
+            Number of the time step, larger than that of the snapshot before.
+        points : (n_owned, 3) float64
+            Current positions [m].
+        point_data : mapping of name to (n_owned, 3) or (n_owned,)
+        cell_data : mapping of name to (n local bars, ...)
+            Of these the counted bars are written.
+
+        Raises
+        ------
+        SimulationFailure
+            On all ranks: disk full, file gone.
+        """
+        file = self._ready()
+        given = {"PointData": point_data, "CellData": cell_data}
+        for kind, names in self._fields.items():
+            if sorted(given[kind]) != names:
+                raise ValueError(f"a snapshot has {kind} {names}, got {sorted(given[kind])}")
+        slabs = {"Points": self.node_order.to_slab(points)}
+        for name in self._fields["PointData"]:
+            slabs[f"PointData/{name}"] = self.node_order.to_slab(np.asarray(point_data[name]))
+        for name in self._fields["CellData"]:
+            slabs[f"CellData/{name}"] = self.bar_order.to_slab(np.asarray(cell_data[name])[self.counted])
+        self._require_room(sum(self._global_bytes(name, slab) for name, slab in slabs.items()))
+        n = self.n_snapshots
+        with self._whole_or_failed():
+            if not self._data:
+                self._create_fields(slabs)
+            for name, slab in slabs.items():
+                order = self.bar_order if name.startswith("CellData") else self.node_order
+                with writing(self.comm, self.path):
+                    grow(self._data[name], (n + 1) * order.n_global)
+                with writing(self.comm, self.path):
+                    first = n * order.n_global + order.first
+                    write_rows(self._data[name], first, slab, collective=self.comm.size > 1)
+            self._append_marks(n, step, time)
+            self._history.write()
+            with writing(self.comm, self.path):
+                self._n_steps.write(np.array(n + 1, dtype=np.int64))
+                file.flush()
+            with writing(self.comm, self.path):
+                grow(self._times, n + 1)
+                if self.comm.rank == 0:
+                    write_rows(self._times, n, np.array([time], dtype=np.float64))
+            self._history.commit()
+            with writing(self.comm, self.path):
+                file.flush()
+        self.n_snapshots = n + 1
+
+    def append_history(self, row: Mapping[str, Any] | None) -> None:
+        """Add a row: rank 0 gives a value for each column, the others None. To be called on all ranks.
+
+        Rows are kept in memory until a snapshot, :meth:`flush_history`, :meth:`close`, or a thousand of them.
+        """
+        if self._history.full:
+            self.flush_history()
+        self._history.append(row)
+
+    def flush_history(self) -> None:
+        """Write the rows kept in memory. Collective."""
+        file = self._ready()
+        if self._history.n_buffered == 0:
+            return
+        self._require_room(0)
+        with self._whole_or_failed():
+            self._history.write()
+            with writing(self.comm, self.path):
+                file.flush()
+            self._history.commit()
+            with writing(self.comm, self.path):
+                file.flush()
+
+    def close(self) -> None:
+        """Write what is in memory and close the file; again: nothing. Collective."""
+        if self._file is None:
+            return
+        try:
+            if not self._failed:
+                self.flush_history()
+        finally:
+            file, self._file = self._file, None
+            if self._broken:
+                release(file, self.comm)
+            else:
+                with writing(self.comm, self.path):
+                    file.close()
+
+    def __enter__(self) -> ResultWriter:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: object) -> None:
+        # An unforeseen error may have come on this rank alone: closing together would wait for ever.
+        if kind is None or self.comm.size == 1 or isinstance(error, PfemError):
+            self.close()
+
+    def _ready(self) -> h5py.File:
+        if self._file is None or self._failed:
+            raise ValueError(f"{self.path}: the writer is closed, or writing failed before")
+        return self._file
+
+    @contextmanager
+    def _whole_or_failed(self) -> Iterator[None]:
+        try:
+            yield
+        except BaseException:
+            self._failed = self._broken = True
+            raise
+
+    def _require_room(self, n_bytes: int) -> None:
+        try:
+            require_room(self.comm, self.path, n_bytes + self._history.reserve_bytes)
+        except SimulationFailure:
+            # The file is whole, so that it can still be closed.
+            self._failed = True
+            raise
+
+    def _row_type(self, name: str, slab: np.ndarray) -> np.dtype:
+        return self._precision if slab.dtype.kind == "f" and name != "Points" else slab.dtype
+
+    def _global_bytes(self, name: str, slab: np.ndarray) -> int:
+        n_rows = self.n_bars if name.startswith("CellData") else self.n_nodes
+        return n_rows * self._row_type(name, slab).itemsize * int(np.prod(slab.shape[1:], dtype=np.int64))
+
+    def _write_connectivity(self, mesh: DistributedMesh) -> None:
+        ends = mesh.node_ids[mesh.bars[self.counted]].astype(np.int64).reshape(-1, 2)
+        ends = self.bar_order.to_slab(ends)
+        vtk, first, count = self._file["VTKHDF"], self.bar_order.first, self.bar_order.count
+        # One offset more than bars: the last rank's.
+        stop = first + count + (self.comm.rank == self.comm.size - 1)
+        together = self.comm.size > 1
+        with writing(self.comm, self.path):
+            write_rows(vtk["Connectivity"], 2 * first, ends.ravel(), collective=together)
+        with writing(self.comm, self.path):
+            write_rows(vtk["Offsets"], first, 2 * np.arange(first, stop), collective=together)
+        with writing(self.comm, self.path):
+            self._file.flush()
+
+    def _create_fields(self, slabs: Mapping[str, np.ndarray]) -> None:
+        vtk = self._file["VTKHDF"]
+        with writing(self.comm, self.path):
+            for name, slab in slabs.items():
+                if name != "Points":
+                    kind, _, field = name.partition("/")
+                    create_field(vtk, kind, field, slab.shape[1:], self._row_type(name, slab))
+            self._data = field_datasets(vtk)
+
+    def _append_marks(self, n: int, step: int, time: float) -> None:
+        """The rows of snapshot n in everything that has one row a snapshot, but for its time in VTKHDF."""
+        with writing(self.comm, self.path):
+            for dataset in (*self._per_step.values(), *self._marks.values()):
+                grow(dataset, n + 1)
+        rows = {"PointOffsets": n * self.n_nodes, "CellDataRows": n * self.n_bars, "NumberOfParts": 1}
+        with writing(self.comm, self.path):
+            if self.comm.rank == 0:
+                for name, dataset in self._per_step.items():
+                    write_rows(dataset, n, np.full((1, *dataset.shape[1:]), rows.get(name, 0)))
+                write_rows(self._marks["step"], n, np.array([step]))
+                write_rows(self._marks["time"], n, np.array([time]))

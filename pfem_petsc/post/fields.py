@@ -1,0 +1,122 @@
+"""What a picture is coloured by: a field of a result as one number a bar or node, its range, and its colours."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from ..errors import InputError
+from ..output.units import prefix_for, unit_of
+from ..registry import nearest
+
+__all__ = ["ColourField", "ColourScale"]
+
+# Middle and start are a dark grey: bars at rest must stand out from a white page as well as strained ones.
+DIVERGING = ("#0ea5e9", "#2563b0", "#535b68", "#b83a30", "#f97316")
+SEQUENTIAL = ("#535b68", "#6b429f", "#b5307c", "#ea5a3d", "#f9a11b")
+
+_SIGNED = ("stress", "strain", "axial_force")
+_COMPONENTS = {"x": 0, "y": 1, "z": 2, 0: 0, 1: 1, 2: 2}
+_SAMPLES = 60  # snapshots that a range is taken from, at most
+
+
+class ColourField:
+    """A point or cell field of a result, reduced to one value a node or bar.
+
+    Parameters
+    ----------
+    result : an open result
+    name : name of a point or cell field
+    component : "x", "y", "z" (or 0, 1, 2) of a vector field; None: its length
+
+    Raises
+    ------
+    InputError
+        For a field that the result does not hold (with the nearest one it does), or a component it has not.
+    """
+
+    def __init__(self, result: Any, name: str, component: str | int | None = None) -> None:
+        first = result.mesh(0)
+        point, cell = list(first.point_data.keys()), list(first.cell_data.keys())
+        if name not in point and name not in cell:
+            raise InputError(f"render: the result holds no field '{name}'{nearest(name, point + cell)}")
+        self.name, self.unit = name, unit_of(name)
+        self.on_nodes = name in point
+        vector = np.ndim(first.point_data[name] if self.on_nodes else first.cell_data[name]) == 2
+        if component is not None and (not vector or component not in _COMPONENTS):
+            why = f"{component!r} is not one of x, y, z" if vector else "it has one value only"
+            raise InputError(f"render: field '{name}' has no such component: {why}")
+        self._component = _COMPONENTS[component] if component is not None else None
+        self._result = result
+        title = name.replace("_", " ")
+        self.title = f"{title} {'xyz'[self._component]}" if self._component is not None else title
+
+    def values(self, index: int) -> np.ndarray:
+        """Values of a snapshot, (nodes,) or (bars,) float64."""
+        values = np.asarray(self._result.field(self.name, index), dtype=float)
+        if values.ndim == 1:
+            return values
+        return np.linalg.norm(values, axis=1) if self._component is None else values[:, self._component]
+
+    def limits(self, indices: Iterable[int]) -> tuple[float, float]:
+        """Range for all frames: symmetric about zero for signed fields.
+
+        In each snapshot one value in a hundred may lie beyond (a spike at an impact would leave the rest without
+        contrast), unless the range that holds all of them is not much larger.
+        """
+        indices = list(indices)
+        chosen = [indices[k] for k in np.unique(np.linspace(0, len(indices) - 1, _SAMPLES).astype(int))]
+        bulk, largest, signed = 0.0, 0.0, self.name in _SIGNED
+        for index in chosen:
+            values = self.values(index)
+            values = values[np.isfinite(values)]
+            if values.size == 0:
+                continue
+            sizes = np.abs(values)
+            bulk = max(bulk, float(np.quantile(sizes, 0.99)))
+            largest = max(largest, float(sizes.max()))
+            signed = signed or bool((values < 0).any())
+        limit = largest if largest <= 2.0 * bulk or bulk == 0.0 else bulk
+        limit = limit or 1.0
+        return (-limit, limit) if signed else (0.0, limit)
+
+
+class ColourScale:
+    """Values to colours, by a table of 256.
+
+    Parameters
+    ----------
+    limits : lower and upper value
+    cmap : a matplotlib colour map or its name; None: chosen by the sign of the lower limit
+    unit : unit of the values
+
+    Raises
+    ------
+    InputError
+        When the limits are not two increasing numbers, or for an unknown colour map.
+    """
+
+    def __init__(self, limits: tuple[float, float], cmap: Any = None, unit: str = "") -> None:
+        import matplotlib
+        from matplotlib.colors import LinearSegmentedColormap
+
+        low, high = limits
+        if not (np.isfinite(low) and np.isfinite(high) and low < high):
+            raise InputError(f"render: colour limits {low:g}, {high:g} must be two finite, increasing numbers")
+        if cmap is None:
+            colours = DIVERGING if low < 0 < high else SEQUENTIAL
+            cmap = LinearSegmentedColormap.from_list("bars", colours)
+        elif isinstance(cmap, str):
+            if cmap not in matplotlib.colormaps:
+                raise InputError(f"render: unknown colour map '{cmap}'{nearest(cmap, list(matplotlib.colormaps))}")
+            cmap = matplotlib.colormaps[cmap]
+        self.low, self.high, self.cmap = float(low), float(high), cmap
+        self.factor, self.unit = prefix_for(max(abs(low), abs(high)), unit)
+        self._table = (255 * cmap(np.linspace(0.0, 1.0, 256))[:, :3] + 0.5).astype(np.uint8)
+
+    def colours(self, values: np.ndarray) -> np.ndarray:
+        """Colours (n, 3) uint8 of values (n,): the end ones beyond the limits, the low one for not-a-numbers."""
+        place = np.nan_to_num((values - self.low) * (255.0 / (self.high - self.low)), nan=0.0, posinf=255, neginf=0)
+        return self._table[np.clip(place, 0, 255).astype(np.uint8)]

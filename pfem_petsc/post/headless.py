@@ -1,0 +1,69 @@
+"""Drawing without a display: find an OpenGL that works before VTK is asked to use one, because VTK crashes hard."""
+
+from __future__ import annotations
+
+import functools
+import os
+import subprocess
+import sys
+
+from ..errors import InputError
+
+__all__ = ["require_rendering"]
+
+VARIABLE = "VTK_DEFAULT_OPENGL_WINDOW"
+
+# Without a display VTK would try X first, warn, and take EGL, which may have a driver that only fails on drawing.
+_HEADLESS = ("vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow")
+
+# Draw a red square where a library is there at all: a crash, a hang or an empty image all count as "does not work".
+_PROBE = """
+import vtkmodules.vtkRenderingOpenGL2
+from vtkmodules.vtkRenderingCore import vtkRenderer, vtkRenderWindow, vtkWindowToImageFilter
+renderer, window, grab = vtkRenderer(), vtkRenderWindow(), vtkWindowToImageFilter()
+renderer.SetBackground(1, 0, 0)
+window.SetOffScreenRendering(1)
+window.SetSize(16, 16)
+window.AddRenderer(renderer)
+window.Render()
+grab.SetInput(window)
+grab.Update()
+assert grab.GetOutput().GetPointData().GetScalars().GetTuple(100)[0] > 200
+print("drawn")
+"""
+
+
+def _works(window: str | None) -> bool:
+    environment = dict(os.environ)
+    if window is not None:
+        environment[VARIABLE] = window
+    try:
+        probe = subprocess.run(
+            [sys.executable, "-c", _PROBE], env=environment, capture_output=True, text=True, timeout=60, check=False
+        )
+    except subprocess.TimeoutExpired:
+        return False
+    return probe.returncode == 0 and "drawn" in probe.stdout
+
+
+@functools.cache
+def require_rendering() -> None:
+    """Make sure that VTK can draw in this process, choosing EGL or OSMesa where there is no display.
+
+    A choice made by the user in ``VTK_DEFAULT_OPENGL_WINDOW`` is tried first. Call before the first render window.
+
+    Raises
+    ------
+    InputError
+        When no OpenGL works; the message says what to install.
+    """
+    candidates: list[str | None] = [None] if VARIABLE in os.environ or os.environ.get("DISPLAY") else []
+    for window in [*candidates, *_HEADLESS]:
+        if _works(window):
+            if window is not None:
+                os.environ[VARIABLE] = window
+            return
+    raise InputError(
+        "render: no OpenGL library works here, so nothing can be drawn; install one that needs no display "
+        "(Debian, Ubuntu: apt-get install libosmesa6, or libegl1 libgl1-mesa-dri; conda: mesalib)"
+    )

@@ -1,0 +1,52 @@
+"""Numbered pictures to an MP4 or a GIF, through ffmpeg."""
+
+from __future__ import annotations
+
+import subprocess
+from pathlib import Path
+
+from ..errors import InputError
+
+__all__ = ["encode"]
+
+# H.264 with 4:2:0 colours plays everywhere, and asks for even sizes
+_FILTERS = {
+    "mp4": ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2:color=white", "-c:v", "libx264", "-preset", "medium", "-crf", "18"],
+    "gif": [
+        "-vf",
+        "scale='min(800,iw)':-2:flags=lanczos,split[a][b];[a]palettegen=stats_mode=diff[p];[b][p]paletteuse=dither=none",
+    ],
+}
+
+
+def encode(pattern: Path, target: Path, fps: float) -> Path:
+    """Make a film of pictures.
+
+    Parameters
+    ----------
+    pattern : path with a ``%04d`` for the number, from 0
+    target : ``.mp4`` (H.264, yuv420p) or ``.gif`` (at most 800 pixels wide)
+    fps : pictures a second
+
+    Raises
+    ------
+    InputError
+        When ffmpeg cannot be found or fails, with its last words.
+    """
+    import imageio_ffmpeg
+
+    kind = target.suffix.lstrip(".")
+    try:
+        program = imageio_ffmpeg.get_ffmpeg_exe()
+    except RuntimeError as error:
+        raise InputError(
+            f"{target}: no ffmpeg for the film ({error}); install imageio-ffmpeg, or use video = none"
+        ) from error
+    command = [program, "-y", "-loglevel", "error", "-framerate", f"{fps:g}", "-i", str(pattern), *_FILTERS[kind]]
+    if kind == "mp4":
+        command += ["-pix_fmt", "yuv420p", "-movflags", "+faststart"]
+    done = subprocess.run([*command, str(target)], capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        last = done.stderr.strip().splitlines()[-1:] or ["no message"]
+        raise InputError(f"{target}: ffmpeg failed ({last[0]}); the pictures are in {pattern.parent}")
+    return target

@@ -1,0 +1,104 @@
+"""Surfaces that stand for walls in pictures, one function a wall type."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..errors import InputError
+from ..registry import lookup
+
+__all__ = ["Surface", "plane", "wall_surfaces"]
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A wall as drawn: its polygons and how deep beyond the face each point lies.
+
+    Parameters
+    ----------
+    name : the wall's name
+    points : (n, 3) float64 [m]
+    faces : (f, 4) int64, corners of quadrilaterals
+    depth : (n,) float64, 0 on the face that nodes touch, 1 where the drawing fades out
+    edge : (e, 2) int64, lines that outline the face
+    """
+
+    name: str
+    points: np.ndarray
+    faces: np.ndarray
+    depth: np.ndarray
+    edge: np.ndarray
+
+
+def plane(wall: Any, bounds: np.ndarray) -> Surface:
+    """Slab behind a plane wall, as wide as the structure's shadow on it and a margin.
+
+    Parameters
+    ----------
+    wall : has ``name``, ``point`` (3,) [m] and ``normal`` (3,), which points to the allowed side
+    bounds : (2, 3) [m], lower and upper corner of all the structure passes through
+    """
+    normal = np.asarray(wall.normal, dtype=float)
+    normal = normal / np.linalg.norm(normal)
+    # two tangents, the first one in the plane of least normal component: axis-aligned walls get axis-aligned edges
+    helper = np.eye(3)[np.argmin(np.abs(normal))]
+    first = np.cross(helper, normal)
+    first /= np.linalg.norm(first)
+    second = np.cross(normal, first)
+    corners = np.array([[bounds[i, 0], bounds[j, 1], bounds[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
+    size = np.linalg.norm(bounds[1] - bounds[0]) or 1.0
+    spans = []
+    for tangent in (first, second):
+        along = corners @ tangent
+        # a structure without extent in this direction still gets a wall that can be seen
+        margin = 0.04 * size + 0.5 * max(0.0, 0.2 * size - np.ptp(along))
+        spans.append((along.min() - margin, along.max() + margin))
+    foot = normal * (np.asarray(wall.point, dtype=float) @ normal)
+    (a, b), (c, d) = spans
+    face = np.array([foot + u * first + v * second for u, v in ((a, c), (b, c), (b, d), (a, d))])
+    points = np.concatenate([face, face - 0.05 * size * normal])
+    faces = np.array([[0, 1, 2, 3], [0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6], [3, 0, 4, 7]])
+    return Surface(
+        wall.name,
+        points,
+        faces,
+        depth=np.repeat([0.0, 1.0], 4),
+        edge=np.array([[0, 1], [1, 2], [2, 3], [3, 0]]),
+    )
+
+
+_OWN: dict[str, Callable[[Any, np.ndarray], Surface]] = {"plane": plane}
+
+
+def _drawing_of(kind: str) -> Callable[[Any, np.ndarray], Any] | None:
+    """The drawing function of a wall type: of its own module (``surface``) where it offers one, else the one here."""
+    try:
+        module = lookup("pfem_petsc.contact.walls", kind, "wall.type")
+    except InputError:
+        return _OWN.get(kind)
+    return getattr(module, "surface", None) or _OWN.get(kind)
+
+
+def wall_surfaces(walls: Iterable[Any], bounds: np.ndarray, note: Callable[[str], None] = print) -> list[Surface]:
+    """Surfaces of a case's walls; a wall whose type has no drawing is skipped, and ``note`` is told.
+
+    A wall module may offer ``surface(parameters, bounds)``, which gives a :class:`Surface`, or points (n, 3) and
+    quadrilaterals (f, 4).
+    """
+    drawn = []
+    for wall in walls:
+        draw = _drawing_of(wall.type)
+        if draw is None:
+            note(f"wall '{wall.name}' is left out of the picture: type '{wall.type}' has no drawing")
+            continue
+        shape = draw(wall, bounds)
+        if not isinstance(shape, Surface):
+            points, faces = (np.asarray(part) for part in shape)
+            edge = np.zeros((0, 2), dtype=int)
+            shape = Surface(wall.name, points, faces, depth=np.zeros(len(points)), edge=edge)
+        drawn.append(shape)
+    return drawn

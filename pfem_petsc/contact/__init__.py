@@ -1,0 +1,1 @@
+"""Contact of nodes with rigid walls, as bounds on nodal positions."""

@@ -1,0 +1,136 @@
+"""What all integrators share: the state they advance and the affine form of their balance.
+
+With positions as unknowns every scheme is an affine map from the position it solves for, x_u = predictor + u, to the
+acceleration and velocity of its balance: a_b = alpha u + a_hat, v_b = eta u + v_hat. The balance is
+
+    M a_b + C v_b + w f_int(x_u) + (1 - w) f_int(x_n) = f_ext + r,
+
+with w = 0 for an explicit scheme. The unknown is the increment u from the predictor, never the position itself:
+accelerations are second differences of positions over h^2, and would lose those digits.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ..case.base import StrictModel
+
+__all__ = ["Balance", "ExplicitScheme", "NoParameters", "Scheme", "State", "lagged_limit"]
+
+
+@dataclass
+class State:
+    """Everything that determines the future of the nodes of a rank.
+
+    Attributes
+    ----------
+    x : (local, 3) positions, with ghosts [m]
+    v, a : (owned, 3) velocity [m/s] and acceleration [m/s2]
+    f : (local, 3) internal force at ``x``, valid for owned nodes [N]
+    external, contact, support : (owned, 3) forces of the last balance [N]
+    time : float [s]
+    step : int
+    memory : arrays (owned, 3) that a scheme keeps between steps
+    """
+
+    x: np.ndarray
+    v: np.ndarray
+    a: np.ndarray
+    f: np.ndarray
+    external: np.ndarray
+    contact: np.ndarray
+    support: np.ndarray
+    time: float = 0.0
+    step: int = 0
+    memory: dict[str, np.ndarray] = field(default_factory=dict)
+
+    @property
+    def position(self) -> np.ndarray:
+        """(owned, 3) view of the positions of owned nodes [m]."""
+        return self.x[: len(self.v)]
+
+
+@dataclass
+class Balance:
+    """The affine form of one step; arrays are (owned, 3).
+
+    Attributes
+    ----------
+    alpha, eta : a_b = alpha u + a_hat [1/s2], v_b = eta u + v_hat [1/s]
+    predictor : x_u = predictor + u [m]
+    v_hat, a_hat : known parts; None for zero
+    time : when x_u holds: walls and supports are where they are then [s]
+    loads : (weight, time) pairs: the external force of the balance
+    weight : w of the module's equation
+    """
+
+    alpha: float
+    eta: float
+    predictor: np.ndarray
+    v_hat: np.ndarray | None
+    a_hat: np.ndarray | None
+    time: float
+    loads: tuple[tuple[float, float], ...]
+    weight: float
+
+
+class NoParameters(StrictModel):
+    """For schemes without parameters."""
+
+
+class Scheme(ABC):
+    """An integrator; a subclass named ``Scheme`` in a module of this package is found by the module's name.
+
+    Attributes
+    ----------
+    explicit : whether the balance needs no force at the unknown position
+    leads : the scheme solves for x_{n+2} at t_{n+1} (central differences), so x_{n+1} is known before the solve
+    at_ends : the balance holds at the ends of steps, so that works follow the trapezoidal rule; else the forces of the
+        balance work over the whole step
+    solves_end : the position solved for is x_{n+1}
+    notice : what users must be told when they choose it; empty for nothing
+    """
+
+    explicit = False
+    leads = False
+    at_ends = True
+    solves_end = True
+    notice = ""
+
+    def __init__(self, parameters: StrictModel) -> None:
+        self.parameters = parameters
+
+    def limit(self, damping_ratio: float = 0.0) -> float:
+        """Largest stable Omega = omega h at a damping ratio; infinite where unconditionally stable."""
+        return np.inf
+
+    def start(self, state: State, h: float) -> None:
+        """Set memory up from the complete state at the start (x, v, a); nothing by default."""
+
+    @abstractmethod
+    def balance(self, state: State, h: float) -> Balance:
+        """The affine form of the step that starts from ``state``."""
+
+    @abstractmethod
+    def finish(self, state: State, balance: Balance, u: np.ndarray, h: float) -> None:
+        """Advance v, a, memory and (unless :attr:`leads`) the owned x of ``state`` after the solve."""
+
+
+class ExplicitScheme(Scheme):
+    """Base of schemes whose Hessian has no stiffness."""
+
+    explicit = True
+
+
+def lagged_limit(alpha_m: float, beta: float, gamma: float, damping_ratio: float) -> float:
+    """Stability limit of the explicit Newmark family with the balance (1-a_m) a1 + a_m a0 + 2 xi w v0 + w^2 x0 = 0.
+
+    The eigenvalue -1 appears at (2 beta - gamma)/2 Omega^2 + xi (2 gamma - 1) Omega - (1 - 2 a_m) = 0.
+    """
+    quadratic = 0.5 * (2.0 * beta - gamma)
+    linear = damping_ratio * (2.0 * gamma - 1.0)
+    constant = 1.0 - 2.0 * alpha_m
+    return 2.0 * constant / (linear + np.sqrt(linear * linear + 4.0 * quadratic * constant))

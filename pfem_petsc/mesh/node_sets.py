@@ -1,0 +1,64 @@
+"""Named node sets of a case, as local indices of owned nodes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..errors import InputError
+from ..registry import nearest
+
+__all__ = ["resolve_node_sets"]
+
+
+def resolve_node_sets(case, mesh) -> dict[str, np.ndarray]:
+    """Owned local indices (int64, ascending) of each node set. Collective.
+
+    Raises
+    ------
+    InputError
+        On all ranks: a group that the mesh lacks, a node number out of range, a set without nodes.
+    """
+    sets = {}
+    for name, node_set in case.node_set.items():
+        where = f"{case.source}: node_set.{name}"
+        members = _members(where, node_set, mesh)
+        if mesh.comm.allreduce(len(members)) == 0:
+            raise InputError(f"{where}: no node of the mesh is in this set; correct the box or the group")
+        sets[name] = members.astype(np.int64)
+    return sets
+
+
+def _members(where: str, node_set, mesh) -> np.ndarray:
+    points = mesh.points[: mesh.n_owned]
+    ids = mesh.node_ids[: mesh.n_owned]
+    if node_set.nearest is not None:
+        distance = np.linalg.norm(points - np.array(node_set.nearest), axis=1)
+        best = (np.inf, -1)
+        if len(distance):
+            shortest = distance.min()
+            best = (float(shortest), int(ids[distance == shortest].min()))
+        winner = min(entry for entry in mesh.comm.allgather(best) if entry[1] >= 0)
+        return np.flatnonzero(ids == winner[1])
+    if node_set.box is not None:
+        low, high = np.array(node_set.box[0]), np.array(node_set.box[1])
+        return np.flatnonzero(((points >= low) & (points <= high)).all(axis=1))
+    if node_set.group is not None:
+        groups = sorted(mesh.node_groups)
+        if node_set.group in mesh.node_groups:
+            return np.sort(mesh.node_groups[node_set.group])
+        bars = mesh.bar_groups.get(node_set.group)
+        if bars is not None:
+            ends = np.unique(mesh.bars[bars])
+            return ends[ends < mesh.n_owned]
+        known = groups + sorted(mesh.bar_groups)
+        hint = nearest(node_set.group, known) if known else "; the mesh has no groups"
+        raise InputError(f"{where}.group = {node_set.group!r}: no such group in the mesh{hint}")
+    if node_set.indices is not None:
+        wanted = np.array(node_set.indices, dtype=np.int64)
+        outside = wanted[(wanted < 0) | (wanted >= mesh.n_nodes)]
+        if len(outside):
+            raise InputError(
+                f"{where}.indices: node {outside[0]} does not exist; the mesh has nodes 0 to {mesh.n_nodes - 1}"
+            )
+        return np.flatnonzero(np.isin(ids, wanted))
+    return np.arange(mesh.n_owned)

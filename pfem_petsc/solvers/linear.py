@@ -1,0 +1,106 @@
+"""Which linear solver a Newton step uses, from the case and the model alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from petsc4py import PETSc
+
+__all__ = ["LinearChoice", "choose_linear", "configure"]
+
+_DIRECT_BELOW = 6000  # unknowns; below, a factorisation costs no more than a few dozen Krylov iterations in any state
+_JACOBI_UP_TO = 5.0  # steps over the explicit limit; 101,376 bars: 13 iterations at 1 x, 102 at 10 x
+_CHOLESKY_UP_TO = 50.0  # incomplete Cholesky: 5, 31, 166 iterations at 1, 10, 100 x; multigrid 8, 13, 14 after a set-up
+
+
+@dataclass(frozen=True)
+class LinearChoice:
+    """A Krylov method and preconditioner, with the words that the log shows."""
+
+    krylov: str
+    preconditioner: str
+    why: str
+
+
+def choose_linear(request: str, unknowns: int, step_ratio: float) -> LinearChoice:
+    """Resolve ``solver.linear``.
+
+    Parameters
+    ----------
+    request : str
+        ``auto``, ``cg``, ``gamg`` or ``mumps``.
+    unknowns : int
+        Of the whole model.
+    step_ratio : float
+        Time step over the critical step of central differences: how much stiffness weighs against mass.
+    """
+    if request == "mumps" or (request == "auto" and unknowns <= _DIRECT_BELOW):
+        why = "asked for" if request != "auto" else f"{unknowns} unknowns, at most {_DIRECT_BELOW}"
+        return LinearChoice("preonly", "lu", f"direct ({why})")
+    if request == "gamg":
+        return LinearChoice("cg", "gamg", "conjugate gradients with multigrid (asked for)")
+    ratio = f"step is {step_ratio:.3g} x the explicit limit"
+    if request == "cg" or step_ratio <= _JACOBI_UP_TO:
+        return LinearChoice("cg", "pbjacobi", f"conjugate gradients, point-block Jacobi ({ratio})")
+    if step_ratio <= _CHOLESKY_UP_TO:
+        return LinearChoice("cg", "icc", f"conjugate gradients, incomplete Cholesky ({ratio})")
+    return LinearChoice("cg", "gamg", f"conjugate gradients, multigrid ({ratio})")
+
+
+def configure(ksp: PETSc.KSP, choice: LinearChoice, reduced: bool) -> None:
+    """Set a linear solver up; options of the same prefix given by the user override it afterwards.
+
+    ``reduced``: the solver works on the inactive unknowns of a contact problem, whose matrix has no blocks.
+    """
+    comm = ksp.comm
+    pc = ksp.getPC()
+    ksp.setType(choice.krylov)
+    if choice.krylov != "preonly":
+        ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
+        ksp.setTolerances(rtol=1e-5, max_it=2000)
+    kind = choice.preconditioner
+    if kind == "gamg" and reduced and PETSc.Sys.getVersion() < (3, 19):
+        kind = "icc"  # PETSc 3.18's multigrid cannot follow an active set that changes
+    if kind == "lu":
+        pc.setType("lu")
+        if comm.size > 1:
+            if _has_mumps():
+                pc.setFactorSolverType("mumps")
+            else:
+                pc.setType("redundant")
+    elif kind == "pbjacobi":
+        pc.setType("jacobi" if reduced else "pbjacobi")
+    elif kind == "icc":
+        if comm.size == 1:
+            pc.setType("icc")
+            pc.setFactorShift(PETSc.Mat.FactorShiftType.POSITIVE_DEFINITE)
+        else:
+            _default(ksp, "sub_pc_type", "icc")
+            _default(ksp, "sub_pc_factor_shift_type", "positive_definite")
+            pc.setType("bjacobi")
+    else:
+        pc.setType(kind)
+
+
+def _default(ksp: PETSc.KSP, name: str, value: str) -> None:
+    options = PETSc.Options(ksp.getOptionsPrefix())
+    if not options.hasName(name):
+        options[name] = value
+
+
+def _has_mumps() -> bool:
+    mat = PETSc.Mat().createAIJ((1, 1), nnz=1, comm=PETSc.COMM_SELF)
+    mat[0, 0] = 1.0
+    mat.assemble()
+    pc = PETSc.PC().create(PETSc.COMM_SELF)
+    pc.setOperators(mat)
+    pc.setType("lu")
+    try:
+        pc.setFactorSolverType("mumps")
+        pc.setUp()
+    except PETSc.Error:
+        return False
+    finally:
+        pc.destroy()
+        mat.destroy()
+    return True

@@ -1,0 +1,171 @@
+"""The Hessian as a PETSc matrix with a fixed pattern, filled by the bars' loops through precomputed places."""
+
+from __future__ import annotations
+
+import numpy as np
+from petsc4py import PETSc
+
+from ..mechanics.compiled import kernel
+
+__all__ = ["BlockPattern", "HessianMatrix"]
+
+
+class BlockPattern:
+    """Block-compressed rows of the owned nodes: one 3 x 3 block for each node and each neighbour by a bar.
+
+    Attributes
+    ----------
+    ptr : (owned + 1,) int32, first block of each block row
+    columns : (blocks,) int64, PETSc node number of each block's column, ascending in a row
+    slots : (b, 4) int32, blocks (a, a), (a, b), (b, b), (b, a) of each bar, -1 where the row is not owned
+    diagonal : (owned,) int32, the diagonal block of each row
+    """
+
+    def __init__(self, mesh) -> None:
+        owned = mesh.n_owned
+        numbers = np.concatenate([mesh.first_node + np.arange(owned, dtype=np.int64), mesh.ghost_numbers])
+        a, b = mesh.bars[:, 0].astype(np.int64), mesh.bars[:, 1].astype(np.int64)
+        first, second = np.flatnonzero(a < owned), np.flatnonzero(b < owned)
+        n = max(mesh.n_nodes, 1)
+        keys = np.concatenate(
+            [
+                np.arange(owned, dtype=np.int64) * n + numbers[:owned],
+                a[first] * n + numbers[b[first]],
+                b[second] * n + numbers[a[second]],
+            ]
+        )
+        unique, place = np.unique(keys, return_inverse=True)
+        place = place.astype(np.int32)
+        rows = unique // n
+        self.columns = unique - rows * n
+        self.ptr = np.zeros(owned + 1, dtype=np.int32)
+        np.cumsum(np.bincount(rows, minlength=owned), out=self.ptr[1:])
+        self.diagonal = place[:owned].copy()
+        self.slots = np.full((len(a), 4), -1, dtype=np.int32)
+        self.slots[first, 0] = self.diagonal[a[first]]
+        self.slots[first, 1] = place[owned : owned + len(first)]
+        self.slots[second, 2] = self.diagonal[b[second]]
+        self.slots[second, 3] = place[owned + len(first) :]
+
+    def scalar_rows(self) -> tuple[np.ndarray, np.ndarray]:
+        """Row pointers and PETSc column numbers of the same pattern in scalar compressed rows (PETSc integers)."""
+        blocks = np.repeat(np.diff(self.ptr), 3)
+        pointers = np.zeros(len(blocks) + 1, dtype=PETSc.IntType)
+        np.cumsum(3 * blocks, out=pointers[1:])
+        columns = np.empty(pointers[-1], dtype=PETSc.IntType)
+        _expand_columns(self.ptr, self.columns, columns)
+        return pointers, columns
+
+
+@kernel
+def _expand_columns(ptr, columns, out):
+    for row in range(len(ptr) - 1):
+        width = 3 * (ptr[row + 1] - ptr[row])
+        for k in range(ptr[row], ptr[row + 1]):
+            at = 6 * ptr[row] + 3 * k
+            for i in range(3):
+                for j in range(3):
+                    out[at + i * width + j] = 3 * columns[k] + j
+
+
+@kernel
+def _add_lumped(ptr, diagonal, inertia, values):
+    for row in range(len(diagonal)):
+        width = 3 * (ptr[row + 1] - ptr[row])
+        at = 6 * ptr[row] + 3 * diagonal[row]
+        for i in range(3):
+            values[at + i * (width + 1)] += inertia[row]
+
+
+@kernel
+def _constrain_rows(ptr, diagonal, fixed, scale, values):
+    for row in range(len(diagonal)):
+        width = 3 * (ptr[row + 1] - ptr[row])
+        start = 9 * ptr[row]
+        for i in range(3):
+            if fixed[row, i]:
+                for j in range(width):
+                    values[start + i * width + j] = 0.0
+                values[6 * ptr[row] + 3 * diagonal[row] + i * (width + 1)] = scale
+
+
+@kernel
+def _constrain_columns(ptr, local_columns, diagonal, fixed, values):
+    for row in range(len(diagonal)):
+        width = 3 * (ptr[row + 1] - ptr[row])
+        for k in range(ptr[row], ptr[row + 1]):
+            column = local_columns[k]
+            at = 6 * ptr[row] + 3 * k
+            for j in range(3):
+                if fixed[column, j]:
+                    for i in range(3):
+                        if k != diagonal[row] or i != j:
+                            values[at + i * width + j] = 0.0
+
+
+class HessianMatrix:
+    """Assembled Hessian of the owned rows; one interface over the two ways PETSc takes values into a fixed pattern.
+
+    ``fill(callback)`` zeroes the values, lets the callback add to them and hands them to PETSc.
+    """
+
+    def __init__(self, mesh, fixed: np.ndarray, any_fixed: bool) -> None:
+        self.mesh = mesh
+        self.pattern = BlockPattern(mesh)
+        pointers, columns = self.pattern.scalar_rows()
+        self.values = np.zeros(len(columns), dtype=np.float64)
+        local, total = 3 * mesh.n_owned, 3 * mesh.n_nodes
+        self.mat = PETSc.Mat().create(comm=mesh.comm)
+        self.mat.setSizes(((local, total), (local, total)), bsize=3)
+        self.mat.setType(PETSc.Mat.Type.AIJ)
+        # setPreallocationCOO came to petsc4py with PETSc 3.19; it takes the values as they are, without index searches
+        self._by_coordinates = hasattr(self.mat, "setPreallocationCOO")
+        if self._by_coordinates:
+            rows = np.repeat(3 * mesh.first_node + np.arange(local, dtype=PETSc.IntType), np.diff(pointers))
+            self.mat.setPreallocationCOO(rows, columns)
+        else:
+            self._pointers, self._columns = pointers, columns
+            self.mat.setPreallocationCSR((pointers, columns))
+        self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+        self.any_fixed = any_fixed
+        if any_fixed:
+            self._fixed = np.zeros((mesh.n_local, 3))
+            self._fixed[: mesh.n_owned] = fixed
+            mesh.update_ghosts(self._fixed)
+            self._local_columns = local_columns(mesh, self.pattern.columns)
+
+    def fill(self, add) -> PETSc.Mat:
+        """Assemble: ``add(values)`` adds the Hessian of the owned rows to the zeroed values."""
+        self.values[:] = 0.0
+        add(self.values)
+        if self._by_coordinates:
+            self.mat.setValuesCOO(self.values, PETSc.InsertMode.INSERT_VALUES)
+        else:
+            self.mat.setValuesCSR(self._pointers, self._columns, self.values)
+            self.mat.assemble()
+        return self.mat
+
+    def add_lumped(self, inertia: np.ndarray, values: np.ndarray) -> None:
+        """Add a nodal inertia (owned,) to the diagonal."""
+        _add_lumped(self.pattern.ptr, self.pattern.diagonal, inertia, values)
+
+    def constrain(self, scale: float, values: np.ndarray) -> None:
+        """Replace rows and columns of prescribed components by ``scale`` on the diagonal."""
+        if self.any_fixed:
+            p = self.pattern
+            _constrain_rows(p.ptr, p.diagonal, self._fixed, scale, values)
+            _constrain_columns(p.ptr, self._local_columns, p.diagonal, self._fixed, values)
+
+    def destroy(self) -> None:
+        """Free the PETSc matrix."""
+        self.mat.destroy()
+
+
+def local_columns(mesh, columns: np.ndarray) -> np.ndarray:
+    """Local node indices (int32) of PETSc node numbers that are owned or ghosts here."""
+    local = (columns - mesh.first_node).astype(np.int64)
+    outside = (local < 0) | (local >= mesh.n_owned)
+    order = np.argsort(mesh.ghost_numbers, kind="stable")
+    found = np.searchsorted(mesh.ghost_numbers[order], columns[outside])
+    local[outside] = mesh.n_owned + order[found] if len(order) else 0
+    return local.astype(np.int32)

@@ -1,0 +1,167 @@
+"""Newton's method by PETSc's SNES, plain or as a variational inequality with bounds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from petsc4py import PETSc
+
+from .linear import LinearChoice, configure
+from .matrix import HessianMatrix
+from .reasons import linear_reason, newton_reason
+
+__all__ = ["NewtonReport", "NewtonSolver", "Problem"]
+
+_STAGNATION = 100.0  # a residual within this many rounding floors that no longer falls has converged
+
+
+class Problem(Protocol):
+    """What is solved: g(u) = 0, or complementary to bounds on u."""
+
+    def residual(self, u: np.ndarray, g: np.ndarray) -> None:
+        """Write g(u) (owned, 3) [N]."""
+
+    def hessian(self, u: np.ndarray, values: np.ndarray) -> None:
+        """Add dg/du to the values of the matrix pattern."""
+
+
+@dataclass(frozen=True)
+class NewtonReport:
+    """How a solve went; ``why`` is empty where it converged."""
+
+    converged: bool
+    newton: int
+    linear: int
+    norm: float
+    why: str
+
+
+class NewtonSolver:
+    """Solves for the position increment of a step; made once for a run.
+
+    Options: prefix ``pfem_`` for free steps and ``pfem_contact_`` for steps with bounds.
+    """
+
+    def __init__(self, mesh, hessian: HessianMatrix, choice: LinearChoice, max_newton: int, length: float) -> None:
+        self.mesh = mesh
+        self.hessian = hessian
+        self.choice = choice
+        self.max_newton = max_newton
+        self.length = length
+        self._u = PETSc.Vec().createMPI((3 * mesh.n_owned, 3 * mesh.n_nodes), bsize=3, comm=mesh.comm)
+        self._g = self._u.duplicate()
+        self._lower = self._u.duplicate()
+        self._upper = self._u.duplicate()
+        self._solvers: dict[bool, PETSc.SNES] = {}
+        self._problem: Problem | None = None
+        self._previous = np.inf
+
+    def solve(
+        self,
+        problem: Problem,
+        u: np.ndarray,
+        tolerance: float,
+        floor: float,
+        bounds: tuple[np.ndarray, np.ndarray] | None = None,
+    ) -> NewtonReport:
+        """Solve in place. Collective.
+
+        Parameters
+        ----------
+        problem : Problem
+        u : (owned, 3) float64
+            Guess on entry, solution on exit [m].
+        tolerance, floor : float
+            Of the 2-norm of the residual [N]: what is asked, and what rounding allows.
+        bounds : pair of (owned, 3) arrays, optional
+            Lower and upper bounds on u [m]; infinite where there is none.
+        """
+        snes = self._solver(bounds is not None)
+        self._problem = problem
+        self._tolerance, self._floor = max(tolerance, floor), floor
+        if bounds is not None:
+            lower, upper = bounds
+            self._lower.array[:] = np.maximum(lower, PETSc.NINFINITY).ravel()
+            self._upper.array[:] = np.minimum(upper, PETSc.INFINITY).ravel()
+            snes.setVariableBounds(self._lower, self._upper)
+        start = u.copy()
+        report = self._attempt(snes, start)
+        if not report.converged and "INDEFINITE" in report.why or "BREAKDOWN" in report.why:
+            report = self._without_definiteness(snes, start, report)
+        u[:] = self._u.array.reshape(u.shape)
+        return report
+
+    def destroy(self) -> None:
+        """Free the PETSc objects."""
+        for snes in self._solvers.values():
+            snes.destroy()
+        for vector in (self._u, self._g, self._lower, self._upper):
+            vector.destroy()
+
+    def _attempt(self, snes: PETSc.SNES, start: np.ndarray) -> NewtonReport:
+        self._u.array[:] = start.ravel()
+        self._previous = np.inf
+        snes.solve(None, self._u)
+        reason = snes.getConvergedReason()
+        norm = snes.getFunctionNorm()
+        converged = reason > 0 or norm <= _STAGNATION * self._floor
+        why = ""
+        if not converged:
+            why = newton_reason(reason)
+            linear = snes.getKSP().getConvergedReason()
+            if linear < 0:
+                why += f"; linear solver: {linear_reason(linear)}"
+        return NewtonReport(converged, snes.getIterationNumber(), snes.getLinearSolveIterations(), norm, why)
+
+    def _without_definiteness(self, snes: PETSc.SNES, start: np.ndarray, first: NewtonReport) -> NewtonReport:
+        """Conjugate gradients met an indefinite tangent: the same step with a method that needs no definiteness."""
+        ksp = snes.getKSP()
+        configure(ksp, LinearChoice("gmres", self.choice.preconditioner, "indefinite"), reduced=True)
+        ksp.setGMRESRestart(100)
+        second = self._attempt(snes, start)
+        configure(ksp, self.choice, reduced=snes.getType() == "vinewtonrsls")
+        return NewtonReport(
+            second.converged, first.newton + second.newton, first.linear + second.linear, second.norm, second.why
+        )
+
+    def _solver(self, contact: bool) -> PETSc.SNES:
+        if contact in self._solvers:
+            return self._solvers[contact]
+        snes = PETSc.SNES().create(self.mesh.comm)
+        snes.setOptionsPrefix("pfem_contact_" if contact else "pfem_")
+        snes.setType("vinewtonrsls" if contact else "newtonls")
+        snes.setFunction(self._residual, self._g)
+        snes.setJacobian(self._hessian, self.hessian.mat, self.hessian.mat)
+        snes.setTolerances(rtol=0.0, atol=0.0, stol=0.0, max_it=self.max_newton)
+        snes.setConvergenceTest(self._converged)
+        if contact:
+            # PETSc's default 1e-8 is absolute: a node that near its bound would be held there, off it
+            options = PETSc.Options(snes.getOptionsPrefix())
+            if not options.hasName("snes_vi_zero_tolerance"):
+                options["snes_vi_zero_tolerance"] = 1e-14 * self.length
+        configure(snes.getKSP(), self.choice, reduced=contact)
+        snes.setFromOptions()
+        self._solvers[contact] = snes
+        return snes
+
+    def _residual(self, snes: PETSc.SNES, u: PETSc.Vec, g: PETSc.Vec) -> None:
+        shape = (self.mesh.n_owned, 3)
+        with g as out:
+            self._problem.residual(u.getArray(readonly=True).reshape(shape), out.reshape(shape))
+
+    def _hessian(self, snes: PETSc.SNES, u: PETSc.Vec, matrix: PETSc.Mat, preconditioner: PETSc.Mat) -> None:
+        array = u.getArray(readonly=True).reshape(self.mesh.n_owned, 3)
+        self.hessian.fill(lambda values: self._problem.hessian(array, values))
+
+    def _converged(self, snes: PETSc.SNES, iteration: int, norms: tuple[float, float, float]) -> int:
+        norm = norms[2]
+        previous, self._previous = self._previous, norm
+        if not np.isfinite(norm):
+            return PETSc.SNES.ConvergedReason.DIVERGED_FNORM_NAN
+        if norm <= self._tolerance:
+            return PETSc.SNES.ConvergedReason.CONVERGED_FNORM_ABS
+        if iteration >= 1 and norm > 0.5 * previous and norm <= _STAGNATION * self._floor:
+            return PETSc.SNES.ConvergedReason.CONVERGED_SNORM_RELATIVE
+        return PETSc.SNES.ConvergedReason.ITERATING

@@ -1,0 +1,94 @@
+"""Everything that a case describes, on the ranks: mesh, bars, inertia, forces, supports, walls."""
+
+from __future__ import annotations
+
+import numpy as np
+from mpi4py import MPI
+
+from ..contact.contact import Contact
+from ..mechanics.bars import Bars, section_of_bars
+from ..mechanics.compiled import kernel
+from ..mechanics.loads import ExternalForce
+from ..mechanics.mass import Inertia
+from ..mechanics.supports import Supports
+from ..mesh import load_slab
+from ..mesh.distribution import distribute
+from ..mesh.node_sets import resolve_node_sets
+from ..parallel.agreement import agreed
+
+__all__ = ["Model"]
+
+
+@kernel
+def _node_stiffness(bars, rest, start, stop, axial, out):
+    for k in range(start, stop):
+        out[bars[k, 0]] += axial / rest[k]
+        out[bars[k, 1]] += axial / rest[k]
+
+
+class Model:
+    """The model of a case on this rank. Construction is collective.
+
+    Attributes
+    ----------
+    mesh, nodes, bars, inertia, external, supports, contact
+    length : largest extent of the mesh [m]
+    reach : largest coordinate magnitude [m], which sets the rounding of positions
+    rounding : 2-norm of the residual that rounding of positions leaves [N]
+    warnings : of the mesh
+    """
+
+    def __init__(self, case, comm: MPI.Comm) -> None:
+        self.case = case
+        self.comm = comm
+        slab = load_slab(case.mesh, comm)
+        self.warnings = list(slab.warnings)
+        with agreed(comm):
+            sections = section_of_bars(case, slab)
+        self.mesh = distribute(slab, sections, comm)
+        del slab, sections
+        mesh = self.mesh
+        self.nodes = resolve_node_sets(case, mesh)
+        self.bars = Bars(mesh, case)
+        self.inertia = Inertia(mesh, self.bars, case.time.mass == "consistent")
+        self.external = ExternalForce(case, self.nodes, self.inertia)
+        with agreed(comm):
+            self.supports = Supports(case, self.nodes, mesh)
+        self.contact = Contact(case, self.nodes, mesh, self.supports.fixed)
+
+        points = mesh.points[: mesh.n_owned]
+        low, high = points.min(axis=0, initial=np.inf), points.max(axis=0, initial=-np.inf)
+        comm.Allreduce(MPI.IN_PLACE, low, op=MPI.MIN)
+        comm.Allreduce(MPI.IN_PLACE, high, op=MPI.MAX)
+        self.low, self.high = low, high
+        self.length = float((high - low).max())
+        self.reach = float(max(np.abs(low).max(), np.abs(high).max()))
+        stiffness = np.zeros(mesh.n_local)
+        for block in self.bars.blocks:
+            axial = block.area * block.parameters[0]
+            _node_stiffness(mesh.bars, self.bars.rest, block.start, block.stop, axial, stiffness)
+        squares = comm.allreduce(float((stiffness[: mesh.n_owned] ** 2).sum()))
+        self.rounding = 4.0 * np.finfo(float).eps * self.reach * np.sqrt(squares)
+        self.total_mass = comm.allreduce(float(self.inertia.mass.sum()))
+        speeds = [np.sqrt(m.young_modulus / m.density) for m in case.material.values()]
+        self.wave_speed = max(speeds)
+
+    def initial_velocity(self) -> np.ndarray:
+        """(owned, 3) [m/s] from the case's ``[initial]`` tables; later tables override earlier ones. Collective."""
+        mesh, comm = self.mesh, self.comm
+        v = np.zeros((mesh.n_owned, 3))
+        points = mesh.points[: mesh.n_owned]
+        for initial in self.case.initial:
+            members = self.nodes[initial.node_set] if initial.node_set is not None else np.arange(mesh.n_owned)
+            spin = np.array(initial.angular_velocity)
+            v[members] = initial.velocity
+            if spin.any():
+                if initial.centre is not None:
+                    centre = np.array(initial.centre)
+                else:
+                    mass = self.inertia.mass[members]
+                    sums = comm.allreduce(np.append(mass @ points[members], mass.sum()))
+                    centre = sums[:3] / sums[3]
+                v[members] += np.cross(spin, points[members] - centre)
+        return v
+

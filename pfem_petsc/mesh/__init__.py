@@ -14,7 +14,7 @@ __all__ = ["load_slab"]
 
 
 def load_slab(mesh: Any, comm: MPI.Comm) -> MeshSlab:
-    """Each rank's part of the mesh that a case asks for, checked. Collective.
+    """Each rank's part of the mesh that a case asks for, checked; what looks odd is in its ``warnings``. Collective.
 
     Parameters
     ----------
@@ -44,5 +44,5 @@ def load_slab(mesh: Any, comm: MPI.Comm) -> MeshSlab:
         from .readers import read_slab
 
         slab = read_slab(Path(mesh.file), comm)
-    check_mesh(slab, comm)
+    slab.warnings = check_mesh(slab, comm)
     return slab

@@ -76,6 +76,8 @@ def _check_bare_nodes(slab: MeshSlab, comm: MPI.Comm, used: np.ndarray) -> None:
     bad = np.flatnonzero(bare)
     lines = [f"node {slab.first_node + i}" for i in bad[:_SHOWN]]
     way_out = "remove them: a node without bars has neither mass nor stiffness"
+    if slab.source.endswith(".msh"):
+        way_out += " (Gmsh saves the nodes of physical groups alone where there are any: put only the bars in them)"
     _refuse(slab, comm, lines, len(bad), "nodes belong to no bar", way_out)
 
 

@@ -87,9 +87,7 @@ class DistributedMesh:
         self._exchange.close()
 
 
-def distribute(
-    slab: MeshSlab, bar_section: np.ndarray, comm: MPI.Comm, partitioner: str = "auto"
-) -> DistributedMesh:
+def distribute(slab: MeshSlab, bar_section: np.ndarray, comm: MPI.Comm, partitioner: str = "auto") -> DistributedMesh:
     """Spread a mesh over the ranks. Collective; no rank ever holds the whole mesh.
 
     Parameters

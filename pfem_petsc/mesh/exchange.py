@@ -62,7 +62,9 @@ class Router:
         # One item is one row, so that the counts stay far from the limit of MPI's 32-bit integers.
         row = MPI.BYTE.Create_contiguous(rows.dtype.itemsize * int(np.prod(rows.shape[1:], dtype=np.int64))).Commit()
         try:
-            self._comm.Alltoallv([rows, (leaving, _starts(leaving)), row], [received, (arriving, _starts(arriving)), row])
+            self._comm.Alltoallv(
+                [rows, (leaving, _starts(leaving)), row], [received, (arriving, _starts(arriving)), row]
+            )
         finally:
             row.Free()
         return received

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..errors import InputError
 
-__all__ = ["MeshSlab", "check_size", "index_type", "slab_of", "slab_range"]
+__all__ = ["MeshSlab", "check_length", "check_size", "index_type", "slab_of", "slab_range"]
 
 
 @dataclass
@@ -37,7 +37,7 @@ class MeshSlab:
     """For messages: the file or the generator."""
     structured: bool = False
     warnings: list[str] = field(default_factory=list)
-    """What the reader left out, for the log (rank 0)."""
+    """What the reader left out or the checks found odd, for the log."""
 
 
 def slab_range(n: int, rank: int, size: int) -> tuple[int, int]:
@@ -61,7 +61,7 @@ def index_type(n: int) -> type[np.signedinteger]:
 
 
 def check_size(n_nodes: int, where: str) -> None:
-    """Refuse a mesh whose unknowns PETSc cannot number, before anything is allocated for it.
+    """Refuse a mesh whose unknowns PETSc cannot number, before anything is allocated for it. Collective (PETSc starts).
 
     Raises
     ------
@@ -76,3 +76,15 @@ def check_size(n_nodes: int, where: str) -> None:
             f"{where}: {n_nodes:,} nodes have {3 * n_nodes:,} unknowns, more than this PETSc can number ({limit:,}): "
             "make the mesh smaller, or use a PETSc configured with 64-bit indices"
         )
+
+
+def check_length(value: float, where: str) -> None:
+    """Refuse lengths [m] whose square is not a floating-point number: bars of them have no length.
+
+    Raises
+    ------
+    InputError
+        Outside 1e-150 to 1e150.
+    """
+    if not 1e-150 < value < 1e150:
+        raise InputError(f"{where}: length {value:g} m cannot be computed with; choose one between 1e-150 and 1e150")

@@ -9,8 +9,7 @@ from typing import Literal
 import numpy as np
 
 from ...case.base import PositiveFloat, PositiveInts3, StrictModel
-from ...errors import InputError
-from ..slab import MeshSlab, check_size, index_type, slab_range
+from ..slab import MeshSlab, check_length, check_size, index_type, slab_range
 
 __all__ = ["Parameters", "generate"]
 
@@ -75,8 +74,7 @@ def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
     n_nodes = sum(lattice.count for lattice in lattices)
     n_bars = sum(family.count for family in families)
     check_size(n_nodes, "mesh.cells")
-    if not np.isfinite(max(parameters.cells) * parameters.pitch):
-        raise InputError(f"mesh.pitch: the lattice is larger than numbers go, with pitch = {parameters.pitch:g}")
+    check_length(parameters.pitch, "mesh.pitch")
     first_node, last_node = slab_range(n_nodes, rank, size)
     first_bar, last_bar = slab_range(n_bars, rank, size)
     points, faces = _nodes(lattices, parameters, first_node, last_node)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...case.base import PositiveFloat, PositiveInt, StrictModel
-from ..slab import MeshSlab, check_size, index_type, slab_range
+from ..slab import MeshSlab, check_length, check_size, index_type, slab_range
 
 __all__ = ["Parameters", "generate"]
 
@@ -26,6 +26,7 @@ def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
     """
     n = parameters.elements
     check_size(n + 1, "mesh.elements")
+    check_length(parameters.length / n, "mesh.length / mesh.elements")
     first_node, last_node = slab_range(n + 1, rank, size)
     first_bar, last_bar = slab_range(n, rank, size)
     points = np.zeros((last_node - first_node, 3))

@@ -1,0 +1,115 @@
+"""A circular plane truss: an outer and an inner polygon in the x-y plane, joined by struts and diagonals."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import field_validator
+
+from ...case.base import PositiveFloat, StrictModel
+from ..slab import MeshSlab, check_length, check_size, index_type, slab_range
+
+__all__ = ["Parameters", "generate"]
+
+
+class Parameters(StrictModel):
+    """Keys of ``[mesh]`` with ``generator = "ring"``."""
+
+    outer_radius: PositiveFloat
+    """Radius through the outer nodes [m]."""
+    inner_radius: PositiveFloat
+    """Radius through the inner nodes [m]."""
+    bays: int
+    """Number of bays around the ring, 3 or more."""
+    bracing: Literal["x", "single"] = "x"
+    """``x``: both diagonals in every bay; ``single``: one, from the outer node to the next inner node."""
+    orientation: Literal["vertex", "flat"] = "vertex"
+    """``vertex``: an outer node at (+outer_radius, 0, 0); ``flat``: an outer chord across the +x axis."""
+
+    @field_validator("bays")
+    @classmethod
+    def _enough_bays(cls, bays: int) -> int:
+        if bays < 3:
+            raise ValueError("a ring has 3 bays or more")
+        return bays
+
+    @field_validator("inner_radius")
+    @classmethod
+    def _inside(cls, inner: float, info: Any) -> float:
+        outer = info.data.get("outer_radius")
+        if outer is not None and inner >= outer:
+            raise ValueError(f"must be less than outer_radius = {outer:g}")
+        return inner
+
+
+def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
+    """This rank's part of the ring.
+
+    Nodes: the outer polygon, anticlockwise, then the inner one. Bars: outer chords, inner chords, radial struts,
+    diagonals from outer node i to inner node i + 1 and, with ``bracing = "x"``, from inner node i to outer node i + 1.
+    Node groups ``outer``, ``inner``, ``impact`` (the outer nodes farthest towards +x) and ``opposite`` (towards -x);
+    bar groups ``outer``, ``inner``, ``radial``, ``diagonal``.
+    """
+    n = parameters.bays
+    n_bars = (5 if parameters.bracing == "x" else 4) * n
+    check_size(2 * n, "mesh.bays")
+    check_length(parameters.outer_radius, "mesh.outer_radius")
+    check_length(parameters.outer_radius - parameters.inner_radius, "mesh.outer_radius - mesh.inner_radius")
+    check_length(parameters.inner_radius / n, "mesh.inner_radius / mesh.bays")
+
+    first_node, last_node = slab_range(2 * n, rank, size)
+    node = np.arange(first_node, last_node)
+    first_bar, last_bar = slab_range(n_bars, rank, size)
+    family, bay = np.divmod(np.arange(first_bar, last_bar), n)
+    after = (bay + 1) % n
+    start = np.choose(family, [bay, n + bay, bay, bay, n + bay])
+    end = np.choose(family, [after, n + after, n + bay, n + after, after])
+
+    def nodes_among(first: int, last: int) -> np.ndarray:
+        return node[(node >= first) & (node < last)]
+
+    def bars_of(first: int, last: int) -> np.ndarray:
+        return first_bar + np.flatnonzero((family >= first) & (family < last))
+
+    return MeshSlab(
+        n_nodes=2 * n,
+        n_bars=n_bars,
+        first_node=first_node,
+        points=_points(parameters, node),
+        first_bar=first_bar,
+        bars=np.stack([start, end], axis=1).astype(index_type(2 * n)),
+        node_groups={
+            "outer": nodes_among(0, n),
+            "inner": nodes_among(n, 2 * n),
+            **{name: node[np.isin(node, members)] for name, members in _extremes(parameters).items()},
+        },
+        bar_groups={
+            "outer": bars_of(0, 1),
+            "inner": bars_of(1, 2),
+            "radial": bars_of(2, 3),
+            "diagonal": bars_of(3, 5),
+        },
+        source=f"generator ring ({parameters.bracing}, {n} bays)",
+        structured=True,
+    )
+
+
+def _points(parameters: Parameters, node: np.ndarray) -> np.ndarray:
+    n = parameters.bays
+    # Half bays from the +x axis, brought to (-n, n] so that the ring is symmetric about it to the last digit.
+    half_bays = 2 * (node % n) + (parameters.orientation == "flat")
+    half_bays = np.where(half_bays > n, half_bays - 2 * n, half_bays)
+    angle = np.pi / n * half_bays
+    radius = np.where(node < n, parameters.outer_radius, parameters.inner_radius)
+    points = np.stack([radius * np.cos(angle), radius * np.sin(angle), np.zeros(len(node))], axis=1)
+    points[half_bays == n, 1] = 0.0
+    return points
+
+
+def _extremes(parameters: Parameters) -> dict[str, list[int]]:
+    """Outer nodes farthest towards +x and -x, counted, not measured."""
+    n = parameters.bays
+    if parameters.orientation == "vertex":
+        return {"impact": [0], "opposite": [n // 2] if n % 2 == 0 else [n // 2, n // 2 + 1]}
+    return {"impact": [n - 1, 0], "opposite": [n // 2] if n % 2 else [n // 2 - 1, n // 2]}

@@ -1,0 +1,189 @@
+"""Sections of Gmsh .msh files as streams of numbers, ASCII and binary alike."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+
+from ...errors import InputError
+
+__all__ = ["Format", "Numbers", "sections"]
+
+
+class Format:
+    """What the $MeshFormat section says.
+
+    Attributes
+    ----------
+    version : str
+        ``"2.2"`` or ``"4.1"``.
+    binary : bool
+    order : str
+        Byte order of binary numbers, ``"<"`` or ``">"``.
+    size_type : str
+        numpy's name for C's size_t in a binary file: ``"u4"`` or ``"u8"``.
+    """
+
+    def __init__(self, path: Path, payload: bytes) -> None:
+        first, _, rest = payload.partition(b"\n")
+        fields = first.split()
+        where = f"{path}: section $MeshFormat"
+        if len(fields) != 3 or fields[1] not in (b"0", b"1") or fields[2] not in (b"4", b"8"):
+            raise InputError(f"{where}: {_shown(first)!r} is not 'version file-type data-size', such as '4.1 0 8'")
+        self.version = {b"2.2": "2.2", b"4.1": "4.1"}.get(fields[0], "")
+        if not self.version:
+            raise InputError(
+                f"{where}: version {_shown(fields[0])} is not read; save the mesh as version 4.1 or 2.2 "
+                "(in Gmsh: Mesh.MshFileVersion)"
+            )
+        self.binary = fields[1] == b"1"
+        self.size_type = "u" + fields[2].decode()
+        self.order = "<"
+        if self.binary:
+            if rest[:4] not in (b"\x01\0\0\0", b"\0\0\0\x01"):
+                raise InputError(f"{where}: the binary number 1 that shows the byte order is missing")
+            self.order = "<" if rest[:1] == b"\x01" else ">"
+
+
+class Numbers:
+    """Numbers of one section, taken from front to back.
+
+    Parameters
+    ----------
+    where : str
+        File and section, for messages.
+    payload : bytes
+    layout : Format
+    count_line : bool
+        The section starts with a count in ASCII, also in a binary file (version 2.2).
+
+    Raises
+    ------
+    InputError
+        From every method, when the section ends early or holds something else than asked for.
+    """
+
+    def __init__(self, where: str, payload: bytes, layout: Format, count_line: bool) -> None:
+        self._where = where
+        self._binary = layout.binary
+        self._order = layout.order
+        self._size_type = layout.size_type
+        self._at = 0
+        if not layout.binary:
+            self._values = _parse(where, payload)
+        elif count_line:
+            first, _, self._bytes = payload.partition(b"\n")
+            self._count = _parse(where, first)
+            if len(self._count) != 1:
+                raise InputError(f"{where}: {_shown(first)!r} is not a count")
+        else:
+            self._bytes = payload
+
+    def count(self) -> int:
+        """The count that a section of version 2.2 starts with."""
+        if self._binary:
+            return int(self._whole(self._count)[0])
+        return int(self.sizes(1)[0])
+
+    def ints(self, n: int) -> np.ndarray:
+        """The next ``n`` integers (C's int)."""
+        return self._take(n, "i4").astype(np.int64) if self._binary else self._whole(self._take(n))
+
+    def sizes(self, n: int) -> np.ndarray:
+        """The next ``n`` counts or tags (C's size_t), as int64."""
+        values = self._take(n, self._size_type) if self._binary else self._whole(self._take(n))
+        if n and (values.min() < 0 or values.max() > np.iinfo(np.int64).max):
+            raise InputError(f"{self._where}: {values.min()} ... {values.max()} are not counts or tags")
+        return values.astype(np.int64)
+
+    def reals(self, n: int) -> np.ndarray:
+        """The next ``n`` floating-point numbers."""
+        return self._take(n, "f8").astype(np.float64) if self._binary else self._take(n)
+
+    def rows(self, n: int, n_ints: int, n_reals: int) -> tuple[np.ndarray, np.ndarray]:
+        """The next ``n`` rows of some integers and then some floating-point numbers."""
+        if self._binary:
+            row = np.dtype([("i", self._order + "i4", (n_ints,)), ("r", self._order + "f8", (n_reals,))])
+            rows = self._cut(n, row)
+            return rows["i"].astype(np.int64), rows["r"].astype(np.float64)
+        rows = self._take(n * (n_ints + n_reals)).reshape(n, n_ints + n_reals)
+        return self._whole(rows[:, :n_ints]), rows[:, n_ints:]
+
+    def peek(self, n: int) -> np.ndarray:
+        """At most the next ``n`` numbers of an ASCII section, without taking them."""
+        return self._values[self._at : self._at + n]
+
+    def end(self) -> None:
+        """Refuse numbers that are left over."""
+        left = len(self._bytes[self._at :].strip()) if self._binary else len(self._values) - self._at
+        if left:
+            what = "bytes" if self._binary else "numbers"
+            raise InputError(f"{self._where}: {left} {what} more than its counts declare")
+
+    def _take(self, n: int, kind: str = "f8") -> np.ndarray:
+        if self._binary:
+            return self._cut(n, np.dtype(self._order + kind))
+        left = len(self._values) - self._at
+        if not 0 <= n <= left:
+            raise InputError(f"{self._where}: its counts declare {n} numbers where {left} are left; is it truncated?")
+        self._at += n
+        return self._values[self._at - n : self._at]
+
+    def _cut(self, n: int, dtype: np.dtype) -> np.ndarray:
+        left = len(self._bytes) - self._at
+        if not 0 <= n * dtype.itemsize <= left:
+            raise InputError(
+                f"{self._where}: its counts declare {n * dtype.itemsize} bytes where {left} are left; is it truncated?"
+            )
+        values = np.frombuffer(self._bytes, dtype, n, self._at)
+        self._at += n * dtype.itemsize
+        return values
+
+    def _whole(self, values: np.ndarray) -> np.ndarray:
+        wrong = values[~((np.abs(values) < 2.0**53) & (values == np.rint(values)))]
+        if wrong.size:
+            raise InputError(f"{self._where}: {wrong.flat[0]:g} is not a count or a tag: a whole number")
+        return values.astype(np.int64)
+
+
+def sections(path: Path, content: bytes) -> dict[str, bytes]:
+    """Payloads of the sections of a file, by name; of several with one name the first."""
+    found: dict[str, bytes] = {}
+    at = 0
+    while True:
+        at = content.find(b"$", at)
+        if at < 0:
+            break
+        newline = content.find(b"\n", at)
+        name = content[at + 1 : newline if newline >= 0 else len(content)].strip()
+        if not name.isalnum() or newline < 0:
+            raise InputError(f"{path}: {_shown(name)!r} is not the name of a section")
+        end = content.find(b"$End" + name, newline)
+        if end < 0:
+            raise InputError(f"{path}: section ${name.decode()} has no end; the file is truncated")
+        found.setdefault(name.decode(), content[newline + 1 : end])
+        at = end + 4 + len(name)
+    return found
+
+
+def _parse(where: str, text: bytes) -> np.ndarray:
+    """All numbers of a text as float64, which holds tags up to 2^53 exactly."""
+    try:
+        with warnings.catch_warnings():
+            # Text that is no number ends the parsing, with a warning in older numpy and an error in newer.
+            warnings.simplefilter("error")
+            return np.fromstring(text, dtype=np.float64, sep=" ") if text.strip() else np.empty(0)
+    except (DeprecationWarning, ValueError):
+        for number, line in enumerate(text.split(b"\n"), 1):
+            for word in line.split():
+                try:
+                    float(word)
+                except ValueError:
+                    raise InputError(f"{where}, line {number}: {_shown(word)!r} is not a number") from None
+        raise InputError(f"{where}: holds something else than numbers") from None
+
+
+def _shown(text: bytes) -> str:
+    return text[:60].decode("utf-8", "replace")

@@ -1,0 +1,147 @@
+"""The package's own mesh file: HDF5, read and written by all ranks, each its slab.
+
+``/points`` (n_nodes, 3) float [m], ``/bars`` (n_bars, 2) integers from 0, ``/node_groups/<name>`` and
+``/bar_groups/<name>`` with the numbers of members, in any order.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+
+from ...errors import InputError
+from ...parallel.agreement import agreed, on_root
+from ..slab import MeshSlab, check_size, slab_range
+
+__all__ = ["read", "write_hdf5"]
+
+# Members of groups are read and written in pieces of this many.
+_PIECE = 1 << 20
+
+# No filter of HDF5 compresses real meshes by more: a dataset that claims it was never written.
+_COMPRESSION = 1100
+
+
+def read(path: Path, comm: MPI.Comm) -> MeshSlab:
+    """Each rank's slab of the mesh in an HDF5 file. Collective; no rank reads more than its part at a time.
+
+    Raises
+    ------
+    InputError
+        On all ranks, naming the dataset, when the file is not HDF5 or its datasets are not those of a mesh.
+    """
+    n_nodes, n_bars, node_names, bar_names = on_root(comm, _describe, path)
+    check_size(n_nodes, str(path))
+    first_node, last_node = slab_range(n_nodes, comm.rank, comm.size)
+    first_bar, last_bar = slab_range(n_bars, comm.rank, comm.size)
+    # Every rank opens the file for itself, read-only: this needs no MPI driver, which a serial h5py lacks.
+    with agreed(comm), _opened(path) as file:
+        try:
+            return MeshSlab(
+                n_nodes=n_nodes,
+                n_bars=n_bars,
+                first_node=first_node,
+                points=file["points"][first_node:last_node].astype(np.float64, copy=False),
+                first_bar=first_bar,
+                bars=file["bars"][first_bar:last_bar].astype(np.int64, copy=False),
+                node_groups=_groups(path, file, "node_groups", node_names, n_nodes, first_node, last_node),
+                bar_groups=_groups(path, file, "bar_groups", bar_names, n_bars, first_bar, last_bar),
+                source=str(path),
+            )
+        except MemoryError:
+            raise InputError(f"{path}: the mesh does not fit in memory; use more ranks") from None
+        except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
+            raise InputError(f"{path}: cannot be read ({error}); the file may be damaged: write it again") from None
+
+
+def write_hdf5(path: Path, slab: MeshSlab, comm: MPI.Comm) -> None:
+    """Write a mesh, each rank its slab. Collective: ranks write one after the other, which needs no MPI driver."""
+    import h5py
+
+    for rank in range(comm.size):
+        if rank == comm.rank:
+            with h5py.File(path, "w" if rank == 0 else "r+", locking=False) as file:
+                if rank == 0:
+                    file.create_dataset("points", (slab.n_nodes, 3), np.float64)
+                    file.create_dataset("bars", (slab.n_bars, 2), slab.bars.dtype)
+                    for kind, groups in (("node_groups", slab.node_groups), ("bar_groups", slab.bar_groups)):
+                        for name in groups:
+                            file.create_dataset(f"{kind}/{name}", (0,), np.int64, maxshape=(None,), chunks=(4096,))
+                file["points"][slab.first_node : slab.first_node + len(slab.points)] = slab.points
+                file["bars"][slab.first_bar : slab.first_bar + len(slab.bars)] = slab.bars
+                for kind, groups in (("node_groups", slab.node_groups), ("bar_groups", slab.bar_groups)):
+                    for name, members in groups.items():
+                        dataset = file[f"{kind}/{name}"]
+                        before = len(dataset)
+                        dataset.resize((before + len(members),))
+                        dataset[before:] = members
+        comm.Barrier()
+
+
+def _opened(path: Path) -> Any:
+    import h5py
+
+    try:
+        return h5py.File(path, "r", locking=False)
+    except (OSError, RuntimeError) as error:
+        raise InputError(f"{path}: not a readable HDF5 file ({error})") from None
+
+
+def _describe(path: Path) -> tuple[int, int, list[str], list[str]]:
+    """Sizes and names of groups, after looking at every dataset's shape and type."""
+    import h5py
+
+    with _opened(path) as file:
+        try:
+            counts = []
+            for name, width, kinds, what in (("points", 3, "f", "floats"), ("bars", 2, "iu", "integers")):
+                dataset = file.get(name)
+                if not isinstance(dataset, h5py.Dataset):
+                    raise InputError(f"{path}: no dataset /{name}; a mesh has /points (n, 3) and /bars (n, 2)")
+                if dataset.ndim != 2 or dataset.shape[1] != width or dataset.dtype.kind not in kinds:
+                    raise InputError(
+                        f"{path}: /{name} has shape {dataset.shape} and type {dataset.dtype}; "
+                        f"expected (n, {width}) {what}"
+                    )
+                # Space never written takes no room in the file, so a small file can declare any size.
+                stored, declared = dataset.id.get_storage_size(), dataset.size * dataset.dtype.itemsize
+                if declared > stored * (_COMPRESSION if dataset.chunks else 1):
+                    raise InputError(f"{path}: /{name} declares {dataset.shape} values but holds {stored} bytes")
+                counts.append(len(dataset))
+            names = [_names(path, file, kind) for kind in ("node_groups", "bar_groups")]
+        except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
+            raise InputError(f"{path}: cannot be read ({error}); the file may be damaged: write it again") from None
+    return counts[0], counts[1], names[0], names[1]
+
+
+def _names(path: Path, file: Any, kind: str) -> list[str]:
+    import h5py
+
+    if kind not in file:
+        return []
+    if not isinstance(file[kind], h5py.Group):
+        raise InputError(f"{path}: /{kind} is not a group of datasets")
+    names = sorted(file[kind])
+    for name in names:
+        dataset = file[kind].get(name)
+        if not isinstance(dataset, h5py.Dataset) or dataset.ndim != 1 or dataset.dtype.kind not in "iu":
+            raise InputError(f"{path}: /{kind}/{name} is not a list of integers")
+    return names
+
+
+def _groups(path: Path, file: Any, kind: str, names: list[str], n: int, first: int, last: int) -> dict[str, np.ndarray]:
+    groups = {}
+    for name in names:
+        dataset = file[kind][name]
+        found = [np.empty(0, np.int64)]
+        for start in range(0, len(dataset), _PIECE):
+            members = dataset[start : start + _PIECE].astype(np.int64)
+            wrong = members[(members < 0) | (members >= n)]
+            if len(wrong):
+                raise InputError(f"{path}: /{kind}/{name} has member {wrong[0]}, but numbers go from 0 to {n - 1}")
+            found.append(members[(members >= first) & (members < last)])
+        groups[name] = np.unique(np.concatenate(found))
+    return groups

@@ -1,0 +1,90 @@
+"""A mesh that one rank has read whole, dealt out to all ranks as slabs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from mpi4py import MPI
+
+from ...errors import InputError
+from ...parallel.agreement import agreed
+from ..slab import MeshSlab, check_size, slab_range
+
+__all__ = ["WholeMesh", "read_and_scatter"]
+
+
+@dataclass
+class WholeMesh:
+    """A mesh as read from a file by one rank; numbers from 0."""
+
+    points: np.ndarray
+    """(n_nodes, 3) float64 [m]."""
+    bars: np.ndarray
+    """(n_bars, 2) int64."""
+    node_groups: dict[str, np.ndarray] = field(default_factory=dict)
+    bar_groups: dict[str, np.ndarray] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+
+
+def read_and_scatter(read: Callable[[Path], WholeMesh], path: Path, comm: MPI.Comm) -> MeshSlab:
+    """Read a file on rank 0 and give every rank its slab. Collective.
+
+    Raises
+    ------
+    InputError
+        On all ranks, as raised by ``read`` on rank 0, and when the file's mesh does not fit in memory.
+    """
+    whole: WholeMesh | None = None
+    with agreed(comm):
+        if comm.rank == 0:
+            try:
+                whole = read(path)
+            except MemoryError:
+                raise InputError(f"{path}: the mesh does not fit in memory; write it as .h5 for many ranks") from None
+    head = None
+    if whole is not None:
+        head = (len(whole.points), len(whole.bars), list(whole.node_groups), list(whole.bar_groups), whole.warnings)
+    n_nodes, n_bars, node_names, bar_names, warnings = comm.bcast(head)
+    check_size(n_nodes, str(path))
+    points = _scatter(comm, whole.points if whole else np.empty((0, 3)), n_nodes)
+    bars = _scatter(comm, whole.bars if whole else np.empty((0, 2), np.int64), n_bars)
+    return MeshSlab(
+        n_nodes=n_nodes,
+        n_bars=n_bars,
+        first_node=slab_range(n_nodes, comm.rank, comm.size)[0],
+        points=points,
+        first_bar=slab_range(n_bars, comm.rank, comm.size)[0],
+        bars=bars,
+        node_groups={name: _members(comm, whole and whole.node_groups[name], n_nodes) for name in node_names},
+        bar_groups={name: _members(comm, whole and whole.bar_groups[name], n_bars) for name in bar_names},
+        source=str(path),
+        warnings=warnings,
+    )
+
+
+def _scatter(comm: MPI.Comm, rows: np.ndarray, n: int) -> np.ndarray:
+    """Deal out the rows that rank 0 has in the ranges of slab_range."""
+    if comm.size == 1:
+        return rows
+    ranges = [slab_range(n, rank, comm.size) for rank in range(comm.size)]
+    mine = np.empty((ranges[comm.rank][1] - ranges[comm.rank][0], rows.shape[1]), rows.dtype)
+    row = MPI.BYTE.Create_contiguous(rows.dtype.itemsize * rows.shape[1]).Commit()
+    try:
+        sizes = ([last - first for first, last in ranges], [first for first, _ in ranges])
+        comm.Scatterv([np.ascontiguousarray(rows), sizes, row], [mine, len(mine), row])
+    finally:
+        row.Free()
+    return mine
+
+
+def _members(comm: MPI.Comm, members: np.ndarray | None, n: int) -> np.ndarray:
+    """The members of a group that rank 0 has which fall in this rank's range of ``n``; ascending, each once."""
+    parts = None
+    if members is not None:
+        members = np.unique(members).astype(np.int64)
+        firsts = [slab_range(n, rank, comm.size)[0] for rank in range(1, comm.size)]
+        parts = np.split(members, np.searchsorted(members, firsts))
+    return comm.scatter(parts)

@@ -1,10 +1,11 @@
-# Sourced by setup.sh: builds the newest PETSc, petsc4py and a parallel h5py into the environment $venv (about ten minutes).
+# Sourced by setup.sh: builds the newest PETSc, petsc4py and a parallel h5py into the environment $venv, in about ten
+# minutes. The functions pip_install and failed are setup.sh's.
 #
-# MUMPS, ScaLAPACK and PT-Scotch are the distribution's; its hypre is too old for a new PETSc, and GAMG serves in its place.
-# The functions pip_install and failed are setup.sh's. PFEM_PETSC_VERSION chooses another version, PFEM_BUILD_JOBS the number of compilers at once.
+# MUMPS, ScaLAPACK and PT-Scotch are the distribution's; its hypre is too old for a new PETSc, and GAMG takes its place.
+# PFEM_PETSC_VERSION chooses another version, PFEM_BUILD_JOBS the number of compilers at once.
 
-build_packages="gcc g++ gfortran make patchelf python3-dev python3-venv openmpi-bin libopenmpi-dev libopenblas-dev
-    libmumps-dev libscalapack-openmpi-dev libptscotch-dev libhdf5-openmpi-dev"
+build_packages=(gcc g++ gfortran make patchelf python3-dev python3-venv openmpi-bin libopenmpi-dev libopenblas-dev
+    libmumps-dev libscalapack-openmpi-dev libptscotch-dev libhdf5-openmpi-dev)
 
 petsc_options() {
     local library name

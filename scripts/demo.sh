@@ -1,11 +1,17 @@
 #!/usr/bin/env bash
 # Sets up, then runs the main job on 2 ranks (a ring of bars thrown against a wall) and renders it.
 #
-# usage: scripts/demo.sh [OPTIONS OF THE RUN...]     e.g. scripts/demo.sh --set time.end=1e-3
+# usage: scripts/demo.sh [--build-petsc] [OPTIONS OF THE RUN...]     e.g. scripts/demo.sh --set time.end=1e-3
 # PFEM_CASE chooses another case, PFEM_RANKS the number of ranks, PFEM_RESULT the folder of the result.
 set -euo pipefail
 
-bash "$(dirname "${BASH_SOURCE[0]}")/setup.sh"
+setup=()
+if [[ ${1:-} == --build-petsc ]]; then
+    setup+=("$1")
+    shift
+    export PFEM_VENV=${PFEM_VENV:-.venv-petsc}
+fi
+bash "$(dirname "${BASH_SOURCE[0]}")/setup.sh" "${setup[@]}"
 source "$(dirname "${BASH_SOURCE[0]}")/environment.sh"
 
 case=${PFEM_CASE:-ring_impact}
@@ -19,5 +25,4 @@ mpirun -n "${PFEM_RANKS:-2}" "$python" -m pfem_petsc "$case" -o "$result" "$@"
 echo
 echo "The result, for ParaView: $result/result.vtkhdf"
 echo "Pictures, video and curves:"
-find "$result" -maxdepth 2 -type f \( -name '*.png' -o -name '*.mp4' -o -name '*.gif' -o -name '*.svg' -o -name '*.pdf' \) \
-    -printf '  %p\n' | sort
+find "$result" -type f -regextype posix-extended -regex '.*\.(png|mp4|gif|svg|pdf)' -printf '  %p\n' | sort

@@ -62,26 +62,31 @@ stamp() {
 
 foundation() { echo "$root $mode $base ${PETSC_DIR:-} ${PETSC_ARCH:-} ${PFEM_PETSC_VERSION:-}"; }
 
+as_root() {
+    if [[ $(id -u) == 0 ]]; then
+        "$@"
+    elif command -v sudo >/dev/null; then
+        sudo "$@"
+    else
+        fail "needs root or sudo for \"$*\": have that done, activate a Python with petsc4py, or set PETSC_DIR"
+    fi
+}
+
+apt_get() {
+    as_root env DEBIAN_FRONTEND=noninteractive apt-get -qq -o DPkg::Lock::Timeout=300 "$@" > "$log" 2>&1 ||
+        failed "$log" "apt-get $*"
+}
+
 # Packages of the distribution: those missing are installed.
 apt_install() {
-    local missing=() package as_root=()
+    local missing=() package
     for package in "$@"; do
         dpkg-query -W -f '${Status}' "$package" 2>/dev/null | grep -q "ok installed" || missing+=("$package")
     done
-    [[ ${#missing[@]} -eq 0 ]] && return
-    if [[ $(id -u) != 0 ]]; then
-        command -v sudo >/dev/null || fail "needs the packages ${missing[*]}: install them, or set PETSC_DIR"
-        as_root=(sudo)
-    fi
+    [[ ${#missing[@]} -gt 0 ]] || return 0
     say "installing ${missing[*]}"
-    "${as_root[@]}" env DEBIAN_FRONTEND=noninteractive apt-get -qq -o DPkg::Lock::Timeout=300 \
-        install --yes --no-install-recommends "${missing[@]}" > "$log" 2>&1 || failed "$log" "apt-get install"
-}
-
-apt_update() {
-    local as_root=()
-    [[ $(id -u) == 0 ]] || as_root=(sudo)
-    "${as_root[@]}" apt-get -qq -o DPkg::Lock::Timeout=300 update > "$log" 2>&1 || failed "$log" "apt-get update"
+    [[ $updated == yes ]] || apt_get update
+    apt_get install --yes --no-install-recommends "${missing[@]}"
 }
 
 available() { apt-cache show "$1" >/dev/null 2>&1; }
@@ -91,9 +96,9 @@ drawing_packages() {
     if ldconfig -p | grep -qE 'libOSMesa|libEGL\.so'; then
         return
     elif available libosmesa6; then
-        echo libosmesa6
+        printf '%s\n' libosmesa6
     else
-        echo libegl1 libgl1-mesa-dri
+        printf '%s\n' libegl1 libgl1-mesa-dri
     fi
 }
 
@@ -104,7 +109,9 @@ petsc_package() {
 
 # An environment that stands on another Python or PETSc than asked for is made anew.
 make_venv() {
-    if ! "$python" -c "" 2>/dev/null || { [[ -f $venv/setup-done ]] && [[ $(tail -n 1 "$venv/setup-done") != "$(foundation)" ]]; }; then
+    local made_from
+    made_from=$(tail -n 1 "$venv/setup-done" 2>/dev/null || foundation)
+    if ! "$python" -c "" 2>/dev/null || [[ $made_from != "$(foundation)" ]]; then
         say "making ${venv#"$root"/} with $1"
         "$1" -m venv --clear "${@:2}" "$venv"
     fi
@@ -137,20 +144,27 @@ install_rest() {
 # Compiled against NumPy 1, a package does not work with NumPy 2; the other way round it does.
 numpy_limit() { "$1" -c "import numpy; print('numpy<2' if numpy.__version__.startswith('1.') else 'numpy')"; }
 
+need_python() {
+    "$1" -c "import sys; sys.exit(sys.version_info < (3, 11))" ||
+        fail "needs Python 3.11 or newer, and $1 is $("$1" --version): a newer distribution, conda, or any newer Python" \
+            "with petsc4py that is active serves"
+}
+
 from_distribution() {
+    [[ ! -x /usr/bin/python3 ]] || need_python /usr/bin/python3
     command -v apt-get >/dev/null || fail "no apt-get here: activate a Python with petsc4py, or set PETSC_DIR"
-    local package
-    # Lists of packages may be missing or out of date; they are fetched only when something is to be installed.
-    if ! { compgen -G '/usr/lib/petscdir/petsc*/*-real' >/dev/null && dpkg -s python3-h5py-mpi python3-venv >/dev/null 2>&1; }; then
-        apt_update
-    fi
+    local package drawing updated=no
     package=$(petsc_package)
-    [[ -n $package ]] || fail "the distribution has no python3-petsc4py-real package: activate a Python with petsc4py," \
-        "set PETSC_DIR, or use --build-petsc"
-    apt_install "$package" python3-mpi4py python3-h5py-mpi openmpi-bin python3-venv libopenblas0-pthread $(drawing_packages)
-    /usr/bin/python3 -c "import sys; sys.exit(sys.version_info < (3, 11))" ||
-        fail "Python 3.11 or newer is needed, and this distribution has $(/usr/bin/python3 --version): newer" \
-            "distributions, conda or another Python with petsc4py work"
+    if [[ -z $package ]]; then
+        apt_get update
+        updated=yes
+        package=$(petsc_package)
+    fi
+    [[ -n $package ]] || fail "no package python3-petsc4py-real here: activate a Python with petsc4py, set PETSC_DIR," \
+        "or use --build-petsc"
+    mapfile -t drawing < <(drawing_packages)
+    apt_install "$package" python3-mpi4py python3-h5py-mpi openmpi-bin python3-venv libopenblas0-pthread "${drawing[@]}"
+    need_python /usr/bin/python3
     make_venv /usr/bin/python3 --system-site-packages
     dpkg -L "$package" | grep '/dist-packages/petsc4py$' | xargs dirname > "$(site_packages)/petsc.pth"
     install_rest "$(numpy_limit /usr/bin/python3)"
@@ -158,9 +172,11 @@ from_distribution() {
 
 from_source() {
     if command -v apt-get >/dev/null; then
-        apt_update
-        apt_install $build_packages $(drawing_packages)
+        local drawing updated=no
+        mapfile -t drawing < <(drawing_packages)
+        apt_install "${build_packages[@]}" "${drawing[@]}"
     fi
+    need_python "$base"
     make_venv "$base"
     build_petsc
     install_rest numpy
@@ -169,6 +185,7 @@ from_source() {
 # An environment on top of the active Python: it sees that one's packages, and adds what is missing.
 from_active() {
     local folder
+    need_python "$base"
     make_venv "$base" --system-site-packages
     {
         "$base" -c "import sysconfig; print(*sorted({sysconfig.get_path(p) for p in ('purelib', 'platlib')}), sep='\n')"
@@ -217,6 +234,10 @@ if MPI.COMM_WORLD.rank == 0:
     print(f"setup: PETSc {petsc}, numpy {numpy.__version__}, h5py {h5py.__version__} (parallel: {h5py.get_config().mpi})")
 ' || fail "the environment does not work"
 }
+
+# One set-up at a time in a checkout.
+exec 9< "$root/scripts/setup.sh"
+flock 9
 
 log=$(mktemp)
 trap 'rm -f "$log"' EXIT

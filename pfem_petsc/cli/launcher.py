@@ -22,7 +22,7 @@ __all__ = ["collectively", "launched_rank", "on_first_rank", "refuse"]
 
 RANK_VARIABLES = ("OMPI_COMM_WORLD_RANK", "PMIX_RANK", "PMI_RANK", "SLURM_PROCID")
 
-GRACE = 5.0
+GRACE = 3.0
 """Seconds in which all ranks must report the same failure; after that the job is aborted."""
 
 

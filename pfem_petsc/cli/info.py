@@ -40,8 +40,8 @@ def describe(result: Result) -> list[str]:
     from ..output.units import engineering
 
     lines = [result.case.title]
-    rows = {"case": result.case.name, "mesh": f"{result.n_nodes:,} nodes, {result.n_bars:,} bars"}
-    rows.update({str(key).replace("_", " "): str(value) for key, value in result.attributes.items()})
+    rows = {"file": str(result.path), "mesh": f"{result.n_nodes:,} nodes, {result.n_bars:,} bars"}
+    rows.update({key: str(value) for key, value in result.attributes.items() if value not in ("", {}, [])})
     times = result.times
     span = f": {engineering(times[0], 's')} to {engineering(times[-1], 's')}" if len(times) else ""
     rows["snapshots"] = f"{len(times)}{span}"

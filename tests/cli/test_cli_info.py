@@ -1,0 +1,53 @@
+"""What ``info`` says about a result."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+
+from pfem_petsc.cli.info import describe
+
+
+def result(history, times=(0.0, 0.5, 1.0), **attributes):
+    return SimpleNamespace(
+        path=Path("rod/result.vtkhdf"),
+        case=SimpleNamespace(title="A rod"),
+        n_nodes=1234,
+        n_bars=5,
+        times=np.array(times),
+        attributes=attributes,
+        history={name: np.array(values) for name, values in history.items()},
+    )
+
+
+def test_summary():
+    lines = describe(result({"time": [0.0, 2e-3]}, times=[0.0, 1e-3], ranks=2, petsc_options={}))
+    assert lines[0] == "A rod"
+    shown = {line.split()[0]: line.split(maxsplit=1)[1] for line in lines[1:6]}
+    assert shown["mesh"] == "1,234 nodes, 5 bars"
+    assert shown["ranks"] == "2"
+    assert shown["snapshots"] == "2: 0 s to 1.000 ms"
+    assert shown["history"] == "2 rows: 0 s to 2.000 ms"
+    assert "petsc_options" not in "\n".join(lines)
+
+
+def test_energies_and_their_balance():
+    """Stored plus lost minus supplied, from start to end: (3 + 1 + 4) - (10) - (-1.5) = -0.5 J, of at most 10 J."""
+    history = {
+        "time": [0.0, 1.0],
+        "kinetic_energy": [10.0, 3.0],
+        "elastic_energy": [0.0, 1.0],
+        "plastic_dissipation": [0.0, 4.0],
+        "external_work": [0.0, -1.5],
+    }
+    lines = describe(result(history))
+    rows = {line.split()[0]: line.split() for line in lines}
+    assert rows["kinetic_energy"][1:] == ["10.00", "J", "3.000", "J"]
+    assert rows["balance"][1:] == ["error", "-500.0", "mJ", "(-5.0e-02", "of", "the", "largest)"]
+
+
+def test_result_without_history():
+    lines = describe(result({}, times=[]))
+    assert any(line.split() == ["history", "0", "rows"] for line in lines)
+    assert any(line.split() == ["snapshots", "0"] for line in lines)
+    assert not any("balance" in line for line in lines)

@@ -38,13 +38,12 @@ class ColourField:
     """
 
     def __init__(self, result: Any, name: str, component: str | int | None = None) -> None:
-        first = result.mesh(0)
-        point, cell = list(first.point_data.keys()), list(first.cell_data.keys())
+        point, cell = list(result.point_fields), list(result.cell_fields)
         if name not in point and name not in cell:
             raise InputError(f"render: the result holds no field '{name}'{nearest(name, point + cell)}")
         self.name, self.unit = name, unit_of(name)
         self.on_nodes = name in point
-        vector = np.ndim(first.point_data[name] if self.on_nodes else first.cell_data[name]) == 2
+        vector = np.ndim(result.field(name, 0)) == 2
         if component is not None and (not vector or component not in _COMPONENTS):
             why = f"{component!r} is not one of x, y, z" if vector else "it has one value only"
             raise InputError(f"render: field '{name}' has no such component: {why}")

@@ -6,7 +6,6 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
-import pyvista
 
 WALL = SimpleNamespace(type="plane", name="wall", node_set=None, point=(1.2, 0.0, 0.0), normal=(-1.0, 0.0, 0.0))
 
@@ -43,6 +42,7 @@ class SyntheticResult:
         self.path = Path(path)
         self.start, self.bars = points, bars
         self.n_nodes, self.n_bars = len(points), len(bars)
+        self.point_fields, self.cell_fields = ["displacement", "velocity"], ["plastic_strain", "strain", "stress"]
         self.times = np.linspace(0.0, end, snapshots)
         self.case = SimpleNamespace(title=title, name="synthetic", wall=list(walls), gravity=None)
         normal = np.array(walls[0].normal if walls else (-1.0, 0.0, 0.0))
@@ -97,12 +97,3 @@ class SyntheticResult:
             other = self.positions(max(0, index - 1))
             return (points - other) / self.times[1]
         return {"strain": strain, "stress": 2.1e11 * 0.001 * strain, "plastic_strain": np.abs(strain)}[name]
-
-    def mesh(self, index):
-        cells = np.column_stack([np.full(len(self.bars), 2), self.bars]).ravel()
-        grid = pyvista.UnstructuredGrid(cells, np.full(len(self.bars), pyvista.CellType.LINE), self.positions(index))
-        for name in ("displacement", "velocity"):
-            grid.point_data[name] = self.field(name, index)
-        for name in ("strain", "stress", "plastic_strain"):
-            grid.cell_data[name] = self.field(name, index)
-        return grid

@@ -1,0 +1,159 @@
+"""A house style for curves, and the few things every chart over time needs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import InputError
+from ..output.units import prefix_for
+
+__all__ = ["COLOURS", "STYLE", "Chart", "thinned", "window_mean"]
+
+COLOURS = ("#2563b0", "#d9482b", "#2a9d5c", "#8a4fbf", "#e09f1f", "#3aa7c9", "#6b7280", "#b5307c")
+
+STYLE: dict[str, Any] = {
+    "font.size": 10,
+    "axes.titlesize": 11,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.labelcolor": "#1f242c",
+    "axes.edgecolor": "#5b6472",
+    "axes.linewidth": 0.8,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "axes.formatter.limits": (-4, 5),
+    "axes.formatter.use_mathtext": True,
+    "axes.xmargin": 0.0,
+    "grid.color": "#e3e6ea",
+    "grid.linewidth": 0.7,
+    "lines.linewidth": 1.4,
+    "legend.frameon": False,
+    "legend.fontsize": 9,
+    "xtick.color": "#3a3f4b",
+    "ytick.color": "#3a3f4b",
+    "savefig.dpi": 150,
+    "figure.facecolor": "white",
+}
+
+_POINTS = 3000  # a curve has at most about so many: more than a picture has columns
+
+
+def thinned(time: np.ndarray, values: np.ndarray, points: int = _POINTS) -> tuple[np.ndarray, np.ndarray]:
+    """A curve (n,) with fewer points that looks the same: lowest and highest value of each stretch of time."""
+    if len(time) <= points:
+        return time, values
+    stretch = -(-len(time) // (points // 2))
+    whole = len(time) // stretch
+    body = values[: whole * stretch].reshape(whole, stretch)
+    with np.errstate(invalid="ignore"):
+        picked = np.stack([np.argmin(body, axis=1), np.argmax(body, axis=1)], axis=1)
+    picked = np.sort(picked, axis=1) + stretch * np.arange(whole)[:, None]
+    rest = np.array([0, *range(whole * stretch, len(time)), len(time) - 1])
+    picked = np.unique(np.concatenate([picked.ravel(), rest]))
+    return time[picked], values[picked]
+
+
+def window_mean(time: np.ndarray, values: np.ndarray, width: float) -> np.ndarray:
+    """Mean of a piecewise linear curve over a window of this width [s] around each point, cut at the ends.
+
+    The integral is exact whatever the spacing of the points, so impulses are kept.
+    """
+    if len(time) < 2 or width <= 0:
+        return values.copy()
+    steps = np.diff(time)
+    integral = np.concatenate([[0.0], np.cumsum(0.5 * steps * (values[1:] + values[:-1]))])
+    low, high = np.maximum(time - width / 2, time[0]), np.minimum(time + width / 2, time[-1])
+
+    def primitive(at: np.ndarray) -> np.ndarray:
+        k = np.clip(np.searchsorted(time, at, side="right") - 1, 0, len(steps) - 1)
+        part = at - time[k]
+        slope = (values[k + 1] - values[k]) / np.where(steps[k] > 0, steps[k], 1.0)
+        return integral[k] + part * (values[k] + 0.5 * slope * part)
+
+    return (primitive(high) - primitive(low)) / (high - low)
+
+
+class Chart:
+    """Panels over a common time axis, one below the other or in columns.
+
+    Parameters
+    ----------
+    time : (n,) [s]
+    title : of the figure
+    rows, columns : of panels
+    heights : relative heights of the rows
+    """
+
+    def __init__(
+        self, time: np.ndarray, title: str, rows: int, columns: int = 1, heights: Sequence[float] | None = None
+    ) -> None:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+
+        relative = list(heights or [1.0] * rows)
+        size = (8.6 if columns == 1 else 5.2 * columns, 0.9 + 2.5 * sum(relative))
+        self.figure = Figure(figsize=size, layout="constrained")
+        FigureCanvasAgg(self.figure)
+        self.axes = self.figure.subplots(rows, columns, sharex=True, squeeze=False, height_ratios=relative)
+        self.figure.suptitle(title, x=0.01, ha="left", fontsize=13, fontweight="bold", color="#1f242c")
+        self.time = np.asarray(time, dtype=float)
+        self.factor, self.unit = prefix_for(float(np.abs(self.time).max()) if self.time.size else 0.0, "s")
+        for axes in self.axes[-1]:
+            axes.set_xlabel(f"time [{self.unit}]")
+
+    def curves(
+        self,
+        axes: Any,
+        label: str,
+        unit: str,
+        curves: Sequence[tuple[str, np.ndarray]],
+        title: str = "",
+        styles: Sequence[dict[str, Any]] | None = None,
+        legend: bool = True,
+    ) -> tuple[float, str]:
+        """Draw named curves (n,) of one unit into a panel; give the factor and unit of its axis."""
+        finite = [np.abs(values[np.isfinite(values)]).max(initial=0.0) for _, values in curves]
+        factor, shown = prefix_for(float(max(finite, default=0.0)), unit)
+        for number, (name, values) in enumerate(curves):
+            time, thin = thinned(self.time, np.asarray(values, dtype=float) * factor)
+            options = {"color": COLOURS[number % len(COLOURS)], **(styles[number] if styles else {})}
+            axes.plot(time * self.factor, thin, label=name, **options)
+        axes.set_ylabel(f"{label} [{shown}]" if shown else label)
+        axes.set_title(title)
+        if legend and len(curves) > 1:
+            axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.0, handlelength=1.4)
+        return factor, shown
+
+    def counts(self, axes: Any, label: str, values: np.ndarray, colour: str = COLOURS[0]) -> None:
+        """Draw whole numbers (n,) a step into a panel."""
+        from matplotlib.ticker import MaxNLocator
+
+        time, thin = thinned(self.time, np.asarray(values, dtype=float))
+        axes.plot(time * self.factor, thin, color=colour, linewidth=1.0, drawstyle="steps-post")
+        axes.fill_between(time * self.factor, thin, step="post", color=colour, alpha=0.15, linewidth=0)
+        axes.yaxis.set_major_locator(MaxNLocator(integer=True, nbins=5))
+        axes.set_ylim(0, max(1.0, 1.08 * float(thin.max(initial=0.0))))
+        axes.set_ylabel(label)
+
+    def save(self, file: Path) -> Path:
+        """Write the picture.
+
+        Raises
+        ------
+        InputError
+            When it cannot be written.
+        """
+        try:
+            file.parent.mkdir(parents=True, exist_ok=True)
+            self.figure.savefig(file)
+        except OSError as error:
+            raise InputError(
+                f"{file}: the picture cannot be written ({error.strerror}); give another folder"
+            ) from error
+        return file

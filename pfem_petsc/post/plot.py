@@ -1,0 +1,264 @@
+"""Curves of a result's history."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import InputError
+from ..output.units import engineering, unit_of
+from ..registry import nearest
+from .chart import COLOURS, STYLE, Chart, window_mean
+
+__all__ = ["plot"]
+
+STORED = ("kinetic_energy", "elastic_energy")
+LOST = ("plastic_dissipation", "damping_dissipation", "numerical_dissipation")
+SUPPLIED = ("external_work", "contact_work")
+WINDOW = 0.02  # width of the mean that smooths wall forces, as a part of the run
+
+History = Mapping[str, np.ndarray]
+
+
+def plot(
+    result_path: Path | str | Any, output: Path | str | None = None, *, curves: Iterable[str] | None = None
+) -> list[Path]:
+    """Draw the history: ``energies.png``, ``momentum.png``, ``probes.png``, ``walls.png``, ``solver.png``.
+
+    Parameters
+    ----------
+    result_path : result file or its folder, or an open result
+    output : folder of the pictures; None: beside the result
+    curves : names of history columns, drawn into ``curves.png`` in place of the other pictures
+
+    Returns
+    -------
+    The files written; there is none for what the result lacks (probes, walls).
+
+    Raises
+    ------
+    InputError
+        For a column that the history does not hold (with the nearest one it does), an empty history, or a folder
+        that cannot be written.
+    """
+    import matplotlib
+
+    with _opened(result_path) as result, matplotlib.rc_context(STYLE):
+        folder = Path(output) if output is not None else Path(result.path).parent
+        history: History = result.history
+        if "time" not in history or len(history["time"]) == 0:
+            raise InputError(f"{result.path}: the history is empty: nothing to plot; set [output] history_every >= 1")
+        case = result.case
+        title = case.title or case.name
+        if curves is not None:
+            return [_named(history, list(curves), title, folder / "curves.png")]
+        drawn = [
+            _energies(history, title, folder / "energies.png"),
+            _momentum(history, title, folder / "momentum.png"),
+            _probes(history, title, folder / "probes.png"),
+            _walls(history, case.wall, title, folder / "walls.png"),
+            _solver(history, title, folder / "solver.png"),
+        ]
+    return [file for file in drawn if file is not None]
+
+
+def _opened(result: Path | str | Any) -> Any:
+    if not isinstance(result, (str, os.PathLike)):
+        return nullcontext(result)
+    from ..output.result import open_result
+
+    return open_result(result)
+
+
+def _read(history: History, name: str) -> np.ndarray:
+    return np.asarray(history[name], dtype=float)
+
+
+def _words(name: str) -> str:
+    return name.replace("_", " ")
+
+
+def balance_error(history: History) -> np.ndarray | None:
+    """What stored, lost and supplied energies leave over since the first row, (n,) [J]; None where none is held."""
+    signs = {**dict.fromkeys((*STORED, *LOST), 1.0), **dict.fromkeys(SUPPLIED, -1.0)}
+    parts = [sign * _read(history, name) for name, sign in signs.items() if name in history]
+    if not parts:
+        return None
+    total = np.sum(parts, axis=0)
+    return total - total[0]
+
+
+def _energies(history: History, title: str, file: Path) -> Path | None:
+    error = balance_error(history)
+    if error is None:
+        return None
+    held = {name: _read(history, name) for name in (*STORED, *LOST, *SUPPLIED) if name in history}
+    largest = max(float(np.nanmax(np.abs(values))) for values in held.values())
+    moving = {name: values for name, values in held.items() if np.abs(values).max() > 1e-12 * largest}
+    still = [_words(name) for name in held if name not in moving]
+    chart = Chart(_read(history, "time"), title, 2, heights=(1.7, 0.8))
+    upper, lower = chart.axes[:, 0]
+    total = sum(values for name, values in held.items() if name in (*STORED, *LOST))
+    curves = [(_words(name), values) for name, values in moving.items()]
+    styles: list[dict[str, Any]] = [{} for _ in curves]
+    curves.append(("stored and lost", total))
+    styles.append({"color": "#1f242c", "linewidth": 1.2, "linestyle": (0, (4, 2)), "zorder": 1.5})
+    chart.curves(upper, "energy", "J", curves, styles=styles)
+    if still:
+        text = "zero throughout: " + ", ".join(still)
+        upper.annotate(text, (0, 1.02), xycoords="axes fraction", fontsize=8, color="#5b6472")
+    chart.curves(lower, "balance error", "J", [("balance error", error)], styles=[{"color": COLOURS[1]}])
+    worst = float(np.nanmax(np.abs(error)))
+    if largest > 0:
+        text = f"largest: {worst / largest:.1e} of {engineering(largest, 'J')}"
+        lower.annotate(text, (1.01, 0.5), xycoords="axes fraction", fontsize=9, color="#5b6472", va="center")
+    return chart.save(file)
+
+
+def _components(values: np.ndarray, names: str = "xyz") -> list[tuple[str, np.ndarray]]:
+    """Named components of (n, 3) that are not zero to rounding throughout; all when all are."""
+    largest = np.nanmax(np.abs(values), initial=0.0)
+    curves = [(name, values[:, k]) for k, name in enumerate(names)]
+    return [(n, v) for n, v in curves if np.nanmax(np.abs(v), initial=0.0) > 1e-9 * largest] or curves
+
+
+def _colours_of(curves: Sequence[tuple[str, np.ndarray]]) -> list[dict[str, Any]]:
+    """The same colour for x, y, z in all panels, also where some are left out."""
+    return [{"color": COLOURS["xyz".index(name)]} for name, _ in curves]
+
+
+def _vector(chart: Chart, axes: Any, label: str, unit: str, values: np.ndarray, title: str = "") -> None:
+    curves = _components(values)
+    chart.curves(axes, label, unit, curves, title, _colours_of(curves), legend=False)
+    axes.legend(loc="upper right", ncols=3, handlelength=1.2)
+
+
+def _momentum(history: History, title: str, file: Path) -> Path | None:
+    names = [name for name in ("momentum", "angular_momentum", "centre_of_mass") if name in history]
+    if not names:
+        return None
+    chart = Chart(_read(history, "time"), title, len(names), heights=[0.9] * len(names))
+    for axes, name in zip(chart.axes[:, 0], names, strict=True):
+        values = _read(history, name)
+        if name == "centre_of_mass":
+            values = values - values[0]
+            label = "centre of mass,\nmoved by"
+        else:
+            label = _words(name)
+        _vector(chart, axes, label, unit_of(name), values)
+    return chart.save(file)
+
+
+def _probes(history: History, title: str, file: Path) -> Path | None:
+    quantities = ("position", "velocity", "acceleration", "reaction")
+    probes: dict[str, dict[str, np.ndarray]] = {}
+    for name in history:
+        parts = name.split("/")
+        if parts[0] == "probe" and parts[-1] in quantities:
+            probes.setdefault("/".join(parts[1:-1]), {})[parts[-1]] = np.asarray(history[name], dtype=float)
+    if not probes:
+        return None
+    # a support's reaction is worth a column only where there is one; accelerations of impacts are mostly noise
+    columns = [q for q in quantities if q != "acceleration" and any(_wanted(q, held) for held in probes.values())]
+    chart = Chart(_read(history, "time"), title, len(probes), len(columns))
+    labels = {"position": "displacement"}
+    for row, (probe, held) in zip(chart.axes, probes.items(), strict=True):
+        for axes, quantity in zip(row, columns, strict=True):
+            if quantity not in held:
+                axes.set_axis_off()
+                continue
+            values = held[quantity]
+            if quantity == "position":
+                values = values - values[:1]
+            nodes = values.shape[1]
+            name = f"{probe} (mean and range of {nodes} nodes)" if nodes > 1 else probe
+            _vector(chart, axes, labels.get(quantity, quantity), unit_of(quantity), values.mean(axis=1), name)
+            if nodes > 1:
+                _range(chart, axes, quantity, values)
+    return chart.save(file)
+
+
+def _wanted(quantity: str, held: dict[str, np.ndarray]) -> bool:
+    return quantity in held and (quantity != "reaction" or bool(np.any(held[quantity])))
+
+
+def _range(chart: Chart, axes: Any, quantity: str, values: np.ndarray) -> None:
+    """Shade lowest to highest of the nodes, in the units the panel has already."""
+    from ..output.units import prefix_for
+
+    mean = values.mean(axis=1)
+    factor, _ = prefix_for(float(np.nanmax(np.abs([v for _, v in _components(mean)]))), unit_of(quantity))
+    every = max(1, len(values) // 3000)
+    time = chart.time[::every] * chart.factor
+    for name, _ in _components(mean):
+        k = "xyz".index(name)
+        low, high = values[::every, :, k].min(axis=1) * factor, values[::every, :, k].max(axis=1) * factor
+        axes.fill_between(time, low, high, color=COLOURS[k], alpha=0.15, linewidth=0)
+
+
+def _walls(history: History, walls: Iterable[Any], title: str, file: Path) -> Path | None:
+    names = [name.removeprefix("wall/").removesuffix("/force") for name in history if name.endswith("/force")]
+    names = [name for name in names if f"wall/{name}/force" in history]
+    if not names:
+        return None
+    time = _read(history, "time")
+    normals = {wall.name: np.asarray(wall.normal, dtype=float) for wall in walls if hasattr(wall, "normal")}
+    chart = Chart(time, title, 2 * len(names), heights=[1.3, 0.5] * len(names))
+    width = WINDOW * float(time[-1] - time[0])
+    for number, name in enumerate(names):
+        upper, lower = chart.axes[2 * number : 2 * number + 2, 0]
+        force = _read(history, f"wall/{name}/force")
+        if name in normals:
+            values, label = force @ normals[name] / np.linalg.norm(normals[name]), "normal force"
+        else:
+            values, label = np.linalg.norm(force, axis=1), "force"
+        smooth = window_mean(time, values, width)
+        styles = [{"color": "#9db7d9", "linewidth": 0.8}, {"color": COLOURS[0], "linewidth": 1.8}]
+        curves = [("as computed", values), (f"mean over {engineering(width, 's', 3)}", smooth)]
+        chart.curves(upper, label, "N", curves, f"Wall '{name}'", styles, legend=False)
+        upper.legend(loc="upper right")
+        if f"wall/{name}/contacts" in history:
+            chart.counts(lower, "nodes in\ncontact", history[f"wall/{name}/contacts"], COLOURS[1])
+        else:
+            lower.set_axis_off()
+    return chart.save(file)
+
+
+def _solver(history: History, title: str, file: Path) -> Path | None:
+    labels = {
+        "newton_iterations": "Newton\niterations",
+        "linear_iterations": "linear\niterations",
+        "active_contacts": "nodes in\ncontact",
+    }
+    names = [name for name in labels if name in history]
+    if not names:
+        return None
+    chart = Chart(_read(history, "time"), title, len(names), heights=[0.7] * len(names))
+    for number, (axes, name) in enumerate(zip(chart.axes[:, 0], names, strict=True)):
+        chart.counts(axes, labels[name], history[name], COLOURS[number])
+    return chart.save(file)
+
+
+def _named(history: History, names: list[str], title: str, file: Path) -> Path:
+    if not names:
+        raise InputError("plot: no curves named; columns: " + ", ".join(history))
+    for name in names:
+        if name not in list(history):
+            raise InputError(f"plot: the history holds no column '{name}'{nearest(name, list(history))}")
+    chart = Chart(_read(history, "time"), title, len(names), heights=[0.9] * len(names))
+    for axes, name in zip(chart.axes[:, 0], names, strict=True):
+        values = _read(history, name)
+        label, unit = _words(name.rsplit("/", 1)[-1]), unit_of(name)
+        if values.ndim == 3:  # nodes of a probe
+            values = values.mean(axis=1)
+            label += " (mean)" if np.asarray(history[name]).shape[1] > 1 else ""
+        if values.ndim == 2:
+            _vector(chart, axes, label, unit, values, name)
+        else:
+            chart.curves(axes, label, unit, [(name, values)], name)
+    return chart.save(file)

@@ -16,7 +16,7 @@ from .parser import PROGRAM, Parser, add_debug
 
 __all__ = ["main"]
 
-VERBS = ("run", "list", "check", "render", "info")
+VERBS = ("run", "list", "check", "render", "plot", "info")
 """Modules of this package: ``EXAMPLE``, ``RANKS``, ``add_arguments(parser)`` and ``run(arguments[, comm])``."""
 
 EXAMPLES = f"""\

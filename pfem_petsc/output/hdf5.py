@@ -5,9 +5,10 @@ from __future__ import annotations
 import os
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -21,6 +22,7 @@ __all__ = [
     "chunk_rows",
     "create_growing",
     "create_new",
+    "first_line",
     "fsync_all",
     "grow",
     "open_shared",
@@ -57,10 +59,12 @@ def require_parallel_hdf5(comm: MPI.Comm) -> None:
             )
 
 
-def create_new(path: Path, comm: MPI.Comm, build, *arguments) -> None:
+def create_new(
+    path: Path, comm: MPI.Comm, build: Callable[..., None], *arguments: Any, userblock_size: int = 0
+) -> None:
     """Make an HDF5 file with its whole structure on rank 0, under a temporary name, then rename it to ``path``.
 
-    ``build(file, *arguments)`` fills it. Nobody sees the file under its own name before the structure is complete.
+    ``build(file, *arguments)`` fills it. The first ``userblock_size`` bytes are left to the caller. Nobody sees the file under its own name before the structure is complete.
     Serial creation makes the structure the same for any number of ranks, and an unwritable folder the same error on
     all of them. Collective.
 
@@ -74,12 +78,13 @@ def create_new(path: Path, comm: MPI.Comm, build, *arguments) -> None:
         temporary = path.with_name(path.name + ".new")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            with h5py.File(temporary, "w", locking=False) as file:
+            with h5py.File(temporary, "w", locking=False, userblock_size=userblock_size) as file:
                 build(file, *arguments)
             os.replace(temporary, path)
-        except OSError as error:
+        except (OSError, RuntimeError) as error:
+            number = getattr(error, "errno", None)
             raise InputError(
-                f"{path}: cannot write there: {os.strerror(error.errno) if error.errno else error}; "
+                f"{path}: cannot write there: {os.strerror(number) if number else first_line(error)}; "
                 "choose another output folder (-o)"
             ) from error
 
@@ -183,7 +188,7 @@ def writing(comm: MPI.Comm, path: Path) -> Iterator[None]:
         yield
     except (OSError, RuntimeError) as error:
         failure = SimulationFailure(
-            f"{path}: writing failed on rank {comm.rank} ({_first_line(error)}): is the disk full, or the folder gone? "
+            f"{path}: writing failed on rank {comm.rank} ({first_line(error)}): is the disk full, or the folder gone? "
             "What was written before stays readable; continue with --restart when there is room"
         )
         failure.__cause__ = error
@@ -257,5 +262,6 @@ def fsync_all(path: Path) -> None:
         os.close(handle)
 
 
-def _first_line(error: BaseException) -> str:
+def first_line(error: BaseException) -> str:
+    """What an error says, without the details HDF5 adds; its type where it says nothing."""
     return str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__

@@ -1,0 +1,226 @@
+"""Checkpoints: the state of a run in the mesh's own numbering, read back bit for bit on any number of ranks."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from mpi4py import MPI
+
+from ..errors import InputError, SimulationFailure
+from ..parallel.agreement import agreed, on_root
+from ..parallel.natural import NaturalOrder
+from .hdf5 import (
+    HDF5_ERRORS,
+    create_new,
+    first_line,
+    fsync_all,
+    open_shared,
+    release,
+    require_parallel_hdf5,
+    require_room,
+    set_text,
+    write_rows,
+    writing,
+)
+from .integrity import check_seal, checksum, seal, seal_size, way_out
+
+__all__ = ["Checkpoint", "newest_checkpoint", "read_checkpoint", "read_checkpoint_header", "write_checkpoint"]
+
+NAME, PREVIOUS = "checkpoint.h5", "checkpoint-previous.h5"
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """What a checkpoint holds.
+
+    Attributes
+    ----------
+    path : Path
+    arrays : dict of name to this rank's owned rows (n_owned, ...), in the types they were written with
+    scalars : dict
+        As it was written; float64 to the last bit.
+    attributes : dict
+    """
+
+    path: Path
+    arrays: dict[str, np.ndarray]
+    scalars: dict[str, Any]
+    attributes: dict[str, Any]
+
+
+def write_checkpoint(
+    path: Path | str,
+    comm: MPI.Comm,
+    arrays: Mapping[str, tuple[NaturalOrder, np.ndarray]],
+    scalars: Mapping[str, Any],
+    attributes: Mapping[str, Any],
+) -> None:
+    """Write a checkpoint so that at any moment there is a complete one.
+
+    It is written under a temporary name, brought onto the disk, and renamed; the one before stays as
+    ``checkpoint-previous.h5``. Collective.
+
+    Parameters
+    ----------
+    path : Path or str
+        The file, commonly ``checkpoint.h5``, in a folder that exists.
+    comm : MPI.Comm
+    arrays : mapping of name to (order, owned rows (n_owned, ...))
+        Numbers of 1, 2, 4 or 8 bytes.
+    scalars, attributes : mappings
+        What JSON can hold; the attributes describe the run (case, versions), the scalars are its state.
+
+    Raises
+    ------
+    SimulationFailure
+        On all ranks: disk full, folder gone. The checkpoints before stay.
+    """
+    require_parallel_hdf5(comm)
+    path = Path(path)
+    temporary = path.with_name(path.name + ".tmp")
+    slabs = {name: order.to_slab(np.asarray(array)) for name, (order, array) in arrays.items()}
+    shapes = {name: ((arrays[name][0].n_global, *slab.shape[1:]), slab.dtype) for name, slab in slabs.items()}
+    n_bytes = sum(dtype.itemsize * int(np.prod(shape, dtype=np.int64)) for shape, dtype in shapes.values())
+    require_room(comm, path, n_bytes, target=path.parent)
+    checks = {name: checksum(comm, slab, arrays[name][0].first) for name, slab in slabs.items()}
+    state = json.dumps({"scalars": dict(scalars), "attributes": dict(attributes)}, default=_plain)
+    try:
+        create_new(temporary, comm, _create, shapes, checks, state, userblock_size=seal_size(len(shapes)))
+    except InputError as error:
+        raise SimulationFailure(f"{path}: no checkpoint could be written: {error}") from error
+
+    with writing(comm, temporary):
+        file = open_shared(temporary, comm)
+    try:
+        for name, slab in slabs.items():
+            with writing(comm, temporary):
+                write_rows(file["arrays"][name], arrays[name][0].first, slab, collective=comm.size > 1)
+        with writing(comm, temporary):
+            file.flush()
+    except SimulationFailure:
+        release(file, comm)
+        if comm.rank == 0:
+            temporary.unlink(missing_ok=True)
+        raise
+    with writing(comm, temporary):
+        file.close()
+    with writing(comm, temporary):
+        if comm.rank == 0:
+            seal(temporary)
+    with writing(comm, temporary):
+        fsync_all(temporary)
+    with writing(comm, path):
+        if comm.rank == 0:
+            _put_in_place(temporary, path)
+
+
+def read_checkpoint(path: Path | str, comm: MPI.Comm, orders: Mapping[str, NaturalOrder]) -> Checkpoint:
+    """Read a checkpoint on any number of ranks. Collective.
+
+    Parameters
+    ----------
+    path : Path or str
+    comm : MPI.Comm
+    orders : mapping of array name to how this run's ranks own its rows
+        The arrays wanted; others in the file are left alone.
+
+    Raises
+    ------
+    InputError
+        On all ranks: file missing, damaged, of another version, without one of the arrays, or with another number of
+        rows.
+    """
+    path = Path(path)
+    scalars, attributes = read_checkpoint_header(path, comm)
+    slabs: dict[str, np.ndarray] = {}
+    expected: dict[str, int] = {}
+    # Reading needs no agreement on each transfer: every rank reads its slab for itself.
+    with agreed(comm), _sound(path), h5py.File(path, "r", locking=False) as file:
+        for name, order in orders.items():
+            if name not in file["arrays"]:
+                known = ", ".join(sorted(file["arrays"])) or "none"
+                raise InputError(f"{path}: has no array {name!r} (it has {known}): it belongs to another kind of run")
+            dataset = file["arrays"][name]
+            if len(dataset) != order.n_global:
+                raise InputError(
+                    f"{path}: {name} has {len(dataset)} rows, the case needs {order.n_global}: it belongs to another "
+                    "mesh; restart the case it was written by"
+                )
+            slabs[name] = dataset[order.first : order.first + order.count]
+            expected[name] = int(dataset.attrs["checksum"])
+    for name, slab in slabs.items():
+        if checksum(comm, slab, orders[name].first) != expected[name]:
+            raise InputError(f"{path}: damaged: the values of {name} do not match their checksum; {way_out(path)}")
+    arrays = {name: orders[name].from_slab(slab) for name, slab in slabs.items()}
+    return Checkpoint(path, arrays, scalars, attributes)
+
+
+def read_checkpoint_header(path: Path | str, comm: MPI.Comm) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Scalars and attributes of a checkpoint, on all ranks. Collective; raises as :func:`read_checkpoint`."""
+    return on_root(comm, _read_header, Path(path))
+
+
+def newest_checkpoint(folder: Path | str) -> Path | None:
+    """The newest checkpoint of an output folder, None where there is none. On one rank."""
+    for name in (NAME, PREVIOUS):
+        if (Path(folder) / name).is_file():
+            return Path(folder) / name
+    return None
+
+
+def _create(file: h5py.File, shapes: Mapping, checks: Mapping[str, int], state: str) -> None:
+    set_text(file, "state", state)
+    file["state"].attrs["checksum"] = zlib.crc32(state.encode())
+    group = file.create_group("arrays")
+    for name, (shape, dtype) in shapes.items():
+        group.create_dataset(name, shape=shape, dtype=dtype).attrs["checksum"] = np.uint64(checks[name])
+
+
+def _put_in_place(temporary: Path, path: Path) -> None:
+    if path.exists():
+        os.replace(path, path.with_name(f"{path.stem}-previous{path.suffix}"))
+    os.replace(temporary, path)
+    # Some network file systems cannot sync folders; they do not delay their entries either.
+    try:
+        fsync_all(path.parent)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP):
+            raise
+
+
+def _read_header(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such checkpoint; name an existing one, or start without --restart")
+    check_seal(path)
+    with _sound(path), h5py.File(path, "r", locking=False) as file:
+        state = file["state"][()]
+        if zlib.crc32(state) != file["state"].attrs["checksum"]:
+            raise InputError(f"{path}: damaged: its state does not match the checksum; {way_out(path)}")
+    state = json.loads(state)
+    return state["scalars"], state["attributes"]
+
+
+@contextmanager
+def _sound(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except HDF5_ERRORS as error:
+        raise InputError(f"{path}: not a checkpoint, or damaged: {first_line(error)}; {way_out(path)}") from error
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, np.generic):
+        return value.item()
+    raise TypeError(f"a checkpoint cannot hold {type(value).__name__} {value!r}")

@@ -1,0 +1,133 @@
+"""Whether a checkpoint is whole: checksums of its arrays, and a seal over everything else in the file.
+
+HDF5 checks little of what it reads, and a damaged file can crash it. So the bytes that it would parse are compared
+with a digest before it opens the file. Digest, format and version stand in the file's user block, a text at its
+beginning that HDF5 passes over. Array values are left to their own checksums, which ranks compute together.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+from mpi4py import MPI
+
+from ..errors import InputError
+
+__all__ = ["check_seal", "checksum", "seal", "seal_size", "way_out"]
+
+FORMAT, VERSION = "pfem_petsc checkpoint", 1
+LARGEST_SEAL = 1 << 20
+# Words summed, or bytes read, at a time.
+BLOCK = 1 << 18
+
+
+def checksum(comm: MPI.Comm, slab: np.ndarray, first: int) -> int:
+    """Checksum of an array whose rows lie in slabs over the ranks, the same for any number of ranks. Collective.
+
+    The sum, modulo 2^64, of all numbers as unsigned words, each times an odd factor made from its index: any single
+    number that changes changes the sum, and numbers that swap places do, too.
+
+    Parameters
+    ----------
+    comm : MPI.Comm
+    slab : (n, ...)
+        Numbers of 1, 2, 4 or 8 bytes.
+    first : int
+        Row of the whole array at which the slab begins.
+    """
+    words = np.ascontiguousarray(slab).reshape(-1).view(f"u{slab.dtype.itemsize}")
+    start = first * int(np.prod(slab.shape[1:], dtype=np.int64))
+    total = np.zeros(1, dtype=np.uint64)
+    for i in range(0, len(words), BLOCK):
+        block = words[i : i + BLOCK].astype(np.uint64)
+        index = np.arange(start + i, start + i + len(block), dtype=np.uint64)
+        factor = (index + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
+        factor ^= factor >> np.uint64(29)
+        total += np.sum(block * (factor | np.uint64(1)), dtype=np.uint64)
+    comm.Allreduce(MPI.IN_PLACE, total, op=MPI.SUM)
+    return int(total[0])
+
+
+def seal_size(n_arrays: int) -> int:
+    """Bytes of user block for the seal over a file with so many arrays: a power of two, as HDF5 wants."""
+    return 1 << (511 + 64 * n_arrays).bit_length()
+
+
+def seal(path: Path) -> None:
+    """Write the seal into the user block of a complete file that is closed. One process."""
+    with h5py.File(path, "r", locking=False) as file:
+        size = file.userblock_size
+        found = [(dataset.id.get_offset(), dataset.id.get_storage_size()) for dataset in file["arrays"].values()]
+    arrays = sorted([offset, length] for offset, length in found if length)
+    content = {"size": path.stat().st_size, "seal_size": size, "arrays": arrays}
+    text = json.dumps({**content, "digest": _digest(path, content)})
+    line = f"{FORMAT} {VERSION}\n{text}\n".encode()
+    if len(line) > size:
+        raise ValueError(f"{path}: seal of {len(line)} bytes for {size}")
+    with open(path, "r+b") as raw:
+        raw.write(line.ljust(size))
+
+
+def check_seal(path: Path) -> None:
+    """Compare a file with its seal, all but the values of its arrays. One process.
+
+    Raises
+    ------
+    InputError
+        When the file is not a checkpoint, of another version, cut, or damaged.
+    """
+    try:
+        with open(path, "rb") as raw:
+            head = raw.read(LARGEST_SEAL).split(b"\n", 2)
+        first = head[0].decode(errors="replace")
+        name, _, version = first.rpartition(" ")
+        if name != FORMAT:
+            raise InputError(f"{path}: not a checkpoint of pfem_petsc, or damaged at its beginning; {way_out(path)}")
+        if version != str(VERSION):
+            raise InputError(
+                f"{path}: has version {version} of the checkpoint format, this program reads {VERSION}: restart with "
+                f"the version of pfem_petsc that wrote it, or {way_out(path)}"
+            )
+        try:
+            content: dict[str, Any] = json.loads(head[1])
+            size, digest = int(content["size"]), content.pop("digest")
+            actual = path.stat().st_size
+            if actual != size:
+                raise InputError(f"{path}: damaged: has {actual} bytes of {size}; {way_out(path)}")
+            sound = _digest(path, content) == digest
+        except (ValueError, KeyError, TypeError, IndexError, OverflowError):
+            sound = False
+        if not sound:
+            raise InputError(f"{path}: damaged: what describes its content does not match the digest; {way_out(path)}")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}; {way_out(path)}") from error
+
+
+def way_out(path: Path) -> str:
+    """What to do without this checkpoint."""
+    previous = path.with_name(f"{path.stem}-previous{path.suffix}")
+    if previous.is_file():
+        return f"restart from the one before: --restart {previous}"
+    return "start without --restart"
+
+
+def _digest(path: Path, content: dict[str, Any]) -> str:
+    """Digest of the seal's content and of all bytes after the user block that are not values of arrays."""
+    digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode())
+    position = int(content["seal_size"])
+    with open(path, "rb") as raw:
+        for offset, length in [*content["arrays"], [int(content["size"]), 0]]:
+            raw.seek(position)
+            while position < offset:
+                block = raw.read(min(BLOCK, offset - position))
+                if not block:
+                    raise ValueError("the file ends early")
+                digest.update(block)
+                position += len(block)
+            position = offset + length
+    return digest.hexdigest()

@@ -1,0 +1,90 @@
+"""Choices that are made once before the first step: scheme, time step, linear solver, stepper."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..errors import InputError
+from ..integrators.base import Scheme
+from ..registry import lookup
+from ..solvers.linear import LinearChoice, choose_linear
+from .explicit import ExplicitStepper
+from .implicit import ImplicitStepper
+from .stability import Frequency, highest_frequency
+from .stepper import Stepper
+
+__all__ = ["Plan", "make_plan", "make_stepper"]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a run will do.
+
+    Attributes
+    ----------
+    scheme : the integrator
+    step : time step [s]
+    steps : number of steps to the end
+    critical_step : largest stable step of the scheme [s], infinite where unconditionally stable
+    frequency : bounds on the highest natural frequency [rad/s]
+    linear : linear solver, None where every node is solved on its own
+    """
+
+    scheme: Scheme
+    step: float
+    steps: int
+    critical_step: float
+    frequency: Frequency
+    linear: LinearChoice | None
+
+
+def make_plan(model) -> Plan:
+    """Resolve what the case leaves open. Collective.
+
+    Raises
+    ------
+    InputError
+        On all ranks, where the step is certainly unstable.
+    """
+    case = model.case
+    time = case.time
+    scheme = lookup("pfem_petsc.integrators", time.integrator, f"{case.source}: time.integrator").Scheme(time.scheme)
+    frequency = highest_frequency(model, model.mesh.points)
+    # mass-proportional damping: xi = c_m / (2 rho omega) is largest where c_m / rho is
+    ratio = max(m.damping / m.density for m in case.material.values()) / (2.0 * max(frequency.lower, 1e-300))
+    limit = scheme.limit(min(ratio, 1e3))
+    if limit == 0.0:
+        raise InputError(
+            f"{case.source}: time: {time.integrator} with these parameters is unstable at any step; take gamma >= 1/2"
+        )
+    critical = limit / frequency.upper if frequency.upper > 0.0 else np.inf
+    certain = limit / frequency.lower if frequency.lower > 0.0 else np.inf
+    if time.step == "auto":
+        if not np.isfinite(critical):
+            raise InputError(
+                f"{case.source}: time.step = \"auto\": {time.integrator} has no critical step here; give time.step [s]"
+            )
+        steps = max(int(np.ceil(time.end / (time.safety * critical))), 1)
+        step = time.end / steps
+    else:
+        step = float(time.step)
+        if step > certain * (1.0 + 1e-9):
+            raise InputError(
+                f"{case.source}: time.step = {step:g} s is above the limit of {time.integrator}, which is unstable "
+                f"beyond {critical:.6g} s for this model; take a smaller step or time.step = \"auto\""
+            )
+        steps = max(int(np.ceil(time.end / step * (1.0 - 1e-12) - 1e-9)), 1)
+    linear = None
+    if not scheme.explicit or model.inertia.consistent:
+        over = step * frequency.upper / 2.0
+        linear = choose_linear(case.solver.linear, 3 * model.mesh.n_nodes, 0.0 if scheme.explicit else over)
+    return Plan(scheme, step, steps, critical, frequency, linear)
+
+
+def make_stepper(model, plan: Plan) -> Stepper:
+    """The stepper of a plan."""
+    if plan.linear is None:
+        return ExplicitStepper(model, plan.scheme, plan.step)
+    return ImplicitStepper(model, plan.scheme, plan.step, plan.linear)

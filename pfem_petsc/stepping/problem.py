@@ -1,0 +1,154 @@
+"""The balance of one step as a function of the position increment: residual and Hessian, in nodal frames at walls."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..contact.frames import NodalFrames
+from ..integrators.base import Balance, State
+from ..mechanics.compiled import kernel
+from ..solvers.matrix import HessianMatrix, local_columns
+
+__all__ = ["StepProblem"]
+
+
+@kernel
+def _turn_blocks(ptr, local_columns, frame_of_row, frame_of_column, inverse, values):
+    """H <- B^-T H B^-1 on the rows and columns of nodes with a frame (index -1: none)."""
+    block = np.zeros((3, 3))
+    for row in range(len(ptr) - 1):
+        width = 3 * (ptr[row + 1] - ptr[row])
+        r = frame_of_row[row]
+        for k in range(ptr[row], ptr[row + 1]):
+            c = frame_of_column[local_columns[k]]
+            if r < 0 and c < 0:
+                continue
+            at = 6 * ptr[row] + 3 * k
+            for i in range(3):
+                for j in range(3):
+                    block[i, j] = values[at + i * width + j]
+            if r >= 0:
+                for j in range(3):
+                    x, y, z = block[0, j], block[1, j], block[2, j]
+                    for i in range(3):
+                        block[i, j] = inverse[r, 0, i] * x + inverse[r, 1, i] * y + inverse[r, 2, i] * z
+            if c >= 0:
+                for i in range(3):
+                    x, y, z = block[i, 0], block[i, 1], block[i, 2]
+                    for j in range(3):
+                        block[i, j] = x * inverse[c, 0, j] + y * inverse[c, 1, j] + z * inverse[c, 2, j]
+            for i in range(3):
+                for j in range(3):
+                    values[at + i * width + j] = block[i, j]
+
+
+class StepProblem:
+    """g(w) of one step, where w is the increment u from the predictor, in nodal coordinates w = B u at walls.
+
+    Components that supports prescribe have a zero residual and a unit row: the guess carries their value.
+    """
+
+    def __init__(
+        self,
+        model,
+        hessian: HessianMatrix,
+        state: State,
+        balance: Balance,
+        external: np.ndarray,
+        frames: NodalFrames | None,
+    ) -> None:
+        self.model = model
+        self.hessian_matrix = hessian
+        self.state = state
+        self.balance = balance
+        self.external = external
+        self.frames = frames
+        mesh, inertia = model.mesh, model.inertia
+        self.x = np.zeros((mesh.n_local, 3))
+        self.f = np.zeros((mesh.n_local, 3))
+        self.u = np.zeros((mesh.n_owned, 3))
+        self._work = np.zeros((mesh.n_owned, 3))
+        self.nodal = balance.alpha * inertia.mass + balance.eta * inertia.damping
+        self.scale = float(self.nodal.max(initial=0.0))
+        # what does not change with u: M a_hat + C v_hat + (1 - w) f_n - f_ext
+        known = -external
+        if balance.a_hat is not None:
+            known = known + inertia.mass_times(balance.a_hat, np.zeros_like(known))
+        if inertia.damped and balance.v_hat is not None:
+            known = known + inertia.damping_times(balance.v_hat, np.zeros_like(known))
+        if balance.weight < 1.0:
+            known = known + (1.0 - balance.weight) * state.f[: mesh.n_owned]
+        self.known = known
+        self._oblique = frames is not None and model.comm.allreduce(int(frames.oblique)) > 0
+        if self._oblique:
+            self._share_frames()
+
+    def _share_frames(self) -> None:
+        mesh, frames = self.model.mesh, self.frames
+        inverse = np.zeros((mesh.n_local, 10))
+        inverse[frames.nodes, 0] = 1.0
+        inverse[frames.nodes, 1:] = frames.inverse.reshape(-1, 9)
+        mesh.update_ghosts(inverse)
+        turned = np.flatnonzero(inverse[:, 0] > 0.0)
+        self._frame_of = np.full(mesh.n_local, -1, dtype=np.int32)
+        self._frame_of[turned] = np.arange(len(turned), dtype=np.int32)
+        self._inverse = np.ascontiguousarray(inverse[turned, 1:]).reshape(-1, 3, 3)
+
+    def increment(self, w: np.ndarray) -> np.ndarray:
+        """u (owned, 3) for w."""
+        self.u[:] = w
+        if self._oblique:
+            at = self.frames.nodes
+            self.u[at] = np.einsum("nij,nj->ni", self.frames.inverse, w[at])
+        return self.u
+
+    def coordinates(self, u: np.ndarray) -> np.ndarray:
+        """w (owned, 3) for u."""
+        w = u.copy()
+        if self._oblique:
+            at = self.frames.nodes
+            w[at] = np.einsum("nij,nj->ni", self.frames.basis, u[at])
+        return w
+
+    def imbalance(self, u: np.ndarray, g: np.ndarray) -> None:
+        """g = M a + C v + f_int - f_ext at u, in x, without regard to supports and walls [N]. Collective."""
+        mesh, inertia, balance = self.model.mesh, self.model.inertia, self.balance
+        owned = mesh.n_owned
+        if inertia.consistent:
+            g[:] = inertia.mass_times(balance.alpha * u, self._work)
+            if inertia.damped and balance.eta:
+                g += inertia.damping_times(balance.eta * u, self._work)
+        else:
+            np.multiply(self.nodal[:, None], u, out=g)
+        g += self.known
+        if balance.weight:
+            self._place(u)
+            self.model.bars.forces(self.x, self.f, commit=False)
+            g += balance.weight * self.f[:owned]
+
+    def residual(self, w: np.ndarray, g: np.ndarray) -> None:
+        """See :class:`~pfem_petsc.solvers.newton.Problem`."""
+        self.imbalance(self.increment(w), g)
+        if self._oblique:
+            at = self.frames.nodes
+            g[at] = np.einsum("nji,nj->ni", self.frames.inverse, g[at])
+        if self.model.supports.any:
+            g[self.model.supports.fixed] = 0.0
+
+    def hessian(self, w: np.ndarray, values: np.ndarray) -> None:
+        """See :class:`~pfem_petsc.solvers.newton.Problem`."""
+        inertia, balance, matrix = self.model.inertia, self.balance, self.hessian_matrix
+        self._place(self.increment(w))
+        if not inertia.consistent:
+            matrix.add_lumped(self.nodal, values)
+        coefficients = inertia.coefficients(balance.alpha, balance.eta)
+        if balance.weight or inertia.consistent:
+            self.model.bars.tangents(self.x, balance.weight, coefficients, matrix.pattern, values)
+        if self._oblique:
+            columns = local_columns(self.model.mesh, matrix.pattern.columns)
+            _turn_blocks(matrix.pattern.ptr, columns, self._frame_of, self._frame_of, self._inverse, values)
+        matrix.constrain(self.scale, values)
+
+    def _place(self, u: np.ndarray) -> None:
+        np.add(self.balance.predictor, u, out=self.x[: self.model.mesh.n_owned])
+        self.model.mesh.update_ghosts(self.x)

@@ -1,0 +1,151 @@
+"""One step of a scheme: the solve for the position increment, with walls, and what it leaves in the state."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..contact.contact import WallForces
+from ..errors import SimulationFailure
+from ..integrators.base import Balance, Scheme, State
+from ..mechanics.bars import StrainEnergy
+
+__all__ = ["Solution", "Stepper"]
+
+
+@dataclass
+class Solution:
+    """The solve of one balance.
+
+    Attributes
+    ----------
+    u : (owned, 3) increment from the predictor [m]
+    internal : (local, 3) internal force in the balance [N]
+    walls : forces per wall, this rank's share
+    newton, linear : iterations
+    contacts : this rank's nodes held by walls
+    """
+
+    u: np.ndarray
+    internal: np.ndarray
+    walls: WallForces
+    newton: int = 0
+    linear: int = 0
+    contacts: int = 0
+
+
+class Stepper(ABC):
+    """Advances the state by the scheme; subclasses solve the balance.
+
+    Attributes
+    ----------
+    state : State
+    energy : StrainEnergy of this rank's bars at the state's positions
+    solution : of the last balance
+    balance : the last balance
+    fault : a failure that only this rank has met yet; raised on all when ranks next meet
+    """
+
+    def __init__(self, model, scheme: Scheme, h: float) -> None:
+        self.model = model
+        self.scheme = scheme
+        self.h = h
+        mesh = model.mesh
+        owned = mesh.n_owned
+        self.energy = StrainEnergy(0.0, 0.0, 0.0, -1)
+        self.fault: SimulationFailure | None = None
+        self.balance: Balance | None = None
+        zeros = lambda: np.zeros((owned, 3))  # noqa: E731
+        self.state = State(
+            x=mesh.points.copy(),
+            v=np.zeros((owned, 3)),
+            a=zeros(),
+            f=np.zeros((mesh.n_local, 3)),
+            external=zeros(),
+            contact=zeros(),
+            support=zeros(),
+        )
+        self.solution = Solution(zeros(), self.state.f, model.contact.none())
+
+    def start(self) -> None:
+        """Complete the state at the start: velocity, internal force, acceleration. Collective."""
+        state, model = self.state, self.model
+        state.v = model.initial_velocity()
+        supports = model.supports
+        if supports.any:
+            # nodes that are moved start with the velocity of their motion
+            tick = 1e-3 * self.h
+            rate = (supports.positions(tick) - supports.positions(0.0)) / tick
+            state.v[supports.nodes, supports.components] = rate
+        self.evaluate(commit=True)
+        model.external.at(0.0, state.external)
+        load = state.external - state.f[: model.mesh.n_owned]
+        if model.inertia.damped:
+            load -= model.inertia.damping_times(state.v, np.zeros_like(load))
+        state.a = self.accelerate(load)
+        state.support[supports.fixed] = -load[supports.fixed]
+        self.scheme.start(state, self.h)
+        if self.scheme.leads:
+            self._solve_and_finish()
+
+    def step(self) -> None:
+        """Advance from t_n to t_{n+1}; the state is complete at both. Collective where the solve is."""
+        state, h = self.state, self.h
+        if self.scheme.leads:
+            self.scheme.advance(state, h)
+            self._arrive()
+            self._solve_and_finish()
+        else:
+            self._solve_and_finish()
+            self._arrive()
+
+    def _arrive(self) -> None:
+        self.state.step += 1
+        self.state.time = self.state.step * self.h
+        self.evaluate(commit=True)
+
+    def _solve_and_finish(self) -> None:
+        state = self.state
+        self.balance = self.scheme.balance(state, self.h)
+        state.external = self._load(self.balance)
+        self.solution = self.solve(self.balance)
+        self.scheme.finish(state, self.balance, self.solution.u, self.h)
+
+    def _load(self, balance: Balance) -> np.ndarray:
+        total = np.zeros_like(self.state.v)
+        if self.model.external.active:
+            part = np.empty_like(total)
+            for weight, time in balance.loads:
+                total += weight * self.model.external.at(time, part)
+        return total
+
+    def evaluate(self, commit: bool) -> None:
+        """Internal force and energies at the state's positions; a collapsed bar becomes a fault."""
+        state, mesh = self.state, self.model.mesh
+        mesh.update_ghosts(state.x)
+        self.energy = self.model.bars.forces(state.x, state.f, commit)
+        if self.energy.failed >= 0 and self.fault is None:
+            self.fault = SimulationFailure(self._collapse(self.energy.failed))
+
+    def _collapse(self, bar: int) -> str:
+        mesh, state = self.model.mesh, self.state
+        a, b = mesh.bars[bar]
+        when = f"step {state.step}, t = {state.time:.6g} s"
+        name = f"bar {mesh.bar_ids[bar]} between nodes {mesh.node_ids[a]} and {mesh.node_ids[b]}"
+        length = float(np.linalg.norm(state.x[b] - state.x[a]))
+        if not np.isfinite(length):
+            return f"{when}: the positions of {name} are not finite: the motion blew up; take a smaller time step"
+        return (
+            f"{when}: {name} has collapsed to {length:.3g} m, from {self.model.bars.rest[bar]:.3g} m; the impact is too "
+            "strong for a truss model: take a lower speed, a stronger material, or a smaller time step"
+        )
+
+    @abstractmethod
+    def accelerate(self, load: np.ndarray) -> np.ndarray:
+        """Acceleration (owned, 3) with M a = load [N] on free components, zero on prescribed ones. Collective."""
+
+    @abstractmethod
+    def solve(self, balance: Balance) -> Solution:
+        """Solve a balance, and leave contact and support forces in the state."""

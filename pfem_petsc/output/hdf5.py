@@ -64,9 +64,9 @@ def create_new(
 ) -> None:
     """Make an HDF5 file with its whole structure on rank 0, under a temporary name, then rename it to ``path``.
 
-    ``build(file, *arguments)`` fills it. The first ``userblock_size`` bytes are left to the caller. Nobody sees the file under its own name before the structure is complete.
-    Serial creation makes the structure the same for any number of ranks, and an unwritable folder the same error on
-    all of them. Collective.
+    ``build(file, *arguments)`` fills it; the first ``userblock_size`` bytes are left to the caller. Nobody sees the
+    file under its own name before the structure is complete. Serial creation makes the structure the same for any
+    number of ranks, and an unwritable folder the same error on all of them. Collective.
 
     Raises
     ------

@@ -54,7 +54,7 @@ class Truss:
         return self.reference + wave, point_data, cell_data
 
     def snapshot(self, step):
-        """What this rank gives to ``write_snapshot``: bars not counted here are spoilt, to see that they are not used."""
+        """What this rank gives to ``write_snapshot``: bars not counted here are spoilt."""
         points, point_data, cell_data = self.whole(step)
         cells = {name: values[self.local_bars].copy() for name, values in cell_data.items()}
         for block in self.mesh.blocks:

@@ -1,3 +1,4 @@
+# shellcheck shell=bash disable=SC2034,SC2154
 # Sourced by setup.sh: builds the newest PETSc, petsc4py and a parallel h5py into the environment $venv, in about ten
 # minutes. The functions pip_install and failed are setup.sh's.
 #

@@ -1,3 +1,4 @@
+# shellcheck shell=bash disable=SC2034,SC2154
 # Sourced by the scripts here: which Python, and the settings under which it runs on several ranks of one machine.
 #
 # PFEM_VENV   the virtual environment; default .venv, or .venv-petsc when the script is given --build-petsc

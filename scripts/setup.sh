@@ -44,12 +44,14 @@ import os, sys
 root = sys.argv[1]
 if os.path.realpath(sys.prefix).startswith(os.path.realpath(root) + os.sep):
     sys.exit(1)
-if not os.environ.get("PETSC_DIR"):
+petsc = os.environ.get("PETSC_DIR")
+if not petsc:
     try:
         import petsc4py
     except ImportError:
         sys.exit(1)
-    sys.exit(petsc4py.__file__.startswith("/usr/lib/"))
+    petsc = petsc4py.__file__
+sys.exit(os.path.realpath(petsc).startswith(("/usr/lib/petscdir/", "/usr/lib/python3/")))
 PYTHON
     echo "$candidate"
 }
@@ -110,11 +112,12 @@ petsc_package() {
 # An environment that stands on another Python or PETSc than asked for is made anew.
 make_venv() {
     local made_from
-    made_from=$(tail -n 1 "$venv/setup-done" 2>/dev/null || foundation)
+    made_from=$(cat "$venv/made-from" 2>/dev/null || foundation)
     if ! "$python" -c "" 2>/dev/null || [[ $made_from != "$(foundation)" ]]; then
         say "making ${venv#"$root"/} with $1"
         "$1" -m venv --clear "${@:2}" "$venv"
     fi
+    foundation > "$venv/made-from"
 }
 
 site_packages() { "$python" -c "import sysconfig; print(sysconfig.get_path('purelib'))"; }
@@ -205,6 +208,8 @@ from_active() {
         say "building petsc4py for the PETSc $version in $PETSC_DIR"
         pip_install "petsc4py==$version.*"
     fi
+    # Bindings that were compiled against NumPy 1 do not load with NumPy 2.
+    has petsc4py.PETSc || pip_install "numpy<2"
     if ! has h5py; then
         if [[ -n ${HDF5_DIR:-} ]]; then
             say "building h5py on the HDF5 in $HDF5_DIR"

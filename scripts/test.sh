@@ -43,9 +43,9 @@ stage() {
 
 color=$([[ -t 1 ]] && echo yes || echo no)
 selected=$([[ $# -gt 0 ]] && echo yes || echo no)
-stage "1 rank" timeout --kill-after=15 "$limit" "$python" -m pytest --color=$color --durations=5 "$@"
-stage "2 ranks" on_ranks 2 "$limit" "$python" -m pytest --color=$color "$@"
-stage "3 ranks" on_ranks 3 "$limit" "$python" -m pytest --color=$color "$@"
+stage "1 rank" timeout --kill-after=15 "$limit" "$python" -m pytest --color="$color" --durations=5 "$@"
+stage "2 ranks" on_ranks 2 "$limit" "$python" -m pytest --color="$color" "$@"
+stage "3 ranks" on_ranks 3 "$limit" "$python" -m pytest --color="$color" "$@"
 
 # The last line is a closing line of pytest: of the first stage, which runs every test, or of the last that failed.
 printf '\n%s%s' "$summary" "$failures"

@@ -37,7 +37,9 @@ def run(arguments: argparse.Namespace, comm: MPI.Comm) -> int:
         print(case.title)
         for label, text in summary.items():
             print(f"  {label:{width}}  {text}")
-        for text in simulation.warnings:
+        for text in simulation.model.warnings:
             print(f"warning: {text}")
+        if simulation.plan.scheme.notice:
+            print(f"note: {simulation.plan.scheme.notice}")
         print("This case can run.")
     return 0

@@ -8,8 +8,8 @@ import numpy as np
 from mpi4py import MPI
 
 from .exchange import GhostExchange, Router
-from .ordering import bar_order, hilbert_keys, node_order
-from .partition import bounding_cube, partition
+from .ordering import bar_order, node_order, sweep_keys
+from .partition import partition
 from .slab import MeshSlab, index_type, slab_of
 
 __all__ = ["Block", "DistributedMesh", "distribute"]
@@ -120,7 +120,7 @@ def distribute(slab: MeshSlab, bar_section: np.ndarray, comm: MPI.Comm, partitio
 
 def _alone(mesh: DistributedMesh, slab: MeshSlab, section: np.ndarray) -> None:
     """One rank: reorder nodes and bars, with as few temporary arrays of the size of the mesh as can be."""
-    order = node_order(hilbert_keys(slab.points, *bounding_cube(slab.points, mesh.comm)))
+    order = node_order(sweep_keys(slab.points))
     place = np.empty(len(order), np.int32)
     place[order] = np.arange(len(order), dtype=np.int32)
     mesh.n_owned = mesh.n_local = slab.n_nodes
@@ -137,12 +137,10 @@ def _alone(mesh: DistributedMesh, slab: MeshSlab, section: np.ndarray) -> None:
 def _among_ranks(mesh: DistributedMesh, slab: MeshSlab, section: np.ndarray, owners: np.ndarray) -> None:
     """Several ranks: nodes go to their owners and are numbered there, then bars go to the owners of their ends."""
     comm = mesh.comm
-    low, extent = bounding_cube(slab.points, comm)
-
     to_owner = Router(comm, owners)
     ids = to_owner.send(np.arange(slab.first_node, slab.first_node + len(slab.points)))
     points = to_owner.send(slab.points)
-    order = node_order(hilbert_keys(points, low, extent), ids)
+    order = node_order(sweep_keys(points), ids)
     n_owned = len(ids)
     starts = np.concatenate([[0], np.cumsum(comm.allgather(n_owned))]).astype(np.int64)
     numbers = np.empty(n_owned, np.int64)

@@ -13,7 +13,7 @@ __all__ = ["require_rendering"]
 
 VARIABLE = "VTK_DEFAULT_OPENGL_WINDOW"
 
-# Without a display VTK would try X first, warn, and take EGL, which may have a driver that only fails on drawing.
+# Nothing is shown, so a display is not asked first: it may be gone, or far away behind ssh.
 _HEADLESS = ("vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow")
 
 # Draw a red square where a library is there at all: a crash, a hang or an empty image all count as "does not work".
@@ -48,17 +48,18 @@ def _works(window: str | None) -> bool:
 
 @functools.cache
 def require_rendering() -> None:
-    """Make sure that VTK can draw in this process, choosing EGL or OSMesa where there is no display.
+    """Make sure that VTK can draw in this process, choosing EGL or OSMesa, whichever works.
 
-    A choice made by the user in ``VTK_DEFAULT_OPENGL_WINDOW`` is tried first. Call before the first render window.
+    A choice made by the user in ``VTK_DEFAULT_OPENGL_WINDOW`` is tried first, what VTK takes by itself last. Call
+    before the first render window.
 
     Raises
     ------
     InputError
         When no OpenGL works; the message says what to install.
     """
-    candidates: list[str | None] = [None] if VARIABLE in os.environ or os.environ.get("DISPLAY") else []
-    for window in [*candidates, *_HEADLESS]:
+    own = [os.environ[VARIABLE]] if VARIABLE in os.environ else []
+    for window in [*own, *_HEADLESS, None]:
         if _works(window):
             if window is not None:
                 os.environ[VARIABLE] = window

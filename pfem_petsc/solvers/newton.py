@@ -12,9 +12,14 @@ from .linear import LinearChoice, configure
 from .matrix import HessianMatrix
 from .reasons import linear_reason, newton_reason
 
-__all__ = ["NewtonReport", "NewtonSolver", "Problem"]
+__all__ = ["NewtonReport", "NewtonSolver", "Problem", "zero_tolerance"]
 
 _STAGNATION = 100.0  # a residual within this many rounding floors that no longer falls has converged
+
+
+def zero_tolerance(length: float) -> float:
+    """Distance to a bound [m] that counts as on it, for a model of an extent [m]: rounding of a position."""
+    return 1e-14 * length
 
 
 class Problem(Protocol):
@@ -140,7 +145,7 @@ class NewtonSolver:
             # PETSc's default 1e-8 is absolute: a node that near its bound would be held there, off it
             options = PETSc.Options(snes.getOptionsPrefix())
             if not options.hasName("snes_vi_zero_tolerance"):
-                options["snes_vi_zero_tolerance"] = 1e-14 * self.length
+                options["snes_vi_zero_tolerance"] = zero_tolerance(self.length)
         configure(snes.getKSP(), self.choice, reduced=contact)
         snes.setFromOptions()
         self._solvers[contact] = snes

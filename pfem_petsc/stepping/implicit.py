@@ -12,7 +12,7 @@ from ..errors import SimulationFailure
 from ..integrators.base import Balance
 from ..solvers.linear import LinearChoice
 from ..solvers.matrix import HessianMatrix
-from ..solvers.newton import NewtonReport, NewtonSolver
+from ..solvers.newton import NewtonReport, NewtonSolver, zero_tolerance
 from .problem import StepProblem
 from .stepper import Solution, Stepper
 
@@ -80,6 +80,8 @@ class ImplicitStepper(Stepper):
                 bounds = self._bounds(frames, balance)
                 np.clip(w, *bounds, out=w)
             report = self.newton.solve(problem, w, tolerance, model.rounding, bounds)
+            if frames is not None:
+                self._snap(w, bounds)
             newton += report.newton
             linear += report.linear
             if not report.converged:
@@ -95,7 +97,7 @@ class ImplicitStepper(Stepper):
                 f"step {state.step + 1}, t = {balance.time:.6g} s: the nodes that touch walls could not be settled in "
                 f"{_ROUNDS} solves; take a smaller time step"
             )
-        walls, contacts = self._forces(problem, frames, bounds, w, u)
+        walls, contacts = self._forces(problem, frames, bounds, w, u, report.norm)
         return Solution(u, problem.f if balance.weight else state.f, walls, newton, linear, contacts)
 
     def _tolerance(self, balance: Balance) -> float:
@@ -159,8 +161,17 @@ class ImplicitStepper(Stepper):
             return None
         return joined
 
-    def _forces(self, problem: StepProblem, frames, bounds, w: np.ndarray, u: np.ndarray) -> tuple[WallForces, int]:
-        """Contact and support forces from the balance at the solution."""
+    def _snap(self, w: np.ndarray, bounds: tuple[np.ndarray, np.ndarray]) -> None:
+        """Put unknowns that the solver counts as on a bound exactly there."""
+        within = 2.0 * zero_tolerance(self.model.length)
+        for bound in bounds:
+            near = np.abs(w - bound) <= within
+            w[near] = bound[near]
+
+    def _forces(
+        self, problem: StepProblem, frames, bounds, w: np.ndarray, u: np.ndarray, noise: float
+    ) -> tuple[WallForces, int]:
+        """Contact and support forces from the balance at the solution; ``noise`` [N] is what a free node has left."""
         model, state = self.model, self.state
         g = np.empty_like(u)
         problem.imbalance(u, g)
@@ -172,8 +183,8 @@ class ImplicitStepper(Stepper):
             lower, upper = bounds
             active = np.zeros((len(at), 3), dtype=np.int8)
             turned = np.einsum("nji,nj->ni", frames.inverse, g[at])
-            active[(w[at] <= lower[at]) & (turned > 0.0)] = -1
-            active[(w[at] >= upper[at]) & (turned < 0.0)] = 1
+            active[(w[at] <= lower[at]) & (turned > noise)] = -1
+            active[(w[at] >= upper[at]) & (turned < -noise)] = 1
             force, walls = model.contact.forces(frames, turned, active)
             state.contact[at] = force
             touching = (active != 0).any(axis=1)

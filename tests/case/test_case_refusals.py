@@ -37,7 +37,10 @@ REFUSED = {
     "unknown table": (["materials.steel.density=1.0"], ["materials", "did you mean 'material'?"]),
     "what is not there yet": (["static.steps=3"], ["static", "unknown key"]),
     "unknown generator": (["mesh.generator=rodd"], ['mesh.generator = "rodd"', "did you mean 'rod'?"]),
-    "unknown generator key": (["mesh.lenght=1.0"], ["mesh.lenght", "generator rod takes length, elements", "'length'?"]),
+    "unknown generator key": (
+        ["mesh.lenght=1.0"],
+        ["mesh.lenght", "generator rod takes length, elements", "'length'?"],
+    ),
     "generator and file": (["mesh.file=a.msh"], ["mesh", "exactly one of the keys generator, file"]),
     "unknown integrator": (["time.integrator=newmrk"], ["time.integrator", '"newmrk"', "did you mean 'newmark'?"]),
     "other scheme's key": (["time.beta=0.5"], ["time.beta", "central_differences takes no parameters"]),

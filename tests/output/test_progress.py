@@ -150,6 +150,7 @@ def test_other_ranks_say_nothing(tmp_path, capsys):
     assert capsys.readouterr() == ("", "")
 
 
+@pytest.mark.parallel
 def test_unwritable_log_is_refused_on_all_ranks(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match=r"log\.txt.*choose another output folder"):

@@ -52,9 +52,7 @@ def test_strided_arrays_and_nan_pass_unchanged():
     order = NaturalOrder(COMM, ids, n)
     wide = np.full((n, 6), np.nan)
     wide[:, ::2] = np.arange(3 * n).reshape(n, 3)
-    np.testing.assert_array_equal(
-        order.to_slab(wide[ids][:, ::2]), wide[order.first : order.first + order.count, ::2]
-    )
+    np.testing.assert_array_equal(order.to_slab(wide[ids][:, ::2]), wide[order.first : order.first + order.count, ::2])
 
 
 @pytest.mark.parametrize("wrong", [[0, 0], [0, 2], [-1, 0]])

@@ -97,3 +97,40 @@ class SyntheticResult:
             other = self.positions(max(0, index - 1))
             return (points - other) / self.times[1]
         return {"strain": strain, "stress": 2.1e11 * 0.001 * strain, "plastic_strain": np.abs(strain)}[name]
+
+
+def write_result(folder: Path, snapshots: int = 5) -> Path:
+    """A real result file of the case ``rod_impact`` with the motion made up; gives its path."""
+    from mpi4py import MPI
+
+    from pfem_petsc.case.schema import Case
+    from pfem_petsc.output.vtkhdf import ResultWriter
+
+    case = Case.load("rod_impact")
+    points, bars = rod(20)
+    made_up = SyntheticResult(folder / "result.vtkhdf", points, bars, case.wall, snapshots, end=5.0)
+    block = SimpleNamespace(section=0, start=0, counted=len(bars), stop=len(bars))
+    mesh = SimpleNamespace(comm=MPI.COMM_SELF, n_nodes=len(points), n_bars=len(bars), n_owned=len(points))
+    mesh.blocks, mesh.node_ids = [block], np.arange(len(points))
+    mesh.bars, mesh.bar_ids = bars.astype(np.int32), np.arange(len(bars))
+    columns = {name: np.shape(values)[1:] for name, values in made_up.history.items()}
+    writer = ResultWriter(
+        made_up.path,
+        MPI.COMM_SELF,
+        mesh,
+        point_fields=made_up.point_fields,
+        cell_fields=made_up.cell_fields,
+        columns=columns,
+        column_types={"step": np.int64},
+        case_text=case.to_toml(),
+        attributes={},
+    )
+    for row in range(len(made_up.history["time"])):
+        writer.append_history({name: values[row] for name, values in made_up.history.items()})
+    for i, time in enumerate(made_up.times):
+        fields = [
+            {name: made_up.field(name, i) for name in names} for names in (made_up.point_fields, made_up.cell_fields)
+        ]
+        writer.write_snapshot(time, i, made_up.positions(i), *fields)
+    writer.close()
+    return made_up.path

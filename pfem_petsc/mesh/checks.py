@@ -9,10 +9,13 @@ from ..errors import InputError
 from .exchange import Router
 from .slab import MeshSlab, slab_of
 
-__all__ = ["SHORT", "check_mesh"]
+__all__ = ["LARGE", "SHORT", "check_mesh"]
 
 SHORT = 1e-6
 """Bars shorter than this fraction of the mean length are reported as suspicious."""
+
+LARGE = 1e150
+"""Coordinates [m] from here on are refused with those that are no numbers: their squares are not."""
 
 _SHOWN = 5
 
@@ -55,9 +58,9 @@ def check_mesh(slab: MeshSlab, comm: MPI.Comm) -> list[str]:
 
 
 def _check_points(slab: MeshSlab, comm: MPI.Comm) -> None:
-    bad = np.flatnonzero(~np.isfinite(slab.points).all(axis=1))
+    bad = np.flatnonzero(~(np.abs(slab.points) < LARGE).all(axis=1))
     lines = [f"node {slab.first_node + i} at ({', '.join(f'{x:g}' for x in slab.points[i])})" for i in bad[:_SHOWN]]
-    _refuse(slab, comm, lines, len(bad), "nodes have coordinates that are not finite numbers", "correct the mesh")
+    _refuse(slab, comm, lines, len(bad), f"nodes have coordinates that are not numbers below {LARGE:g}", "correct them")
 
 
 def _check_ends(slab: MeshSlab, comm: MPI.Comm) -> None:

@@ -118,7 +118,7 @@ def _spacing(extents: np.ndarray, n: int) -> float:
         return 1.0
     low = high / n
     for _ in range(60):
-        middle = (low * high) ** 0.5
+        middle = low**0.5 * high**0.5
         if np.prod(extents / middle + 1.0) > n:
             low = middle
         else:

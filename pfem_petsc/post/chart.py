@@ -54,8 +54,9 @@ def thinned(time: np.ndarray, values: np.ndarray, points: int = _POINTS) -> tupl
     with np.errstate(invalid="ignore"):
         picked = np.stack([np.argmin(body, axis=1), np.argmax(body, axis=1)], axis=1)
     picked = np.sort(picked, axis=1) + stretch * np.arange(whole)[:, None]
-    rest = np.array([0, *range(whole * stretch, len(time)), len(time) - 1])
-    picked = np.unique(np.concatenate([picked.ravel(), rest]))
+    rest = values[whole * stretch - 1 :]  # shorter than a stretch; it overlaps by a point so that it is never empty
+    last = whole * stretch - 1 + np.array([np.argmin(rest), np.argmax(rest)])
+    picked = np.unique(np.concatenate([picked.ravel(), last, [0, len(time) - 1]]))
     return time[picked], values[picked]
 
 

@@ -1,0 +1,104 @@
+"""Curves: files, content, refusals."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from PIL import Image
+from synthetic import SyntheticResult, ring, write_result
+
+from pfem_petsc.errors import InputError
+from pfem_petsc.post.chart import thinned, window_mean
+from pfem_petsc.post.plot import balance_error, plot
+
+
+@pytest.fixture
+def result(tmp_path):
+    return SyntheticResult(tmp_path / "result.vtkhdf", *ring())
+
+
+def saturated(file) -> np.ndarray:
+    """Pixels (n, 3) with a colour: curves, not axes and text."""
+    picture = np.asarray(Image.open(file).convert("RGB")).reshape(-1, 3).astype(int)
+    return picture[np.ptp(picture, axis=1) > 60]
+
+
+def test_all_pictures_of_a_result_file(tmp_path):
+    file = write_result(tmp_path)
+    written = plot(file)
+    assert [path.name for path in written] == ["energies.png", "momentum.png", "probes.png", "walls.png", "solver.png"]
+    for path in written:
+        assert path.parent == tmp_path and len(saturated(path)) > 500
+
+
+def test_what_a_result_lacks_is_left_out(tmp_path, result):
+    result.history = {name: values for name, values in result.history.items() if "/" not in name}
+    names = [path.name for path in plot(result, tmp_path / "pictures")]
+    assert names == ["energies.png", "momentum.png", "solver.png"]
+
+
+def test_named_curves(tmp_path, result):
+    written = plot(result, tmp_path, curves=["kinetic_energy", "momentum", "probe/tip/velocity", "wall/wall/contacts"])
+    assert [path.name for path in written] == ["curves.png"] and len(saturated(written[0])) > 500
+    assert not (tmp_path / "energies.png").exists()
+
+
+def test_unknown_curve_is_refused_with_the_nearest(tmp_path, result):
+    with pytest.raises(InputError, match=r"no column 'kinetic_enrgy', did you mean 'kinetic_energy'\?"):
+        plot(result, tmp_path, curves=["kinetic_enrgy"])
+    with pytest.raises(InputError, match="no curves named"):
+        plot(result, tmp_path, curves=[])
+
+
+def test_empty_history_is_refused(tmp_path, result):
+    result.history = {name: values[:0] for name, values in result.history.items()}
+    with pytest.raises(InputError, match="history is empty"):
+        plot(result, tmp_path)
+
+
+def test_one_row_is_enough(tmp_path, result):
+    result.history = {name: values[:1] for name, values in result.history.items()}
+    assert len(plot(result, tmp_path)) == 5
+
+
+def test_folder_that_cannot_be_made_is_refused(tmp_path, result):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="cannot be written"):
+        plot(result, tmp_path / "file")
+
+
+def test_balance_error_counts_supply_against_storage_and_loss():
+    history = {
+        "kinetic_energy": np.array([10.0, 6.0]),
+        "elastic_energy": np.array([0.0, 3.0]),
+        "plastic_dissipation": np.array([0.0, 2.0]),
+        "external_work": np.array([0.0, 1.5]),
+        "contact_work": np.array([0.0, -0.75]),
+    }
+    assert balance_error(history) == pytest.approx([0.0, 6 + 3 + 2 - 1.5 + 0.75 - 10])
+
+
+def test_thinned_curve_keeps_spikes_and_ends():
+    time = np.linspace(0, 1, 100_003)
+    values = np.sin(7 * time)
+    values[54_321], values[77_777] = 50.0, -50.0
+    short_time, short = thinned(time, values, 1000)
+    assert len(short) < 1010 and np.all(np.diff(short_time) > 0)
+    assert {50.0, -50.0, values[0], values[-1]} <= set(short)
+    assert short_time[np.argmax(short)] == time[54_321]
+
+
+def integral(values, time):
+    return float(np.sum(0.5 * np.diff(time) * (values[1:] + values[:-1])))
+
+
+def test_window_mean_keeps_the_impulse_of_uneven_steps():
+    random = np.random.default_rng(1)
+    time = np.cumsum(random.uniform(0.5e-3, 1.5e-3, 400))
+    values = np.where(np.abs(time - time[200]) < 0.05, random.uniform(0, 2e3, 400), 0.0)
+    smooth = window_mean(time, values, 0.03)
+    assert integral(smooth, time) == pytest.approx(integral(values, time), rel=2e-3)
+    assert smooth.max() < 0.8 * values.max()
+    line = 3.0 * time - 1.0
+    inner = slice(50, 350)
+    assert window_mean(time, line, 0.03)[inner] == pytest.approx(line[inner], rel=1e-9, abs=1e-12)

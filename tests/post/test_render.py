@@ -1,0 +1,184 @@
+"""Pictures: not blank, walls seen, films complete, options refused, VTK's crash foreseen."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+from PIL import Image
+from synthetic import WALL, SyntheticResult, lattice, ring, rod, write_result
+
+from pfem_petsc.errors import InputError
+from pfem_petsc.post import headless
+from pfem_petsc.post.page import Page
+from pfem_petsc.post.render import render
+
+SMALL = (480, 270)
+
+
+def pixels(file) -> np.ndarray:
+    return np.asarray(Image.open(file).convert("RGB")).astype(int)
+
+
+def drawing(file) -> np.ndarray:
+    """The part of a frame without title, time and colour bar."""
+    picture = pixels(file)
+    left, top, width, height = Page.region_of((picture.shape[1], picture.shape[0]))
+    return picture[top : top + height, left : left + width]
+
+
+def inked(picture: np.ndarray) -> np.ndarray:
+    return (picture.min(axis=2) < 200).nonzero()
+
+
+def silent(text: str) -> None:
+    raise AssertionError(text)
+
+
+def draw(tmp_path, result=None, **options):
+    result = result or SyntheticResult(tmp_path / "result.vtkhdf", *ring())
+    options = {"size": SMALL, "video": "none", "poster": False, "note": silent, **options}
+    return render(result, tmp_path / "out", **options)
+
+
+def test_frames_film_and_poster_from_a_result_file(tmp_path):
+    file = write_result(tmp_path)
+    written = render(file, size=SMALL, fps=10, video="both", note=silent)
+    names = [path.relative_to(tmp_path).as_posix() for path in written]
+    frames = [f"frames/frame_{k:04d}.png" for k in range(5)]
+    assert names == ["render.png", "render.mp4", "render.gif", *frames]
+    for path in written:
+        if path.suffix == ".png":
+            assert len(np.unique(pixels(path).reshape(-1, 3), axis=0)) > 100
+    assert pixels(written[-1]).shape == (270, 480, 3)
+    count, seconds = imageio_ffmpeg.count_frames_and_secs(str(tmp_path / "render.mp4"))
+    assert count == 5 and seconds == pytest.approx(0.5, abs=0.01)
+    assert Image.open(tmp_path / "render.gif").n_frames == 5
+
+
+def test_folder_is_as_good_as_the_file_and_old_frames_go(tmp_path):
+    write_result(tmp_path, snapshots=4)
+    render(tmp_path, size=SMALL, video="none", poster=False)
+    written = render(tmp_path, size=SMALL, video="none", poster=False, frames=2)
+    assert sorted((tmp_path / "frames").iterdir()) == written and len(written) == 2
+
+
+def test_odd_sizes_make_a_film(tmp_path):
+    draw(tmp_path, size=(321, 241), video="mp4", frames=3)
+    reader = imageio_ffmpeg.read_frames(str(tmp_path / "out" / "render.mp4"))
+    meta = next(reader)
+    reader.close()
+    assert meta["size"] == (322, 242) and meta["pix_fmt"].startswith("yuv420p") and meta["codec"] == "h264"
+
+
+def test_wall_is_seen_where_it_is(tmp_path):
+    with_wall = drawing(draw(tmp_path, frames=[0])[0])
+    result = SyntheticResult(tmp_path / "x", *ring())
+    other = SimpleNamespace(**{**vars(WALL), "point": (-1.2, 0.0, 0.0), "normal": (1.0, 0.0, 0.0)})
+    result.case.wall = [other]
+    turned = drawing(draw(tmp_path, result, frames=[0])[0])
+    # the wall is the only thing at the upper edge of the structure's field: right of it, or left when turned
+    columns = [inked(picture[: picture.shape[0] // 22])[1].mean() / picture.shape[1] for picture in (with_wall, turned)]
+    assert columns[0] > 0.6 and columns[1] < 0.4
+    # it fades out on the side that nodes cannot reach
+    row = with_wall[with_wall.shape[0] // 22, :, 0]
+    darkest = int(np.argmin(row))
+    assert row[darkest - 3] == 255 and row[darkest] < 150 < row[darkest + 8] < 255
+
+
+def test_unknown_wall_is_left_out_with_a_note(tmp_path):
+    notes = []
+    result = SyntheticResult(tmp_path / "x", *ring())
+    result.case.wall = [SimpleNamespace(type="pyramid", name="tomb")]
+    draw(tmp_path, result, frames=[0], note=notes.append)
+    assert notes == ["wall 'tomb' is left out of the picture: type 'pyramid' has no drawing"]
+
+
+def test_camera_stays_and_the_structure_moves(tmp_path):
+    files = draw(tmp_path, frames=[0, 6])
+    first, last = (drawing(file) for file in files)
+    assert inked(last)[1].min() > inked(first)[1].min() + 3  # it flew to the right
+    edge = first.shape[0] // 22
+    assert np.array_equal(first[edge], last[edge])  # only wall here, not moved
+    for picture in (first, last):
+        rows, columns = inked(picture)
+        assert rows.min() > 0 and rows.max() < picture.shape[0] - 1
+        assert columns.min() > 0 and columns.max() < picture.shape[1] - 1
+
+
+def test_stress_shows_in_colour(tmp_path):
+    rest, hit = (drawing(file) for file in draw(tmp_path, frames=[0, 6]))
+
+    def blue(picture):
+        return int(((picture[..., 2] - picture[..., 0]) > 70).sum())
+
+    assert blue(rest) == 0 and blue(hit) > 30
+
+
+def test_point_field_and_component(tmp_path):
+    files = draw(tmp_path, field="velocity", component="x", frames=[3, 9])
+    there, back = (drawing(file) for file in files)
+    warm = [int(((p[..., 0] - p[..., 2]) > 70).sum()) for p in (there, back)]
+    cold = [int(((p[..., 2] - p[..., 0]) > 70).sum()) for p in (there, back)]
+    assert warm[0] > 10 * max(1, cold[0]) and cold[1] > 10 * max(1, warm[1])
+
+
+@pytest.mark.parametrize("structure", [rod, lattice])
+def test_other_shapes_fill_the_picture(tmp_path, structure):
+    rows, columns = inked(drawing(draw(tmp_path, SyntheticResult(tmp_path / "x", *structure()), frames=[0])[0]))
+    assert max(np.ptp(rows) / 217, np.ptp(columns) / 416) > 0.6
+
+
+def test_many_bars_are_drawn_as_lines(tmp_path):
+    result = SyntheticResult(tmp_path / "x", *lattice(11))
+    assert result.n_bars > 5000
+    picture = drawing(draw(tmp_path, result, frames=[6], field="velocity")[0])
+    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 500
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"field": "stres"}, "did you mean 'stress'"),
+        ({"field": "velocity", "component": "w"}, "not one of x, y, z"),
+        ({"component": "x"}, "one value only"),
+        ({"view": "top"}, "auto, xy, xz, yz, iso"),
+        ({"video": "avi"}, "mp4, gif, both, none"),
+        ({"frames": [99]}, "snapshots 0 to 12"),
+        ({"frames": 0}, "must be positive"),
+        ({"clim": (1.0, 1.0)}, "increasing"),
+        ({"cmap": "viridiss"}, "did you mean 'viridis'"),
+        ({"fps": 0}, "fps = 0"),
+        ({"size": (10, 10)}, "160 to 8192"),
+    ],
+)
+def test_refused_options(tmp_path, options, message):
+    with pytest.raises(InputError, match=message):
+        draw(tmp_path, **options)
+
+
+def test_folder_that_cannot_be_made_is_refused(tmp_path):
+    (tmp_path / "out").write_text("")
+    with pytest.raises(InputError, match="cannot be written here"):
+        draw(tmp_path, frames=[0])
+
+
+def test_crash_of_the_graphics_is_foreseen(monkeypatch):
+    """A probe that dies like VTK without OpenGL ends in a message of what to install, not in a dead process."""
+    monkeypatch.setattr(headless, "_PROBE", "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)")
+    with pytest.raises(InputError, match=r"libosmesa6.*libegl1 libgl1-mesa-dri"):
+        headless.require_rendering.__wrapped__()
+
+
+def test_a_display_that_is_not_there_does_not_matter(tmp_path):
+    environment = {**os.environ, "DISPLAY": ":987"}
+    environment.pop(headless.VARIABLE, None)
+    code = "import os, pfem_petsc.post.headless as h; h.require_rendering(); print(os.environ[h.VARIABLE])"
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=200)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.strip() in ("vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow")

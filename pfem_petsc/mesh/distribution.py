@@ -103,7 +103,7 @@ def distribute(slab: MeshSlab, bar_section: np.ndarray, comm: MPI.Comm, partitio
     Returns
     -------
     DistributedMesh
-        The same for the same mesh, number of ranks and partitioner.
+        The same in every run of the same mesh, number of ranks and partitioner.
     """
     mesh = DistributedMesh()
     mesh.comm = comm

@@ -28,7 +28,8 @@ def partition(slab: MeshSlab, comm: MPI.Comm, partitioner: str = "auto") -> tupl
     partitioner : str
         ``"ptscotch"`` cuts few bars (PETSc must have been built with it); ``"coordinates"`` cuts a space-filling
         curve into equal parts, whatever the slabs; ``"auto"`` takes the second for structured meshes and where
-        PETSc lacks the first.
+        PETSc lacks the first. Both give the same in every run; ``"ptscotch"`` draws on random numbers that go on from
+        call to call, so a second call in one process may differ.
 
     Returns
     -------

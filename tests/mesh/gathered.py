@@ -1,0 +1,68 @@
+"""Whole meshes put together from the ranks' parts, to check them against."""
+
+from __future__ import annotations
+
+import numpy as np
+from mpi4py import MPI
+
+from pfem_petsc.mesh.slab import MeshSlab, slab_range
+
+
+def whole(slab: MeshSlab, comm: MPI.Comm) -> MeshSlab:
+    """The mesh of all slabs, on every rank."""
+
+    def joined(parts: np.ndarray) -> np.ndarray:
+        return np.concatenate(comm.allgather(parts))
+
+    return MeshSlab(
+        n_nodes=slab.n_nodes,
+        n_bars=slab.n_bars,
+        first_node=0,
+        points=joined(slab.points),
+        first_bar=0,
+        bars=joined(slab.bars).astype(np.int64),
+        node_groups={name: joined(members) for name, members in slab.node_groups.items()},
+        bar_groups={name: joined(members) for name, members in slab.bar_groups.items()},
+        source=slab.source,
+        structured=slab.structured,
+        warnings=slab.warnings,
+    )
+
+
+def slab_from(
+    points: np.ndarray,
+    bars: np.ndarray,
+    comm: MPI.Comm,
+    node_groups: dict[str, list[int]] | None = None,
+    bar_groups: dict[str, list[int]] | None = None,
+) -> MeshSlab:
+    """This rank's slab of a small mesh that every rank has whole."""
+    points, bars = np.asarray(points, dtype=float).reshape(-1, 3), np.asarray(bars, dtype=np.int64).reshape(-1, 2)
+    nodes = slab_range(len(points), comm.rank, comm.size)
+    edges = slab_range(len(bars), comm.rank, comm.size)
+
+    def members(groups: dict[str, list[int]] | None, first: int, last: int) -> dict[str, np.ndarray]:
+        arrays = {name: np.array(sorted(numbers), dtype=np.int64) for name, numbers in (groups or {}).items()}
+        return {name: numbers[(numbers >= first) & (numbers < last)] for name, numbers in arrays.items()}
+
+    return MeshSlab(
+        n_nodes=len(points),
+        n_bars=len(bars),
+        first_node=nodes[0],
+        points=points[slice(*nodes)],
+        first_bar=edges[0],
+        bars=bars[slice(*edges)],
+        node_groups=members(node_groups, *nodes),
+        bar_groups=members(bar_groups, *edges),
+        source="test mesh",
+    )
+
+
+def stiffness_modes(points: np.ndarray, bars: np.ndarray) -> int:
+    """Motions of the nodes that stretch no bar: 6 for a braced space truss that floats."""
+    direction = points[bars[:, 1]] - points[bars[:, 0]]
+    direction /= np.linalg.norm(direction, axis=1)[:, None]
+    stretch = np.zeros((len(bars), len(points), 3))
+    stretch[np.arange(len(bars)), bars[:, 0]] = -direction
+    stretch[np.arange(len(bars)), bars[:, 1]] = direction
+    return 3 * len(points) - np.linalg.matrix_rank(stretch.reshape(len(bars), -1), tol=1e-8)

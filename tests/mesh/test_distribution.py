@@ -1,0 +1,211 @@
+import numpy as np
+import pytest
+from gathered import slab_from, whole
+
+from pfem_petsc.errors import InputError
+from pfem_petsc.mesh.distribution import distribute
+from pfem_petsc.mesh.generators import lattice, rod
+from pfem_petsc.mesh.ordering import hilbert_keys, sweep_keys
+
+pytestmark = pytest.mark.parallel
+
+PARTITIONERS = ["coordinates", "ptscotch"]
+
+
+def five_nodes(comm):
+    """A square pyramid, its base, and one bar turned round; on 8 ranks some own nothing."""
+    points = [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0.5, 0.5, 1]]
+    bars = [[0, 1], [1, 2], [2, 3], [3, 0], [4, 0], [1, 4], [2, 4], [3, 4], [0, 2]]
+    return slab_from(points, bars, comm, {"top": [4], "base": [0, 1, 2, 3]}, {"edges": [4, 5, 6, 7], "none": []})
+
+
+def irregular(comm):
+    """Random points joined to some others, numbered at random, with groups."""
+    random = np.random.default_rng(5)
+    points = random.uniform(-1, 3, (200, 3)) * [4.0, 1.0, 0.2]
+    pairs = random.integers(0, 200, (900, 2))
+    pairs = pairs[pairs[:, 0] != pairs[:, 1]]
+    pairs = np.concatenate([pairs, np.stack([np.arange(199), np.arange(1, 200)], 1)])
+    _, first = np.unique(np.sort(pairs, axis=1), axis=0, return_index=True)
+    pairs = random.permutation(pairs[first])
+    return slab_from(points, pairs, comm, {"some": range(0, 200, 7)}, {"third": range(0, len(pairs), 3)})
+
+
+def cube(comm):
+    keys = lattice.Parameters(kind="cubic", cells=[4, 3, 5], pitch=0.1)
+    return lattice.generate(keys, comm.rank, comm.size)
+
+
+MESHES = {"five_nodes": five_nodes, "irregular": irregular, "cube": cube}
+
+
+@pytest.fixture(params=[(mesh, partitioner) for mesh in MESHES for partitioner in PARTITIONERS], ids="-".join)
+def case(request, comm):
+    """(whole mesh, its sections, the distributed mesh)"""
+    name, partitioner = request.param
+    slab = MESHES[name](comm)
+    section = ((np.arange(len(slab.bars)) + slab.first_bar) % 3).astype(np.int32)
+    mesh = distribute(slab, section, comm, partitioner)
+    yield whole(slab, comm), np.arange(slab.n_bars) % 3, mesh
+    mesh.close()
+
+
+def test_every_node_is_owned_once_and_numbered_in_order(comm, case):
+    original, _, mesh = case
+    owned = np.concatenate(comm.allgather(mesh.node_ids[: mesh.n_owned]))
+    np.testing.assert_array_equal(np.sort(owned), np.arange(original.n_nodes))
+    assert mesh.first_node == sum(comm.allgather(mesh.n_owned)[: comm.rank])
+    assert mesh.n_local == mesh.n_owned + len(mesh.ghost_numbers) == len(mesh.node_ids) == len(mesh.points)
+    np.testing.assert_array_equal(mesh.points, original.points[mesh.node_ids])
+    # A ghost's PETSc number is its place among all owned nodes.
+    np.testing.assert_array_equal(owned[mesh.ghost_numbers], mesh.node_ids[mesh.n_owned :])
+    assert (np.diff(mesh.ghost_numbers) > 0).all()
+
+
+def test_every_bar_is_counted_once_where_its_first_end_is_owned(comm, case):
+    original, sections, mesh = case
+    np.testing.assert_array_equal(mesh.node_ids[mesh.bars], original.bars[mesh.bar_ids])
+    counted = [np.empty(0, np.int64)]
+    at = 0
+    for block in mesh.blocks:
+        assert block.start == at <= block.counted <= block.stop
+        at = block.stop
+        counted.append(mesh.bar_ids[block.start : block.counted])
+        assert set(sections[mesh.bar_ids[block.start : block.stop]]) == {block.section}
+        assert (mesh.bars[block.start : block.counted, 0] < mesh.n_owned).all()
+        assert (mesh.bars[block.counted : block.stop, 0] >= mesh.n_owned).all()
+    assert at == len(mesh.bars)
+    everywhere = np.concatenate(comm.allgather(np.concatenate(counted)))
+    np.testing.assert_array_equal(np.sort(everywhere), np.arange(original.n_bars))
+
+
+def test_all_bars_of_owned_nodes_are_here_and_no_others(case):
+    original, _, mesh = case
+    is_owned = np.zeros(original.n_nodes, bool)
+    is_owned[mesh.node_ids[: mesh.n_owned]] = True
+    expected = np.flatnonzero(is_owned[original.bars].any(axis=1))
+    np.testing.assert_array_equal(np.sort(mesh.bar_ids), expected)
+    ends = np.unique(original.bars[expected])
+    np.testing.assert_array_equal(np.sort(mesh.node_ids[mesh.n_owned :]), ends[~is_owned[ends]])
+
+
+def test_groups_keep_their_members(comm, case):
+    original, _, mesh = case
+    assert list(mesh.node_groups) == list(original.node_groups)
+    for name, members in mesh.node_groups.items():
+        assert (members < mesh.n_owned).all()
+        found = np.concatenate(comm.allgather(mesh.node_ids[members]))
+        np.testing.assert_array_equal(np.sort(found), np.sort(original.node_groups[name]))
+    assert list(mesh.bar_groups) == list(original.bar_groups)
+    for name, members in mesh.bar_groups.items():
+        assert (np.diff(members) > 0).all()
+        here = np.intersect1d(original.bar_groups[name], mesh.bar_ids)
+        np.testing.assert_array_equal(np.sort(mesh.bar_ids[members]), here)
+
+
+@pytest.mark.parametrize("columns", [1, 3, 7])
+def test_ghosts_take_the_owners_values(case, columns):
+    _, _, mesh = case
+    wanted = mesh.node_ids[:, None] * 10.0 + np.arange(columns)
+    for offset in (0.0, 0.25):
+        values = np.full((mesh.n_local, columns), np.nan)
+        values[: mesh.n_owned] = wanted[: mesh.n_owned] + offset
+        mesh.update_ghosts(values)
+        np.testing.assert_array_equal(values, wanted + offset)
+
+
+def test_updates_of_different_width_may_overlap(case):
+    _, _, mesh = case
+    one, three = np.zeros(mesh.n_local), np.zeros((mesh.n_local, 3))
+    one[: mesh.n_owned] = mesh.node_ids[: mesh.n_owned]
+    three[: mesh.n_owned] = mesh.points[: mesh.n_owned]
+    mesh.begin_update(three)
+    mesh.begin_update(one)
+    mesh.end_update(three)
+    mesh.end_update(one)
+    np.testing.assert_array_equal(one, mesh.node_ids)
+    np.testing.assert_array_equal(three, mesh.points)
+
+
+def test_arrays_that_cannot_be_updated_are_refused(case):
+    _, _, mesh = case
+    if mesh.n_neighbours:
+        for wrong in (np.zeros((mesh.n_local + 1, 2)), np.zeros((mesh.n_local, 2), np.float32)):
+            with pytest.raises(ValueError, match="ghosts are updated in"):
+                mesh.update_ghosts(wrong)
+    else:
+        assert mesh.n_local == mesh.n_owned
+
+
+def test_parts_are_balanced(comm, case):
+    original, _, mesh = case
+    if mesh.partitioner == "coordinates":
+        assert abs(mesh.n_owned - original.n_nodes / comm.size) < 2
+    else:
+        assert mesh.n_owned < 1.3 * original.n_nodes / comm.size + 2
+
+
+def test_the_result_is_the_same_each_time(comm):
+    slabs = irregular(comm), irregular(comm)
+    meshes = [distribute(slab, np.zeros(len(slab.bars), np.int32), comm, "coordinates") for slab in slabs]
+    for name in ("node_ids", "ghost_numbers", "bars", "bar_ids"):
+        np.testing.assert_array_equal(getattr(meshes[0], name), getattr(meshes[1], name))
+
+
+def test_ranks_own_nothing_when_there_are_more_ranks_than_nodes(comm):
+    slab = rod.generate(rod.Parameters(length=1.0, elements=1), comm.rank, comm.size)
+    mesh = distribute(slab, np.zeros(len(slab.bars), np.int32), comm)
+    assert comm.allreduce(mesh.n_owned) == 2
+    assert comm.allreduce(sum(block.counted - block.start for block in mesh.blocks)) == 1
+    values = np.zeros((mesh.n_local, 2))
+    values[: mesh.n_owned] = 1.0
+    mesh.update_ghosts(values)
+    assert (values == 1.0).all()
+
+
+def test_partitioner_is_chosen_by_the_mesh(comm):
+    one_rank = "none (one rank)"
+    for slab, used in ((cube(comm), "coordinates"), (irregular(comm), "ptscotch")):
+        mesh = distribute(slab, np.zeros(len(slab.bars), np.int32), comm)
+        assert mesh.partitioner in (used, one_rank, "coordinates")
+        assert (mesh.partitioner == one_rank) == (comm.size == 1)
+    with pytest.raises(InputError, match="unknown value 'metis'"):
+        distribute(slab, np.zeros(len(slab.bars), np.int32), comm, "metis")
+
+
+def test_hilbert_curve_visits_neighbour_after_neighbour():
+    n = 8
+    points = np.indices((n, n, n)).reshape(3, -1).T.astype(float)
+    order = np.argsort(hilbert_keys(points, np.zeros(3), float(n - 1)))
+    steps = np.abs(np.diff(points[order], axis=0)).sum(axis=1)
+    np.testing.assert_array_equal(steps, 1.0)
+
+
+@pytest.mark.parametrize("cells", [[5, 5, 5], [9, 4, 2]])
+def test_a_lattice_is_swept_in_its_own_order(cells):
+    mesh = lattice.generate(lattice.Parameters(kind="cubic", cells=cells, pitch=0.013), 0, 1)
+    np.testing.assert_array_equal(np.argsort(sweep_keys(mesh.points), kind="stable"), np.arange(mesh.n_nodes))
+
+
+def test_bars_lie_close_to_each_other_in_memory(comm):
+    """A lattice numbered at random is brought back to bars that span little more than a layer of nodes."""
+    n = 9
+    mesh = lattice.generate(lattice.Parameters(kind="cubic", cells=[n, n, n], pitch=1.0), 0, 1)
+    shuffled = np.random.default_rng(1).permutation(mesh.n_nodes)
+    points = np.empty_like(mesh.points)
+    points[shuffled] = mesh.points
+    slab = slab_from(points, shuffled[mesh.bars], comm)
+    local = distribute(slab, np.zeros(len(slab.bars), np.int32), comm, "coordinates")
+    span = np.abs(np.diff(local.bars[(local.bars < local.n_owned).all(axis=1)], axis=1))
+    assert span.max() <= (n + 1) ** 2 + (n + 1)
+
+
+def test_widths_of_one_row_arrays_on_one_rank():
+    from mpi4py import MPI
+
+    slab = five_nodes(MPI.COMM_SELF)
+    mesh = distribute(slab, np.full(len(slab.bars), 2, np.int32), MPI.COMM_SELF)
+    (block,) = mesh.blocks
+    assert (block.section, block.start, block.counted, block.stop) == (2, 0, 9, 9)
+    mesh.update_ghosts(mesh.points)
+    assert mesh.n_neighbours == 0

@@ -1,0 +1,175 @@
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from gathered import stiffness_modes, whole
+from pydantic import ValidationError
+
+from pfem_petsc.errors import InputError
+from pfem_petsc.mesh.checks import check_mesh
+from pfem_petsc.mesh.generators import lattice, ring, rod
+
+pytestmark = pytest.mark.parallel
+
+GENERATED = {
+    "rod": (rod, {"length": 2.0, "elements": 7}),
+    "ring": (ring, {"outer_radius": 3.0, "inner_radius": 2.5, "bays": 9}),
+    "ring_single_flat": (
+        ring,
+        {"outer_radius": 3.0, "inner_radius": 2.5, "bays": 8, "bracing": "single", "orientation": "flat"},
+    ),
+    "cubic": (lattice, {"kind": "cubic", "cells": [2, 3, 4], "pitch": 0.1}),
+    "octet": (lattice, {"kind": "octet", "cells": [3, 2, 2], "pitch": 0.1}),
+    "bcc": (lattice, {"kind": "bcc", "cells": [2, 2, 3], "pitch": 0.1}),
+    "one_cell": (lattice, {"kind": "cubic", "cells": [1, 1, 1], "pitch": 1.0}),
+}
+
+
+def made(module, comm, **keys):
+    return module.generate(module.Parameters(**keys), comm.rank, comm.size)
+
+
+def reference_cubic(n):
+    """Edges and both face diagonals of n^3 cubes, in the order and numbering of the shared reference lattice."""
+    m = n + 1
+    k = np.arange(m**3).reshape(m, m, m)
+    a, b, w = slice(0, n), slice(1, m), slice(None)
+    pairs = [((a, w, w), (b, w, w)), ((w, a, w), (w, b, w)), ((w, w, a), (w, w, b)), ((a, a, w), (b, b, w))]
+    pairs += [((b, a, w), (a, b, w)), ((a, w, a), (b, w, b)), ((b, w, a), (a, w, b)), ((w, a, a), (w, b, b))]
+    pairs += [((w, b, a), (w, a, b))]
+    return np.concatenate([np.stack([k[one].ravel(), k[two].ravel()], 1) for one, two in pairs])
+
+
+@pytest.mark.parametrize("name", GENERATED)
+def test_every_rank_makes_its_part_of_the_same_sound_mesh(comm, name):
+    module, keys = GENERATED[name]
+    slab = made(module, comm, **keys)
+    mesh, alone = whole(slab, comm), module.generate(module.Parameters(**keys), 0, 1)
+    assert (mesh.n_nodes, mesh.n_bars) == (len(mesh.points), len(mesh.bars))
+    np.testing.assert_array_equal(mesh.points, alone.points)
+    np.testing.assert_array_equal(mesh.bars, alone.bars)
+    for kind in ("node_groups", "bar_groups"):
+        assert list(getattr(slab, kind)) == list(getattr(alone, kind))
+        for group, members in getattr(alone, kind).items():
+            np.testing.assert_array_equal(np.sort(getattr(mesh, kind)[group]), members)
+    slab.structured = False
+    assert check_mesh(slab, comm) == []
+
+
+@pytest.mark.parametrize(("n", "nodes", "bars"), [(10, 1_331, 10_230), (22, 12_167, 101_706), (48, 117_649, 1_023_120)])
+def test_cubic_lattice_has_the_bars_of_the_reference(comm, n, nodes, bars):
+    mesh = whole(made(lattice, comm, kind="cubic", cells=[n, n, n], pitch=0.01), comm)
+    assert (mesh.n_nodes, mesh.n_bars) == (nodes, bars)
+    np.testing.assert_array_equal(mesh.bars, reference_cubic(n))
+    np.testing.assert_array_equal(mesh.points, np.indices((n + 1,) * 3).reshape(3, -1).T * 0.01)
+
+
+def test_octet_bars_join_all_nearest_neighbours(comm):
+    pitch = 0.2
+    mesh = whole(made(lattice, comm, kind="octet", cells=[3, 3, 3], pitch=pitch), comm)
+    length = np.linalg.norm(mesh.points[mesh.bars[:, 1]] - mesh.points[mesh.bars[:, 0]], axis=1)
+    np.testing.assert_allclose(length, pitch / np.sqrt(2), rtol=1e-12)
+    distance = np.linalg.norm(mesh.points[:, None] - mesh.points[None], axis=2)
+    assert mesh.n_bars == np.count_nonzero(np.abs(distance - pitch / np.sqrt(2)) < 1e-9) / 2
+    interior = ((mesh.points > 0.1 * pitch) & (mesh.points < 2.9 * pitch)).all(axis=1)
+    bars_of_node = np.bincount(mesh.bars.ravel(), minlength=mesh.n_nodes)
+    assert set(bars_of_node[interior]) == {12}
+    # 4 nodes a cell and 12 x 4 / 2 bars a cell inside; the faces add theirs.
+    assert mesh.n_nodes == 4**3 + 3 * 4 * 3 * 3
+    assert mesh.n_bars == 4 * 3 * 4 * 9 + 12 * 27
+
+
+def test_bcc_has_half_diagonals_and_edges(comm):
+    mesh = whole(made(lattice, comm, kind="bcc", cells=[3, 3, 3], pitch=2.0), comm)
+    length = np.linalg.norm(mesh.points[mesh.bars[:, 1]] - mesh.points[mesh.bars[:, 0]], axis=1)
+    assert np.count_nonzero(np.isclose(length, np.sqrt(3.0))) == 8 * 27
+    assert np.count_nonzero(np.isclose(length, 2.0)) == 3 * 3 * 16
+
+
+@pytest.mark.parametrize("kind", ["cubic", "octet", "bcc"])
+def test_lattices_are_no_mechanisms(comm, kind):
+    mesh = whole(made(lattice, comm, kind=kind, cells=[2, 2, 3], pitch=1.0), comm)
+    assert stiffness_modes(mesh.points, mesh.bars) == 6
+
+
+@pytest.mark.parametrize("kind", ["cubic", "octet", "bcc"])
+def test_lattice_faces_are_node_groups(comm, kind):
+    cells, pitch = [2, 3, 4], 0.5
+    mesh = whole(made(lattice, comm, kind=kind, cells=cells, pitch=pitch), comm)
+    for axis, names in enumerate((("left", "right"), ("front", "back"), ("bottom", "top"))):
+        for name, value in zip(names, (0.0, cells[axis] * pitch)):
+            np.testing.assert_array_equal(
+                np.sort(mesh.node_groups[name]), np.flatnonzero(np.isclose(mesh.points[:, axis], value))
+            )
+
+
+def test_rod_lies_on_the_x_axis(comm):
+    mesh = whole(made(rod, comm, length=1.0, elements=20), comm)
+    np.testing.assert_array_equal(mesh.points[:, 0], np.arange(21) / 20)
+    assert not mesh.points[:, 1:].any()
+    np.testing.assert_array_equal(mesh.bars, list(pairwise(range(21))))
+    assert mesh.node_groups["start"].tolist() == [0]
+    assert mesh.node_groups["end"].tolist() == [20]
+    np.testing.assert_array_equal(mesh.bar_groups["rod"], np.arange(20))
+
+
+@pytest.mark.parametrize("bracing", ["x", "single"])
+@pytest.mark.parametrize("orientation", ["vertex", "flat"])
+@pytest.mark.parametrize("bays", [7, 14])
+def test_ring_is_a_braced_plane_truss(comm, bays, orientation, bracing):
+    outer, inner = 22.83, 22.37
+    keys = {"outer_radius": outer, "inner_radius": inner, "bays": bays, "bracing": bracing, "orientation": orientation}
+    mesh = whole(made(ring, comm, **keys), comm)
+    assert (mesh.n_nodes, mesh.n_bars) == (2 * bays, (5 if bracing == "x" else 4) * bays)
+    radius = np.hypot(mesh.points[:, 0], mesh.points[:, 1])
+    np.testing.assert_allclose(radius, np.repeat([outer, inner], bays), rtol=1e-14)
+    length = np.linalg.norm(mesh.points[mesh.bars[:, 1]] - mesh.points[mesh.bars[:, 0]], axis=1)
+    half = np.pi / bays
+    expected = {
+        "outer": 2 * outer * np.sin(half),
+        "inner": 2 * inner * np.sin(half),
+        "radial": outer - inner,
+        "diagonal": np.sqrt(outer**2 + inner**2 - 2 * outer * inner * np.cos(2 * half)),
+    }
+    assert list(mesh.bar_groups) == list(expected)
+    for name, value in expected.items():
+        np.testing.assert_allclose(length[mesh.bar_groups[name]], value, rtol=1e-12)
+    x = mesh.points[:, 0]
+    np.testing.assert_array_equal(mesh.node_groups["impact"], np.flatnonzero(x > x.max() - 1e-9))
+    np.testing.assert_array_equal(mesh.node_groups["opposite"], np.flatnonzero(x < x.min() + 1e-9))
+    assert len(mesh.node_groups["impact"]) == (1 if orientation == "vertex" else 2)
+    # Held in its plane it has the three rigid motions left, and each node's own motion out of the plane.
+    assert stiffness_modes(mesh.points, mesh.bars) == 3 + 2 * bays
+
+
+@pytest.mark.parametrize(
+    ("module", "keys", "text"),
+    [
+        (rod, {"length": 1.0, "elements": 800_000_000}, "mesh.elements: 800,000,001 nodes"),
+        (lattice, {"cells": [100_000, 100_000, 100_000], "pitch": 1.0}, "mesh.cells"),
+        (lattice, {"cells": [1, 1, 1], "pitch": 1e-300}, "mesh.pitch"),
+        (rod, {"length": 1e-300, "elements": 2}, "mesh.length"),
+    ],
+)
+def test_sizes_that_cannot_be_computed_with_are_refused(comm, module, keys, text):
+    from petsc4py import PETSc
+
+    if np.iinfo(PETSc.IntType).bits == 64 and "nodes" in text:
+        pytest.skip("this PETSc numbers so many unknowns")
+    with pytest.raises(InputError, match=text):
+        made(module, comm, **keys)
+
+
+@pytest.mark.parametrize(
+    ("module", "keys"),
+    [
+        (ring, {"outer_radius": 1.0, "inner_radius": 1.0, "bays": 8}),
+        (ring, {"outer_radius": 1.0, "inner_radius": 0.5, "bays": 2}),
+        (rod, {"length": 1.0, "elements": 0}),
+        (lattice, {"kind": "cubic", "cells": [1, 1], "pitch": 1.0}),
+        (lattice, {"kind": "kagome", "cells": [1, 1, 1], "pitch": 1.0}),
+    ],
+)
+def test_keys_are_checked(module, keys):
+    with pytest.raises(ValidationError):
+        module.Parameters(**keys)

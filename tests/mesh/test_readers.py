@@ -1,0 +1,134 @@
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from gathered import stiffness_modes, whole
+from samples import BARS, GMSH, LEGS, POINTS, TOP, write_hdf5, write_vtk
+
+from pfem_petsc.errors import InputError
+from pfem_petsc.mesh import load_slab
+from pfem_petsc.mesh.generators import lattice, ring
+from pfem_petsc.mesh.readers import hdf5, read_slab
+from pfem_petsc.mesh.slab import slab_range
+
+pytestmark = pytest.mark.parallel
+
+MESHES = Path(__file__).parents[2] / "meshes"
+
+
+def written(comm, folder, name, content):
+    path = folder / name
+    if comm.rank == 0:
+        content(path) if callable(content) else path.write_bytes(content)
+    comm.Barrier()
+    return path
+
+
+def read(path, comm):
+    return load_slab(SimpleNamespace(generator=None, file=path), comm)
+
+
+def check_sample(mesh, tops=("top",), legs=("legs",)):
+    np.testing.assert_array_equal(mesh.points, POINTS)
+    np.testing.assert_array_equal(mesh.bars, BARS)
+    for name in tops:
+        assert mesh.node_groups[name].tolist() == TOP
+    for name in legs:
+        assert sorted(mesh.bar_groups[name].tolist()) == LEGS
+
+
+@pytest.mark.parametrize("kind", GMSH)
+def test_gmsh(comm, shared_tmp_path, kind):
+    slab = read(written(comm, shared_tmp_path, "truss.msh", GMSH[kind]), comm)
+    assert slab.first_bar == slab_range(6, comm.rank, comm.size)[0]
+    check_sample(whole(slab, comm))
+    (warning,) = slab.warnings
+    assert warning.endswith("left out 1 elements that are neither lines nor points")
+
+
+def test_gmsh_with_windows_line_ends_and_other_sections(comm, shared_tmp_path):
+    content = GMSH["2.2 ascii"].replace(b"$Nodes", b"$Comments\n5 $ x\n$EndComments\n$Nodes").replace(b"\n", b"\r\n")
+    check_sample(whole(read(written(comm, shared_tmp_path, "truss.msh", content), comm), comm))
+
+
+@pytest.mark.parametrize("version", ["gmsh22", "gmsh"])
+@pytest.mark.parametrize("binary", [False, True])
+def test_gmsh_written_by_meshio(comm, shared_tmp_path, version, binary):
+    meshio = pytest.importorskip("meshio")
+
+    def write(path):
+        mesh = meshio.Mesh(POINTS, [("line", BARS)])
+        mesh.write(path, file_format=version, binary=binary)
+
+    check_sample(whole(read(written(comm, shared_tmp_path, "truss.msh", write), comm), comm), (), ())
+
+
+@pytest.mark.parametrize("suffix", ["vtu", "vtkhdf"])
+def test_vtk(comm, shared_tmp_path, suffix):
+    mesh = whole(read(written(comm, shared_tmp_path, f"truss.{suffix}", write_vtk), comm), comm)
+    check_sample(mesh, ("group_2",), ("legs" if suffix == "vtu" else "section_1",))
+    assert list(mesh.node_groups) == ["group_2"]
+
+
+def test_hdf5_of_another_writer(comm, shared_tmp_path):
+    check_sample(whole(read(written(comm, shared_tmp_path, "truss.h5", write_hdf5), comm), comm))
+
+
+def test_hdf5_gives_back_what_was_written(comm, shared_tmp_path):
+    keys = lattice.Parameters(kind="octet", cells=[3, 4, 2], pitch=0.37)
+    slab = lattice.generate(keys, comm.rank, comm.size)
+    slab.bar_groups["every_third"] = np.arange(slab.first_bar, slab.first_bar + len(slab.bars), 3)
+    path = shared_tmp_path / "lattice.h5"
+    hdf5.write_hdf5(path, slab, comm)
+    again = read(path, comm)
+    for name in ("n_nodes", "n_bars", "first_node", "first_bar"):
+        assert getattr(again, name) == getattr(slab, name)
+    np.testing.assert_array_equal(again.points, slab.points)
+    np.testing.assert_array_equal(again.bars, slab.bars)
+    for kind in ("node_groups", "bar_groups"):
+        groups, original = getattr(again, kind), getattr(slab, kind)
+        assert sorted(groups) == sorted(original)
+        for name in groups:
+            np.testing.assert_array_equal(groups[name], np.sort(original[name]))
+
+
+def test_the_ring_in_the_repository_is_the_generators(comm):
+    keys = {"outer_radius": 22.83, "inner_radius": 22.37, "bays": 14, "bracing": "x", "orientation": "vertex"}
+    original = ring.generate(ring.Parameters(**keys), 0, 1)
+    mesh = whole(read(MESHES / "ring.msh", comm), comm)
+    # The file holds the numbers of the machine that made it, whose sines may differ in the last digit.
+    np.testing.assert_allclose(mesh.points, original.points, rtol=0, atol=1e-13)
+    np.testing.assert_array_equal(mesh.bars, original.bars)
+    assert mesh.node_groups["impact"].tolist() == [0]
+    assert mesh.node_groups["opposite"].tolist() == [7]
+    for name, members in original.bar_groups.items():
+        np.testing.assert_array_equal(np.sort(mesh.bar_groups[name]), members)
+
+
+@pytest.mark.parametrize(
+    ("name", "nodes", "bars", "node_groups", "bar_groups"),
+    [
+        ("space_truss.msh", 261, 1565, {"lowest": 1, "highest": 1}, {"skin": 354, "core": 1211}),
+        ("mast.vtu", 52, 222, {"base": 4, "head": 4}, {"legs": 48, "horizontals": 52, "braces": 122}),
+    ],
+)
+def test_the_other_meshes_in_the_repository_are_braced_trusses(comm, name, nodes, bars, node_groups, bar_groups):
+    slab = read(MESHES / name, comm)
+    assert slab.warnings == []
+    mesh = whole(slab, comm)
+    assert (mesh.n_nodes, mesh.n_bars) == (nodes, bars)
+    assert {group: len(members) for group, members in mesh.node_groups.items()} == node_groups
+    assert {group: len(members) for group, members in mesh.bar_groups.items()} == bar_groups
+    assert stiffness_modes(mesh.points, mesh.bars) == 6
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [("missing.msh", "cannot open .*missing.msh: No such file"), ("ring.stl", "no reader for 'ring.stl'; known.*.msh")],
+)
+def test_files_that_are_not_there_or_not_known(comm, shared_tmp_path, name, text):
+    if name != "missing.msh":
+        written(comm, shared_tmp_path, name, b"solid")
+    with pytest.raises(InputError, match=text):
+        read_slab(shared_tmp_path / name, comm)

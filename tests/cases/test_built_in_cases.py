@@ -1,0 +1,132 @@
+"""Every built-in case runs, and gives the number that its comments promise."""
+
+import numpy as np
+import pytest
+
+from pfem_petsc import Case, Simulation
+from pfem_petsc.case.builtin import built_in_cases
+from pfem_petsc.output.result import open_result
+
+pytestmark = pytest.mark.parallel
+
+NUMBERS = {}
+
+
+def number(function):
+    """The function checks the case it is named after."""
+    NUMBERS[function.__name__] = function
+    return function
+
+
+@pytest.fixture
+def run(comm, shared_tmp_path):
+    """Run a built-in case; gives its history as arrays, the same on all ranks."""
+
+    def run(name, *overrides):
+        simulation = Simulation(Case.load(name, overrides), comm, output=shared_tmp_path / name, quiet=True)
+        assert simulation.run() == 0
+        history = None
+        if comm.rank == 0:
+            result = open_result(shared_tmp_path / name)
+            history = {column: result.history[column] for column in result.history}
+        return comm.bcast(history)
+
+    return run
+
+
+def contacts(history, wall):
+    """First and last time [s] of each contact with a wall."""
+    touching = np.concatenate([[0], history[f"wall/{wall}/contacts"] > 0, [0]]).astype(int)
+    first, last = np.flatnonzero(np.diff(touching) == 1), np.flatnonzero(np.diff(touching) == -1) - 1
+    return list(zip(history["time"][first], history["time"][last], strict=True))
+
+
+def forces(history, wall):
+    """Wall force of each row [N]."""
+    return np.linalg.norm(history[f"wall/{wall}/force"], axis=1)
+
+
+@number
+def rod_impact(run):
+    """Contact from 0.1 to about 2.1; force spike 2.5 times rho c A v; 2.5 % of the energy lost (formulas: 5.1)."""
+    history = run("rod_impact")
+    ((first, last),) = contacts(history, "wall")
+    assert first == pytest.approx(0.1, abs=0.011)
+    assert last == pytest.approx(2.13, abs=0.021)
+    assert forces(history, "wall").max() == pytest.approx(2.5 * 0.5, rel=1e-6)
+    energy = history["kinetic_energy"] + history["elastic_energy"]
+    assert energy[-1] / energy[0] == pytest.approx(0.975, abs=1e-3)
+    assert history["momentum"][-1, 0] / history["momentum"][0, 0] == pytest.approx(-0.958, abs=1e-3)
+
+
+@number
+def bar_collision(run):
+    """Contact from 5.0 to 105.5 us, mean force 132.7 kN, mean rebound 4.92 m/s (formulas: 5.2)."""
+    history = run("bar_collision")
+    ((first, last),) = contacts(history, "symmetry")
+    assert first == pytest.approx(4.95e-6, abs=5.1e-7)
+    assert last == pytest.approx(105.25e-6, abs=5.1e-7)
+    force = forces(history, "symmetry")
+    assert force.max() == pytest.approx(297e3, rel=1e-3)
+    inside = (history["time"] > 5.1e-6) & (history["time"] < 98.9e-6)
+    assert force[inside].mean() == pytest.approx(133.5e3, rel=0.02)
+    assert 5.136 * history["momentum"][-1, 0] / history["momentum"][0, 0] == pytest.approx(-4.92, abs=0.01)
+
+
+@number
+def bar_collision_plastic(run):
+    """A plateau of 60.48 kN by plane wave theory, and a longer contact, to 173 us (formulas: 3.2, 5.2)."""
+    history = run("bar_collision_plastic")
+    ((_, last),) = contacts(history, "symmetry")
+    assert last == pytest.approx(173e-6, abs=1e-6)
+    plateau = (history["time"] > 20e-6) & (history["time"] < 90e-6)
+    assert forces(history, "symmetry")[plateau].mean() == pytest.approx(60.48e3, rel=0.02)
+    assert history["plastic_dissipation"][-1] > 0.5 * history["kinetic_energy"][0]
+
+
+@number
+def ring_impact(run):
+    """First contact from 5.0 to 35.0 ms (formulas: 5.3, candidate R1)."""
+    history = run("ring_impact", "time.end=0.04")
+    ((first, last),) = contacts(history, "wall")
+    assert first == pytest.approx(5.0e-3, abs=1e-4)
+    assert last == pytest.approx(35.0e-3, abs=1e-4)
+
+
+@number
+def lattice_drop(run):
+    """A smaller one: leaves at 136 us with 4.11 m/s, by an independent computation with half the step."""
+    history = run("lattice_drop", "mesh.cells=[8, 8, 8]", "node_set.top.nearest=[0.08, 0.08, 0.08]", "time.end=2e-4")
+    episodes = contacts(history, "floor")
+    assert episodes[0][0] == pytest.approx(5e-6, abs=3e-6)
+    assert episodes[-1][1] == pytest.approx(136e-6, rel=0.03)
+    assert 20.0 * history["momentum"][-1, 2] / abs(history["momentum"][0, 2]) == pytest.approx(4.11, rel=0.02)
+
+
+@number
+def tumbling_lattice(run):
+    """Momentum and angular momentum to rounding, energy within its oscillation."""
+    history = run("tumbling_lattice", "time.end=0.05")
+    for name in ("momentum", "angular_momentum"):
+        assert np.abs(history[name] - history[name][0]).max() < 1e-12 * np.abs(history[name][0]).max()
+    energy = history["kinetic_energy"] + history["elastic_energy"]
+    assert np.abs(energy / energy[0] - 1.0).max() < 1e-5
+    assert history["elastic_energy"].max() > 0.01 * energy[0]
+
+
+@number
+def pendulum(run):
+    """Half a period of 1.184 s between two passages of the bottom, bar force there 3 m g (formulas: 3.5)."""
+    history = run("pendulum", "time.end=1.8")
+    x, time = history["probe/tip/position"][:, 0, 0], history["time"]
+    passed = np.flatnonzero(np.sign(x[1:]) != np.sign(x[:-1]))
+    bottom = time[passed] - x[passed] * (time[passed + 1] - time[passed]) / (x[passed + 1] - x[passed])
+    assert bottom[1] - bottom[0] == pytest.approx(2.36784 / 2, rel=2e-4)
+    tension = history["probe/hinge/reaction"][passed[0], 0]
+    weight = 0.05 * 9.81  # of the tip; the hinge carries its own half of the bar as well
+    assert np.linalg.norm(tension) == pytest.approx(4 * weight, rel=0.01)
+
+
+@pytest.mark.parametrize("name", built_in_cases())
+def test_promised_numbers(name, run):
+    NUMBERS[name](run)

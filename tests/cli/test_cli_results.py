@@ -1,0 +1,131 @@
+"""From a case to results, and from results to what is said and drawn about them, by the command line."""
+
+import pytest
+
+from pfem_petsc.cli.main import main
+
+
+@pytest.fixture(scope="module")
+def short_run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("results") / "short"
+    assert main(["rod_impact", "-o", str(folder), "--quiet", "--set", "time.end=0.5", "title=A short run"]) == 0
+    return folder
+
+
+def test_check_says_what_would_run(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["check", "rod_impact", "--set", "time.step=auto"]) == 0
+    shown = capsys.readouterr().out
+    rows = {line[2:].partition("  ")[0]: line for line in shown.splitlines() if line.startswith("  ")}
+    assert rows["nodes"].split()[-1] == "21"
+    assert rows["critical step"].split()[-2:] == ["50.00", "ms"]
+    assert rows["time step"].endswith("44.6429 ms, 112 steps to 5.000 s")  # 0.9 of the limit, made to divide the end
+    assert shown.splitlines()[-1] == "This case can run."
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("override", "text"),
+    [
+        ("time.step=1.0", "time.step"),
+        ("wall.0.point=[0.5, 0.0, 0.0]", "beyond the wall"),
+        ("mesh.elements=4000000000000000000", "mesh.elements"),
+        ("section.default.bars=none", "section"),
+        ("node_set.tip={group = 'tp'}", "tip"),
+    ],
+)
+def test_check_refuses_what_cannot_run(override, text, capsys):
+    assert main(["check", "rod_impact", "--set", override]) == 2
+    printed = capsys.readouterr()
+    assert text in printed.err
+    assert "Traceback" not in printed.err
+    assert "can run" not in printed.out
+
+
+def test_results_go_to_a_folder_named_after_the_case(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    words = ["rod_impact", "--quiet", "--set", "time.end=0.05"]
+    assert main(words) == 0
+    assert (tmp_path / "results" / "rod_impact" / "result.vtkhdf").is_file()
+    assert main(words) == 0
+    assert len(list((tmp_path / "results").iterdir())) == 2
+
+
+def test_quiet_run_prints_nothing(tmp_path, capsys):
+    assert main(["rod_impact", "-o", str(tmp_path / "quiet"), "--quiet", "--set", "time.end=0.05"]) == 0
+    assert capsys.readouterr().out == ""
+    assert main(["rod_impact", "-o", str(tmp_path / "loud"), "--set", "time.end=0.05"]) == 0
+    assert "Elastic rod against a rigid wall" in capsys.readouterr().out
+
+
+def test_folder_that_cannot_be_made(tmp_path, capsys):
+    (tmp_path / "file").write_text("")
+    assert main(["rod_impact", "-o", str(tmp_path / "file" / "results")]) == 2
+    assert str(tmp_path / "file") in capsys.readouterr().err
+
+
+def test_info(short_run, capsys):
+    assert main(["info", str(short_run)]) == 0
+    by_folder = capsys.readouterr().out
+    assert main(["info", str(short_run / "result.vtkhdf")]) == 0
+    assert capsys.readouterr().out == by_folder
+    lines = by_folder.splitlines()
+    assert lines[0] == "A short run"
+    rows = {line.split()[0]: line.split(maxsplit=1)[1] for line in lines if line.startswith("  ")}
+    assert rows["mesh"] == "21 nodes, 20 bars"
+    assert rows["ranks"] == "1"
+    assert rows["snapshots"] == "6: 0 s to 500.0 ms"
+    assert rows["history"] == "51 rows: 0 s to 500.0 ms"
+    assert "wall/wall/force" in by_folder
+    balance = next(line for line in lines if "balance error" in line)
+    assert float(balance.partition("(")[2].split()[0]) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_plot(short_run, tmp_path, capsys):
+    assert main(["plot", str(short_run), "-o", str(tmp_path)]) == 0
+    written = capsys.readouterr().out.split()
+    assert str(tmp_path / "energies.png") in written
+    assert sorted(map(str, tmp_path.iterdir())) == sorted(written)
+    assert main(["plot", str(short_run), "-o", str(tmp_path), "--curves", "wall/wall/force"]) == 0
+    assert capsys.readouterr().out.split() == [str(tmp_path / "curves.png")]
+    assert main(["plot", str(short_run), "--curves", "wall/wall/forse"]) == 2
+    assert "did you mean 'wall/wall/force'" in capsys.readouterr().err
+
+
+def test_render(short_run, tmp_path, capsys):
+    words = ["render", str(short_run), "-o", str(tmp_path), "--frames", "0,5", "--size", "320x240", "--video", "none"]
+    assert main([*words, "--field", "stress", "--clim", "-1e8", "1e8", "--no-poster"]) == 0
+    printed = capsys.readouterr().out
+    assert "2 frames" in printed
+    assert sorted(path.name for path in (tmp_path / "frames").iterdir()) == ["frame_0000.png", "frame_0001.png"]
+    assert main([*words, "--field", "stres"]) == 2
+    assert "did you mean 'stress'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("verb", ["info", "plot", "render"])
+def test_result_that_is_none(verb, tmp_path, capsys):
+    assert main([verb, str(tmp_path)]) == 2
+    assert str(tmp_path) in capsys.readouterr().err
+    (tmp_path / "result.vtkhdf").write_text("this is no HDF5 file")
+    assert main([verb, str(tmp_path)]) == 2
+    assert str(tmp_path / "result.vtkhdf") in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("words", [["--size", "big"], ["--frames", "some"], ["--fps", "x"]])
+def test_refused_option_of_render(words, capsys):
+    assert main(["render", "anything", *words]) == 2
+    assert words[1] in capsys.readouterr().err
+
+
+def test_petsc_takes_its_options(on_ranks, tmp_path):
+    done = on_ranks(
+        2, "-m", "pfem_petsc", "rod_impact", "--quiet", "--set", "time.end=0.05", "--", "-log_view", cwd=tmp_path
+    )
+    assert done.returncode == 0, done.stderr
+    assert "PETSc Performance Summary" in done.stdout
+
+
+def test_one_rank_draws_and_tells(on_ranks, short_run, tmp_path):
+    done = on_ranks(2, "-m", "pfem_petsc", "info", short_run, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("A short run") == 1

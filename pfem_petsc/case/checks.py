@@ -7,7 +7,7 @@ from typing import Any
 
 from ..registry import nearest
 from .problems import Problems
-from .tables import CELL_FIELDS, POINT_FIELDS
+from .settings import CELL_FIELDS, POINT_FIELDS
 
 __all__ = ["check_names"]
 

@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 
 from ..errors import InputError
 from ..registry import lookup, nearest
+from . import settings as s
 from . import tables as t
 from .base import StrictModel
 from .problems import Path as KeyPath
@@ -78,7 +79,7 @@ def read_tables(data: Mapping[str, Any], folder: Path, problems: Problems) -> di
         "wall": _walls(data.get("wall"), problems),
         "time": _time(data, problems),
         "output": _output(data.get("output", {}), problems),
-        "solver": problems.read(t.Solver, data.get("solver", {}), ("solver",)),
+        "solver": problems.read(s.Solver, data.get("solver", {}), ("solver",)),
     }
 
 
@@ -190,32 +191,32 @@ def _walls(data: Any, problems: Problems) -> list[StrictModel]:
     return [wall for wall in walls if wall is not None]
 
 
-def _time(data: Mapping[str, Any], problems: Problems) -> t.Time | None:
+def _time(data: Mapping[str, Any], problems: Problems) -> s.Time | None:
     table = _required(data, "time", problems)
     if table is None:
         return None
-    own, others = _split(t.TimeKeys, table)
-    keys = problems.read(t.TimeKeys, own, ("time",))
+    own, others = _split(s.TimeKeys, table)
+    keys = problems.read(s.TimeKeys, own, ("time",))
     name = own.get("integrator")
     if not isinstance(name, str):
         return None
     model = _parameters_model(INTEGRATORS, name, ("time", "integrator"), problems)
     if model is None:
         return None
-    scheme = problems.read(model, others, ("time",), known=list(t.TimeKeys.model_fields), taker=name)
+    scheme = problems.read(model, others, ("time",), known=list(s.TimeKeys.model_fields), taker=name)
     automatic = keys is not None and keys.step == "auto"
     if automatic and not lookup(INTEGRATORS, name, "time.integrator").Scheme.explicit:
         message = f"only explicit schemes can choose their step, and {name} is implicit: give it in seconds"
         problems.add(("time", "step"), message, "auto")
     if keys is None or scheme is None:
         return None
-    return t.Time(**keys.model_dump(), scheme=scheme)
+    return s.Time(**keys.model_dump(), scheme=scheme)
 
 
-def _output(data: Any, problems: Problems) -> t.Output | None:
+def _output(data: Any, problems: Problems) -> s.Output | None:
     if not isinstance(data, Mapping):
         problems.add(("output",), "expected a table", data)
         return None
-    probes = _listed(t.Probe, data.get("probe"), ("output", "probe"), problems)
-    keys = problems.read(t.OutputKeys, {k: v for k, v in data.items() if k != "probe"}, ("output",))
-    return None if keys is None else t.Output(**keys.model_dump(), probe=tuple(probes))
+    probes = _listed(s.Probe, data.get("probe"), ("output", "probe"), problems)
+    keys = problems.read(s.OutputKeys, {k: v for k, v in data.items() if k != "probe"}, ("output",))
+    return None if keys is None else s.Output(**keys.model_dump(), probe=tuple(probes))

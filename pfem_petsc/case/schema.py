@@ -34,7 +34,7 @@ class Case:
     node_set, material, section : tables by name, in the file's order
     initial, support, load, temperature, wall : lists of tables
     gravity : :class:`~pfem_petsc.case.tables.Gravity` or None
-    time, output, solver : tables
+    time, output, solver : tables of :mod:`~pfem_petsc.case.settings`
 
     Notes
     -----

@@ -1,0 +1,92 @@
+"""The tables of a case file that say how it is solved and what is written, each with its keys (SI units)."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, InstanceOf, field_validator
+
+from .base import Name, NonNegativeInt, PositiveFloat, PositiveInt, StrictModel, listed
+
+__all__ = ["CELL_FIELDS", "POINT_FIELDS", "Output", "OutputKeys", "Probe", "Solver", "Time", "TimeKeys"]
+
+POINT_FIELDS = ("displacement", "velocity", "acceleration", "contact_force")
+CELL_FIELDS = ("strain", "stress", "axial_force", "plastic_strain", "temperature")
+
+
+class TimeKeys(StrictModel):
+    """The keys of [time] that are not an integrator's own."""
+
+    integrator: str
+    """name of a time integration scheme"""
+    step: Any
+    """time step [s], or "auto" with an explicit scheme"""
+    end: PositiveFloat
+    """end time [s]"""
+    mass: Literal["lumped", "consistent"] = "lumped"
+    """mass matrix"""
+    safety: Annotated[float, Field(gt=0.0, le=1.0)] = 0.9
+    """factor on the critical step where step = "auto\""""
+
+    @field_validator("step")
+    @classmethod
+    def _step(cls, step: Any) -> float | str:
+        if step == "auto":
+            return "auto"
+        if isinstance(step, bool) or not isinstance(step, int | float):
+            raise ValueError('expected a number of seconds in SI units without quotes and unit, or "auto"')
+        if not (step > 0 and math.isfinite(step)):
+            raise ValueError('expected a finite number of seconds > 0, or "auto"')
+        return float(step)
+
+
+class Time(TimeKeys):
+    """The time integration: scheme, its parameters, step and end."""
+
+    scheme: InstanceOf[StrictModel]
+
+
+class Probe(StrictModel):
+    """A node set whose motion and reaction are recorded in the history."""
+
+    name: Name
+    """names the probe in the results"""
+    node_set: str
+    """name of a node set"""
+
+
+class OutputKeys(StrictModel):
+    """The keys of [output], probes aside."""
+
+    fields_every: NonNegativeInt = 10
+    """steps between field snapshots; 0: none but first and last"""
+    history_every: PositiveInt = 1
+    """steps between rows of the history"""
+    checkpoint_every: NonNegativeInt = 0
+    """steps between checkpoints; 0: none"""
+    fields: Annotated[tuple[str, ...], listed] | None = None
+    """names of the fields to write; default: all"""
+    precision: Literal["float64", "float32"] = "float64"
+    """precision of the fields in the result file"""
+
+
+class Output(OutputKeys):
+    """What is written, and how often."""
+
+    probe: tuple[Probe, ...] = ()
+
+
+class Solver(StrictModel):
+    """How the nonlinear and linear systems are solved."""
+
+    linear: Literal["auto", "cg", "gamg", "mumps"] = "auto"
+    """linear solver"""
+    operator: Literal["auto", "assembled", "matrix_free"] = "auto"
+    """form of the Hessian"""
+    rtol: Annotated[float, Field(gt=0.0, lt=1.0)] = 1e-9
+    """relative tolerance of the residual"""
+    atol: PositiveFloat | None = None
+    """absolute tolerance of the residual [N]; default: from the model's force scale"""
+    max_newton: PositiveInt = 50
+    """Newton iterations allowed in a step"""

@@ -42,7 +42,7 @@ def prefix_for(magnitude: float, unit: str) -> tuple[float, str]:
     Powers (``m²``), temperatures and pure numbers keep their unit, because a prefix would be read wrongly there;
     so does zero and all that is not finite. Kilograms have their prefix already.
     """
-    plain = unit in ("s", "m", "m/s", "m/s²", "N", "Pa", "J")
+    plain = unit in ("s", "m", "m/s", "m/s²", "N", "Pa", "J", "B")
     if not plain or not math.isfinite(magnitude) or magnitude == 0.0:
         return 1.0, unit
     # a hair of tolerance, so that 999.9999999 ms reads 1 s

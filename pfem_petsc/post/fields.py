@@ -14,7 +14,7 @@ from ..registry import nearest
 __all__ = ["ColourField", "ColourScale"]
 
 # Middle and start are a dark grey: bars at rest must stand out from a white page as well as strained ones.
-DIVERGING = ("#0ea5e9", "#2563b0", "#535b68", "#b83a30", "#f97316")
+DIVERGING = ("#16b1f3", "#1f74d4", "#535b68", "#d2402f", "#fb8a1e")
 SEQUENTIAL = ("#535b68", "#6b429f", "#b5307c", "#ea5a3d", "#f9a11b")
 
 _SIGNED = ("stress", "strain", "axial_force")

@@ -120,11 +120,15 @@ def _energies(history: History, title: str, file: Path) -> Path | None:
     return chart.save(file)
 
 
-def _components(values: np.ndarray, names: str = "xyz") -> list[tuple[str, np.ndarray]]:
-    """Named components of (n, 3) that are not zero to rounding throughout; all when all are."""
-    largest = np.nanmax(np.abs(values), initial=0.0)
-    curves = [(name, values[:, k]) for k, name in enumerate(names)]
-    return [(n, v) for n, v in curves if np.nanmax(np.abs(v), initial=0.0) > 1e-9 * largest] or curves
+def _components(values: np.ndarray, scale: float = 0.0) -> list[tuple[str, np.ndarray]]:
+    """Named components of (n, 3) that are not zero to rounding throughout; all, as zero, when all are.
+
+    Rounding is relative to the largest value, or to a ``scale`` where the vector is a difference of larger ones.
+    """
+    floor = 1e-9 * max(float(np.nanmax(np.abs(values), initial=0.0)), scale)
+    curves = [(name, values[:, k]) for k, name in enumerate("xyz")]
+    kept = [(name, v) for name, v in curves if np.nanmax(np.abs(v), initial=0.0) > floor]
+    return kept or [(name, np.zeros_like(v)) for name, v in curves]
 
 
 def _colours_of(curves: Sequence[tuple[str, np.ndarray]]) -> list[dict[str, Any]]:
@@ -132,10 +136,12 @@ def _colours_of(curves: Sequence[tuple[str, np.ndarray]]) -> list[dict[str, Any]
     return [{"color": COLOURS["xyz".index(name)]} for name, _ in curves]
 
 
-def _vector(chart: Chart, axes: Any, label: str, unit: str, values: np.ndarray, title: str = "") -> None:
-    curves = _components(values)
+def _vector(
+    chart: Chart, axes: Any, label: str, unit: str, values: np.ndarray, title: str = "", scale: float = 0.0
+) -> None:
+    curves = _components(values, scale)
     chart.curves(axes, label, unit, curves, title, _colours_of(curves), legend=False)
-    axes.legend(loc="upper right", ncols=3, handlelength=1.2)
+    axes.legend(loc="best", ncols=3, handlelength=1.2)
 
 
 def _momentum(history: History, title: str, file: Path) -> Path | None:
@@ -144,13 +150,14 @@ def _momentum(history: History, title: str, file: Path) -> Path | None:
         return None
     chart = Chart(_read(history, "time"), title, len(names), heights=[0.9] * len(names))
     for axes, name in zip(chart.axes[:, 0], names, strict=True):
-        values = _read(history, name)
+        values, label, scale = _read(history, name), _words(name), 0.0
         if name == "centre_of_mass":
             values = values - values[0]
             label = "centre of mass,\nmoved by"
-        else:
-            label = _words(name)
-        _vector(chart, axes, label, unit_of(name), values)
+        elif name == "angular_momentum" and {"momentum", "centre_of_mass"} <= set(names):
+            arm = np.linalg.norm(_read(history, "centre_of_mass"), axis=1)
+            scale = float(np.nanmax(arm * np.linalg.norm(_read(history, "momentum"), axis=1)))
+        _vector(chart, axes, label, unit_of(name), values, scale=scale)
     return chart.save(file)
 
 
@@ -220,13 +227,23 @@ def _walls(history: History, walls: Iterable[Any], title: str, file: Path) -> Pa
         smooth = window_mean(time, values, width)
         styles = [{"color": "#9db7d9", "linewidth": 0.8}, {"color": COLOURS[0], "linewidth": 1.8}]
         curves = [("as computed", values), (f"mean over {engineering(width, 's', 3)}", smooth)]
-        chart.curves(upper, label, "N", curves, f"Wall '{name}'", styles, legend=False)
+        factor, unit = chart.curves(upper, label, "N", curves, f"Wall '{name}'", styles, legend=False)
+        _cut_peaks(upper, values * factor, smooth * factor, unit)
         upper.legend(loc="upper right")
         if f"wall/{name}/contacts" in history:
             chart.counts(lower, "nodes in\ncontact", history[f"wall/{name}/contacts"], COLOURS[1])
         else:
             lower.set_axis_off()
     return chart.save(file)
+
+
+def _cut_peaks(axes: Any, values: np.ndarray, smooth: np.ndarray, unit: str) -> None:
+    """Where single peaks (the inertia of a node that is stopped within a step) would flatten the rest: say how high."""
+    highest, mean = float(np.nanmax(values)), float(np.nanmax(smooth))
+    if mean > 0.0 and highest > 5.0 * mean:
+        axes.set_ylim(-0.15 * mean, 3.0 * mean)
+        text = f"peaks reach {highest:.4g} {unit}"
+        axes.annotate(text, (0.01, 0.97), xycoords="axes fraction", fontsize=9, color="#5b6472", va="top")
 
 
 def _solver(history: History, title: str, file: Path) -> Path | None:
@@ -236,6 +253,8 @@ def _solver(history: History, title: str, file: Path) -> Path | None:
         "active_contacts": "nodes in\ncontact",
     }
     names = [name for name in labels if name in history]
+    # an explicit scheme iterates nowhere: its panels would be empty
+    names = [name for name in names if name == "active_contacts" or np.any(history[name])]
     if not names:
         return None
     chart = Chart(_read(history, "time"), title, len(names), heights=[0.7] * len(names))

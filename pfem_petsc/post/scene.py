@@ -51,10 +51,15 @@ class Scene:
         self._factor = 2 if self._tubes else 1
         window = (size[0] * self._factor, size[1] * self._factor)
         pixels = size[1] / (2.0 * camera.half_height)
+        lengths = pixels * np.linalg.norm(points[bars[:, 1]] - points[bars[:, 0]], axis=1)
+        shortest = float(np.quantile(lengths, 0.1))
         if bar_width is None:
-            length = np.linalg.norm(points[bars[:, 1]] - points[bars[:, 0]], axis=1).mean() * pixels if len(bars) else 1
+            # not so thick that the chords of a slender truss grow together
             scale = min(size[0] / 1100, size[1] / 600)
-            bar_width = float(np.clip(0.11 * length, (3.0 if self._tubes else 1.2) * scale, 6.0 * scale))
+            wish = min(0.11 * float(lengths.mean()), 0.4 * shortest)
+            bar_width = float(np.clip(wish, (2.0 if self._tubes else 1.2) * scale, 6.0 * scale))
+        if nodes is None:
+            nodes = len(bars) <= 400 and shortest > 3.0 * bar_width
         depths = np.array(np.meshgrid(*bounds.T)).reshape(3, -1).T @ camera.towards
         self._near, self._deep = depths.max(), max(float(np.ptp(depths)), 1e-300)
 
@@ -73,7 +78,7 @@ class Scene:
         self._actor = None
         self._width = bar_width * self._factor
         self._balls = None
-        if nodes or (nodes is None and len(bars) <= 400):
+        if nodes:
             self._balls = pyvista.PolyData(self._lines.points.copy())
             ball = plotter.add_mesh(
                 self._balls,

@@ -22,6 +22,7 @@ __all__ = [
     "chunk_rows",
     "create_growing",
     "create_new",
+    "dataset_names",
     "first_line",
     "fsync_all",
     "grow",
@@ -146,6 +147,13 @@ def create_growing(
 def grow(dataset: h5py.Dataset, n_rows: int) -> None:
     """Set the number of rows. Collective where the file is."""
     dataset.id.set_extent((n_rows, *dataset.shape[1:]))
+
+
+def dataset_names(group: h5py.Group) -> list[str]:
+    """Names of all datasets in a group and its groups, relative to it: ["time", "wall/floor/force"]."""
+    names: list[str] = []
+    group.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None)
+    return names
 
 
 def write_rows(dataset: h5py.Dataset, first: int, rows: np.ndarray | None, collective: bool = False) -> None:

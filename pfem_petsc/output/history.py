@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +11,9 @@ import numpy as np
 from mpi4py import MPI
 
 from ..errors import InputError
-from .hdf5 import create_growing, grow, write_rows, writing
+from .hdf5 import create_growing, dataset_names, grow, write_rows, writing
 
-__all__ = ["HistoryWriter", "create_history"]
+__all__ = ["HistoryWriter", "check_columns", "create_history"]
 
 # Rows a chunk: small, so that a short run makes a small file (a whole chunk is allocated for the first row).
 ROWS_PER_CHUNK = 512
@@ -33,6 +33,30 @@ def create_history(file: h5py.File, columns: Mapping[str, tuple[int, ...]], type
         create_growing(group, name, tuple(shape), dtype, max(1, min(ROWS_PER_CHUNK, per_chunk)))
 
 
+def check_columns(file: h5py.File, path: Path, columns: Mapping[str, tuple[int, ...]]) -> None:
+    """Refuse to continue a file whose history has other columns.
+
+    Raises
+    ------
+    InputError
+    """
+    group = file["history"]
+    for name, shape in columns.items():
+        found = group.get(name)
+        if not isinstance(found, h5py.Dataset) or found.shape[1:] != tuple(shape):
+            has = f"rows of shape {found.shape[1:]}" if isinstance(found, h5py.Dataset) else "nothing"
+            raise InputError(
+                f"{path}: history/{name}: the run records rows of shape {tuple(shape)}, the file has {has}: it was "
+                "written with another case; restart with the same walls and probes, or write elsewhere (-o)"
+            )
+    others = sorted(set(dataset_names(group)) - set(columns))
+    if others:
+        raise InputError(
+            f"{path}: the history has {', '.join(others)}, which the run does not record: it was written with another "
+            "case; restart with the same walls and probes, or write elsewhere (-o)"
+        )
+
+
 class HistoryWriter:
     """Appends rows to ``/history``.
 
@@ -46,27 +70,13 @@ class HistoryWriter:
     comm : MPI.Comm
     path : Path
         Named in messages.
-    columns : mapping of column name to the shape of one row's value, () for a number
-
-    Raises
-    ------
-    InputError
-        When the file's columns are others (a run is continued with another case).
+    columns : collection of column names
     """
 
-    def __init__(self, file: h5py.File, comm: MPI.Comm, path: Path, columns: Mapping[str, tuple[int, ...]]) -> None:
-        self._file, self._comm, self._path = file, comm, path
+    def __init__(self, file: h5py.File, comm: MPI.Comm, path: Path, columns: Collection[str]) -> None:
+        self._comm, self._path = comm, path
         group = file["history"]
-        self._datasets = {}
-        for name, shape in columns.items():
-            found = group.get(name)
-            if not isinstance(found, h5py.Dataset) or found.shape[1:] != tuple(shape):
-                has = f"rows of shape {found.shape[1:]}" if isinstance(found, h5py.Dataset) else "nothing"
-                raise InputError(
-                    f"{path}: history/{name}: the run records rows of shape {tuple(shape)}, the file has {has}: it was "
-                    "written with another case; restart with the same walls and probes, or write elsewhere (-o)"
-                )
-            self._datasets[name] = found
+        self._datasets = {name: group[name] for name in columns}
         self._rows_attribute = h5py.h5a.open(group.id, b"rows")
         self.n_rows = int(group.attrs["rows"])
         row_bytes = sum(d.dtype.itemsize * int(np.prod(d.shape[1:], dtype=np.int64)) for d in self._datasets.values())

@@ -8,7 +8,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from .hdf5 import chunk_rows, create_growing
+from .hdf5 import chunk_rows, create_growing, dataset_names
 from .history import create_history
 from .provenance import write_case
 
@@ -18,7 +18,6 @@ __all__ = [
     "complete_snapshots",
     "create_field",
     "create_result",
-    "dataset_names",
     "field_datasets",
 ]
 
@@ -110,13 +109,6 @@ def complete_snapshots(file: h5py.File) -> int:
         rows = n_bars if name.startswith("CellData") else n_nodes
         lengths += [len(dataset) // rows] if rows else []
     return min(lengths)
-
-
-def dataset_names(group: h5py.Group) -> list[str]:
-    """Names of all datasets in a group and its groups, relative to it: ["time", "wall/floor/force"]."""
-    names: list[str] = []
-    group.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None)
-    return names
 
 
 def complete_rows(file: h5py.File) -> int:

@@ -10,8 +10,9 @@ import h5py
 import numpy as np
 
 from ..errors import InputError
-from .hdf5 import fsync_all, grow, write_rows
-from .layout import PER_STEP, complete_rows, complete_snapshots, dataset_names, field_datasets
+from .hdf5 import dataset_names, fsync_all, grow, write_rows
+from .history import check_columns
+from .layout import PER_STEP, complete_rows, complete_snapshots, field_datasets
 from .provenance import read_attributes, write_case
 
 __all__ = ["reopen", "repair"]
@@ -71,6 +72,7 @@ def reopen(
     after_step: int,
     sizes: tuple[int, int],
     fields: Mapping[str, list[str]],
+    columns: Mapping[str, tuple[int, ...]],
     case_text: str,
     attributes: Mapping[str, Any],
 ) -> None:
@@ -84,13 +86,14 @@ def reopen(
     sizes : (int, int)
         Nodes and bars of the case.
     fields : mapping of "PointData" and "CellData" to sorted names
+    columns : mapping of history column to the shape of one row's value
     case_text, attributes
         Replace what ``/case`` holds; the step is added to its ``restarts_after_step``.
 
     Raises
     ------
     InputError
-        When the file is missing, damaged, or of another mesh or other fields.
+        When the file is missing, damaged, or of another mesh, other fields or columns.
     """
     n_snapshots, _ = repair(path, after_step)
     with h5py.File(path, "r+", locking=False) as file:
@@ -107,5 +110,6 @@ def reopen(
                     f"{path}: has the fields {', '.join(sorted(vtk[kind])) or 'none'} ({kind}), the case asks for "
                     f"{', '.join(names) or 'none'}: keep [output] fields as it was, or write elsewhere (-o)"
                 )
+        check_columns(file, path, columns)
         earlier = list(read_attributes(file["case"]).get("restarts_after_step", []))
         write_case(file, case_text, {**attributes, "restarts_after_step": [*earlier, after_step]})

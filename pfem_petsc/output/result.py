@@ -13,8 +13,8 @@ import numpy as np
 
 from ..errors import InputError
 from ..registry import nearest
-from .hdf5 import HDF5_ERRORS
-from .layout import complete_rows, complete_snapshots, dataset_names
+from .hdf5 import HDF5_ERRORS, dataset_names
+from .layout import complete_rows, complete_snapshots
 from .provenance import read_attributes
 
 if TYPE_CHECKING:

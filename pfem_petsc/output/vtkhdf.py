@@ -12,7 +12,7 @@ import numpy as np
 from mpi4py import MPI
 
 from ..errors import PfemError, SimulationFailure
-from ..parallel.agreement import agreed, on_root
+from ..parallel.agreement import on_root
 from ..parallel.natural import NaturalOrder
 from .hdf5 import (
     create_new,
@@ -107,7 +107,7 @@ class ResultWriter:
         if append_after_step is None:
             create_new(self.path, comm, create_result, *sizes, columns, column_types, case_text, described)
         else:
-            on_root(comm, reopen, self.path, append_after_step, sizes, self._fields, case_text, described)
+            on_root(comm, reopen, self.path, append_after_step, sizes, self._fields, columns, case_text, described)
         with writing(comm, self.path):
             self._file = open_shared(self.path, comm)
         vtk, steps = self._file["VTKHDF"], self._file["VTKHDF/Steps"]
@@ -118,8 +118,7 @@ class ResultWriter:
         self.n_snapshots = int(steps.attrs["NSteps"])
         # Points and fields; made with the first snapshot, which knows the shapes.
         self._data = field_datasets(vtk) if self.n_snapshots else {}
-        with agreed(comm):
-            self._history = HistoryWriter(self._file, comm, self.path, columns)
+        self._history = HistoryWriter(self._file, comm, self.path, columns)
         if append_after_step is None:
             with self._whole_or_failed():
                 self._write_connectivity(mesh)

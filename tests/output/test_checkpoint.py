@@ -9,6 +9,7 @@ import h5py
 import numpy as np
 import pytest
 from mpi4py import MPI
+from truss import alone
 
 from pfem_petsc.errors import InputError, SimulationFailure
 from pfem_petsc.output.checkpoint import newest_checkpoint, read_checkpoint, write_checkpoint
@@ -195,7 +196,10 @@ def test_a_kill_leaves_a_complete_checkpoint(tmp_path):
     random = np.random.default_rng()
     for _ in range(6):
         writer = subprocess.Popen(
-            [sys.executable, "-c", WRITER, str(Path(__file__).parent), str(tmp_path)], stdout=subprocess.PIPE, text=True
+            [sys.executable, "-c", WRITER, str(Path(__file__).parent), str(tmp_path)],
+            stdout=subprocess.PIPE,
+            text=True,
+            env=alone(),
         )
         try:
             written = int(writer.stdout.readline())

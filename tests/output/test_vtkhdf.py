@@ -1,0 +1,292 @@
+"""The result file: values, structure, and that VTK and ``open_result`` read it, in the same way from any rank count."""
+
+import h5py
+import numpy as np
+import pytest
+import pyvista
+from mpi4py import MPI
+from truss import Truss, options, write
+from vtkmodules.util.numpy_support import vtk_to_numpy
+from vtkmodules.vtkIOHDF import vtkHDFReader
+
+from pfem_petsc.errors import InputError, SimulationFailure
+from pfem_petsc.output.layout import complete_snapshots
+from pfem_petsc.output.result import open_result
+from pfem_petsc.output.vtkhdf import ResultWriter
+
+COMM = MPI.COMM_WORLD
+STEPS = range(23)
+WRITTEN = [0, 5, 10, 15, 20]
+
+
+def write_all(path, comm=COMM, **changes):
+    truss = Truss(comm, idle=(1,) if comm.size > 1 else ())
+    with ResultWriter(path, comm, truss.mesh, **options(**changes)) as writer:
+        write(writer, truss, STEPS)
+    return truss
+
+
+def read_with_vtk(path, step):
+    """Grid of a step by VTK's own reader, and how many steps there are."""
+    reader = vtkHDFReader()
+    reader.SetFileName(str(path))
+    reader.UpdateInformation()
+    reader.SetStep(step)
+    reader.Update()
+    return pyvista.wrap(reader.GetOutputDataObject(0)), reader.GetNumberOfSteps()
+
+
+def assert_grid_is(grid, truss, step):
+    points, point_data, cell_data = truss.whole(step)
+    np.testing.assert_array_equal(grid.points, points)
+    np.testing.assert_array_equal(grid.cells.reshape(-1, 3)[:, 1:], truss.ends)
+    assert set(grid.celltypes) == {pyvista.CellType.LINE}
+    assert sorted(grid.point_data) == sorted(point_data)
+    assert sorted(grid.cell_data) == sorted(cell_data)
+    for name, values in point_data.items():
+        np.testing.assert_array_equal(grid.point_data[name], values)
+    for name, values in cell_data.items():
+        np.testing.assert_array_equal(grid.cell_data[name], values)
+
+
+def assert_history_is(history, truss, steps):
+    assert sorted(history) == sorted(truss.row(0))
+    for name in history:
+        np.testing.assert_array_equal(history[name], [truss.row(step)[name] for step in steps])
+
+
+def tree(path):
+    """All there is in a file but what depends on the number of ranks: shapes, types, chunks, attributes, values."""
+    found = {}
+
+    def visit(name, item):
+        if isinstance(item, h5py.Dataset):
+            found[name] = (item.shape, item.maxshape, item.dtype.str, item.chunks, item[()].tobytes())
+        else:
+            # Names, not objects: a dataset with two names is visited once.
+            found[name] = sorted(item)
+        found[name + " attributes"] = {k: str(v) for k, v in item.attrs.items() if k != "ranks"}
+
+    with h5py.File(path) as file:
+        file.visititems(visit)
+    return found
+
+
+@pytest.mark.parallel
+def test_values_by_vtk_and_by_open_result(shared_tmp_path):
+    truss = write_all(shared_tmp_path / "deep" / "er" / "result.vtkhdf")
+    path = shared_tmp_path / "deep" / "er" / "result.vtkhdf"
+    if COMM.rank == 0:
+        with open_result(path.parent) as result:
+            assert (result.n_nodes, result.n_bars) == (23, 41)
+            np.testing.assert_array_equal(result.steps, WRITTEN)
+            np.testing.assert_array_equal(result.times, 0.01 * np.array(WRITTEN))
+            np.testing.assert_array_equal(result.bars, truss.ends)
+            for i, step in enumerate(WRITTEN):
+                grid, n_steps = read_with_vtk(path, i)
+                assert n_steps == len(WRITTEN)
+                assert grid.field_data["Time"][0] == 0.01 * step if "Time" in grid.field_data else True
+                assert_grid_is(grid, truss, step)
+                assert_grid_is(result.mesh(i), truss, step)
+            assert_grid_is(result.mesh(-1), truss, WRITTEN[-1])
+            assert_history_is(result.history, truss, STEPS)
+            assert result.history["newton_iterations"].dtype == np.int32
+            np.testing.assert_array_equal(result.history.wall.floor.force, result.history["wall/floor/force"])
+            np.testing.assert_array_equal(result.history["wall"]["floor"]["force"][:, 2], 2.0 * np.array(STEPS))
+            assert result.case_text == options()["case_text"]
+            assert result.attributes["ranks"] == COMM.size
+            assert result.attributes["argv"] == [1, 2]
+            assert {"petsc", "numpy", "h5py", "python", "pfem_petsc"} <= set(result.attributes)
+            with pytest.raises(IndexError):
+                result.positions(5)
+            with pytest.raises(InputError, match="no field 'stresss', did you mean 'stress'"):
+                result.field("stresss", 0)
+            with pytest.raises(KeyError, match="did you mean 'momentum'"):
+                result.history["momentums"]
+        assert_grid_is(pyvista.read(path), truss, WRITTEN[0])
+
+
+@pytest.mark.parallel
+def test_the_file_of_all_ranks_equals_that_of_one(shared_tmp_path):
+    write_all(shared_tmp_path / "together.vtkhdf")
+    if COMM.rank == 0:
+        write_all(shared_tmp_path / "alone.vtkhdf", MPI.COMM_SELF)
+        together, alone = tree(shared_tmp_path / "together.vtkhdf"), tree(shared_tmp_path / "alone.vtkhdf")
+        assert together.keys() == alone.keys()
+        for name in alone:
+            assert together[name] == alone[name], name
+        assert alone["VTKHDF/Points"][0] == (5 * 23, 3)
+        assert alone["VTKHDF/Points"][3] == (23, 3)
+
+
+@pytest.mark.parallel
+def test_readable_while_it_is_written(shared_tmp_path):
+    path = shared_tmp_path / "result.vtkhdf"
+    truss = Truss(COMM)
+    writer = ResultWriter(path, COMM, truss.mesh, **options())
+    if COMM.rank == 0:
+        assert len(open_result(path).times) == 0
+    result = None
+    for i, step in enumerate(WRITTEN):
+        write(writer, truss, range(step, step + 5))
+        if COMM.rank == 0:
+            grid, n_steps = read_with_vtk(path, i)
+            assert n_steps == i + 1
+            assert_grid_is(grid, truss, step)
+            assert_grid_is(pyvista.read(path), truss, 0)
+            result = result or open_result(path)
+            result.reload()
+            assert_grid_is(result.mesh(i), truss, step)
+            # Rows since the snapshot are still in memory.
+            assert_history_is(result.history, truss, range(step + 1))
+        COMM.Barrier()
+    writer.flush_history()
+    if COMM.rank == 0:
+        assert_history_is(open_result(path).history, truss, range(25))
+    writer.close()
+
+
+@pytest.mark.parallel
+def test_single_precision_is_for_fields(shared_tmp_path):
+    path = shared_tmp_path / "result.vtkhdf"
+    truss = write_all(path, precision="float32")
+    if COMM.rank == 0:
+        result = open_result(path)
+        for name in ("displacement", "stress"):
+            assert result.field(name, 0).dtype == np.float32
+        assert result.field("reached", 0).dtype == np.int64
+        np.testing.assert_array_equal(result.positions(2), truss.whole(10)[0])
+        np.testing.assert_array_equal(result.field("displacement", 2), truss.whole(10)[1]["displacement"].astype("f4"))
+        grid, _ = read_with_vtk(path, 2)
+        assert vtk_to_numpy(grid.GetCellData().GetArray("stress")).dtype == np.float32
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("after", [0, 7, 12, 20])
+def test_going_on_after_a_step_gives_the_same_file(shared_tmp_path, after):
+    write_all(shared_tmp_path / "straight.vtkhdf")
+    path = shared_tmp_path / "restarted.vtkhdf"
+    truss = write_all(path)
+    with ResultWriter(path, COMM, truss.mesh, **options(append_after_step=after)) as writer:
+        write(writer, truss, range(after + 1, STEPS.stop))
+    if COMM.rank == 0:
+        straight, restarted = tree(shared_tmp_path / "straight.vtkhdf"), tree(path)
+        assert restarted.pop("case attributes")["restarts_after_step"] == str(f"json:[{after}]".encode())
+        straight.pop("case attributes")
+        assert straight == restarted
+        grid, n_steps = read_with_vtk(path, 4)
+        assert n_steps == 5
+        assert_grid_is(grid, truss, 20)
+
+
+@pytest.mark.parallel
+def test_going_on_before_the_first_snapshot(shared_tmp_path):
+    path = shared_tmp_path / "result.vtkhdf"
+    truss = write_all(path)
+    for _ in range(2):
+        with ResultWriter(path, COMM, truss.mesh, **options(append_after_step=-1)) as writer:
+            assert writer.n_snapshots == 0
+            write(writer, truss, STEPS)
+        if COMM.rank == 0:
+            assert_grid_is(read_with_vtk(path, 3)[0], truss, 15)
+            assert_history_is(open_result(path).history, truss, STEPS)
+
+
+@pytest.mark.parallel
+def test_going_on_with_another_case_is_refused(shared_tmp_path):
+    path = shared_tmp_path / "result.vtkhdf"
+    truss = write_all(path)
+    columns = {name: shape for name, shape in options()["columns"].items() if name != "momentum"}
+    for changes, message in (
+        ({"cell_fields": ["strain"]}, "has the fields section, stress .CellData., the case asks for strain"),
+        ({"columns": {**columns, "momentum": (4,)}}, r"history/momentum: the run records rows of shape \(4,\)"),
+        (
+            {"columns": {**options()["columns"], "wall/roof/force": (3,)}},
+            "history/wall/roof/force.*the file has nothing",
+        ),
+    ):
+        with pytest.raises(InputError, match=message):
+            ResultWriter(path, COMM, truss.mesh, **options(append_after_step=5, **changes))
+    larger = Truss(COMM, n_nodes=24)
+    with pytest.raises(InputError, match="has 23 nodes and 41 bars, the case has 24 and 41"):
+        ResultWriter(path, COMM, larger.mesh, **options(append_after_step=5))
+    with pytest.raises(InputError, match="no such result file"):
+        ResultWriter(path.with_name("none.vtkhdf"), COMM, truss.mesh, **options(append_after_step=5))
+
+
+@pytest.mark.parallel
+def test_many_history_rows_come_in_blocks(shared_tmp_path):
+    path = shared_tmp_path / "result.vtkhdf"
+    truss = Truss(COMM)
+    with ResultWriter(path, COMM, truss.mesh, **options()) as writer:
+        for step in range(5000):
+            writer.append_history(truss.row(step) if COMM.rank == 0 else None)
+            if step == 3000 and COMM.rank == 0:
+                assert len(open_result(path).history["time"]) == 2048
+        assert writer.n_snapshots == 0
+    if COMM.rank == 0:
+        assert_history_is(open_result(path).history, truss, range(5000))
+
+
+@pytest.mark.parallel
+def test_unwritable_folder_is_refused_on_all_ranks(shared_tmp_path):
+    if COMM.rank == 0:
+        (shared_tmp_path / "file").write_text("not a folder")
+    COMM.Barrier()
+    with pytest.raises(InputError, match="file/result.vtkhdf: cannot write there"):
+        write_all(shared_tmp_path / "file" / "result.vtkhdf")
+
+
+@pytest.mark.parallel
+def test_a_folder_that_vanishes_ends_the_run_on_all_ranks(shared_tmp_path):
+    path = shared_tmp_path / "out" / "result.vtkhdf"
+    truss = Truss(COMM)
+    with ResultWriter(path, COMM, truss.mesh, **options()) as writer:
+        write(writer, truss, range(10))
+        COMM.Barrier()
+        if COMM.rank == 0:
+            path.parent.rename(shared_tmp_path / "moved")
+        COMM.Barrier()
+        with pytest.raises(SimulationFailure, match="gone or unreachable"):
+            write(writer, truss, range(10, 20))
+    if COMM.rank == 0:
+        assert_history_is(open_result(shared_tmp_path / "moved").history, truss, range(6))
+
+
+@pytest.mark.parallel
+def test_wrong_fields_are_refused(shared_tmp_path):
+    truss = Truss(COMM)
+    with ResultWriter(shared_tmp_path / "result.vtkhdf", COMM, truss.mesh, **options()) as writer:
+        points, point_data, _ = truss.snapshot(0)
+        with pytest.raises(ValueError, match="CellData"):
+            writer.write_snapshot(0.0, 0, points, point_data, {})
+
+
+@pytest.mark.parallel
+def test_no_fields_and_no_history(shared_tmp_path):
+    path = shared_tmp_path / "result.vtkhdf"
+    truss = Truss(COMM)
+    nothing = options(point_fields=[], cell_fields=[], columns={})
+    with ResultWriter(path, COMM, truss.mesh, **nothing) as writer:
+        for step in (0, 5):
+            writer.write_snapshot(0.01 * step, step, truss.snapshot(step)[0], {}, {})
+    if COMM.rank == 0:
+        np.testing.assert_array_equal(read_with_vtk(path, 1)[0].points, truss.whole(5)[0])
+        assert len(open_result(path).history) == 0
+
+
+def test_small_files_stay_small(tmp_path):
+    write_all(tmp_path / "result.vtkhdf")
+    assert (tmp_path / "result.vtkhdf").stat().st_size < 200_000
+
+
+def test_large_snapshots_do_not_share_chunks_where_sizes_allow(tmp_path):
+    truss = Truss(MPI.COMM_SELF, n_nodes=120_000, n_bars=120_000)
+    with ResultWriter(tmp_path / "result.vtkhdf", MPI.COMM_SELF, truss.mesh, **options()) as writer:
+        write(writer, truss, (0, 5))
+    with h5py.File(tmp_path / "result.vtkhdf") as file:
+        points = file["VTKHDF/Points"]
+        assert 120_000 % points.chunks[0] == 0
+        assert 100_000 < points.chunks[0] * 24 <= 1 << 20
+        assert complete_snapshots(file) == 2
+    assert_grid_is(read_with_vtk(tmp_path / "result.vtkhdf", 1)[0], truss, 5)

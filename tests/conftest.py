@@ -10,6 +10,7 @@ from __future__ import annotations
 import gc
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -38,6 +39,8 @@ def pytest_configure(config: pytest.Config) -> None:
     if AGREEMENT is not None:
         # A folder of its own for each rank: pytest's numbered ones are claimed by several at once.
         config.option.basetemp = tempfile.mkdtemp(prefix=f"pytest-rank{WORLD.rank}-")
+        # Ended from outside, as at a time limit: the report of what was found so far still comes.
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
 
 
 @pytest.hookimpl(tryfirst=True)

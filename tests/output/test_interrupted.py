@@ -54,7 +54,8 @@ for path in sys.argv[2:]:
 
 def killed_writer(path, seconds):
     """Write a step at a time until killed."""
-    writer = subprocess.Popen([sys.executable, "-c", WRITER, str(HERE), str(path)], **started)
+    command = [sys.executable, "-c", WRITER, str(HERE), str(path)]
+    writer = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=alone())
     try:
         assert writer.stdout.readline() == "open\n"
         while len(open_result(path).times) == 0:

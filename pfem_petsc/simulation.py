@@ -24,7 +24,7 @@ from .stepping.recorder import Recorder
 __all__ = ["Simulation", "Step"]
 
 POINT_FIELDS = ("displacement", "velocity", "acceleration", "contact_force")
-CELL_FIELDS = ("strain", "stress", "axial_force", "plastic_strain")
+CELL_FIELDS = ("strain", "stress", "axial_force", "plastic_strain", "temperature")
 _MEETING = 20  # steps between agreements on faults where no history row brings the ranks together
 
 
@@ -136,7 +136,11 @@ class Simulation:
         self._started = True
         self._prepare_folder()
         self._progress = Progress(
-            self.comm, self.case.title, self.plan.steps, self.plan.step * self.plan.steps, self.quiet,
+            self.comm,
+            self.case.title,
+            self.plan.steps,
+            self.plan.step * self.plan.steps,
+            self.quiet,
             self.folder / "log.txt",
         )
         self._progress.summary(self.summary())
@@ -147,10 +151,16 @@ class Simulation:
         self.stepper.start()
         self._agree_on_faults()
         self.ledger = Ledger(self.stepper)
+        self.stepper.booking = self.ledger.update
+        if hasattr(self.stepper, "message"):
+            self.stepper.message = self._progress.warning
         self.recorder = Recorder(self.stepper, self.ledger)
         fields = self.case.output.fields
         self.point_fields = [n for n in POINT_FIELDS if fields is None or n in fields]
-        self.cell_fields = [n for n in CELL_FIELDS if fields is None or n in fields]
+        heated = self.model.temperatures.any
+        self.cell_fields = [
+            n for n in CELL_FIELDS if (n in fields if fields is not None else n != "temperature" or heated)
+        ]
         self._writer = ResultWriter(
             self.folder / "result.vtkhdf",
             self.comm,
@@ -214,7 +224,6 @@ class Simulation:
     def _advance(self) -> Step:
         stepper, output = self.stepper, self.case.output
         stepper.step()
-        self.ledger.update()
         solution = stepper.solution
         self.recorder.count(solution.newton, solution.linear)
         step = self.state.step
@@ -262,6 +271,10 @@ class Simulation:
             "contact_force": lambda: state.contact,
         }
         bars = self.model.bars.fields(state.x) if self.cell_fields else {}
+        if "temperature" in self.cell_fields:
+            bars["temperature"] = (
+                self.model.temperatures.values if self.model.temperatures.any else 0.0 * bars["strain"]
+            )
         self._writer.write_snapshot(
             state.time,
             state.step,
@@ -302,6 +315,8 @@ def _prepare_folder(folder: Path) -> None:
             folder.rename(aside)
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{folder}: cannot write the results there: {error.strerror}; choose another with -o") from error
+        raise InputError(
+            f"{folder}: cannot write the results there: {error.strerror}; choose another with -o"
+        ) from error
     if not os.access(folder, os.W_OK | os.X_OK):
         raise InputError(f"{folder}: cannot write the results there: permission denied; choose another with -o")

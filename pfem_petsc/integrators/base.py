@@ -65,6 +65,7 @@ class Balance:
     time : when x_u holds: walls and supports are where they are then [s]
     loads : (weight, time) pairs: the external force of the balance
     weight : w of the module's equation
+    from_start : the internal force is that of the step from x_n to x_u (discrete gradient), not that at x_u
     """
 
     alpha: float
@@ -75,6 +76,7 @@ class Balance:
     time: float
     loads: tuple[tuple[float, float], ...]
     weight: float
+    from_start: bool = False
 
 
 class NoParameters(StrictModel):
@@ -91,6 +93,7 @@ class Scheme(ABC):
     at_ends : the balance holds at the ends of steps, so that works follow the trapezoidal rule; else the forces of the
         balance work over the whole step
     solves_end : the position solved for is x_{n+1}
+    symmetric : whether the Hessian is
     notice : what users must be told when they choose it; empty for nothing
     """
 
@@ -98,6 +101,7 @@ class Scheme(ABC):
     leads = False
     at_ends = True
     solves_end = True
+    symmetric = True
     notice = ""
 
     def __init__(self, parameters: StrictModel) -> None:
@@ -109,6 +113,9 @@ class Scheme(ABC):
 
     def start(self, state: State, h: float) -> None:
         """Set memory up from the complete state at the start (x, v, a); nothing by default."""
+
+    def step_changed(self, state: State) -> None:
+        """Forget what holds for the old step only; the state (x, v, a) is complete. Nothing by default."""
 
     @abstractmethod
     def balance(self, state: State, h: float) -> Balance:

@@ -21,6 +21,10 @@ Parameters = NoParameters
 class Scheme(Base):
     """Houbolt's method (implicit)."""
 
+    def step_changed(self, state: State) -> None:
+        state.memory.pop("d0", None)
+        state.memory.pop("d1", None)
+
     def balance(self, state: State, h: float) -> Balance:
         common = {"a_hat": None, "time": state.time + h, "loads": ((1.0, state.time + h),), "weight": 1.0}
         if "d0" not in state.memory:

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..errors import InputError
 from .compiled import kernel
+from .conserving import make_conserving_kernels
 from .kernels import make_kernels
 from .materials import elastic, elastoplastic
 from .strain import MEASURES
@@ -42,6 +43,7 @@ class BarBlock:
     parameters: np.ndarray
     history: np.ndarray
     kernels: SimpleNamespace
+    conserving: SimpleNamespace
 
 
 @kernel
@@ -63,6 +65,7 @@ class Bars:
     ends : (b, 2) int32, local node indices of each bar
     rest : (b,) float64, rest lengths [m]
     thermal : (b,) thermal strains, or (0,) where no temperature acts
+    thermal_at_start : thermal strains at the start of the step, where they vary
     blocks : bars by section
     """
 
@@ -72,6 +75,7 @@ class Bars:
         self.rest = np.empty(len(mesh.bars))
         _rest_lengths(mesh.points, mesh.bars, self.rest)
         self.thermal = np.empty(0)
+        self.thermal_at_start = self.thermal
         names = list(case.section)
         self.blocks: list[BarBlock] = []
         for block in mesh.blocks:
@@ -93,6 +97,7 @@ class Bars:
                     parameters=law.pack(material),
                     history=np.zeros((count, law.HISTORY)),
                     kernels=make_kernels(law.response),
+                    conserving=make_conserving_kernels(law.response),
                 )
             )
 
@@ -122,6 +127,19 @@ class Bars:
             block.kernels.tangents(
                 *self._arguments(x, block), block.start, block.stop, m, weight, pattern.ptr, pattern.slots, values
             )
+
+    def step_forces(self, x0: np.ndarray, x: np.ndarray, f: np.ndarray) -> None:
+        """Discrete-gradient forces ``f`` (local nodes, 3) [N] of a step from ``x0`` to ``x``."""
+        f[:] = 0.0
+        for block in self.blocks:
+            arguments = self._arguments(x, block)
+            block.conserving.forces(x0, self.thermal_at_start, *arguments, block.start, block.stop, f)
+
+    def step_tangents(self, x0, x, weight: float, inertia: list[float], pattern, values: np.ndarray) -> None:
+        """As :meth:`tangents`, for :meth:`step_forces`."""
+        for block, m in zip(self.blocks, inertia, strict=True):
+            arguments = (x0, self.thermal_at_start, *self._arguments(x, block), block.start, block.stop)
+            block.conserving.tangents(*arguments, m, weight, pattern.ptr, pattern.slots, values)
 
     def product(self, x: np.ndarray, u: np.ndarray, out: np.ndarray) -> None:
         """``out`` = K_t(x) u for local arrays (nodes, 3); valid for owned nodes."""

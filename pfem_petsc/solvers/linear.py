@@ -22,7 +22,7 @@ class LinearChoice:
     why: str
 
 
-def choose_linear(request: str, unknowns: int, step_ratio: float) -> LinearChoice:
+def choose_linear(request: str, unknowns: int, step_ratio: float, symmetric: bool = True) -> LinearChoice:
     """Resolve ``solver.linear``.
 
     Parameters
@@ -33,18 +33,23 @@ def choose_linear(request: str, unknowns: int, step_ratio: float) -> LinearChoic
         Of the whole model.
     step_ratio : float
         Time step over the critical step of central differences: how much stiffness weighs against mass.
+    symmetric : bool
+        Whether the matrix is; GMRES and incomplete LU stand in for conjugate gradients and Cholesky where it is not.
     """
     if request == "mumps" or (request == "auto" and unknowns <= _DIRECT_BELOW):
         why = "asked for" if request != "auto" else f"{unknowns} unknowns, at most {_DIRECT_BELOW}"
         return LinearChoice("preonly", "lu", f"direct ({why})")
+    krylov, method = ("cg", "conjugate gradients") if symmetric else ("gmres", "GMRES")
     if request == "gamg":
-        return LinearChoice("cg", "gamg", "conjugate gradients with multigrid (asked for)")
+        return LinearChoice(krylov, "gamg", f"{method}, multigrid (asked for)")
     ratio = f"step is {step_ratio:.3g} x the explicit limit"
     if request == "cg" or step_ratio <= _JACOBI_UP_TO:
-        return LinearChoice("cg", "pbjacobi", f"conjugate gradients, point-block Jacobi ({ratio})")
+        return LinearChoice(krylov, "pbjacobi", f"{method}, point-block Jacobi ({ratio})")
     if step_ratio <= _CHOLESKY_UP_TO:
-        return LinearChoice("cg", "icc", f"conjugate gradients, incomplete Cholesky ({ratio})")
-    return LinearChoice("cg", "gamg", f"conjugate gradients, multigrid ({ratio})")
+        if symmetric:
+            return LinearChoice(krylov, "icc", f"{method}, incomplete Cholesky ({ratio})")
+        return LinearChoice(krylov, "ilu", f"{method}, incomplete LU ({ratio})")
+    return LinearChoice(krylov, "gamg", f"{method}, multigrid ({ratio})")
 
 
 def configure(ksp: PETSc.KSP, choice: LinearChoice, reduced: bool) -> None:
@@ -70,13 +75,14 @@ def configure(ksp: PETSc.KSP, choice: LinearChoice, reduced: bool) -> None:
                 pc.setType("redundant")
     elif kind == "pbjacobi":
         pc.setType("jacobi" if reduced else "pbjacobi")
-    elif kind == "icc":
+    elif kind in ("icc", "ilu"):
+        shift = "positive_definite" if kind == "icc" else "nonzero"
         if comm.size == 1:
-            pc.setType("icc")
-            pc.setFactorShift(PETSc.Mat.FactorShiftType.POSITIVE_DEFINITE)
+            pc.setType(kind)
+            _default(ksp, "pc_factor_shift_type", shift)
         else:
-            _default(ksp, "sub_pc_type", "icc")
-            _default(ksp, "sub_pc_factor_shift_type", "positive_definite")
+            _default(ksp, "sub_pc_type", kind)
+            _default(ksp, "sub_pc_factor_shift_type", shift)
             pc.setType("bjacobi")
     else:
         pc.setType(kind)

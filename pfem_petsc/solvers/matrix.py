@@ -109,7 +109,7 @@ class HessianMatrix:
     ``fill(callback)`` zeroes the values, lets the callback add to them and hands them to PETSc.
     """
 
-    def __init__(self, mesh, fixed: np.ndarray, any_fixed: bool) -> None:
+    def __init__(self, mesh, fixed: np.ndarray, any_fixed: bool, symmetric: bool = True) -> None:
         self.mesh = mesh
         self.pattern = BlockPattern(mesh)
         pointers, columns = self.pattern.scalar_rows()
@@ -126,7 +126,7 @@ class HessianMatrix:
         else:
             self._pointers, self._columns = pointers, columns
             self.mat.setPreallocationCSR((pointers, columns))
-        self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+        self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
         self.any_fixed = any_fixed
         if any_fixed:
             self._fixed = np.zeros((mesh.n_local, 3))

@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
 from ..contact.contact import WallForces
 from ..contact.frames import NodalFrames
-from ..errors import SimulationFailure
 from ..integrators.base import Balance
 from ..solvers.linear import LinearChoice
 from ..solvers.matrix import HessianMatrix
 from ..solvers.newton import NewtonReport, NewtonSolver, zero_tolerance
 from .problem import StepProblem
-from .stepper import Solution, Stepper
+from .stepper import NotConverged, Solution, Stepper
 
 __all__ = ["ImplicitStepper"]
 
+_HALVINGS = 10  # most halvings of a step: to 1/1024
 _ROUNDS = 20  # re-solves of a step because a wall was reached that the step had not expected
 
 
@@ -26,9 +28,45 @@ class ImplicitStepper(Stepper):
 
     def __init__(self, model, scheme, h: float, choice: LinearChoice) -> None:
         super().__init__(model, scheme, h)
-        self.hessian = HessianMatrix(model.mesh, model.supports.fixed, model.supports.any)
+        self.hessian = HessianMatrix(model.mesh, model.supports.fixed, model.supports.any, scheme.symmetric)
         self.newton = NewtonSolver(model.mesh, self.hessian, choice, model.case.solver.max_newton, model.length)
+        self.level = 0  # the next step is made in 2**level parts
+        self.message: Callable[[str], None] = lambda text: None
         self._held = np.zeros(model.mesh.n_owned, dtype=bool)  # nodes held by walls in the last step
+
+    def step(self) -> None:
+        """Advance by one step; where it does not converge, in halves of halves, which grow back step by step.
+
+        Raises
+        ------
+        NotConverged
+            On all ranks, when the smallest part does not converge either.
+        """
+        state, ticks = self.state, 2**_HALVINGS
+        start, done = state.time, 0
+        end = (state.step + 1) * self.h
+        size = ticks >> self.level
+        self.smallest = self.h
+        while done < ticks:
+            self._set_part(self.h * (size / ticks))
+            try:
+                self._make_part(end if done + size == ticks else start + self.h * ((done + size) / ticks))
+            except NotConverged as failure:
+                if size == 1:
+                    raise NotConverged(f"{failure} (the step was halved {_HALVINGS} times)") from failure
+                size //= 2
+                self.level += 1
+                self.message(f"{failure}; halving the step to {self.h * size / ticks:.4g} s")
+                continue
+            done += size
+        self.level = max(self.level - 1, 0)
+        state.step += 1
+
+    def _set_part(self, part: float) -> None:
+        if part != self.part:
+            self.scheme.step_changed(self.state)
+            self.part = part
+        self.smallest = min(self.smallest, part)
 
     def destroy(self) -> None:
         """Free the PETSc objects."""
@@ -66,13 +104,17 @@ class ImplicitStepper(Stepper):
 
     def solve(self, balance: Balance) -> Solution:
         model, state = self.model, self.state
+        if model.temperatures.varying:
+            model.temperatures.apply(balance.time)
         tolerance = self._tolerance(balance)
         guess = self._guess(balance)
         candidates = self._candidates(balance)
         newton = linear = 0
         for _ in range(_ROUNDS):
-            frames = None if candidates is None else model.contact.frames(
-                candidates, balance.predictor + guess, balance.time
+            frames = (
+                None
+                if candidates is None
+                else model.contact.frames(candidates, balance.predictor + guess, balance.time)
             )
             problem = StepProblem(model, self.hessian, state, balance, state.external, frames)
             w, bounds = problem.coordinates(guess), None
@@ -85,7 +127,7 @@ class ImplicitStepper(Stepper):
             newton += report.newton
             linear += report.linear
             if not report.converged:
-                raise SimulationFailure(self._failure(problem, w, report, tolerance))
+                raise NotConverged(self._failure(problem, w, report, tolerance))
             u = problem.increment(w).copy()
             broken = self._broken(balance, u, candidates)
             if broken is None:
@@ -93,7 +135,7 @@ class ImplicitStepper(Stepper):
             candidates = broken
             guess = u
         else:
-            raise SimulationFailure(
+            raise NotConverged(
                 f"step {state.step + 1}, t = {balance.time:.6g} s: the nodes that touch walls could not be settled in "
                 f"{_ROUNDS} solves; take a smaller time step"
             )
@@ -106,7 +148,7 @@ class ImplicitStepper(Stepper):
         owned = model.mesh.n_owned
         sums = np.array(
             [
-                ((model.inertia.mass[:, None] * state.v) ** 2).sum() / self.h**2,
+                ((model.inertia.mass[:, None] * state.v) ** 2).sum() / self.part**2,
                 (state.external**2).sum(),
                 (state.f[:owned] ** 2).sum(),
             ]
@@ -209,5 +251,5 @@ class ImplicitStepper(Stepper):
         return (
             f"step {self.state.step + 1}, t = {problem.balance.time:.6g} s: no convergence after {report.newton} Newton "
             f"iterations: {report.why}; residual {report.norm:.3g} N, asked {tolerance:.3g} N; worst at node {node} "
-            f"({residual:.3g} N). Take a smaller time.step, or solver.linear = \"mumps\""
+            f'({residual:.3g} N). Take a smaller time.step, or solver.linear = "mumps"'
         )

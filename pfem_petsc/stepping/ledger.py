@@ -3,7 +3,7 @@
 For a scheme whose balance holds at the ends of steps (``at_ends``), works follow the trapezoidal rule: with dx = x1 - x0,
 external work = (e0 + e1) dx/2, contact work (r0 + r1) dx/2, damping dissipation (C v0 + C v1) dx/2, and the numerical
 dissipation is what inertia and internal force work beyond the change of their energies:
-(M a0 + M a1) dx/2 - dT + (f0 + f1) dx/2 - dU - dD. For the others the forces of the one balance work over the whole step.
+(M a0 + M a1) dx/2 - dT + (f0 + f1) dx/2 - dU - dD + dH, with the work dH of changing temperatures. For the others the forces of the one balance work over the whole step.
 The sum of all changes is then the work of the residual, zero up to the solver's tolerance.
 """
 
@@ -17,7 +17,7 @@ from ..mechanics.bars import StrainEnergy
 
 __all__ = ["Ledger", "Moment"]
 
-TERMS = ("external_work", "contact_work", "damping_dissipation", "numerical_dissipation")
+TERMS = ("external_work", "contact_work", "damping_dissipation", "numerical_dissipation", "thermal_work")
 
 
 @dataclass
@@ -43,7 +43,7 @@ class Ledger:
 
     Attributes
     ----------
-    work : (4,) sums since the start [J]: external (supports included), contact, damping, numerical
+    work : (5,) sums since the start [J]: external (supports included), contact, damping, numerical, thermal
     """
 
     def __init__(self, stepper) -> None:
@@ -51,6 +51,9 @@ class Ledger:
         self.model = stepper.model
         self.work = np.zeros(len(TERMS))
         self._before = self._moment()
+        if self.model.temperatures.varying:
+            self._stress = self.model.bars.fields(stepper.state.x)["stress"]
+            self._thermal = self.model.bars.thermal.copy()
 
     def update(self) -> None:
         """Book the step just made."""
@@ -58,17 +61,38 @@ class Ledger:
         before, self._before = self._before, after
         dx = after.x - before.x
         stored = after.kinetic - before.kinetic + sum(after.energy[:3]) - sum(before.energy[:3])
+        heating = self._heating()
         if self.stepper.scheme.at_ends:
+
             def work(name):
                 return 0.5 * _dot(getattr(before, name) + getattr(after, name), dx)
         else:
             balanced = self._balanced(before)
+
             def work(name):
                 return _dot(balanced[name], dx)
+
         self.work[0] += work("external")
         self.work[1] += work("contact")
         self.work[2] += work("damping")
-        self.work[3] += work("inertial") + work("internal") - stored
+        self.work[3] += work("inertial") + work("internal") + heating - stored
+        self.work[4] += heating
+
+    def _heating(self) -> float:
+        """Work that a changing temperature does on the counted bars: -A l0 (s0 + s1)/2 (change of thermal strain)."""
+        model = self.model
+        if not model.temperatures.varying:
+            return 0.0
+        stress = model.bars.fields(self.stepper.state.x)["stress"]
+        before, self._stress = self._stress, stress
+        change = model.bars.thermal - self._thermal
+        self._thermal = model.bars.thermal.copy()
+        total = 0.0
+        for block in model.bars.blocks:
+            part = slice(block.start, block.counted)
+            mean = 0.5 * (before[part] + stress[part])
+            total -= block.area * float((model.bars.rest[part] * mean * change[part]).sum())
+        return total
 
     @property
     def kinetic(self) -> float:

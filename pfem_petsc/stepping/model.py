@@ -11,6 +11,7 @@ from ..mechanics.compiled import kernel
 from ..mechanics.loads import ExternalForce
 from ..mechanics.mass import Inertia
 from ..mechanics.supports import Supports
+from ..mechanics.temperature import Temperatures
 from ..mesh import load_slab
 from ..mesh.distribution import distribute
 from ..mesh.node_sets import resolve_node_sets
@@ -31,7 +32,7 @@ class Model:
 
     Attributes
     ----------
-    mesh, nodes, bars, inertia, external, supports, contact
+    mesh, nodes, bars, inertia, external, supports, temperatures, contact
     length : largest extent of the mesh [m]
     reach : largest coordinate magnitude [m], which sets the rounding of positions
     rounding : 2-norm of the residual that rounding of positions leaves [N]
@@ -54,6 +55,7 @@ class Model:
         self.external = ExternalForce(case, self.nodes, self.inertia)
         with agreed(comm):
             self.supports = Supports(case, self.nodes, mesh)
+            self.temperatures = Temperatures(case, mesh, self.bars)
         self.contact = Contact(case, self.nodes, mesh, self.supports.fixed)
 
         points = mesh.points[: mesh.n_owned]
@@ -91,4 +93,3 @@ class Model:
                     centre = sums[:3] / sums[3]
                 v[members] += np.cross(spin, points[members] - centre)
         return v
-

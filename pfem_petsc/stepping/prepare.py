@@ -64,7 +64,7 @@ def make_plan(model) -> Plan:
     if time.step == "auto":
         if not np.isfinite(critical):
             raise InputError(
-                f"{case.source}: time.step = \"auto\": {time.integrator} has no critical step here; give time.step [s]"
+                f'{case.source}: time.step = "auto": {time.integrator} has no critical step here; give time.step [s]'
             )
         steps = max(int(np.ceil(time.end / (time.safety * critical))), 1)
         step = time.end / steps
@@ -73,13 +73,15 @@ def make_plan(model) -> Plan:
         if step > certain * (1.0 + 1e-9):
             raise InputError(
                 f"{case.source}: time.step = {step:g} s is above the limit of {time.integrator}, which is unstable "
-                f"beyond {critical:.6g} s for this model; take a smaller step or time.step = \"auto\""
+                f'beyond {critical:.6g} s for this model; take a smaller step or time.step = "auto"'
             )
         steps = max(int(np.ceil(time.end / step * (1.0 - 1e-12) - 1e-9)), 1)
     linear = None
     if not scheme.explicit or model.inertia.consistent:
         over = step * frequency.upper / 2.0
-        linear = choose_linear(case.solver.linear, 3 * model.mesh.n_nodes, 0.0 if scheme.explicit else over)
+        linear = choose_linear(
+            case.solver.linear, 3 * model.mesh.n_nodes, 0.0 if scheme.explicit else over, scheme.symmetric
+        )
     return Plan(scheme, step, steps, critical, frequency, linear)
 
 

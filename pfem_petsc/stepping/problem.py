@@ -123,7 +123,10 @@ class StepProblem:
         g += self.known
         if balance.weight:
             self._place(u)
-            self.model.bars.forces(self.x, self.f, commit=False)
+            if balance.from_start:
+                self.model.bars.step_forces(self.state.x, self.x, self.f)
+            else:
+                self.model.bars.forces(self.x, self.f, commit=False)
             g += balance.weight * self.f[:owned]
 
     def residual(self, w: np.ndarray, g: np.ndarray) -> None:
@@ -143,7 +146,11 @@ class StepProblem:
             matrix.add_lumped(self.nodal, values)
         coefficients = inertia.coefficients(balance.alpha, balance.eta)
         if balance.weight or inertia.consistent:
-            self.model.bars.tangents(self.x, balance.weight, coefficients, matrix.pattern, values)
+            bars, arguments = self.model.bars, (balance.weight, coefficients, matrix.pattern, values)
+            if balance.from_start:
+                bars.step_tangents(self.state.x, self.x, *arguments)
+            else:
+                bars.tangents(self.x, *arguments)
         if self._oblique:
             columns = local_columns(self.model.mesh, matrix.pattern.columns)
             _turn_blocks(matrix.pattern.ptr, columns, self._frame_of, self._frame_of, self._inverse, values)

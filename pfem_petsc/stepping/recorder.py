@@ -35,8 +35,8 @@ class Recorder:
         self.columns |= {name: () for name in ("newton_iterations", "linear_iterations", "active_contacts")}
         self.columns |= {name: () for name in ("kinetic_energy", "elastic_energy", "plastic_dissipation")}
         self.columns |= {name: () for name in ("plastic_heat", "hardening_energy", "damping_dissipation")}
-        self.columns |= {name: () for name in ("external_work", "contact_work", "numerical_dissipation")}
-        self.columns |= {"energy_imbalance": ()}
+        self.columns |= {name: () for name in ("external_work", "contact_work", "thermal_work")}
+        self.columns |= {name: () for name in ("numerical_dissipation", "energy_imbalance")}
         self.columns |= {name: (3,) for name in ("momentum", "angular_momentum", "centre_of_mass", "support_force")}
         self.types: dict[str, Any] = dict.fromkeys(
             ("step", "newton_iterations", "linear_iterations", "active_contacts"), np.int64
@@ -90,17 +90,17 @@ class Recorder:
 
     def _unpack(self, sums: np.ndarray) -> dict[str, Any]:
         stepper, state = self.stepper, self.stepper.state
-        kinetic, elastic, heat, hardening, external, contact, damping, numerical = sums[:8]
-        held = kinetic + elastic + heat + hardening + damping + numerical - external - contact
+        kinetic, elastic, heat, hardening, external, contact, damping, numerical, thermal = sums[:9]
+        held = kinetic + elastic + heat + hardening + damping + numerical - external - contact - thermal
         if self.start_energy is None:
             self.start_energy = float(held)
         row: dict[str, Any] = {
             "time": state.time,
             "step": state.step,
-            "step_size": stepper.h,
+            "step_size": stepper.smallest,
             "newton_iterations": int(self.iterations[0]),
             "linear_iterations": int(self.iterations[1]),
-            "active_contacts": round(sums[20]),
+            "active_contacts": round(sums[21]),
             "kinetic_energy": kinetic,
             "elastic_energy": elastic,
             "plastic_dissipation": heat + hardening,
@@ -109,15 +109,16 @@ class Recorder:
             "damping_dissipation": damping,
             "external_work": external,
             "contact_work": contact,
+            "thermal_work": thermal,
             "numerical_dissipation": numerical,
             "energy_imbalance": held - self.start_energy,
-            "momentum": sums[8:11],
-            "angular_momentum": sums[11:14],
-            "centre_of_mass": sums[14:17] / self.model.total_mass,
-            "support_force": sums[17:20],
+            "momentum": sums[9:12],
+            "angular_momentum": sums[12:15],
+            "centre_of_mass": sums[15:18] / self.model.total_mass,
+            "support_force": sums[18:21],
         }
         self.iterations[:] = 0
-        at = 21
+        at = 22
         names = self.model.contact.names
         for k, name in enumerate(names):
             row[f"wall/{name}/force"] = sums[at + 3 * k : at + 3 * k + 3]

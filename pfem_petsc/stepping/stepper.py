@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +13,11 @@ from ..errors import SimulationFailure
 from ..integrators.base import Balance, Scheme, State
 from ..mechanics.bars import StrainEnergy
 
-__all__ = ["Solution", "Stepper"]
+__all__ = ["NotConverged", "Solution", "Stepper"]
+
+
+class NotConverged(SimulationFailure):
+    """A solve failed before anything of the state was changed: a smaller step may do. Raised on all ranks."""
 
 
 @dataclass
@@ -46,12 +51,15 @@ class Stepper(ABC):
     solution : of the last balance
     balance : the last balance
     fault : a failure that only this rank has met yet; raised on all when ranks next meet
+    h : the case's time step [s]; ``part`` the part of it being made, ``smallest`` the smallest part of the last step
+    booking : called after each part of a step
     """
 
     def __init__(self, model, scheme: Scheme, h: float) -> None:
         self.model = model
         self.scheme = scheme
-        self.h = h
+        self.h = self.part = self.smallest = h
+        self.booking: Callable[[], None] = lambda: None
         mesh = model.mesh
         owned = mesh.n_owned
         self.energy = StrainEnergy(0.0, 0.0, 0.0, -1)
@@ -92,26 +100,34 @@ class Stepper(ABC):
 
     def step(self) -> None:
         """Advance from t_n to t_{n+1}; the state is complete at both. Collective where the solve is."""
-        state, h = self.state, self.h
+        self._make_part((self.state.step + 1) * self.h)
+        self.state.step += 1
+
+    def _make_part(self, end: float) -> None:
+        """Advance by ``part``, to the time ``end``."""
+        if self.model.temperatures.varying:
+            self.model.bars.thermal_at_start[:] = self.model.bars.thermal
         if self.scheme.leads:
-            self.scheme.advance(state, h)
-            self._arrive()
+            self.scheme.advance(self.state, self.part)
+            self._arrive(end)
             self._solve_and_finish()
         else:
             self._solve_and_finish()
-            self._arrive()
+            self._arrive(end)
+        self.booking()
 
-    def _arrive(self) -> None:
-        self.state.step += 1
-        self.state.time = self.state.step * self.h
+    def _arrive(self, end: float) -> None:
+        self.state.time = end
+        if self.model.temperatures.varying:
+            self.model.temperatures.apply(end)
         self.evaluate(commit=True)
 
     def _solve_and_finish(self) -> None:
         state = self.state
-        self.balance = self.scheme.balance(state, self.h)
+        self.balance = self.scheme.balance(state, self.part)
         state.external = self._load(self.balance)
         self.solution = self.solve(self.balance)
-        self.scheme.finish(state, self.balance, self.solution.u, self.h)
+        self.scheme.finish(state, self.balance, self.solution.u, self.part)
 
     def _load(self, balance: Balance) -> np.ndarray:
         total = np.zeros_like(self.state.v)

@@ -1,0 +1,123 @@
+"""Bars between two positions: the discrete-gradient force of Simo-Tarnow type, which conserves energy and momenta.
+
+Between d0 and d1 (end differences of a bar at the start and end of a step) with d = (d0 + d1)/2, the force on the ends is
+-+ A l0 S R d, with the mean stress S = (s0 + s1)/2 and R = (e1 - e0)/((l1^2 - l0^2)/2). Its work over the step is exactly
+A l0 S (e1 - e0), which is the change of energy of a linear elastic bar; it is along d, so that both momenta are kept.
+For engineering strain R = 2/(L (l0 + l1)), for Green's 1/L^2, for the logarithmic ln(l1/l0)/((l1^2 - l0^2)/2).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import cache
+from types import SimpleNamespace
+
+from numba.extending import register_jitable
+
+from .compiled import kernel
+from .kernels import COLLAPSED_STRETCH
+from .strain import strain_of
+
+__all__ = ["make_conserving_kernels"]
+
+
+@register_jitable
+def _ratio(measure: int, s0: float, s1: float) -> tuple[float, float]:
+    """L^2 R and L^2 dR/ds1 for the stretches s0 = l0/L, s1 = l1/L."""
+    if measure == 0:
+        total = s0 + s1
+        return 2.0 / total, -2.0 / (total * total)
+    if measure == 1:
+        return 1.0, 0.0
+    q = s1 / s0 - 1.0
+    if abs(q) < 1e-4:
+        # ln(1+q)/(q (1 + q/2)) = 1 - q + 5/6 q^2 - 2/3 q^3 + ...
+        value = 1.0 - q * (1.0 - q * (5.0 / 6.0 - q * (2.0 / 3.0)))
+        slope = -1.0 + q * (5.0 / 3.0 - 2.0 * q)
+    else:
+        bottom = q * (1.0 + 0.5 * q)
+        value = math.log1p(q) / bottom
+        slope = (1.0 / (1.0 + q) - value * (1.0 + q)) / bottom
+    return value / (s0 * s0), slope / (s0 * s0 * s0)
+
+
+@cache
+def make_conserving_kernels(response: Callable) -> SimpleNamespace:
+    """Kernels ``forces`` and ``tangents`` of a material law; arguments as in :mod:`~pfem_petsc.mechanics.kernels`, with
+    positions and thermal strains at the start (``x0``, ``cold``) and end (``x``, ``thermal``) of the step."""
+
+    @kernel
+    def pair(x0, x, a, b, rest, shift0, shift, p, area, measure, history, row):
+        """Coefficient c = A l0 S R [N/m], dc/dl1 [N/m2], d (3) [m] and n1 (3); c is NaN for a collapsed bar."""
+        ox = x0[b, 0] - x0[a, 0]
+        oy = x0[b, 1] - x0[a, 1]
+        oz = x0[b, 2] - x0[a, 2]
+        dx = x[b, 0] - x[a, 0]
+        dy = x[b, 1] - x[a, 1]
+        dz = x[b, 2] - x[a, 2]
+        length = math.sqrt(dx * dx + dy * dy + dz * dz)
+        s0 = math.sqrt(ox * ox + oy * oy + oz * oz) / rest
+        s1 = length / rest
+        if not (s1 > COLLAPSED_STRETCH):
+            return math.nan, 0.0, dx, dy, dz, 0.0, 0.0, 0.0
+        e0, _, _ = strain_of(measure, s0)
+        e1, slope, _ = strain_of(measure, s1)
+        stress0, _, _, _, _ = response(e0 - shift0, p, history, row, False)
+        stress1, modulus, _, _, _ = response(e1 - shift, p, history, row, False)
+        mean = 0.5 * (stress0 + stress1)
+        r, dr = _ratio(measure, s0, s1)
+        c = area * mean * r / rest
+        dc = area * (0.5 * modulus * slope * r + mean * dr) / (rest * rest)
+        i = 1.0 / length
+        return c, dc, 0.5 * (ox + dx), 0.5 * (oy + dy), 0.5 * (oz + dz), dx * i, dy * i, dz * i
+
+    @kernel
+    def forces(x0, cold, x, bars, rest, thermal, p, area, measure, history, start, stop, f):
+        """Add the step's internal forces to ``f``."""
+        warm = len(thermal) > 0
+        for k in range(start, stop):
+            a = bars[k, 0]
+            b = bars[k, 1]
+            shift0 = cold[k] if warm else 0.0
+            shift = thermal[k] if warm else 0.0
+            c, _, dx, dy, dz, _, _, _ = pair(x0, x, a, b, rest[k], shift0, shift, p, area, measure, history, k - start)
+            f[a, 0] -= c * dx
+            f[a, 1] -= c * dy
+            f[a, 2] -= c * dz
+            f[b, 0] += c * dx
+            f[b, 1] += c * dy
+            f[b, 2] += c * dz
+
+    @kernel
+    def tangents(
+        x0, cold, x, bars, rest, thermal, p, area, measure, history, start, stop, inertia, weight, ptr, slots, values
+    ):
+        """Add ``weight`` df/dx1 = c/2 I + dc/dl1 d n1^T (not symmetric) and the consistent inertia."""
+        warm = len(thermal) > 0
+        d = [0.0, 0.0, 0.0]
+        n = [0.0, 0.0, 0.0]
+        for k in range(start, stop):
+            a = bars[k, 0]
+            b = bars[k, 1]
+            shift0 = cold[k] if warm else 0.0
+            shift = thermal[k] if warm else 0.0
+            c, dc, d[0], d[1], d[2], n[0], n[1], n[2] = pair(
+                x0, x, a, b, rest[k], shift0, shift, p, area, measure, history, k - start
+            )
+            mass = inertia * rest[k]
+            for side in range(4):
+                slot = slots[k, side]
+                if slot < 0:
+                    continue
+                row = a if side < 2 else b
+                sign = weight if side % 2 == 0 else -weight
+                m = 2.0 * mass if side % 2 == 0 else mass
+                at = 6 * ptr[row] + 3 * slot
+                wide = 3 * (ptr[row + 1] - ptr[row])
+                for i in range(3):
+                    for j in range(3):
+                        values[at + i * wide + j] += sign * dc * d[i] * n[j]
+                    values[at + i * wide + i] += sign * 0.5 * c + m
+
+    return SimpleNamespace(forces=forces, tangents=tangents)

@@ -1,0 +1,51 @@
+"""Temperatures of bars above the reference, constant or over time, and the thermal strains alpha theta they cause."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..errors import InputError
+from ..registry import nearest
+from .loads import Table
+
+__all__ = ["Temperatures"]
+
+
+class Temperatures:
+    """Temperature of each local bar.
+
+    Attributes
+    ----------
+    any : whether the case has temperatures
+    varying : whether any of them changes over time
+    """
+
+    def __init__(self, case, mesh, bars) -> None:
+        self.any = bool(case.temperature)
+        self.varying = any(entry.table is not None for entry in case.temperature)
+        self._bars = bars
+        self._entries = []
+        for index, entry in enumerate(case.temperature):
+            members = slice(None)
+            if entry.bars is not None:
+                if entry.bars not in mesh.bar_groups:
+                    known = sorted(mesh.bar_groups)
+                    hint = nearest(entry.bars, known) if known else "; the mesh has no bar groups"
+                    raise InputError(
+                        f"{case.source}: temperature[{index}].bars = {entry.bars!r}: no such bar group in the mesh{hint}"
+                    )
+                members = mesh.bar_groups[entry.bars]
+            self._entries.append((members, entry.value, Table(entry.table) if entry.table is not None else None))
+        self.values = np.zeros(len(mesh.bars) if self.any else 0)
+        if self.any:
+            bars.thermal = np.zeros(len(mesh.bars))
+            self.apply(0.0)
+            bars.thermal_at_start = bars.thermal.copy()
+
+    def apply(self, time: float) -> None:
+        """Give the bars their thermal strains at a time [s]; later entries of the case override earlier ones."""
+        for members, value, table in self._entries:
+            self.values[members] = value if table is None else table(time)[0]
+        for block in self._bars.blocks:
+            part = slice(block.start, block.stop)
+            self._bars.thermal[part] = block.thermal_expansion * self.values[part]

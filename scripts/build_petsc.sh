@@ -39,19 +39,20 @@ build_petsc() {
     # The wheel finds the machine's MPI at run time; the same package from source takes ten minutes.
     pip_install --only-binary=mpi4py mpi4py
 
+    # No wheel from pip's cache: it holds the paths of the environment that it was built in.
     echo "setup: building PETSc with $jobs job(s); its log: $venv/petsc.log"
     PATH=$venv/bin:$PATH PETSC_CONFIGURE_OPTIONS=$(petsc_options) MAKEFLAGS=-j$jobs \
-        "$python" -m pip install --verbose --no-build-isolation --no-deps "petsc$version" > "$venv/petsc.log" 2>&1 ||
+        "$python" -m pip install --verbose --no-cache-dir --no-build-isolation --no-deps "petsc$version" > "$venv/petsc.log" 2>&1 ||
         failed "$venv/petsc.log"
     echo "setup: building petsc4py"
     PETSC_DIR=$("$python" -c "import petsc; print(petsc.get_petsc_dir())") MAKEFLAGS=-j$jobs \
-        "$python" -m pip install --verbose --no-build-isolation --no-deps \
+        "$python" -m pip install --verbose --no-cache-dir --no-build-isolation --no-deps \
         "petsc4py==$("$python" -c "from importlib.metadata import version; print(version('petsc'))")" \
         > "$venv/petsc4py.log" 2>&1 || failed "$venv/petsc4py.log"
     echo "setup: building h5py on the parallel HDF5"
     hdf5=/usr/lib/$(gcc -print-multiarch)/hdf5/openmpi
     # Without isolation, or an old mpi4py is compiled first for the sake of its headers.
     HDF5_MPI=ON CC=mpicc HDF5_DIR=$hdf5 \
-        "$python" -m pip install --verbose --no-build-isolation --no-deps --no-binary=h5py h5py \
+        "$python" -m pip install --verbose --no-cache-dir --no-build-isolation --no-deps --no-binary=h5py h5py \
         > "$venv/h5py.log" 2>&1 || failed "$venv/h5py.log"
 }

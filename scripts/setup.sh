@@ -206,7 +206,7 @@ from_active() {
         version=$(awk '$2 == "PETSC_VERSION_MAJOR" {a = $3} $2 == "PETSC_VERSION_MINOR" {b = $3} END {print a "." b}' \
             "$PETSC_DIR/include/petscversion.h")
         say "building petsc4py for the PETSc $version in $PETSC_DIR"
-        pip_install "petsc4py==$version.*"
+        pip_install --no-cache-dir "petsc4py==$version.*"
     fi
     # Bindings that were compiled against NumPy 1 do not load with NumPy 2.
     has petsc4py.PETSc || pip_install "numpy<2"
@@ -214,7 +214,8 @@ from_active() {
         if [[ -n ${HDF5_DIR:-} ]]; then
             say "building h5py on the HDF5 in $HDF5_DIR"
             pip_install cython pkgconfig setuptools wheel
-            HDF5_MPI=ON CC=mpicc pip_install --no-build-isolation --no-deps --no-binary=h5py h5py
+            HDF5_MPI=ON CC=mpicc pip_install --no-cache-dir --no-build-isolation --no-deps \
+                --no-binary=h5py h5py
         else
             pip_install h5py
         fi

@@ -223,6 +223,7 @@ def test_engineering_prefixes():
     assert engineering(2.4e-6, "s") == "2.400 µs"
     assert engineering(2.1e11, "Pa") == "210.0 GPa"
     assert engineering(-3.21e4, "N") == "-32.10 kN"
+    assert engineering(2.28e8, "B") == "228.0 MB"
     assert engineering(0.0, "J") == "0 J"
     assert engineering(1e-3, "s") == "1.000 ms"
     assert engineering(12.5, "K") == "12.50 K"
@@ -243,4 +244,5 @@ def test_units():
     assert unit_of("wall/floor/force") == "N"
     assert unit_of("probe/tip/velocity") == "m/s"
     assert unit_of("numerical_dissipation") == unit_of("contact_work") == unit_of("kinetic_energy") == "J"
+    assert unit_of("energy_imbalance") == "J" and unit_of("step_size") == "s"
     assert unit_of("newton_iterations") == unit_of("plastic_strain") == ""

@@ -26,13 +26,16 @@ _ROUNDS = 20  # re-solves of a step because a wall was reached that the step had
 class ImplicitStepper(Stepper):
     """Newton's method on the free step; a variational inequality once a node can reach a wall."""
 
+    kept_numbers = (*Stepper.kept_numbers, "level")
+    kept_arrays = ("held",)
+
     def __init__(self, model, scheme, h: float, choice: LinearChoice) -> None:
         super().__init__(model, scheme, h)
         self.hessian = HessianMatrix(model.mesh, model.supports.fixed, model.supports.any, scheme.symmetric)
         self.newton = NewtonSolver(model.mesh, self.hessian, choice, model.case.solver.max_newton, model.length)
         self.level = 0  # the next step is made in 2**level parts
         self.message: Callable[[str], None] = lambda text: None
-        self._held = np.zeros(model.mesh.n_owned, dtype=bool)  # nodes held by walls in the last step
+        self.held = np.zeros(model.mesh.n_owned, dtype=bool)  # nodes held by walls in the last step
 
     def step(self) -> None:
         """Advance by one step; where it does not converge, in halves of halves, which grow back step by step.
@@ -173,7 +176,7 @@ class ImplicitStepper(Stepper):
         ahead = balance.time - state.time
         move = ahead * state.v
         reach = 0.5 * np.linalg.norm(move, axis=1) + 1e-9 * model.length
-        near = self._held.copy()
+        near = self.held.copy()
         if len(move):
             near |= (model.contact.gaps(state.position + move, balance.time) <= reach[:, None]).any(axis=1)
         if model.comm.allreduce(int(near.any()), op=MPI.MAX) == 0:
@@ -219,7 +222,7 @@ class ImplicitStepper(Stepper):
         problem.imbalance(u, g)
         state.contact = np.zeros_like(u)
         walls, contacts = model.contact.none(), 0
-        self._held[:] = False
+        self.held[:] = False
         if frames is not None:
             at = frames.nodes
             lower, upper = bounds
@@ -230,7 +233,7 @@ class ImplicitStepper(Stepper):
             force, walls = model.contact.forces(frames, turned, active)
             state.contact[at] = force
             touching = (active != 0).any(axis=1)
-            self._held[at] = touching
+            self.held[at] = touching
             contacts = int(touching.sum())
         state.support = np.zeros_like(u)
         fixed = model.supports.fixed

@@ -53,7 +53,12 @@ class Stepper(ABC):
     fault : a failure that only this rank has met yet; raised on all when ranks next meet
     h : the case's time step [s]; ``part`` the part of it being made, ``smallest`` the smallest part of the last step
     booking : called after each part of a step
+    kept_numbers, kept_arrays : names of attributes that, with the state, determine what comes: numbers, and arrays with
+        a row for each owned node
     """
+
+    kept_numbers: tuple[str, ...] = ("part", "smallest")
+    kept_arrays: tuple[str, ...] = ()
 
     def __init__(self, model, scheme: Scheme, h: float) -> None:
         self.model = model

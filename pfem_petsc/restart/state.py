@@ -1,0 +1,169 @@
+"""Everything that determines the future of a run, as arrays and numbers that a checkpoint holds.
+
+Nodal arrays are those of the state, of the scheme's memory and of the stepper; bar arrays are the plastic history and
+the thermal strains. Internal forces and energies are saved rather than computed again: of a bar that yields the second
+evaluation may differ from the first in the last digit. Sums that each rank has for itself (works, energies, wall forces)
+are saved rank by rank, and given back so on as many ranks; on others the total goes to rank 0.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+
+from ..contact.contact import WallForces
+from ..mechanics.bars import StrainEnergy
+from ..mesh.exchange import Router
+from ..mesh.slab import slab_of
+from ..output.checkpoint import Checkpoint
+from ..parallel.natural import NaturalOrder
+
+__all__ = ["STATE_VERSION", "RunState"]
+
+STATE_VERSION = 1
+"""Changed with the meaning of what is saved."""
+
+_MEMORY = "memory."
+_KEPT = "stepper."
+
+
+class RunState:
+    """Collects the state of a run, and puts it back. Construction is collective.
+
+    Parameters
+    ----------
+    stepper : Stepper
+    """
+
+    def __init__(self, stepper) -> None:
+        self.stepper = stepper
+        self.model = stepper.model
+        mesh, comm = self.model.mesh, self.model.comm
+        self.comm = comm
+        self.counted = np.concatenate(
+            [np.arange(block.start, block.counted) for block in mesh.blocks] or [np.empty(0, dtype=np.int64)]
+        ).astype(np.int64)
+        self.node_order = NaturalOrder(comm, mesh.node_ids[: mesh.n_owned], mesh.n_nodes)
+        self.bar_order = NaturalOrder(comm, mesh.bar_ids[self.counted], mesh.n_bars)
+        self._columns = comm.allreduce(max((b.history.shape[1] for b in self.model.bars.blocks), default=0), op=MPI.MAX)
+
+    def arrays(self) -> dict[str, tuple[NaturalOrder, np.ndarray]]:
+        """Name to (order, rows owned by this rank) of all arrays; the same names on all ranks."""
+        nodes = {name: (self.node_order, array) for name, array in self._node_arrays().items()}
+        bars = {name: (self.bar_order, array[self.counted]) for name, array in self._bar_arrays().items()}
+        return {**nodes, **bars}
+
+    def scalars(self, ledger, recorder, row: dict[str, Any]) -> dict[str, Any]:
+        """The numbers. Collective."""
+        stepper, energy, walls = self.stepper, self.stepper.energy, self.stepper.solution.walls
+        mine = {
+            "work": ledger.work.tolist(),
+            "energy": list(energy[:3]),
+            "wall_force": walls.force.tolist(),
+            "wall_contacts": walls.contacts.tolist(),
+            "contacts": int(stepper.solution.contacts),
+        }
+        return {
+            "step": stepper.state.step,
+            "time": stepper.state.time,
+            "stepper": {name: getattr(stepper, name) for name in stepper.kept_numbers},
+            "iterations": recorder.iterations.tolist(),
+            "start_energy": recorder.start_energy,
+            "row": {name: float(row[name]) for name in ("energy_imbalance", "active_contacts")},
+            "node_arrays": sorted(self._node_arrays()),
+            "bar_arrays": sorted(self._bar_arrays()),
+            "ranks": self.comm.allgather(mine),
+        }
+
+    def orders(self, scalars: dict[str, Any]) -> dict[str, NaturalOrder]:
+        """How the arrays of a checkpoint with these numbers are to be read: nodal rows by owner, bars in slabs."""
+        slab = np.arange(self.bar_order.first, self.bar_order.first + self.bar_order.count)
+        bars = NaturalOrder(self.comm, slab, self.model.mesh.n_bars)
+        return dict.fromkeys(scalars["node_arrays"], self.node_order) | dict.fromkeys(scalars["bar_arrays"], bars)
+
+    def put_back(self, checkpoint: Checkpoint) -> None:
+        """Set the stepper to what a checkpoint holds; instead of its ``start``. Collective."""
+        stepper, state, owned = self.stepper, self.stepper.state, self.model.mesh.n_owned
+        scalars = checkpoint.scalars
+        for name in scalars["node_arrays"]:
+            values = checkpoint.arrays[name]
+            if name.startswith(_MEMORY):
+                state.memory[name.removeprefix(_MEMORY)] = values.copy()
+            elif name.startswith(_KEPT):
+                array = getattr(stepper, name.removeprefix(_KEPT))
+                array[:] = values.astype(array.dtype)
+            else:
+                getattr(state, name)[:owned] = values
+        self.model.mesh.update_ghosts(state.x)
+        self._put_back_bars(checkpoint)
+        state.step, state.time = int(scalars["step"]), float(scalars["time"])
+        for name, value in scalars["stepper"].items():
+            setattr(stepper, name, value)
+        mine = self._share(scalars["ranks"])
+        stepper.energy = StrainEnergy(*mine["energy"], -1)
+        walls = stepper.solution.walls
+        shape = walls.force.shape
+        stepper.solution.walls = WallForces(
+            np.array(mine["wall_force"], dtype=float).reshape(shape), np.array(mine["wall_contacts"], dtype=np.int64)
+        )
+        stepper.solution.contacts = mine["contacts"]
+
+    def put_back_sums(self, checkpoint: Checkpoint, ledger, recorder) -> dict[str, Any]:
+        """Set ledger and recorder, both made after :meth:`put_back`; gives what is known of the last row."""
+        scalars = checkpoint.scalars
+        ledger.work[:] = self._share(scalars["ranks"])["work"]
+        recorder.iterations[:] = scalars["iterations"]
+        recorder.start_energy = scalars["start_energy"]
+        return dict(scalars["row"])
+
+    def _share(self, ranks: list[dict[str, Any]]) -> dict[str, Any]:
+        """This rank's share of the sums: its own on as many ranks, else all on rank 0 and nothing elsewhere."""
+        if len(ranks) == self.comm.size:
+            return ranks[self.comm.rank]
+        total = {name: sum(np.array(share[name]) for share in ranks) for name in ranks[0]}
+        return {name: value if self.comm.rank == 0 else 0 * value for name, value in total.items()}
+
+    def _node_arrays(self) -> dict[str, np.ndarray]:
+        """Rows of owned nodes, by name: every array of the state, so that none added later is forgotten."""
+        state, owned = self.stepper.state, self.model.mesh.n_owned
+        found = {}
+        for item in dataclasses.fields(state):
+            value = getattr(state, item.name)
+            if isinstance(value, np.ndarray):
+                found[item.name] = value[:owned]
+        found |= {_MEMORY + name: array for name, array in state.memory.items()}
+        return found | {_KEPT + name: _numbers(getattr(self.stepper, name)) for name in self.stepper.kept_arrays}
+
+    def _bar_arrays(self) -> dict[str, np.ndarray]:
+        """Rows of all local bars, by name."""
+        bars = self.model.bars
+        found = {}
+        if self._columns:
+            history = np.zeros((len(bars.ends), self._columns))
+            for block in bars.blocks:
+                history[block.start : block.stop, : block.history.shape[1]] = block.history
+            found["history"] = history
+        if self.model.temperatures.any:
+            found |= {"thermal_strain": bars.thermal, "temperature": self.model.temperatures.values}
+        return found
+
+    def _put_back_bars(self, checkpoint: Checkpoint) -> None:
+        """Bars evaluated on two ranks get the same values on both."""
+        mesh, bars = self.model.mesh, self.model.bars
+        asking = Router(self.comm, slab_of(mesh.bar_ids, mesh.n_bars, self.comm.size))
+        asked = asking.send(mesh.bar_ids) - self.bar_order.first
+        for name in checkpoint.scalars["bar_arrays"]:
+            values = asking.reply(checkpoint.arrays[name][asked])
+            if name == "history":
+                for block in bars.blocks:
+                    block.history[:] = values[block.start : block.stop, : block.history.shape[1]]
+            else:
+                target = bars.thermal if name == "thermal_strain" else self.model.temperatures.values
+                target[:] = values
+
+
+def _numbers(array: np.ndarray) -> np.ndarray:
+    return array.astype(np.uint8) if array.dtype == bool else array

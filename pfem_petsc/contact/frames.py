@@ -39,8 +39,9 @@ class NodalFrames:
         self.oblique = False
 
 
-def build_frames(nodes: np.ndarray, fixed: np.ndarray, normals: np.ndarray, offsets: np.ndarray,
-                 gaps: np.ndarray) -> NodalFrames:
+def build_frames(
+    nodes: np.ndarray, fixed: np.ndarray, normals: np.ndarray, offsets: np.ndarray, gaps: np.ndarray
+) -> NodalFrames:
     """Frames of nodes from their planes, nearest plane first.
 
     Parameters
@@ -51,7 +52,7 @@ def build_frames(nodes: np.ndarray, fixed: np.ndarray, normals: np.ndarray, offs
     gaps : (m, w) distances to the planes [m], to rank them
     """
     frames = NodalFrames(nodes, offsets.shape[1])
-    if (np.abs(normals).max(axis=2, initial=1.0) == 1.0).all():
+    if (np.abs(normals).max(axis=2) == 1.0).all():
         _along_axes(frames, fixed, normals, offsets)
         return frames
     for i in range(len(nodes)):
@@ -73,8 +74,9 @@ def _along_axes(frames: NodalFrames, fixed: np.ndarray, normals: np.ndarray, off
         frames.upper[high, axis[high]] = np.minimum(frames.upper[high, axis[high]], -offsets[high, wall])
 
 
-def _frame(frames: NodalFrames, i: int, fixed: np.ndarray, normals: np.ndarray, offsets: np.ndarray,
-           gaps: np.ndarray) -> None:
+def _frame(
+    frames: NodalFrames, i: int, fixed: np.ndarray, normals: np.ndarray, offsets: np.ndarray, gaps: np.ndarray
+) -> None:
     basis = np.full((3, 3), np.nan)
     basis[fixed] = np.eye(3)[fixed]
     for wall in np.argsort(gaps, kind="stable"):
@@ -93,7 +95,7 @@ def _frame(frames: NodalFrames, i: int, fixed: np.ndarray, normals: np.ndarray, 
     free = np.isnan(basis[:, 0])
     if free.any():
         rest = basis[~free]
-        complement = np.linalg.svd(rest)[2][len(rest):] if len(rest) else np.eye(3)
+        complement = np.linalg.svd(rest)[2][len(rest) :] if len(rest) else np.eye(3)
         axes = np.eye(3)[free]
         # keep plain axes where they are orthogonal to the rest, so that nothing is turned without need
         basis[free] = axes if len(rest) == 0 or np.abs(axes @ rest.T).max() == 0.0 else complement

@@ -1,0 +1,166 @@
+"""Bar forces, tangents and fields of a lattice against whole-mesh NumPy, on any number of ranks."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from bar_twins import Law, shaken, whole_truss
+
+from pfem_petsc import Case
+from pfem_petsc.solvers.matrix import HessianMatrix
+from pfem_petsc.stepping.model import Model
+
+pytestmark = pytest.mark.parallel
+
+AREA = 2e-3
+ELASTIC = Law(70e9)
+PLASTIC = Law(70e9, 90e6, isotropic=3e9, kinematic=5e9)
+LAWS = [
+    pytest.param(replace(law, strain=strain), id=f"{name}-{strain}")
+    for name, law in (("elastic", ELASTIC), ("plastic", PLASTIC))
+    for strain in ("engineering", "green", "logarithmic")
+]
+
+
+@pytest.fixture
+def truss(comm):
+    """A model of a small lattice and its twin; the twin's bars have a plastic past where the law has one."""
+
+    def make(law):
+        case = Case.from_dict(
+            {
+                "mesh": {"generator": "lattice", "kind": "octet", "cells": [1, 1, 1], "pitch": 1.0},
+                "material": {"it": law.case()},
+                "section": {"it": {"area": AREA, "material": "it"}},
+                "time": {"integrator": "newmark", "step": 1e-5, "end": 1e-4},
+            }
+        )
+        model = Model(case, comm)
+        twin = whole_truss(model, AREA, law)
+        if law.yield_stress is not None:
+            random = np.random.default_rng(8)
+            twin.plastic = random.uniform(-2e-3, 2e-3, len(twin.bars))
+            twin.accumulated = np.abs(twin.plastic) + random.uniform(0.0, 2e-3, len(twin.bars))
+            for block in model.bars.blocks:
+                ids = model.mesh.bar_ids[block.start : block.stop]
+                block.history[:] = np.column_stack([twin.plastic[ids], twin.accumulated[ids]])
+        return model, twin
+
+    return make
+
+
+def local(model, values):
+    """Rows of an array in mesh numbering at this rank's nodes, ghosts included."""
+    return np.ascontiguousarray(values[model.mesh.node_ids])
+
+
+def whole(model, values):
+    """An array of this rank's nodes (or more) in mesh numbering, the same on every rank."""
+    mesh = model.mesh
+    out = np.zeros((mesh.n_nodes, *values.shape[1:]))
+    out[mesh.node_ids[: mesh.n_owned]] = values[: mesh.n_owned]
+    return model.comm.allreduce(out)
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_forces_and_energies(law, truss):
+    model, twin = truss(law)
+    x = shaken(twin, 4e-3)
+    f = np.empty((model.mesh.n_local, 3))
+    energy = model.bars.forces(local(model, x), f, commit=False)
+    expected = twin.forces(x)
+    assert np.abs(whole(model, f) - expected).max() < 1e-12 * np.abs(expected).max()
+    bar = twin.response(x)
+    volume = AREA * twin.rest
+    elastic, heat, hardening = (model.comm.allreduce(part) for part in energy[:3])
+    assert elastic == pytest.approx(volume @ (0.5 * bar["stress"] ** 2 / law.young_modulus), rel=1e-12)
+    if law.yield_stress is not None:
+        accumulated, plastic = bar["accumulated"], bar["plastic_strain"]
+        assert heat == pytest.approx(volume @ (law.yield_stress * accumulated), rel=1e-12)
+        stored = 0.5 * law.isotropic * accumulated**2 + 0.5 * law.kinematic * plastic**2
+        assert hardening == pytest.approx(volume @ stored, rel=1e-12)
+        yielding = np.mean(accumulated > twin.accumulated)
+        assert 0.1 < yielding < 0.9  # both branches of the law were met
+    else:
+        assert heat == hardening == 0.0
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_force_is_the_derivative_of_the_elastic_energy(law, truss):
+    """By central differences of the energy, along one direction, before any bar yields."""
+    model, twin = truss(replace(law, yield_stress=law.yield_stress and 1e12))
+    x, u = shaken(twin, 4e-3), shaken(twin, 1.0, seed=5) - twin.points
+    f = np.empty((model.mesh.n_local, 3))
+    model.bars.forces(local(model, x), f, commit=False)
+    work = (whole(model, f) * u).sum()
+    sides = [model.bars.forces(local(model, x + s * 1e-5 * u), f, commit=False).elastic for s in (1.0, -1.0)]
+    change = model.comm.allreduce(sides[0] - sides[1])
+    assert change / 2e-5 == pytest.approx(work, rel=1e-6)
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_plastic_state_is_kept_only_when_committed(law, truss):
+    model, twin = truss(law)
+    x = shaken(twin, 4e-3)
+    f = np.empty((model.mesh.n_local, 3))
+    before = [block.history.copy() for block in model.bars.blocks]
+    model.bars.forces(local(model, x), f, commit=False)
+    for block, history in zip(model.bars.blocks, before):
+        assert np.array_equal(block.history, history)
+    model.bars.forces(local(model, x), f, commit=True)
+    if law.yield_stress is not None:
+        bar = twin.response(x)
+        for block in model.bars.blocks:
+            ids = model.mesh.bar_ids[block.start : block.stop]
+            expected = np.column_stack([bar["plastic_strain"], bar["accumulated"]])[ids]
+            assert np.abs(block.history - expected).max(initial=0.0) < 1e-15
+        twin.plastic, twin.accumulated = bar["plastic_strain"], bar["accumulated"]
+    expected = twin.forces(x)
+    model.bars.forces(local(model, x), f, commit=False)
+    assert np.abs(whole(model, f) - expected).max() < 1e-10 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_matrix_product_and_derivative_of_forces_agree(law, truss):
+    """Assembled K_t times a vector, the matrix-free product, and finite and complex-step differences."""
+    model, twin = truss(law)
+    mesh = model.mesh
+    x, u = shaken(twin, 4e-3), shaken(twin, 1.0, seed=5) - twin.points
+    expected = (twin.stiffness(x) @ u.ravel()).reshape(-1, 3)
+    size = np.abs(expected).max()
+
+    out = np.empty((mesh.n_local, 3))
+    model.bars.product(local(model, x), local(model, u), out)
+    assert np.abs(whole(model, out) - expected).max() < 1e-12 * size
+
+    hessian = HessianMatrix(mesh, model.supports.fixed, model.supports.any)
+    inertia = [0.0] * len(model.bars.blocks)
+    matrix = hessian.fill(lambda values: model.bars.tangents(local(model, x), 1.0, inertia, hessian.pattern, values))
+    right, left = matrix.createVecs()
+    right.array[:] = local(model, u)[: mesh.n_owned].ravel()
+    matrix.mult(right, left)
+    assert np.abs(whole(model, left.array.reshape(-1, 3)) - expected).max() < 1e-12 * size
+    for thing in (right, left):
+        thing.destroy()
+    hessian.destroy()
+
+    forward, backward = np.empty((mesh.n_local, 3)), np.empty((mesh.n_local, 3))
+    h = 1e-8  # small enough that no bar changes its branch of the law
+    model.bars.forces(local(model, x + h * u), forward, commit=False)
+    model.bars.forces(local(model, x - h * u), backward, commit=False)
+    assert np.abs(whole(model, (forward - backward) / (2 * h)) - expected).max() < 1e-7 * size
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_fields(law, truss):
+    model, twin = truss(law)
+    x = shaken(twin, 4e-3)
+    model.bars.forces(local(model, x), np.empty((model.mesh.n_local, 3)), commit=True)
+    bar = twin.response(x)
+    fields = model.bars.fields(local(model, x))
+    for name in ("strain", "stress", "axial_force", "plastic_strain"):
+        if name == "plastic_strain" and law.yield_stress is None:
+            assert not fields[name].any()
+            continue
+        expected = bar[name][model.mesh.bar_ids]
+        assert np.abs(fields[name] - expected).max(initial=0.0) < 1e-12 * np.abs(bar[name]).max(), name

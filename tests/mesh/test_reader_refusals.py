@@ -120,10 +120,11 @@ def test_hdf5_that_declares_more_than_it_holds(tmp_path):
 
 @pytest.mark.parametrize("suffix", ["msh", "vtu", "vtkhdf", "h5"])
 @pytest.mark.parametrize("content", [b"", b"\0" * 1000, b"$", b"<VTKFile", b"\x89HDF\r\n\x1a\n" + b"\xff" * 500])
-def test_garbage_is_refused(tmp_path, suffix, content):
+def test_garbage_is_refused_without_a_word_on_stderr(tmp_path, capfd, suffix, content):
     path = tmp_path / f"garbage.{suffix}"
     path.write_bytes(content)
     refusal(path)
+    assert capfd.readouterr().err == ""
 
 
 @pytest.mark.parametrize("suffix", ["vtu", "vtkhdf", "h5"])
@@ -133,6 +134,16 @@ def test_truncated_files_are_refused(tmp_path, suffix, share):
     (write_hdf5 if suffix == "h5" else write_vtk)(path)
     content = path.read_bytes()
     path.write_bytes(content[: int(share * len(content))])
+    refusal(path)
+
+
+def test_vtu_on_which_vtk_aborts_is_refused(tmp_path):
+    """A number of compressed blocks in the billions, for which VTK throws where nothing catches."""
+    path = tmp_path / "blocks.vtu"
+    write_vtk(path)
+    content = path.read_bytes()
+    assert b"AQAAAACA" in content
+    path.write_bytes(content.replace(b"AQAAAACA", b"AQAA5ACA"))
     refusal(path)
 
 

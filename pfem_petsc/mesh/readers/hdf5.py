@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -107,7 +108,7 @@ def _describe(path: Path) -> tuple[int, int, list[str], list[str]]:
                         f"expected (n, {width}) {what}"
                     )
                 # Space never written takes no room in the file, so a small file can declare any size.
-                stored, declared = dataset.id.get_storage_size(), dataset.size * dataset.dtype.itemsize
+                stored, declared = dataset.id.get_storage_size(), prod(dataset.shape) * dataset.dtype.itemsize
                 if declared > stored * (_COMPRESSION if dataset.chunks else 1):
                     raise InputError(f"{path}: /{name} declares {dataset.shape} values but holds {stored} bytes")
                 counts.append(len(dataset))

@@ -7,20 +7,22 @@ Point arrays of the same names make node groups (a value below 0: in none).
 
 from __future__ import annotations
 
+import os
+import signal
+import subprocess
+import sys
+import tempfile
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from mpi4py import MPI
 
 from ...errors import InputError
 from ..slab import MeshSlab
+from . import vtk_extract
 from .scatter import WholeMesh, read_and_scatter
 
 __all__ = ["read"]
-
-_VTK_LINE = 3
-_ARRAYS = ("group", "section")
 
 
 def read(path: Path, comm: MPI.Comm) -> MeshSlab:
@@ -35,68 +37,26 @@ def read(path: Path, comm: MPI.Comm) -> MeshSlab:
 
 
 def _read(path: Path) -> WholeMesh:
-    from vtkmodules.util.numpy_support import vtk_to_numpy
-    from vtkmodules.vtkCommonCore import vtkCommand
-
-    messages: list[str] = []
-    reader = _reader(path)
-
-    def note(_caller: Any, _event: str, text: str) -> None:
-        messages.append(" ".join(text.split()))
-
-    note.CallDataType = "string0"
-    reader.AddObserver(vtkCommand.ErrorEvent, note)
-    reader.AddObserver(vtkCommand.WarningEvent, note)
-    reader.SetFileName(str(path))
-    reader.Update()
-    grid = reader.GetOutputDataObject(0)
-    if messages:
-        raise InputError(f"{path}: cannot be read: {messages[0][-300:]}")
-    if grid is None or not grid.IsA("vtkUnstructuredGrid"):
-        raise InputError(f"{path}: holds a {grid.GetClassName() if grid else 'nothing'}, not an unstructured grid")
-    n_nodes, n_bars = grid.GetNumberOfPoints(), grid.GetNumberOfCells()
-    if n_nodes == 0 or n_bars == 0:
-        raise InputError(f"{path}: {n_nodes} points and {n_bars} cells: not a mesh of bars, or a damaged file")
-    types = grid.GetDistinctCellTypesArray()
-    found = sorted(types.GetValue(i) for i in range(types.GetNumberOfTuples()))
-    if found != [_VTK_LINE]:
-        raise InputError(f"{path}: cells of types {found}; bars are lines (type {_VTK_LINE}), and nothing else is read")
-    ends = vtk_to_numpy(grid.GetCells().GetConnectivityArray())
-    if len(ends) != 2 * n_bars:
-        raise InputError(f"{path}: {n_bars} lines with {len(ends)} ends; a bar has two")
-    mesh = WholeMesh(
-        points=np.array(vtk_to_numpy(grid.GetPoints().GetData()), dtype=np.float64),
-        bars=ends.reshape(-1, 2).astype(np.int64),
-    )
-    mesh.node_groups = _groups(path, grid.GetPointData(), grid.GetFieldData())
-    mesh.bar_groups = _groups(path, grid.GetCellData(), grid.GetFieldData())
+    with tempfile.TemporaryDirectory() as folder:
+        result = Path(folder, "mesh.npz")
+        # -P: without the program's own folder in the path, where this module would stand in for the package vtk.
+        command = [sys.executable, "-P", vtk_extract.__file__, str(path.resolve()), str(result)]
+        environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, errors="replace", check=False)
+        if done.returncode == vtk_extract.REFUSED:
+            raise InputError(f"{path}: {done.stdout.strip()}")
+        if done.returncode < 0:
+            raise InputError(
+                f"{path}: VTK ended with signal {signal.Signals(-done.returncode).name} while reading it; "
+                "the file is damaged or too large for this machine: write it again"
+            )
+        if done.returncode:
+            last = done.stderr.strip().splitlines()[-1:] or ["no message"]
+            raise InputError(f"{path}: cannot be read with VTK ({last[0]}); is VTK 9.2 or newer installed?")
+        with np.load(result, allow_pickle=False) as arrays:
+            mesh = WholeMesh(points=arrays["points"], bars=arrays["bars"])
+            for key in arrays.files:
+                kind, slash, name = key.partition("/")
+                if slash:
+                    getattr(mesh, kind)[name] = arrays[key]
     return mesh
-
-
-def _reader(path: Path) -> Any:
-    if path.suffix.lower() == ".vtu":
-        from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridReader
-
-        return vtkXMLUnstructuredGridReader()
-    from vtkmodules.vtkIOHDF import vtkHDFReader
-
-    return vtkHDFReader()
-
-
-def _groups(path: Path, data: Any, fields: Any) -> dict[str, np.ndarray]:
-    from vtkmodules.util.numpy_support import vtk_to_numpy
-
-    groups = {}
-    for array_name in _ARRAYS:
-        array = data.GetArray(array_name)
-        if array is None:
-            continue
-        values = vtk_to_numpy(array)
-        if values.ndim != 1 or not np.array_equal(values, np.rint(values)):
-            raise InputError(f"{path}: array {array_name!r} must hold one whole number for each")
-        names = fields.GetAbstractArray(f"{array_name}_names")
-        n_names = names.GetNumberOfValues() if names is not None and names.IsA("vtkStringArray") else 0
-        for value in np.unique(values[values >= 0]):
-            i = int(value)
-            groups[names.GetValue(i) if i < n_names else f"{array_name}_{i}"] = np.flatnonzero(values == value)
-    return groups

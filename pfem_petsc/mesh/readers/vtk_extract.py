@@ -1,0 +1,99 @@
+"""Take a mesh of lines out of a VTK file: run as a program, ``vtk_extract.py FILE RESULT.npz``.
+
+A process of its own, because VTK aborts the process on some damaged files. Imports neither MPI nor this package.
+A file that is no mesh of bars: status 3 and the reason on stdout.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import numpy as np
+
+REFUSED = 3
+
+_VTK_LINE = 3
+_ARRAYS = ("group", "section")
+
+
+def main(path: str, result: str) -> int:
+    """Read ``path``, write ``points``, ``bars`` and ``node_groups/<name>``, ``bar_groups/<name>`` to ``result``."""
+    from vtkmodules.vtkCommonCore import vtkOutputWindow, vtkStringOutputWindow
+
+    listener = vtkStringOutputWindow()
+    vtkOutputWindow.SetInstance(listener)
+    reader = _reader(path)
+    reader.SetFileName(path)
+    reader.Update()
+    grid = reader.GetOutputDataObject(0)
+    # "ERROR: In FILE, line N", then on the next line "CLASS (ADDRESS): " and the message.
+    lines = listener.GetOutput().splitlines()
+    messages = [line.split("): ", 1)[-1] for line in lines if line and not line.startswith(("ERROR", "Warning"))]
+    try:
+        if lines:
+            raise ValueError(f"cannot be read: {(messages or lines)[0].strip()}")
+        arrays = _arrays(grid)
+    except ValueError as error:
+        print(error)
+        return REFUSED
+    np.savez(result, **arrays)
+    return 0
+
+
+def _reader(path: str) -> Any:
+    if path.lower().endswith(".vtu"):
+        from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridReader
+
+        return vtkXMLUnstructuredGridReader()
+    from vtkmodules.vtkIOHDF import vtkHDFReader
+
+    return vtkHDFReader()
+
+
+def _arrays(grid: Any) -> dict[str, np.ndarray]:
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    if grid is None or not grid.IsA("vtkUnstructuredGrid"):
+        raise ValueError(f"holds a {grid.GetClassName() if grid else 'nothing'}, not an unstructured grid")
+    n_nodes, n_bars = grid.GetNumberOfPoints(), grid.GetNumberOfCells()
+    if n_nodes == 0 or n_bars == 0:
+        raise ValueError(f"{n_nodes} points and {n_bars} cells: not a mesh of bars, or a damaged file")
+    types = grid.GetDistinctCellTypesArray()
+    found = sorted(types.GetValue(i) for i in range(types.GetNumberOfTuples()))
+    if found != [_VTK_LINE]:
+        raise ValueError(f"cells of types {found}; bars are lines (type {_VTK_LINE}), and nothing else is read")
+    ends = vtk_to_numpy(grid.GetCells().GetConnectivityArray())
+    if len(ends) != 2 * n_bars:
+        raise ValueError(f"{n_bars} lines with {len(ends)} ends; a bar has two")
+    arrays = {
+        "points": vtk_to_numpy(grid.GetPoints().GetData()).astype(np.float64),
+        "bars": ends.reshape(-1, 2).astype(np.int64),
+    }
+    for kind, data in (("node_groups", grid.GetPointData()), ("bar_groups", grid.GetCellData())):
+        for name, members in _groups(data, grid.GetFieldData()).items():
+            arrays[f"{kind}/{name}"] = members
+    return arrays
+
+
+def _groups(data: Any, fields: Any) -> dict[str, np.ndarray]:
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    groups = {}
+    for array_name in _ARRAYS:
+        array = data.GetArray(array_name)
+        if array is None:
+            continue
+        values = vtk_to_numpy(array)
+        if values.ndim != 1 or not np.array_equal(values, np.rint(values)):
+            raise ValueError(f"array {array_name!r} must hold one whole number for each")
+        names = fields.GetAbstractArray(f"{array_name}_names")
+        n_names = names.GetNumberOfValues() if names is not None and names.IsA("vtkStringArray") else 0
+        for value in np.unique(values[values >= 0]):
+            i = int(value)
+            groups[names.GetValue(i) if i < n_names else f"{array_name}_{i}"] = np.flatnonzero(values == value)
+    return groups
+
+
+if __name__ == "__main__":
+    sys.exit(main(*sys.argv[1:]))

@@ -32,7 +32,7 @@ stage() {
     result=${PIPESTATUS[0]}
     [[ $result == 5 && $selected == yes && $name != "1 rank" ]] && result=0
     # mpirun gives its ranks a terminal, whatever there is outside: colours and carriage returns.
-    line=$(sed 's/\x1b\[[0-9;]*m//g; s/\r$//' "$log" | grep -E '^=+ .* in [0-9.]+s.* =+$' | tail -n 1)
+    line=$(sed 's/\x1b\[[0-9;]*m//g; s/\r$//' "$log" | grep -E '^(=+ )?[0-9]+ .* in [0-9.]+s' | tail -n 1)
     if [[ $result == 0 ]]; then
         summary="$name: passed"$'\n'"${line:-no closing line}"$'\n'"$summary"
     else

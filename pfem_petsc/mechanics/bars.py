@@ -40,7 +40,7 @@ class BarBlock:
     damping: float
     thermal_expansion: float
     measure: int
-    parameters: np.ndarray
+    parameters: tuple[float, ...]
     history: np.ndarray
     kernels: SimpleNamespace
     conserving: SimpleNamespace
@@ -95,9 +95,9 @@ class Bars:
                     thermal_expansion=material.thermal_expansion,
                     measure=MEASURES[material.strain],
                     parameters=law.pack(material),
-                    history=np.zeros((count, law.HISTORY)),
-                    kernels=make_kernels(law.response),
-                    conserving=make_conserving_kernels(law.response),
+                    history=np.zeros((count if law.REMEMBERS else 0, 2)),
+                    kernels=make_kernels(law.response, law.REMEMBERS),
+                    conserving=make_conserving_kernels(law.response, law.REMEMBERS),
                 )
             )
 
@@ -159,14 +159,14 @@ class Bars:
                 out["stress"],
                 out["axial_force"],
             )
-            if block.history.shape[1]:
+            if len(block.history):
                 out["plastic_strain"][block.start : block.stop] = block.history[:, 0]
         return out
 
     @property
     def plastic(self) -> bool:
         """Whether any bar of this rank can yield."""
-        return any(block.history.shape[1] for block in self.blocks)
+        return any(len(block.history) for block in self.blocks)
 
 
 def section_of_bars(case, slab) -> np.ndarray:

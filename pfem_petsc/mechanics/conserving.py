@@ -43,34 +43,27 @@ def _ratio(measure: int, s0: float, s1: float) -> tuple[float, float]:
 
 
 @cache
-def make_conserving_kernels(response: Callable) -> SimpleNamespace:
+def make_conserving_kernels(response: Callable, remembers: bool) -> SimpleNamespace:
     """Kernels ``forces`` and ``tangents`` of a material law; arguments as in :mod:`~pfem_petsc.mechanics.kernels`, with
     positions and thermal strains at the start (``x0``, ``cold``) and end (``x``, ``thermal``) of the step."""
 
-    @kernel
-    def pair(x0, x, a, b, rest, shift0, shift, p, area, measure, history, row):
-        """Coefficient c = A l0 S R [N/m], dc/dl1 [N/m2], d (3) [m] and n1 (3); c is NaN for a collapsed bar."""
-        ox = x0[b, 0] - x0[a, 0]
-        oy = x0[b, 1] - x0[a, 1]
-        oz = x0[b, 2] - x0[a, 2]
-        dx = x[b, 0] - x[a, 0]
-        dy = x[b, 1] - x[a, 1]
-        dz = x[b, 2] - x[a, 2]
+    @register_jitable
+    def pair(ox, oy, oz, dx, dy, dz, rest, shift0, shift, p, area, measure, plastic, accumulated):
+        """Coefficient c = A l0 S R [N/m], dc/dl1 [N/m2] and 1/l1; c is NaN for a collapsed bar."""
         length = math.sqrt(dx * dx + dy * dy + dz * dz)
         s0 = math.sqrt(ox * ox + oy * oy + oz * oz) / rest
         s1 = length / rest
         if not (s1 > COLLAPSED_STRETCH):
-            return math.nan, 0.0, dx, dy, dz, 0.0, 0.0, 0.0
+            return math.nan, 0.0, 0.0
         e0, _, _ = strain_of(measure, s0)
         e1, slope, _ = strain_of(measure, s1)
-        stress0, _, _, _, _ = response(e0 - shift0, p, history, row, False)
-        stress1, modulus, _, _, _ = response(e1 - shift, p, history, row, False)
+        stress0, _, _, _, _, _, _ = response(e0 - shift0, p, plastic, accumulated)
+        stress1, modulus, _, _, _, _, _ = response(e1 - shift, p, plastic, accumulated)
         mean = 0.5 * (stress0 + stress1)
         r, dr = _ratio(measure, s0, s1)
         c = area * mean * r / rest
         dc = area * (0.5 * modulus * slope * r + mean * dr) / (rest * rest)
-        i = 1.0 / length
-        return c, dc, 0.5 * (ox + dx), 0.5 * (oy + dy), 0.5 * (oz + dz), dx * i, dy * i, dz * i
+        return c, dc, 1.0 / length
 
     @kernel
     def forces(x0, cold, x, bars, rest, thermal, p, area, measure, history, start, stop, f):
@@ -81,7 +74,16 @@ def make_conserving_kernels(response: Callable) -> SimpleNamespace:
             b = bars[k, 1]
             shift0 = cold[k] if warm else 0.0
             shift = thermal[k] if warm else 0.0
-            c, _, dx, dy, dz, _, _, _ = pair(x0, x, a, b, rest[k], shift0, shift, p, area, measure, history, k - start)
+            plastic = history[k - start, 0] if remembers else 0.0
+            accumulated = history[k - start, 1] if remembers else 0.0
+            ox = x0[b, 0] - x0[a, 0]
+            oy = x0[b, 1] - x0[a, 1]
+            oz = x0[b, 2] - x0[a, 2]
+            dx = x[b, 0] - x[a, 0]
+            dy = x[b, 1] - x[a, 1]
+            dz = x[b, 2] - x[a, 2]
+            c, _, _ = pair(ox, oy, oz, dx, dy, dz, rest[k], shift0, shift, p, area, measure, plastic, accumulated)
+            dx, dy, dz = 0.5 * (ox + dx), 0.5 * (oy + dy), 0.5 * (oz + dz)
             f[a, 0] -= c * dx
             f[a, 1] -= c * dy
             f[a, 2] -= c * dz
@@ -95,16 +97,24 @@ def make_conserving_kernels(response: Callable) -> SimpleNamespace:
     ):
         """Add ``weight`` df/dx1 = c/2 I + dc/dl1 d n1^T (not symmetric) and the consistent inertia."""
         warm = len(thermal) > 0
-        d = [0.0, 0.0, 0.0]
-        n = [0.0, 0.0, 0.0]
         for k in range(start, stop):
             a = bars[k, 0]
             b = bars[k, 1]
             shift0 = cold[k] if warm else 0.0
             shift = thermal[k] if warm else 0.0
-            c, dc, d[0], d[1], d[2], n[0], n[1], n[2] = pair(
-                x0, x, a, b, rest[k], shift0, shift, p, area, measure, history, k - start
+            plastic = history[k - start, 0] if remembers else 0.0
+            accumulated = history[k - start, 1] if remembers else 0.0
+            ox = x0[b, 0] - x0[a, 0]
+            oy = x0[b, 1] - x0[a, 1]
+            oz = x0[b, 2] - x0[a, 2]
+            dx = x[b, 0] - x[a, 0]
+            dy = x[b, 1] - x[a, 1]
+            dz = x[b, 2] - x[a, 2]
+            c, dc, inverse = pair(
+                ox, oy, oz, dx, dy, dz, rest[k], shift0, shift, p, area, measure, plastic, accumulated
             )
+            d = (0.5 * (ox + dx), 0.5 * (oy + dy), 0.5 * (oz + dz))
+            n = (dx * inverse, dy * inverse, dz * inverse)
             mass = inertia * rest[k]
             for side in range(4):
                 slot = slots[k, side]

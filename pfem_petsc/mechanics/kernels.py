@@ -12,6 +12,8 @@ from collections.abc import Callable
 from functools import cache
 from types import SimpleNamespace
 
+from numba.extending import register_jitable
+
 from .compiled import kernel
 from .strain import strain_of
 
@@ -21,12 +23,14 @@ COLLAPSED_STRETCH = 1e-3  # a bar below this fraction of its rest length has bee
 
 
 @cache
-def make_kernels(response: Callable) -> SimpleNamespace:
+def make_kernels(response: Callable, remembers: bool) -> SimpleNamespace:
     """Kernels of a material law: ``forces``, ``tangents``, ``product``, ``fields``.
 
     Common arguments: ``x`` (local nodes, 3) [m]; ``bars`` (b, 2) local ends; ``rest`` (b,) rest lengths [m]; ``thermal``
     (b,) thermal strains, or (0,) for none; ``p`` the law's parameters; ``area`` [m2]; ``measure`` of
-    :mod:`~pfem_petsc.mechanics.strain`; ``history`` of the bars of this block, whose row is ``k - start``.
+    :mod:`~pfem_petsc.mechanics.strain`; ``history`` of the bars of this block, whose row is ``k - start``: plastic and
+    accumulated plastic strain, (0, 2) for a law that does not remember. No array goes into an inner function: counting
+    its references costs more than the bar.
     """
 
     @kernel
@@ -55,7 +59,12 @@ def make_kernels(response: Callable) -> SimpleNamespace:
             strain, slope, _ = strain_of(measure, stretch)
             if warm:
                 strain -= thermal[k]
-            stress, _, u, q, w = response(strain, p, history, k - start, commit)
+            plastic = history[k - start, 0] if remembers else 0.0
+            accumulated = history[k - start, 1] if remembers else 0.0
+            stress, _, plastic, new, u, q, w = response(strain, p, plastic, accumulated)
+            if remembers and commit and new != accumulated:
+                history[k - start, 0] = plastic
+                history[k - start, 1] = new
             if k < counted:
                 volume = area * rest[k]
                 elastic += volume * u
@@ -70,18 +79,14 @@ def make_kernels(response: Callable) -> SimpleNamespace:
             f[b, 2] += c * dz
         return elastic, heat, hardening, failed
 
-    @kernel
-    def stiffness(x, a, b, rest, strain_shift, p, area, measure, history, row):
-        """dN/dl [N/m], N/l [N/m] and n of one bar."""
-        dx = x[b, 0] - x[a, 0]
-        dy = x[b, 1] - x[a, 1]
-        dz = x[b, 2] - x[a, 2]
+    @register_jitable
+    def stiffness(dx, dy, dz, rest, shift, p, area, measure, plastic, accumulated):
+        """dN/dl [N/m], N/l [N/m] and 1/l of one bar."""
         length = math.sqrt(dx * dx + dy * dy + dz * dz)
         strain, slope, curvature = strain_of(measure, length / rest)
-        stress, modulus, _, _, _ = response(strain - strain_shift, p, history, row, False)
+        stress, modulus, _, _, _, _, _ = response(strain - shift, p, plastic, accumulated)
         axial = area * (modulus * slope * slope + stress * curvature) / rest
-        geometric = area * stress * slope / length
-        return axial, geometric, dx / length, dy / length, dz / length
+        return axial, area * stress * slope / length, 1.0 / length
 
     @kernel
     def tangents(x, bars, rest, thermal, p, area, measure, history, start, stop, inertia, weight, ptr, slots, values):
@@ -95,7 +100,15 @@ def make_kernels(response: Callable) -> SimpleNamespace:
             a = bars[k, 0]
             b = bars[k, 1]
             shift = thermal[k] if warm else 0.0
-            axial, geometric, nx, ny, nz = stiffness(x, a, b, rest[k], shift, p, area, measure, history, k - start)
+            nx = x[b, 0] - x[a, 0]
+            ny = x[b, 1] - x[a, 1]
+            nz = x[b, 2] - x[a, 2]
+            plastic = history[k - start, 0] if remembers else 0.0
+            accumulated = history[k - start, 1] if remembers else 0.0
+            axial, geometric, inverse = stiffness(nx, ny, nz, rest[k], shift, p, area, measure, plastic, accumulated)
+            nx *= inverse
+            ny *= inverse
+            nz *= inverse
             axial = weight * (axial - geometric)
             geometric = weight * geometric
             mass = inertia * rest[k]
@@ -130,7 +143,15 @@ def make_kernels(response: Callable) -> SimpleNamespace:
             a = bars[k, 0]
             b = bars[k, 1]
             shift = thermal[k] if warm else 0.0
-            axial, geometric, nx, ny, nz = stiffness(x, a, b, rest[k], shift, p, area, measure, history, k - start)
+            nx = x[b, 0] - x[a, 0]
+            ny = x[b, 1] - x[a, 1]
+            nz = x[b, 2] - x[a, 2]
+            plastic = history[k - start, 0] if remembers else 0.0
+            accumulated = history[k - start, 1] if remembers else 0.0
+            axial, geometric, inverse = stiffness(nx, ny, nz, rest[k], shift, p, area, measure, plastic, accumulated)
+            nx *= inverse
+            ny *= inverse
+            nz *= inverse
             dx = u[b, 0] - u[a, 0]
             dy = u[b, 1] - u[a, 1]
             dz = u[b, 2] - u[a, 2]
@@ -157,7 +178,9 @@ def make_kernels(response: Callable) -> SimpleNamespace:
             dz = x[b, 2] - x[a, 2]
             strain, slope, _ = strain_of(measure, math.sqrt(dx * dx + dy * dy + dz * dz) / rest[k])
             shift = thermal[k] if warm else 0.0
-            stress, _, _, _, _ = response(strain - shift, p, history, k - start, False)
+            plastic = history[k - start, 0] if remembers else 0.0
+            accumulated = history[k - start, 1] if remembers else 0.0
+            stress, _, _, _, _, _, _ = response(strain - shift, p, plastic, accumulated)
             strain_out[k] = strain
             stress_out[k] = stress
             force_out[k] = area * stress * slope

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-import numpy as np
 from numba.extending import register_jitable
 
-__all__ = ["HISTORY", "pack", "response"]
+__all__ = ["REMEMBERS", "pack", "response"]
 
-HISTORY = 0
+REMEMBERS = False
 
 
-def pack(material) -> np.ndarray:
+def pack(material) -> tuple[float, ...]:
     """Parameters as the response reads them: (E,) [Pa]."""
-    return np.array([material.young_modulus], dtype=np.float64)
+    return (float(material.young_modulus),)
 
 
 @register_jitable
-def response(strain, p, history, k, commit):
-    """Stress [Pa], tangent modulus [Pa] and energy densities [J/m3]: elastic, plastic heat, hardening."""
+def response(strain, p, plastic, accumulated):
+    """Stress [Pa], tangent modulus [Pa], the two history variables, and energy densities [J/m3]: elastic, heat,
+    hardening."""
     stress = p[0] * strain
-    return stress, p[0], 0.5 * stress * strain, 0.0, 0.0
+    return stress, p[0], plastic, accumulated, 0.5 * stress * strain, 0.0, 0.0

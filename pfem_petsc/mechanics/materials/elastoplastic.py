@@ -7,28 +7,28 @@ of state s_Y a + K a^2/2 + H e_p^2/2: its first term is heat, the rest is stored
 
 from __future__ import annotations
 
-import numpy as np
 from numba.extending import register_jitable
 
-__all__ = ["HISTORY", "pack", "response"]
+__all__ = ["REMEMBERS", "pack", "response"]
 
-HISTORY = 2  # columns of the history array: plastic strain, accumulated plastic strain
+REMEMBERS = True
 
 
-def pack(material) -> np.ndarray:
+def pack(material) -> tuple[float, ...]:
     """Parameters as the response reads them: (E, s_Y, K, H) [Pa]."""
-    return np.array(
-        [material.young_modulus, material.yield_stress, material.isotropic_hardening, material.kinematic_hardening],
-        dtype=np.float64,
+    return (
+        float(material.young_modulus),
+        float(material.yield_stress),
+        float(material.isotropic_hardening),
+        float(material.kinematic_hardening),
     )
 
 
 @register_jitable
-def response(strain, p, history, k, commit):
-    """Stress [Pa], tangent modulus [Pa] and energy densities [J/m3]: elastic, plastic heat, hardening."""
-    plastic = history[k, 0]
-    accumulated = history[k, 1]
-    young, yield_stress, isotropic, kinematic = p[0], p[1], p[2], p[3]
+def response(strain, p, plastic, accumulated):
+    """Stress [Pa], tangent modulus [Pa], the new plastic and accumulated plastic strain, and energy densities [J/m3]:
+    elastic, heat, hardening."""
+    young, yield_stress, isotropic, kinematic = p
     stress = young * (strain - plastic)
     tangent = young
     relative = stress - kinematic * plastic
@@ -41,8 +41,6 @@ def response(strain, p, history, k, commit):
         plastic += step
         stress -= young * step
         tangent = young * (isotropic + kinematic) / (young + isotropic + kinematic)
-        if commit:
-            history[k, 0] = plastic
-            history[k, 1] = accumulated
     hardening = 0.5 * (isotropic * accumulated * accumulated + kinematic * plastic * plastic)
-    return stress, tangent, 0.5 * stress * (strain - plastic), yield_stress * accumulated, hardening
+    elastic = 0.5 * stress * (strain - plastic)
+    return stress, tangent, plastic, accumulated, elastic, yield_stress * accumulated, hardening

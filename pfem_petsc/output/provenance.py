@@ -12,9 +12,12 @@ import h5py
 import numpy as np
 from mpi4py import MPI
 
-from .hdf5 import set_text
+from .hdf5 import dataset_names, set_text
 
 __all__ = ["describe_run", "read_attributes", "write_case"]
+
+# HDF5 1.10's own limit is 64 KiB for an attribute with all that belongs to it.
+LONGEST_ATTRIBUTE = 1 << 15
 
 
 def describe_run(comm: MPI.Comm, attributes: Mapping[str, Any]) -> dict[str, Any]:
@@ -40,22 +43,31 @@ def describe_run(comm: MPI.Comm, attributes: Mapping[str, Any]) -> dict[str, Any
 
 
 def write_case(file: h5py.File, case_text: str, attributes: Mapping[str, Any]) -> None:
-    """Store the case in ``/case``: dataset ``text``, attributes. What is not a number or text is stored as JSON."""
+    """Store the case in ``/case``: dataset ``text``, attributes. What is not a number or text is stored as JSON.
+
+    Attributes too long for HDF5's become datasets of the same name.
+    """
     group = file.require_group("case")
-    set_text(group, "text", case_text)
     for name, value in attributes.items():
         if isinstance(value, (bool, int, float, np.integer, np.floating, np.bool_)):
             group.attrs[name] = value
         else:
             text = value if isinstance(value, str) else "json:" + json.dumps(value, default=_plain)
-            # Attributes over 64 KiB do not fit HDF5's default format; none has reason to be.
-            group.attrs.create(name, text.encode(), dtype=h5py.string_dtype("utf-8", max(1, len(text.encode()))))
+            raw = text.encode()
+            group.pop(name, None)
+            if len(raw) > LONGEST_ATTRIBUTE:
+                set_text(group, name, text)
+                group.attrs.pop(name, None)
+            else:
+                group.attrs.create(name, raw, dtype=h5py.string_dtype("utf-8", max(1, len(raw))))
+    set_text(group, "text", case_text)
 
 
 def read_attributes(group: h5py.Group) -> dict[str, Any]:
     """The attributes stored by :func:`write_case`, with their types."""
     found: dict[str, Any] = {}
-    for name, value in group.attrs.items():
+    long = {name: group[name][()] for name in dataset_names(group) if name != "text"}
+    for name, value in [*group.attrs.items(), *long.items()]:
         if isinstance(value, bytes):
             value = value.decode()
         if isinstance(value, str) and value.startswith("json:"):

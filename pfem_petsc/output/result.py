@@ -109,7 +109,7 @@ class Result:
         """The case, read from the text in the file."""
         from ..case.schema import Case
 
-        return Case.from_toml(self.case_text, Path(self.attributes.get("case_folder", self.path.parent)))
+        return Case.from_toml(self.case_text, Path(self.attributes.get("folder", self.path.parent)))
 
     @property
     def bars(self) -> np.ndarray:

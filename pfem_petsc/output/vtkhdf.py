@@ -39,12 +39,14 @@ class ResultWriter:
     """Writes snapshots and history of a run to one file: the same for any number of ranks.
 
     ``/VTKHDF`` is a temporal UnstructuredGrid of lines in the mesh's own numbering: connectivity once, points (the
-    current positions) and fields a snapshot. A snapshot's data, offsets and count are flushed before its time is
-    written and flushed: VTK's reader crashes on a file with more times than steps, and a kill may come at any moment.
+    current positions) and fields a snapshot. A kill may come at any moment, also within a flush, which writes in an
+    order of its own. So a snapshot's data and offsets are flushed before it is counted, and its count is flushed before
+    its time is written: VTK cannot read a step without data, and crashes on more times than steps.
     ``/history`` has a row a recorded step, ``/case`` what is needed to run the case again, ``/snapshots`` step and
     time of each snapshot.
 
-    All methods are collective. After a :class:`SimulationFailure` the writer only closes.
+    All methods are collective. After a :class:`SimulationFailure` they raise it again, and the
+    writer can only be closed.
 
     Parameters
     ----------
@@ -99,8 +101,9 @@ class ResultWriter:
         self.bar_order = NaturalOrder(comm, mesh.bar_ids[self.counted], self.n_bars)
         self._fields = {"PointData": sorted(point_fields), "CellData": sorted(cell_fields)}
         self._file: h5py.File | None = None
-        # No more can be written; the file itself is damaged.
-        self._failed = self._broken = False
+        # Why no more can be written, and whether the open file can still be closed.
+        self._failure: SimulationFailure | None = None
+        self._broken = False
 
         described = describe_run(comm, attributes)
         sizes = (self.n_nodes, self.n_bars)
@@ -175,14 +178,15 @@ class ResultWriter:
             self._append_marks(n, step, time)
             self._history.write()
             with writing(self.comm, self.path):
+                file.flush()
+            self._history.commit()
+            with writing(self.comm, self.path):
                 self._n_steps.write(np.array(n + 1, dtype=np.int64))
                 file.flush()
             with writing(self.comm, self.path):
                 grow(self._times, n + 1)
                 if self.comm.rank == 0:
                     write_rows(self._times, n, np.array([time], dtype=np.float64))
-            self._history.commit()
-            with writing(self.comm, self.path):
                 file.flush()
         self.n_snapshots = n + 1
 
@@ -214,7 +218,7 @@ class ResultWriter:
         if self._file is None:
             return
         try:
-            if not self._failed:
+            if self._failure is None:
                 self.flush_history()
         finally:
             file, self._file = self._file, None
@@ -233,24 +237,27 @@ class ResultWriter:
             self.close()
 
     def _ready(self) -> h5py.File:
-        if self._file is None or self._failed:
-            raise ValueError(f"{self.path}: the writer is closed, or writing failed before")
+        if self._failure is not None:
+            raise self._failure
+        if self._file is None:
+            raise ValueError(f"{self.path}: the writer is closed")
         return self._file
 
     @contextmanager
     def _whole_or_failed(self) -> Iterator[None]:
         try:
             yield
-        except BaseException:
-            self._failed = self._broken = True
+        except BaseException as error:
+            self._broken = True
+            known = isinstance(error, SimulationFailure)
+            self._failure = error if known else SimulationFailure(f"{self.path}: a write was interrupted: {error!r}")
             raise
 
     def _require_room(self, n_bytes: int) -> None:
         try:
             require_room(self.comm, self.path, n_bytes + self._history.reserve_bytes)
-        except SimulationFailure:
-            # The file is whole, so that it can still be closed.
-            self._failed = True
+        except SimulationFailure as error:
+            self._failure = error
             raise
 
     def _row_type(self, name: str, slab: np.ndarray) -> np.dtype:

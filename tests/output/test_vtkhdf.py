@@ -249,6 +249,8 @@ def test_a_folder_that_vanishes_ends_the_run_on_all_ranks(shared_tmp_path):
         COMM.Barrier()
         with pytest.raises(SimulationFailure, match="gone or unreachable"):
             write(writer, truss, range(10, 20))
+        with pytest.raises(SimulationFailure, match="gone or unreachable"):
+            writer.flush_history()
     if COMM.rank == 0:
         assert_history_is(open_result(shared_tmp_path / "moved").history, truss, range(6))
 
@@ -290,3 +292,16 @@ def test_large_snapshots_do_not_share_chunks_where_sizes_allow(tmp_path):
         assert 100_000 < points.chunks[0] * 24 <= 1 << 20
         assert complete_snapshots(file) == 2
     assert_grid_is(read_with_vtk(tmp_path / "result.vtkhdf", 1)[0], truss, 5)
+
+
+@pytest.mark.parallel
+def test_attributes_of_any_length_come_back(shared_tmp_path):
+    path = shared_tmp_path / "result.vtkhdf"
+    given = {"probe_nodes/tip": list(range(30_000)), "probe_nodes/base": [1], "yes": True, "step": 0.1}
+    given = {**given, "nothing": None, "long": "é" * 50_000, "empty": ""}
+    truss = write_all(path, attributes=given)
+    for changed in (given, {**given, "long": "short", "probe_nodes/base": list(range(30_000))}):
+        ResultWriter(path, COMM, truss.mesh, **options(append_after_step=99, attributes=changed)).close()
+        if COMM.rank == 0:
+            found = open_result(path).attributes
+            assert {name: found[name] for name in given} == changed

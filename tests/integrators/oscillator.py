@@ -1,0 +1,160 @@
+"""The linear oscillator as a model of the program: one bar, one free node that moves along it.
+
+With engineering strain and motion along the bar the force is linear; omega^2 = 2 E/(rho l^2) with lumped mass, and
+3 E/(rho l^2) with consistent mass. Also the schemes' amplification matrices, written down anew.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from mpi4py import MPI
+
+from pfem_petsc import Case
+from pfem_petsc.registry import lookup
+from pfem_petsc.stepping.explicit import ExplicitStepper
+from pfem_petsc.stepping.implicit import ImplicitStepper
+from pfem_petsc.stepping.model import Model
+from pfem_petsc.stepping.prepare import make_plan
+
+YOUNG, DENSITY, LENGTH = 2.0, 1.0, 1.0
+OMEGA = {"lumped": np.sqrt(2 * YOUNG / DENSITY) / LENGTH, "consistent": np.sqrt(3 * YOUNG / DENSITY) / LENGTH}
+
+
+def case(integrator, parameters=None, mass="lumped", damping_ratio=0.0, h=1e-3, end=1.0, velocity=0.0):
+    """The oscillator with a step h [s]; the free node starts at rest length, with a velocity [m/s]."""
+    damping = 2.0 * damping_ratio * OMEGA[mass] * DENSITY
+    return Case.from_dict(
+        {
+            "mesh": {"generator": "rod", "length": LENGTH, "elements": 1},
+            "node_set": {"base": {"nearest": [0.0, 0.0, 0.0]}, "mass": {"nearest": [LENGTH, 0.0, 0.0]}},
+            "material": {"it": {"young_modulus": YOUNG, "density": DENSITY, "damping": damping}},
+            "section": {"it": {"area": 1.0, "material": "it"}},
+            "initial": {"on": [{"node_set": "mass", "velocity": [velocity, 0.0, 0.0]}]},
+            "support": [{"node_set": "base", "fix": "xyz"}, {"node_set": "mass", "fix": "yz"}],
+            "time": {"integrator": integrator, "step": h, "end": end, "mass": mass, **(parameters or {})},
+            "solver": {"rtol": 1e-14},
+            "output": {"probe": [{"name": "mass", "node_set": "mass"}]},
+        }
+    )
+
+
+def stepper(omega_h, integrator, parameters=None, mass="lumped", damping_ratio=0.0, x0=0.0, v0=0.0):
+    """A started stepper at Omega = omega h, also above the limit at which the program refuses to start.
+
+    ``x0`` [m] and ``v0`` [m/s] are those of the free node.
+    """
+    the_case = case(integrator, parameters, mass, damping_ratio)
+    model = Model(the_case, MPI.COMM_SELF)
+    scheme = lookup("pfem_petsc.integrators", integrator, "test").Scheme(the_case.time.scheme)
+    h = omega_h / OMEGA[mass]
+    if scheme.explicit and mass == "lumped":
+        it = ExplicitStepper(model, scheme, h)
+    else:
+        it = ImplicitStepper(model, scheme, h, make_plan(Model(case("newmark", mass=mass), MPI.COMM_SELF)).linear)
+    free = int(np.flatnonzero(model.mesh.node_ids == 1)[0])
+    it.state.position[free, 0] += x0
+    model.initial_velocity = lambda: v0 * np.outer(np.arange(2) == free, [1.0, 0.0, 0.0])
+    it.start()
+    it.free = free
+    return it
+
+
+def displacements(it, steps):
+    """(steps + 1,) displacement of the free node from the bar's rest length; fewer where it runs away."""
+    found = [it.state.position[it.free, 0] - LENGTH]
+    for _ in range(steps):
+        it.step()
+        found.append(it.state.position[it.free, 0] - LENGTH)
+        if not abs(found[-1]) < 1e-2 * LENGTH:
+            break
+    return np.array(found)
+
+
+def roots(d, order):
+    """Roots of the recurrence of an order that a sequence follows: the scheme's eigenvalues, by least squares."""
+    d = d / np.abs(d).max()
+    delayed = np.stack([d[k : len(d) - order + k] for k in range(order)], axis=1)
+    coefficients = np.linalg.lstsq(delayed, d[order:], rcond=None)[0]
+    return np.roots([1.0, *-coefficients[::-1]])
+
+
+def properties(eigenvalues, omega_h):
+    """Spectral radius, algorithmic damping ratio and period error (T' - T)/T of the principal pair."""
+    principal = max((z for z in eigenvalues if z.imag > 1e-9), key=abs)
+    angle = np.angle(principal)
+    return np.abs(eigenvalues).max(), -np.log(abs(principal)) / angle, omega_h / angle - 1.0
+
+
+def newmark_family(beta, gamma, alpha_m=0.0, alpha_f=0.0, lagged_velocity=False):
+    """Eigenvalues of (1-a_m) a1 + a_m a0 + 2 xi w v + w^2 x = 0 with v, x weighted (1-a_f) new + a_f old."""
+
+    def eigenvalues(omega_h, damping_ratio=0.0):
+        w2, c = omega_h**2, 2.0 * damping_ratio * omega_h
+        v1, v0 = (0.0, 1.0) if lagged_velocity else (1.0 - alpha_f, alpha_f)
+        # rows: balance, position, velocity; columns: x, h v, h^2 a
+        new = np.array([[(1 - alpha_f) * w2, v1 * c, 1 - alpha_m], [1, 0, -beta], [0, 1, -gamma]])
+        old = np.array([[-alpha_f * w2, -v0 * c, -alpha_m], [1, 1, 0.5 - beta], [0, 1, 1 - gamma]])
+        return np.linalg.eigvals(np.linalg.solve(new, old))
+
+    return eigenvalues
+
+
+def explicit_alpha(rho):
+    a_m = (2 * rho - 1) / (1 + rho)
+    beta = (5 - 3 * rho) / ((1 + rho) ** 2 * (2 - rho))
+    return newmark_family(beta, 1.5 - a_m, a_m, 1.0, lagged_velocity=True)
+
+
+def implicit_alpha(rho):
+    a_m, a_f = (2 * rho - 1) / (rho + 1), rho / (rho + 1)
+    return newmark_family((1 - a_m + a_f) ** 2 / 4, 0.5 - a_m + a_f, a_m, a_f)
+
+
+def chung_lee(beta):
+    return newmark_family(beta, 1.5, 0.0, 1.0, lagged_velocity=True)
+
+
+def central_differences(omega_h, damping_ratio=0.0):
+    c = damping_ratio * omega_h
+    return np.roots([1 + c, omega_h**2 - 2, 1 - c])
+
+
+def houbolt(omega_h, damping_ratio=0.0):
+    c = damping_ratio * omega_h / 3
+    return np.roots([2 + omega_h**2 + 11 * c, -5 - 18 * c, 4 + 9 * c, -1 - 2 * c])
+
+
+def wilson(theta):
+    def eigenvalues(omega_h, damping_ratio=0.0):
+        # linear acceleration over theta h: x_t, h v_t as rows over (x, h v, h^2 a0, h^2 a1)
+        t = theta
+        x_t = np.array([1, t, t**2 / 2 - t**3 / 6, t**3 / 6])
+        v_t = np.array([0, 1, t - t**2 / 2, t**2 / 2])
+        a_t = np.array([0, 0, 1 - t, t])
+        balance = a_t + 2 * damping_ratio * omega_h * v_t + omega_h**2 * x_t
+        a1 = -balance[:3] / balance[3]
+        x1 = np.array([1, 1, 1 / 3, 0])[:3] + a1 / 6
+        v1 = np.array([0, 1, 0.5]) + a1 / 2
+        return np.linalg.eigvals(np.array([x1, v1, a1]))
+
+    return eigenvalues
+
+
+# name in messages: integrator, its parameters, order of the position recurrence, amplification
+SCHEMES = {
+    "central_differences": ("central_differences", {}, 2, central_differences),
+    "chung_lee 1": ("chung_lee", {"beta": 1.0}, 3, chung_lee(1.0)),
+    "chung_lee 1.02": ("chung_lee", {"beta": 1.02}, 3, chung_lee(1.02)),
+    "chung_lee 28/27": ("chung_lee", {}, 3, chung_lee(28 / 27)),
+    "hulbert_chung 0": ("hulbert_chung", {"rho_b": 0.0}, 3, explicit_alpha(0.0)),
+    "hulbert_chung 0.8": ("hulbert_chung", {}, 3, explicit_alpha(0.8)),
+    "souza_moura": ("souza_moura", {}, 3, explicit_alpha(0.3)),
+    "newmark": ("newmark", {}, 2, newmark_family(1.0, 1.5)),
+    "trapezoid": ("newmark", {"beta": 0.25, "gamma": 0.5}, 2, newmark_family(0.25, 0.5)),
+    "houbolt": ("houbolt", {}, 3, houbolt),
+    "wilson 1.4": ("wilson", {}, 3, wilson(1.4)),
+    "wilson 1.5": ("wilson", {"theta": 1.5}, 3, wilson(1.5)),
+    "wilson 2": ("wilson", {"theta": 2.0}, 3, wilson(2.0)),
+    "generalized_alpha 0.8": ("generalized_alpha", {}, 3, implicit_alpha(0.8)),
+    "generalized_alpha 0": ("generalized_alpha", {"rho_inf": 0.0}, 3, implicit_alpha(0.0)),
+}

@@ -305,3 +305,16 @@ def test_attributes_of_any_length_come_back(shared_tmp_path):
         if COMM.rank == 0:
             found = open_result(path).attributes
             assert {name: found[name] for name in given} == changed
+
+
+@pytest.mark.parallel
+def test_a_serial_h5py_is_refused_on_several_ranks(shared_tmp_path, monkeypatch):
+    class Config:
+        mpi = False
+
+    monkeypatch.setattr(h5py, "get_config", Config)
+    if COMM.size == 1:
+        write_all(shared_tmp_path / "result.vtkhdf")
+    else:
+        with pytest.raises(InputError, match="serial build.*install h5py built with MPI"):
+            write_all(shared_tmp_path / "result.vtkhdf")

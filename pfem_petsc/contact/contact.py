@@ -7,18 +7,32 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import InputError, SimulationFailure
+from ..parallel.agreement import agreed
 from ..registry import lookup
 from .frames import NodalFrames, build_frames
+from .motion import WallMotion
 from .projection import project
+from .search import near_planes
 
 __all__ = ["Contact", "WallForces"]
+
+_CURVED_ROUNDS = 100  # projections of an explicit step until tangent planes and positions agree
+_ZERO = np.zeros(1)
 
 
 @dataclass
 class WallForces:
-    """Per wall: force on the truss [N] (walls, 3) and nodes in contact (walls,), sums over this rank's nodes."""
+    """Per wall, sums over this rank's nodes.
+
+    Attributes
+    ----------
+    force : (walls, 3) on the truss [N]
+    moment : (walls, 3) of that about the origin [N m]
+    contacts : (walls,) nodes in contact
+    """
 
     force: np.ndarray
+    moment: np.ndarray
     contacts: np.ndarray
 
 
@@ -29,37 +43,73 @@ class Contact:
     ----------
     names : of the walls, in the case's order
     any : whether the case has walls
+    moving : (walls,) bool
+    state : of the nodes, for walls that must know where nodes come from; set by the stepper
     """
 
-    def __init__(self, case, nodes: dict[str, np.ndarray], mesh, fixed: np.ndarray) -> None:
+    def __init__(self, case, nodes: dict[str, np.ndarray], mesh, fixed: np.ndarray, parameters=None) -> None:
+        walls = list(case.wall) if parameters is None else parameters
         self.source = case.source
         self.mesh = mesh
         self.fixed = fixed
-        self.names = [wall.name for wall in case.wall]
-        self.any = bool(case.wall)
+        self.state = None
+        self.names = [wall.name for wall in walls]
+        self.any = bool(walls)
         self.walls = [
-            lookup("pfem_petsc.contact.walls", wall.type, f"{case.source}: wall.type").Wall(wall) for wall in case.wall
+            lookup("pfem_petsc.contact.walls", wall.type, f"{case.source}: wall.type").Wall(wall) for wall in walls
         ]
-        self.members = np.ones((mesh.n_owned, len(self.walls)), dtype=bool)
-        for k, wall in enumerate(case.wall):
+        self.motion = WallMotion(walls)
+        self.moving = self.motion.moving
+        self.everyone = np.array([wall.node_set is None for wall in walls], dtype=bool)
+        self.members = np.ones((mesh.n_owned, len(walls)), dtype=bool)
+        for k, wall in enumerate(walls):
             if wall.node_set is not None:
                 self.members[:, k] = False
                 self.members[nodes[wall.node_set], k] = True
-        self.everyone = [wall.node_set is None for wall in case.wall]
+        self.flat = np.array([wall.flat for wall in self.walls], dtype=bool)
+        self.partial = any(wall.partial for wall in self.walls)
+        self._normals = np.zeros((len(walls), 3))
+        self._offsets = np.zeros(len(walls))
+        for k in np.flatnonzero(self.flat):
+            self._normals[k], self._offsets[k] = self.walls[k].normal, self.walls[k].offset
+        extent = np.ptp(mesh.points, axis=0).max() if len(mesh.points) else 0.0
+        self.length = max(mesh.comm.allgather(float(extent)))
 
     def none(self) -> WallForces:
         """No contact."""
-        return WallForces(np.zeros((len(self.walls), 3)), np.zeros(len(self.walls), dtype=np.int64))
+        n = len(self.walls)
+        return WallForces(np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n, dtype=np.int64))
+
+    def positions(self, time: float) -> np.ndarray:
+        """Where the walls' centres are (walls, 3) [m]."""
+        return np.array([wall.centre for wall in self.walls]).reshape(-1, 3) + self.motion.shifts(time)
 
     def gaps(self, x: np.ndarray, time: float) -> np.ndarray:
         """Distances (owned, walls) [m] of positions (owned, 3) from the walls, infinite where a wall is no concern."""
+        shifts = self.motion.shifts(time)
         gaps = np.full((len(x), len(self.walls)), np.inf)
-        for k, wall in enumerate(self.walls):
-            normals, offsets = wall.planes(x, time)
-            gaps[:, k] = np.einsum("ij,ij->i", normals, x) - offsets
+        for k in range(len(self.walls)):
+            gaps[:, k] = self.gap(k, x, shifts)
             if not self.everyone[k]:
                 gaps[~self.members[:, k], k] = np.inf
         return gaps
+
+    def gap(self, k: int, x: np.ndarray, shifts: np.ndarray) -> np.ndarray:
+        """Distances (m,) [m] of positions (m, 3) from wall k."""
+        normals, offsets = self.walls[k].planes(x - shifts[k])
+        return np.einsum("ij,ij->i", normals, x - shifts[k]) - offsets
+
+    def near(self, x: np.ndarray, shifts: np.ndarray, reach: np.ndarray = _ZERO) -> np.ndarray:
+        """(owned,) bool: nodes at positions (owned, 3) within reach of a wall; (owned,) or (1,) [m], 0: beyond it."""
+        near = np.zeros(len(x), dtype=bool)
+        if self.flat.any():
+            at = self.flat
+            offsets = self._offsets[at] + np.einsum("ij,ij->i", self._normals[at], shifts[at])
+            members = self.members if self.flat.all() else np.ascontiguousarray(self.members[:, at])
+            near_planes(x, self._normals[at], offsets, self.everyone[at], members, reach, near)
+        for k in np.flatnonzero(~self.flat):
+            near |= (self.gap(k, x, shifts) < reach) & self.members[:, k]
+        return near
 
     def check_start(self, x: np.ndarray, length: float) -> None:
         """Refuse nodes that start beyond a wall by more than rounding of the model's size ``length`` [m]. Collective.
@@ -73,7 +123,9 @@ class Contact:
             return
         comm = self.mesh.comm
         gaps = self.gaps(x, 0.0)
-        for k, name in enumerate(self.names):
+        for k, wall in enumerate(self.walls):
+            if wall.partial:  # nothing starts beyond a wall that nodes can pass by
+                continue
             deepest, node, count = 0.0, -1, 0
             if len(gaps):
                 at = int(np.argmin(gaps[:, k]))
@@ -83,18 +135,34 @@ class Contact:
             count = comm.allreduce(count)
             if count:
                 raise InputError(
-                    f"{self.source}: wall {name!r}: node {node} starts {-depth:.6g} m beyond the wall "
+                    f"{self.source}: wall {self.names[k]!r}: node {node} starts {-depth:.6g} m beyond the wall "
                     f"({count} node{'s' if count > 1 else ''} in all); move the wall or the mesh, turn the normal to the "
-                    "allowed side, or name the nodes that it concerns with 'node_set'"
+                    "allowed side, name the nodes that it concerns with 'node_set', or let 'adjust = true' move the nodes"
                 )
 
-    def _planes(self, nodes: np.ndarray, x: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray]:
-        """Planes (m, w, 3), (m, w) of some nodes at positions (m, 3); offset -inf where a wall is no concern."""
-        normals = np.zeros((len(nodes), len(self.walls), 3))
-        offsets = np.empty((len(nodes), len(self.walls)))
+    def concerned(self, nodes: np.ndarray, x: np.ndarray, shifts: np.ndarray) -> np.ndarray:
+        """(m, walls) bool: walls that can stop nodes on their way to positions (m, 3)."""
+        concerned = self.members[nodes]
+        if self.partial and self.state is not None:
+            state = self.state
+            before = state.position[nodes]
+            earlier = self.motion.shifts(state.time)
+            for k, wall in enumerate(self.walls):
+                if wall.partial:
+                    # a node that the wall held may be beyond it by what the scheme makes of the balance
+                    held = state.contact[nodes] @ wall.normal > 0.0
+                    slack = np.where(held, 0.1 * wall.half.min(), 1e-9 * self.length)
+                    concerned[:, k] &= wall.stops(before - earlier[k], x - shifts[k], slack)
+        return concerned
+
+    def planes(self, concerned: np.ndarray, x: np.ndarray, shifts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Planes (m, w, 3), (m, w) at positions (m, 3); offset -inf where a wall is no concern."""
+        normals = np.empty((len(x), len(self.walls), 3))
+        offsets = np.empty((len(x), len(self.walls)))
         for k, wall in enumerate(self.walls):
-            normals[:, k], offsets[:, k] = wall.planes(x, time)
-        offsets[~self.members[nodes]] = -np.inf
+            normals[:, k], offsets[:, k] = wall.planes(x - shifts[k])
+            offsets[:, k] += normals[:, k] @ shifts[k]
+        offsets[~concerned] = -np.inf
         return normals, offsets
 
     def explicit(self, x: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float) -> tuple:
@@ -110,52 +178,78 @@ class Contact:
         -------
         (nodes, correction (m, 3) [m], force (m, 3) [N] by the walls, WallForces)
         """
-        gaps = self.gaps(x, time)
-        nodes = np.flatnonzero((gaps < 0.0).any(axis=1))
+        shifts = self.motion.shifts(time)
+        nodes = np.flatnonzero(self.near(x, shifts))
         walls = self.none()
         if len(nodes) == 0:
             return nodes, np.empty((0, 3)), np.empty((0, 3)), walls
         free = x[nodes]
-        normals, offsets = self._planes(nodes, free, time)
-        moved = free.copy()
-        multipliers = np.zeros(offsets.shape)
-        stuck = project(moved, self.fixed[nodes], normals, offsets, tolerance, multipliers)
-        if stuck >= 0:
-            node = self.mesh.node_ids[nodes[stuck]]
-            touched = [name for name, offset in zip(self.names, offsets[stuck], strict=True) if offset > -np.inf]
+        concerned = self.concerned(nodes, free, shifts)
+        at = free
+        for _ in range(_CURVED_ROUNDS):
+            normals, offsets = self.planes(concerned, at, shifts)
+            moved, multipliers = free.copy(), np.zeros(offsets.shape)
+            stuck = project(moved, self.fixed[nodes], normals, offsets, tolerance, multipliers)
+            if stuck >= 0:
+                raise SimulationFailure(self._no_room(nodes[stuck], offsets[stuck], time))
+            if self.flat.all() or np.abs(moved - at).max() <= tolerance:
+                break
+            at = moved
+        else:
+            node = self.mesh.node_ids[nodes[np.argmax(np.abs(moved - at).max(axis=1))]]
             raise SimulationFailure(
-                f"no position of node {node} at time {time:.6g} s satisfies all walls ({', '.join(touched)}) and its "
-                "supports; the walls leave it no room"
+                f"the place of node {node} on curved walls at time {time:.6g} s was not found in {_CURVED_ROUNDS} rounds; "
+                "take a smaller time step"
             )
-        force = multipliers[:, :, None] * normals * stiffness[nodes][:, None, None]
-        walls.force = force.sum(axis=0)
-        walls.contacts = (multipliers > 0.0).sum(axis=0)
+        strength = multipliers * stiffness[nodes][:, None]
+        force = strength[:, :, None] * normals
+        self._sum(walls, force, moved, multipliers > 0.0)
         x[nodes] = moved
         return nodes, moved - free, force.sum(axis=1), walls
 
-    def frames(self, candidates: np.ndarray, x: np.ndarray, time: float) -> NodalFrames:
-        """Coordinates and bounds of candidate nodes (owned local indices) from their planes at positions (owned, 3)."""
-        at = x[candidates]
-        normals, offsets = self._planes(candidates, at, time)
-        gaps = np.einsum("iwk,ik->iw", normals, at) - offsets
-        return build_frames(candidates, self.fixed[candidates], normals, offsets, gaps)
+    def _sum(self, walls: WallForces, force: np.ndarray, x: np.ndarray, touching: np.ndarray) -> None:
+        """Sums of forces (m, w, 3) on nodes at (m, 3)."""
+        walls.force = force.sum(axis=0)
+        walls.moment = np.cross(x[:, None, :], force).sum(axis=0)
+        walls.contacts = touching.sum(axis=0)
 
-    def forces(self, frames: NodalFrames, residual: np.ndarray, active: np.ndarray) -> tuple[np.ndarray, WallForces]:
-        """Forces of an implicit step from its residual on the active bounds.
+    def _no_room(self, node: int, offsets: np.ndarray, time: float) -> str:
+        touched = [name for name, offset in zip(self.names, offsets, strict=True) if offset > -np.inf]
+        return (
+            f"no position of node {self.mesh.node_ids[node]} at time {time:.6g} s satisfies all walls "
+            f"({', '.join(touched)}) and its supports; the walls leave it no room"
+        )
+
+    def frames(
+        self, candidates: np.ndarray, x: np.ndarray, time: float, concerned: np.ndarray, rank: np.ndarray | None = None
+    ) -> NodalFrames:
+        """Coordinates and bounds of candidate nodes from their planes at positions (owned, 3). Collective.
+
+        ``concerned`` (m, walls) says which walls can stop a candidate; ``rank`` (m, walls) in which order they are taken
+        where there are more than three; default: nearest first.
+        """
+        at = x[candidates]
+        normals, offsets = self.planes(concerned, at, self.motion.shifts(time))
+        if rank is None:
+            rank = np.einsum("iwk,ik->iw", normals, at) - offsets
+        tolerance = 1e-12 * self.length
+        frames = build_frames(candidates, self.fixed[candidates], normals, offsets, rank, tolerance)
+        with agreed(self.mesh.comm):
+            if frames.contradiction >= 0:
+                node = frames.contradiction
+                raise SimulationFailure(self._no_room(candidates[node], offsets[node], time))
+        return frames
+
+    def strengths(self, frames: NodalFrames, residual: np.ndarray, active: np.ndarray) -> np.ndarray:
+        """Normal forces (m, walls) [N] of an implicit step from its residual on the active bounds.
 
         Parameters
         ----------
         frames : NodalFrames
         residual : (m, 3) residual of the frames' nodes in their coordinates [N]
         active : (m, 3) int8: -1 on the lower bound, +1 on the upper, 0 on none
-
-        Returns
-        -------
-        force : (m, 3) by the walls on each node, in x [N]
-        WallForces
         """
-        walls = self.none()
-        total = np.zeros((len(frames.nodes), 3))
+        strengths = np.zeros(frames.rows.shape)
         every = np.arange(len(frames.nodes))
         left = np.where(active != 0, residual, 0.0)
         for k in range(len(self.walls)):
@@ -163,10 +257,13 @@ class Contact:
             sign = frames.signs[:, k]
             safe = np.maximum(row, 0)
             touching = (row >= 0) & (active[every, safe] == -sign)
-            strength = np.where(touching, left[every, safe], 0.0)
+            strengths[touching, k] = np.abs(left[every[touching], safe[touching]])
             left[every[touching], safe[touching]] = 0.0  # walls that share a bound: the first takes the force
-            force = strength[:, None] * frames.basis[every, safe]
-            total += force
-            walls.force[k] = force.sum(axis=0)
-            walls.contacts[k] = int((touching & (strength != 0.0)).sum())
-        return total, walls
+        return strengths
+
+    def forces(self, frames: NodalFrames, strengths: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, WallForces]:
+        """Forces (m, 3) on the frames' nodes at (m, 3) from normal forces (m, walls), and their sums per wall."""
+        walls = self.none()
+        force = strengths[:, :, None] * frames.normals
+        self._sum(walls, force, x, strengths > 0.0)
+        return force.sum(axis=1), walls

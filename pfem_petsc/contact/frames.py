@@ -1,17 +1,24 @@
 """Bounds on nodal coordinates for implicit steps, and the oblique coordinates that turn planes into bounds.
 
 At a node, y = B x with the normals of up to three independent planes as rows of B makes each plane a bound on one
-coordinate; opposite planes bound the same coordinate from both sides. Rows along the axes stay in the slot of their axis,
-so that walls along the axes need no change of coordinates at all.
+coordinate; opposite planes bound the same coordinate from both sides. Rows along the axes stay in their axis's slot,
+so that walls along the axes need no change of coordinates at all. Planes are taken in the order of a rank, nearest first;
+a plane that finds no row, or leans on the rows taken with less than :data:`MIN_SINE`, waits: whether it is kept is
+verified after the solve.
 """
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
-__all__ = ["MAX_CONDITION", "NodalFrames", "build_frames"]
+from ..mechanics.compiled import kernel
 
-MAX_CONDITION = 50.0  # of B: planes closer to parallel than about 2 degrees do not share a node's coordinates
+__all__ = ["MIN_SINE", "NodalFrames", "build_frames"]
+
+MIN_SINE = 0.04  # of the angle between a normal and the span of the rows before it: 2.3 degrees, cond(B) <= 50
+_PARALLEL = 1e-14  # 1 - |cos| of normals that share a row
 
 
 class NodalFrames:
@@ -24,105 +31,170 @@ class NodalFrames:
     lower, upper : (m, 3) bounds on y [m], infinite where there is none
     rows : (m, w) int8: the coordinate (0, 1, 2) that wall k bounds at the node, -1 where it does not
     signs : (m, w) +1 for a lower bound, -1 for an upper one
+    normals : (m, w, 3) unit normals of the planes
     oblique : whether any basis is not the identity
+    contradiction : index in ``nodes`` of a node whose bounds leave it no room, -1 for none
     """
 
     def __init__(self, nodes: np.ndarray, walls: int) -> None:
         m = len(nodes)
         self.nodes = nodes
-        self.basis = np.tile(np.eye(3), (m, 1, 1))
-        self.inverse = self.basis.copy()
+        self.basis = np.zeros((m, 3, 3))
+        self.inverse = np.zeros((m, 3, 3))
         self.lower = np.full((m, 3), -np.inf)
         self.upper = np.full((m, 3), np.inf)
         self.rows = np.full((m, walls), -1, dtype=np.int8)
         self.signs = np.ones((m, walls))
+        self.normals = np.zeros((m, walls, 3))
         self.oblique = False
+        self.contradiction = -1
 
 
 def build_frames(
-    nodes: np.ndarray, fixed: np.ndarray, normals: np.ndarray, offsets: np.ndarray, gaps: np.ndarray
+    nodes: np.ndarray, fixed: np.ndarray, normals: np.ndarray, offsets: np.ndarray, rank: np.ndarray, tolerance: float
 ) -> NodalFrames:
-    """Frames of nodes from their planes, nearest plane first.
+    """Frames of nodes from their planes, lowest rank first.
 
     Parameters
     ----------
     nodes : (m,) owned local indices
     fixed : (m, 3) bool, prescribed components: their axes are rows of B
     normals, offsets : (m, w, 3), (m, w) planes n . x >= d; offset -inf where a wall does not concern a node
-    gaps : (m, w) distances to the planes [m], to rank them
+    rank : (m, w) order in which planes are taken, commonly the distance [m]
+    tolerance : opposite bounds that overlap by no more are met in their middle [m]
     """
     frames = NodalFrames(nodes, offsets.shape[1])
-    if (np.abs(normals).max(axis=2) == 1.0).all():
-        _along_axes(frames, fixed, normals, offsets)
-        return frames
-    for i in range(len(nodes)):
-        _frame(frames, i, fixed[i], normals[i], offsets[i], gaps[i])
+    frames.normals = normals
+    frames.oblique, frames.contradiction = _build(
+        fixed, normals, offsets, rank, tolerance, frames.basis, frames.inverse, frames.lower, frames.upper, frames.rows,
+        frames.signs,
+    )
     return frames
 
 
-def _along_axes(frames: NodalFrames, fixed: np.ndarray, normals: np.ndarray, offsets: np.ndarray) -> None:
-    """All planes along the axes: bounds on the components as they are."""
-    every = np.arange(len(frames.nodes))
-    for wall in range(offsets.shape[1]):
-        axis = np.argmax(np.abs(normals[:, wall]), axis=1)
-        sign = np.sign(normals[every, wall, axis])
-        at = np.flatnonzero((offsets[:, wall] > -np.inf) & ~fixed[every, axis])
-        frames.rows[at, wall] = axis[at]
-        frames.signs[at, wall] = sign[at]
-        low, high = at[sign[at] > 0], at[sign[at] < 0]
-        frames.lower[low, axis[low]] = np.maximum(frames.lower[low, axis[low]], offsets[low, wall])
-        frames.upper[high, axis[high]] = np.minimum(frames.upper[high, axis[high]], -offsets[high, wall])
+@kernel
+def _rest(vector, spanned, n, out):
+    """Length of the part of a unit vector off the span of n orthonormal vectors, which goes to ``out``."""
+    for c in range(3):
+        out[c] = vector[c]
+    for _ in range(2):  # twice is enough for orthogonality to rounding
+        for p in range(n):
+            s = 0.0
+            for c in range(3):
+                s += spanned[p, c] * out[c]
+            for c in range(3):
+                out[c] -= s * spanned[p, c]
+    return math.sqrt(out[0] * out[0] + out[1] * out[1] + out[2] * out[2])
 
 
-def _frame(
-    frames: NodalFrames, i: int, fixed: np.ndarray, normals: np.ndarray, offsets: np.ndarray, gaps: np.ndarray
-) -> None:
-    basis = np.full((3, 3), np.nan)
-    basis[fixed] = np.eye(3)[fixed]
-    for wall in np.argsort(gaps, kind="stable"):
-        if offsets[wall] == -np.inf:
-            continue
-        normal = normals[wall]
-        slot, sign = _slot(basis, fixed, normal)
-        if slot < 0:
-            continue
-        frames.rows[i, wall] = slot
-        frames.signs[i, wall] = sign
-        if sign > 0:
-            frames.lower[i, slot] = max(frames.lower[i, slot], offsets[wall])
-        else:
-            frames.upper[i, slot] = min(frames.upper[i, slot], -offsets[wall])
-    free = np.isnan(basis[:, 0])
-    if free.any():
-        rest = basis[~free]
-        complement = np.linalg.svd(rest)[2][len(rest) :] if len(rest) else np.eye(3)
-        axes = np.eye(3)[free]
-        # keep plain axes where they are orthogonal to the rest, so that nothing is turned without need
-        basis[free] = axes if len(rest) == 0 or np.abs(axes @ rest.T).max() == 0.0 else complement
-    frames.basis[i] = basis
-    frames.inverse[i] = np.linalg.inv(basis)
-    if not np.array_equal(basis, np.eye(3)):
-        frames.oblique = True
-
-
-def _slot(basis: np.ndarray, fixed: np.ndarray, normal: np.ndarray) -> tuple[int, float]:
-    """Row of the basis for a normal: an existing parallel one, the slot of its axis, or the next free; -1 for none."""
-    taken = ~np.isnan(basis[:, 0])
-    for row in np.flatnonzero(taken):
-        cosine = float(basis[row] @ normal)
-        if abs(cosine) > 1.0 - 1e-14:
-            return (-1, 1.0) if fixed[row] else (int(row), float(np.sign(cosine)))
-    axis = int(np.argmax(np.abs(normal)))
-    along = abs(normal[axis]) == 1.0
-    if along and not taken[axis]:
-        trial, slot, sign = np.eye(3)[axis], axis, float(np.sign(normal[axis]))
-    else:
-        free = np.flatnonzero(~taken)
-        if len(free) == 0:
-            return -1, 1.0
-        trial, slot, sign = normal, int(free[np.argmax(np.abs(normal[free]))]), 1.0
-    rows = np.vstack([basis[taken], trial])
-    if np.linalg.cond(rows) > MAX_CONDITION:
-        return -1, 1.0
-    basis[slot] = trial
-    return slot, sign
+@kernel
+def _build(fixed, normals, offsets, rank, tolerance, basis, inverse, lower, upper, rows, signs):
+    m, w = offsets.shape
+    taken = np.zeros(3, dtype=np.bool_)
+    spanned = np.zeros((3, 3))
+    part = np.zeros(3)
+    unit = np.zeros(3)
+    best_part = np.zeros(3)
+    done = np.zeros(w, dtype=np.bool_)
+    oblique = False
+    contradiction = -1
+    for i in range(m):
+        n = 0
+        for c in range(3):
+            taken[c] = fixed[i, c]
+            if taken[c]:
+                basis[i, c, c] = 1.0
+                spanned[n, 0] = spanned[n, 1] = spanned[n, 2] = 0.0
+                spanned[n, c] = 1.0
+                n += 1
+        for k in range(w):
+            done[k] = offsets[i, k] == -math.inf
+        while True:
+            wall = -1
+            for k in range(w):
+                if not done[k] and (wall < 0 or rank[i, k] < rank[i, wall]):
+                    wall = k
+            if wall < 0:
+                break
+            done[wall] = True
+            normal = normals[i, wall]
+            slot, sign, shared = -1, 1.0, False
+            for row in range(3):
+                if taken[row]:
+                    cosine = basis[i, row, 0] * normal[0] + basis[i, row, 1] * normal[1] + basis[i, row, 2] * normal[2]
+                    if abs(cosine) > 1.0 - _PARALLEL:
+                        shared = True
+                        if not fixed[i, row]:
+                            slot = row
+                            sign = 1.0 if cosine > 0.0 else -1.0
+            if shared and slot < 0:
+                continue
+            if not shared:
+                if n == 3:
+                    continue
+                length = _rest(normal, spanned, n, part)
+                if length < MIN_SINE:
+                    continue
+                axis = 0
+                for c in range(3):
+                    if abs(normal[c]) > abs(normal[axis]):
+                        axis = c
+                along = abs(normal[axis]) == 1.0
+                if along and not taken[axis]:
+                    slot = axis
+                    sign = 1.0 if normal[axis] > 0.0 else -1.0
+                    basis[i, slot, axis] = 1.0
+                else:
+                    for c in range(3):
+                        if not taken[c] and (slot < 0 or abs(normal[c]) > abs(normal[slot])):
+                            slot = c
+                    for c in range(3):
+                        basis[i, slot, c] = normal[c]
+                for c in range(3):
+                    spanned[n, c] = part[c] / length
+                n += 1
+                taken[slot] = True
+            rows[i, wall] = slot
+            signs[i, wall] = sign
+            if sign > 0.0:
+                lower[i, slot] = max(lower[i, slot], offsets[i, wall])
+            else:
+                upper[i, slot] = min(upper[i, slot], -offsets[i, wall])
+        for slot in range(3):
+            if taken[slot]:
+                continue
+            # the axis of the slot where it can be had, so that nothing is turned without need
+            best = -1.0
+            for shift in range(3):
+                axis = (slot + shift) % 3
+                for c in range(3):
+                    unit[c] = 1.0 if c == axis else 0.0
+                length = _rest(unit, spanned, n, part)
+                if length > best + 1e-9:
+                    best = length
+                    for c in range(3):
+                        best_part[c] = part[c] / length
+            for c in range(3):
+                basis[i, slot, c] = best_part[c]
+                spanned[n, c] = best_part[c]
+            n += 1
+        b = basis[i]
+        for r in range(3):
+            p, q = (r + 1) % 3, (r + 2) % 3
+            for c in range(3):
+                s, t = (c + 1) % 3, (c + 2) % 3
+                inverse[i, c, r] = b[p, s] * b[q, t] - b[p, t] * b[q, s]
+        determinant = b[0, 0] * inverse[i, 0, 0] + b[0, 1] * inverse[i, 1, 0] + b[0, 2] * inverse[i, 2, 0]
+        plain = True
+        for r in range(3):
+            for c in range(3):
+                inverse[i, r, c] /= determinant
+                plain = plain and b[r, c] == (1.0 if r == c else 0.0)
+            if lower[i, r] > upper[i, r]:
+                if lower[i, r] > upper[i, r] + tolerance and contradiction < 0:
+                    contradiction = i
+                middle = 0.5 * (lower[i, r] + upper[i, r])
+                lower[i, r] = middle
+                upper[i, r] = middle
+        oblique = oblique or not plain
+    return oblique, contradiction

@@ -3,7 +3,8 @@
 With lumped mass, minimise |x - x_free|^2 subject to n_k . x >= d_k for the planes that the node's walls offer; the mass
 is the same in all directions, so it drops out. The solution is the one active set of at most three independent planes
 whose multipliers are not negative and whose point breaks no other plane: 0 <= lambda complementary to N x - d >= 0.
-Clamping one plane after the other is wrong where planes are oblique.
+Clamping one plane after the other is wrong where planes are oblique. Only planes that are broken on the way take part in
+the search: the optimum for them that breaks no other plane is the optimum for all.
 """
 
 from __future__ import annotations
@@ -16,11 +17,12 @@ from ..mechanics.compiled import kernel
 
 __all__ = ["project"]
 
+_THIN = 1e-12  # squared length of a normal's free part below which supports alone decide
+
 
 @kernel
-def _solve(gram, rhs, n, out):
+def _solve(gram, rhs, n, factor, out):
     """Solve the n x n (n <= 3) symmetric positive system by Cholesky; False where it is not positive."""
-    factor = np.zeros((3, 3))
     for i in range(n):
         for j in range(i + 1):
             s = gram[i, j]
@@ -46,6 +48,70 @@ def _solve(gram, rhs, n, out):
 
 
 @kernel
+def _best_set(free, gap, among, count, tolerance, gram, rhs, factor, solution, chosen, multipliers, move):
+    """The optimum for ``among[:count]`` planes: number of active planes, in ``chosen`` with ``multipliers``; 0: none fits.
+
+    ``move`` (3,) takes the way to the optimum.
+    """
+    best = math.inf
+    found = 0
+    active = np.zeros(3, dtype=np.int64)
+    trial = np.zeros(3)
+    for i in range(count):
+        for j in range(i, count):
+            for l in range(j, count):
+                if j == i and l != j:
+                    continue
+                n = 1
+                active[0] = among[i]
+                if j > i:
+                    active[1] = among[j]
+                    n = 2
+                    if l > j:
+                        active[2] = among[l]
+                        n = 3
+                for p in range(n):
+                    for q in range(n):
+                        s = 0.0
+                        for c in range(3):
+                            s += free[active[p], c] * free[active[q], c]
+                        gram[p, q] = s
+                    rhs[p] = -gap[active[p]]
+                if not _solve(gram, rhs, n, factor, solution):
+                    continue
+                usable = True
+                for p in range(n):
+                    if solution[p] < 0.0:
+                        usable = False
+                if not usable:
+                    continue
+                distance = 0.0
+                for c in range(3):
+                    trial[c] = 0.0
+                    for p in range(n):
+                        trial[c] += solution[p] * free[active[p], c]
+                    distance += trial[c] * trial[c]
+                if distance >= best:
+                    continue
+                for q in range(count):
+                    k = among[q]
+                    g = gap[k]
+                    for c in range(3):
+                        g += free[k, c] * trial[c]
+                    if g < -tolerance:
+                        usable = False
+                if usable:
+                    best = distance
+                    found = n
+                    for p in range(n):
+                        chosen[p] = active[p]
+                        multipliers[p] = solution[p]
+                    for c in range(3):
+                        move[c] = trial[c]
+    return found
+
+
+@kernel
 def project(x, fixed, normals, offsets, tolerance, multipliers):
     """Move nodes to the nearest position that breaks no plane.
 
@@ -65,91 +131,59 @@ def project(x, fixed, normals, offsets, tolerance, multipliers):
     m, w = offsets.shape
     free = np.zeros((w, 3))
     gap = np.zeros(w)
-    active = np.zeros(3, dtype=np.int64)
+    usable = np.zeros(w, dtype=np.bool_)
+    among = np.zeros(w, dtype=np.int64)
     gram = np.zeros((3, 3))
+    factor = np.zeros((3, 3))
     rhs = np.zeros(3)
     solution = np.zeros(3)
-    trial = np.zeros(3)
+    chosen = np.zeros(3, dtype=np.int64)
+    strengths = np.zeros(3)
+    move = np.zeros(3)
     stuck = -1
     for i in range(m):
-        broken = False
+        count = 0
         for k in range(w):
             multipliers[i, k] = 0.0
             g = -offsets[i, k]
+            length = 0.0
             for c in range(3):
                 g += normals[i, k, c] * x[i, c]
                 free[k, c] = 0.0 if fixed[i, c] else normals[i, k, c]
+                length += free[k, c] * free[k, c]
             gap[k] = g
-            if g < 0.0:
-                broken = True
-        if not broken:
-            continue
-        best = math.inf
+            usable[k] = length > _THIN and g < math.inf
+            if usable[k] and g < 0.0:
+                among[count] = k
+                count += 1
         found = 0
-        found_set = np.zeros(3, dtype=np.int64)
-        found_multipliers = np.zeros(3)
-        # all subsets of one, two and three planes; -1 pads
-        for first in range(w):
-            for second in range(first, w):
-                for third in range(second, w):
-                    if second == first and third != second:
-                        continue
-                    n = 1
-                    active[0] = first
-                    if second > first:
-                        active[1] = second
-                        n = 2
-                        if third > second:
-                            active[2] = third
-                            n = 3
-                    usable = True
-                    for p in range(n):
-                        if not gap[active[p]] < math.inf:
-                            usable = False
-                        for q in range(n):
-                            s = 0.0
-                            for c in range(3):
-                                s += free[active[p], c] * free[active[q], c]
-                            gram[p, q] = s
-                        if gram[p, p] < 1e-12:
-                            usable = False
-                        rhs[p] = -gap[active[p]]
-                    if not usable or not _solve(gram, rhs, n, solution):
-                        continue
-                    for p in range(n):
-                        if solution[p] < 0.0:
-                            usable = False
-                    if not usable:
-                        continue
-                    worst = 0.0
-                    distance = 0.0
-                    for c in range(3):
-                        trial[c] = 0.0
-                        for p in range(n):
-                            trial[c] += solution[p] * free[active[p], c]
-                        distance += trial[c] * trial[c]
-                    for k in range(w):
-                        g = gap[k]
-                        length = 0.0
-                        for c in range(3):
-                            g += free[k, c] * trial[c]
-                            length += free[k, c] * free[k, c]
-                        if length > 1e-12 and g < worst:
-                            worst = g
-                    if worst < -tolerance:
-                        continue
-                    if distance < best:
-                        best = distance
-                        found = n
-                        for p in range(n):
-                            found_set[p] = active[p]
-                            found_multipliers[p] = solution[p]
-        if found == 0:
-            if stuck < 0:
-                stuck = i
-            continue
+        while count > 0:
+            found = _best_set(
+                free, gap, among, count, tolerance, gram, rhs, factor, solution, chosen, strengths, move
+            )
+            if found == 0:
+                if stuck < 0:
+                    stuck = i
+                break
+            before = count
+            for k in range(w):
+                if not usable[k]:
+                    continue
+                g = gap[k]
+                for c in range(3):
+                    g += free[k, c] * move[c]
+                if g < -tolerance:
+                    known = False
+                    for q in range(before):
+                        known = known or among[q] == k
+                    if not known:
+                        among[count] = k
+                        count += 1
+            if count == before:
+                break
         for p in range(found):
-            multipliers[i, found_set[p]] = found_multipliers[p]
+            multipliers[i, chosen[p]] = strengths[p]
+        if found > 0:
             for c in range(3):
-                x[i, c] += found_multipliers[p] * free[found_set[p], c]
+                x[i, c] += move[c]
     return stuck

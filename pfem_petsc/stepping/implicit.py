@@ -8,19 +8,17 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from ..contact.contact import WallForces
-from ..contact.frames import NodalFrames
+from ..contact.rounds import ContactRounds
 from ..integrators.base import Balance
 from ..solvers.linear import LinearChoice
 from ..solvers.matrix import HessianMatrix
-from ..solvers.newton import NewtonReport, NewtonSolver, zero_tolerance
+from ..solvers.newton import NewtonReport, NewtonSolver
 from .problem import StepProblem
 from .stepper import NotConverged, Solution, Stepper
 
 __all__ = ["ImplicitStepper"]
 
 _HALVINGS = 10  # most halvings of a step: to 1/1024
-_ROUNDS = 20  # re-solves of a step because a wall was reached that the step had not expected
 
 
 class ImplicitStepper(Stepper):
@@ -111,39 +109,34 @@ class ImplicitStepper(Stepper):
             model.temperatures.apply(balance.time)
         tolerance = self._tolerance(balance)
         guess = self._guess(balance)
-        candidates = self._candidates(balance)
+        contacts = ContactRounds(model, self.state, balance, self.held)
         newton = linear = 0
-        for _ in range(_ROUNDS):
-            frames = (
-                None
-                if candidates is None
-                else model.contact.frames(candidates, balance.predictor + guess, balance.time)
-            )
+        while True:
+            frames = contacts.frames(balance.predictor + guess)
             problem = StepProblem(model, self.hessian, state, balance, state.external, frames)
             w, bounds = problem.coordinates(guess), None
             if frames is not None:
-                bounds = self._bounds(frames, balance)
+                bounds = contacts.bounds()
                 np.clip(w, *bounds, out=w)
             report = self.newton.solve(problem, w, tolerance, model.rounding, bounds)
-            if frames is not None:
-                self._snap(w, bounds)
             newton += report.newton
             linear += report.linear
             if not report.converged:
                 raise NotConverged(self._failure(problem, w, report, tolerance))
+            if frames is not None:
+                contacts.snap(w)
             u = problem.increment(w).copy()
-            broken = self._broken(balance, u, candidates)
-            if broken is None:
+            g = np.empty_like(u)
+            problem.imbalance(u, g)
+            if contacts.settled(w, u, g, report.norm):
                 break
-            candidates = broken
             guess = u
-        else:
-            raise NotConverged(
-                f"step {state.step + 1}, t = {balance.time:.6g} s: the nodes that touch walls could not be settled in "
-                f"{_ROUNDS} solves; take a smaller time step"
-            )
-        walls, contacts = self._forces(problem, frames, bounds, w, u, report.norm)
-        return Solution(u, problem.f if balance.weight else state.f, walls, newton, linear, contacts)
+        state.contact, walls, self.held = contacts.forces(u)
+        state.support = np.zeros_like(u)
+        fixed = model.supports.fixed
+        state.support[fixed] = g[fixed] - state.contact[fixed]
+        internal = problem.f if balance.weight else state.f
+        return Solution(u, internal, walls, newton, linear, int(self.held.sum()))
 
     def _tolerance(self, balance: Balance) -> float:
         """Of the residual's 2-norm [N]: relative to the forces at work (momentum per step, loads, internal forces)."""
@@ -167,78 +160,6 @@ class ImplicitStepper(Stepper):
             at = (supports.nodes, supports.components)
             guess[at] = supports.positions(balance.time) - balance.predictor[at]
         return guess
-
-    def _candidates(self, balance: Balance) -> np.ndarray | None:
-        """Owned nodes that may touch a wall in this step; None where no rank has any (free flight). Collective."""
-        model, state = self.model, self.state
-        if not model.contact.any:
-            return None
-        ahead = balance.time - state.time
-        move = ahead * state.v
-        reach = 0.5 * np.linalg.norm(move, axis=1) + 1e-9 * model.length
-        near = self.held.copy()
-        if len(move):
-            near |= (model.contact.gaps(state.position + move, balance.time) <= reach[:, None]).any(axis=1)
-        if model.comm.allreduce(int(near.any()), op=MPI.MAX) == 0:
-            return None
-        return np.flatnonzero(near)
-
-    def _bounds(self, frames: NodalFrames, balance: Balance) -> tuple[np.ndarray, np.ndarray]:
-        """Bounds on w: those of the frames less B predictor."""
-        shape = (self.model.mesh.n_owned, 3)
-        lower, upper = np.full(shape, -np.inf), np.full(shape, np.inf)
-        at = frames.nodes
-        base = np.einsum("nij,nj->ni", frames.basis, balance.predictor[at])
-        lower[at] = frames.lower - base
-        upper[at] = frames.upper - base
-        return lower, upper
-
-    def _broken(self, balance: Balance, u: np.ndarray, candidates: np.ndarray | None) -> np.ndarray | None:
-        """Candidates joined by nodes that ended beyond a wall; None where there are none. Collective."""
-        model = self.model
-        if not model.contact.any:
-            return None
-        known = np.empty(0, dtype=np.int64) if candidates is None else candidates
-        gaps = model.contact.gaps(balance.predictor + u, balance.time)
-        beyond = np.flatnonzero((gaps < -1e-12 * model.length).any(axis=1))
-        joined = np.union1d(known, beyond)
-        if model.comm.allreduce(int(len(joined) > len(known)), op=MPI.MAX) == 0:
-            return None
-        return joined
-
-    def _snap(self, w: np.ndarray, bounds: tuple[np.ndarray, np.ndarray]) -> None:
-        """Put unknowns that the solver counts as on a bound exactly there."""
-        within = 2.0 * zero_tolerance(self.model.length)
-        for bound in bounds:
-            near = np.abs(w - bound) <= within
-            w[near] = bound[near]
-
-    def _forces(
-        self, problem: StepProblem, frames, bounds, w: np.ndarray, u: np.ndarray, noise: float
-    ) -> tuple[WallForces, int]:
-        """Contact and support forces from the balance at the solution; ``noise`` [N] is what a free node has left."""
-        model, state = self.model, self.state
-        g = np.empty_like(u)
-        problem.imbalance(u, g)
-        state.contact = np.zeros_like(u)
-        walls, contacts = model.contact.none(), 0
-        self.held[:] = False
-        if frames is not None:
-            at = frames.nodes
-            lower, upper = bounds
-            active = np.zeros((len(at), 3), dtype=np.int8)
-            turned = np.einsum("nji,nj->ni", frames.inverse, g[at])
-            active[(w[at] <= lower[at]) & (turned > noise)] = -1
-            active[(w[at] >= upper[at]) & (turned < -noise)] = 1
-            force, walls = model.contact.forces(frames, turned, active)
-            state.contact[at] = force
-            touching = (active != 0).any(axis=1)
-            self.held[at] = touching
-            contacts = int(touching.sum())
-        state.support = np.zeros_like(u)
-        fixed = model.supports.fixed
-        state.support[fixed] = g[fixed] - state.contact[fixed]
-        return walls, contacts
 
     def _failure(self, problem: StepProblem, w: np.ndarray, report: NewtonReport, tolerance: float) -> str:
         """What to tell about a step that did not converge: worst node and residual, reasons, ways out. Collective."""

@@ -70,6 +70,7 @@ class Stepper(ABC):
         self.energy = StrainEnergy(0.0, 0.0, 0.0, -1)
         self.fault: SimulationFailure | None = None
         self.balance: Balance | None = None
+        self.zero = np.zeros((owned, 3))  # stands for forces that do not act: never written
         zeros = lambda: np.zeros((owned, 3))  # noqa: E731
         self.state = State(
             x=mesh.points.copy(),
@@ -80,6 +81,7 @@ class Stepper(ABC):
             contact=zeros(),
             support=zeros(),
         )
+        model.contact.state = self.state
         self.solution = Solution(zeros(), self.state.f, model.contact.none())
 
     def start(self) -> None:
@@ -135,11 +137,12 @@ class Stepper(ABC):
         self.scheme.finish(state, self.balance, self.solution.u, self.part)
 
     def _load(self, balance: Balance) -> np.ndarray:
+        if not self.model.external.active:
+            return self.zero
         total = np.zeros_like(self.state.v)
-        if self.model.external.active:
-            part = np.empty_like(total)
-            for weight, time in balance.loads:
-                total += weight * self.model.external.at(time, part)
+        part = np.empty_like(total)
+        for weight, time in balance.loads:
+            total += weight * self.model.external.at(time, part)
         return total
 
     def evaluate(self, commit: bool) -> None:

@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 from pydantic import field_validator
 
-from ...case.base import Vector3, WallParameters
+from ...case.base import Vector3
+from .base import BaseWall, WallKeys, direction
 
 __all__ = ["Parameters", "Wall"]
 
 
-class Parameters(WallParameters):
+class Parameters(WallKeys):
     """Keys of a plane wall."""
 
     point: Vector3
@@ -21,19 +22,19 @@ class Parameters(WallParameters):
     @field_validator("normal")
     @classmethod
     def _has_length(cls, value: tuple[float, float, float]) -> tuple[float, float, float]:
-        if not np.linalg.norm(value) > 0.0:
-            raise ValueError("has zero length; give the direction of the allowed side")
-        return value
+        return direction(value, "the direction of the allowed side")
 
 
-class Wall:
+class Wall(BaseWall):
     """The plane n . x = d."""
+
+    flat = True
 
     def __init__(self, parameters: Parameters) -> None:
         normal = np.array(parameters.normal)
         self.normal = normal / np.linalg.norm(normal)
-        self.offset = float(self.normal @ np.array(parameters.point))
+        self.centre = np.array(parameters.point, dtype=np.float64)
+        self.offset = float(self.normal @ self.centre)
 
-    def planes(self, x: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray]:
-        """Tangent planes at positions (m, 3) [m]: unit normals (m, 3) and offsets (m,) [m]; allowed is n . x >= d."""
+    def planes(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return np.broadcast_to(self.normal, x.shape), np.full(len(x), self.offset)

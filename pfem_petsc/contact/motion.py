@@ -1,0 +1,33 @@
+"""Where walls are: their displacement from the place that the case gives them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..mechanics.loads import Table
+
+__all__ = ["WallMotion"]
+
+
+class WallMotion:
+    """Displacements of all walls of a case.
+
+    Attributes
+    ----------
+    moving : (w,) bool, walls that move at all
+    """
+
+    def __init__(self, walls) -> None:
+        self._tables = [Table(wall.motion) if wall.motion is not None else None for wall in walls]
+        self._velocities = np.array(
+            [wall.velocity if wall.velocity is not None else (0.0, 0.0, 0.0) for wall in walls], dtype=np.float64
+        ).reshape(-1, 3)
+        self.moving = np.array([wall.velocity is not None or wall.motion is not None for wall in walls], dtype=bool)
+
+    def shifts(self, time: float) -> np.ndarray:
+        """Displacements (w, 3) [m] at a time [s]."""
+        shifts = self._velocities * time
+        for k, table in enumerate(self._tables):
+            if table is not None:
+                shifts[k] = table(time)
+        return shifts

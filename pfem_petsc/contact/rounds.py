@@ -1,0 +1,190 @@
+"""The contact side of an implicit step: who may touch what, bounds, and re-solves until nothing unexpected is left.
+
+A step is solved with bounds for the nodes that may reach a wall. Afterwards all walls are verified: nodes that were not
+expected at a wall, walls that found no place among three coordinates, and curved walls whose tangent plane was that of
+another point. Where something is left, the step is solved again, from where it is, with what was learnt.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from mpi4py import MPI
+
+from ..integrators.base import Balance, State
+from ..solvers.newton import zero_tolerance
+from ..stepping.stepper import NotConverged
+from .contact import WallForces
+from .frames import NodalFrames
+
+__all__ = ["ContactRounds"]
+
+_ROUNDS = 50  # solves of a step
+
+
+class ContactRounds:
+    """Contact in one implicit step.
+
+    Parameters
+    ----------
+    model : Model
+    state : at the start of the step
+    balance : of the step
+    held : (owned,) bool, nodes held by walls in the last step
+    """
+
+    def __init__(self, model, state: State, balance: Balance, held: np.ndarray) -> None:
+        self.contact = model.contact
+        self.model = model
+        self.state = state
+        self.balance = balance
+        self.held = held
+        self.round = 0
+        self._frames: NodalFrames | None = None
+        self._rank: np.ndarray | None = None
+        self._seen: set[bytes] = set()
+        self.candidates = self._expected() if self.contact.any else None
+
+    def _expected(self) -> np.ndarray | None:
+        """Owned nodes that may touch a wall in this step; None where no rank has any (free flight). Collective."""
+        state, contact, time = self.state, self.contact, self.balance.time
+        move = (time - state.time) * state.v
+        reach = 0.5 * np.linalg.norm(move, axis=1) + 1e-9 * self.model.length
+        self._shifts = contact.motion.shifts(time)
+        near = self.held | contact.near(state.position + move, self._shifts, reach)
+        if self.model.comm.allreduce(int(near.any()), op=MPI.MAX) == 0:
+            return None
+        nodes = np.flatnonzero(near)
+        self._concerned = contact.concerned(nodes, (state.position + move)[nodes], self._shifts)
+        return nodes
+
+    def frames(self, x: np.ndarray) -> NodalFrames | None:
+        """Frames of the candidates from the planes at positions (owned, 3). Collective."""
+        self._frames = None
+        if self.candidates is not None:
+            self._frames = self.contact.frames(self.candidates, x, self.balance.time, self._concerned, self._rank)
+        return self._frames
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Bounds on w (owned, 3): those of the frames less B predictor."""
+        frames = self._frames
+        shape = (self.model.mesh.n_owned, 3)
+        lower, upper = np.full(shape, -np.inf), np.full(shape, np.inf)
+        at = frames.nodes
+        base = np.einsum("nij,nj->ni", frames.basis, self.balance.predictor[at])
+        lower[at] = frames.lower - base
+        upper[at] = frames.upper - base
+        self._bounds = lower, upper
+        return lower, upper
+
+    def snap(self, w: np.ndarray) -> None:
+        """Put unknowns that the solver counts as on a bound exactly there."""
+        within = 2.0 * zero_tolerance(self.model.length)
+        for bound in self._bounds:
+            near = np.abs(w - bound) <= within
+            w[near] = bound[near]
+
+    def settled(self, w: np.ndarray, u: np.ndarray, g: np.ndarray, noise: float) -> bool:
+        """Whether the solution keeps all walls; if not, the next round knows better. Collective.
+
+        Parameters
+        ----------
+        w, u : (owned, 3) solution in the frames' coordinates and in x [m]
+        g : (owned, 3) imbalance there [N]
+        noise : what a free node has left of it [N]
+        """
+        contact = self.contact
+        if not contact.any:
+            return True
+        x = self.balance.predictor + u
+        self.strengths = None
+        if self._frames is not None:
+            self.strengths = self._strengths(w, g, noise)
+        tolerance = 1e-12 * self.model.length
+        beyond = np.flatnonzero(contact.near(x, self._shifts, np.array([-tolerance])))
+        unsettled, joined = self._unexpected(beyond, x, tolerance)
+        if not contact.flat.all() and self._frames is not None:
+            unsettled = unsettled or self._off_surface(x, tolerance)
+        if self.model.comm.allreduce(int(unsettled), op=MPI.MAX) == 0:
+            return True
+        self.round += 1
+        if self.round >= _ROUNDS:
+            names = self.model.comm.allgather(self.model.mesh.node_ids[beyond[:3]].tolist())
+            shown = ", ".join(str(node) for part in names for node in part)
+            raise NotConverged(
+                f"step {self.state.step + 1}, t = {self.balance.time:.6g} s: the nodes that touch walls could not be "
+                f"settled in {_ROUNDS} solves{f' (nodes {shown})' if shown else ''}; take a smaller time step"
+            )
+        self._join(joined, x)
+        return False
+
+    def _strengths(self, w: np.ndarray, g: np.ndarray, noise: float) -> np.ndarray:
+        frames = self._frames
+        at = frames.nodes
+        lower, upper = self._bounds
+        active = np.zeros((len(at), 3), dtype=np.int8)
+        turned = np.einsum("nji,nj->ni", frames.inverse, g[at])
+        active[(w[at] <= lower[at]) & (turned > noise)] = -1
+        active[(w[at] >= upper[at]) & (turned < -noise)] = 1
+        return self.contact.strengths(frames, turned, active)
+
+    def _unexpected(self, beyond: np.ndarray, x: np.ndarray, tolerance: float) -> tuple[bool, np.ndarray]:
+        """Whether nodes beyond walls were not held back by a bound on them, and these nodes."""
+        if len(beyond) == 0:
+            return False, beyond
+        contact = self.contact
+        concerned = contact.concerned(beyond, x[beyond], self._shifts)
+        normals, offsets = contact.planes(concerned, x[beyond], self._shifts)
+        gaps = np.einsum("iwk,ik->iw", normals, x[beyond]) - offsets
+        broken = gaps < -tolerance
+        if self._frames is not None:
+            place = np.searchsorted(self.candidates, beyond)
+            known = place < len(self.candidates)
+            known[known] = self.candidates[place[known]] == beyond[known]
+            # what a bound keeps is kept to rounding of the coordinates; supports decide over walls
+            broken[known] &= self._frames.rows[place[known]] < 0
+        thin = (np.where(contact.fixed[beyond][:, None, :], 0.0, normals) ** 2).sum(axis=2) <= 1e-12
+        broken &= ~thin
+        return bool(broken.any()), beyond[broken.any(axis=1)]
+
+    def _off_surface(self, x: np.ndarray, tolerance: float) -> bool:
+        """Whether a node pressed against a curved wall is not on its surface."""
+        at = self._frames.nodes
+        for k in np.flatnonzero(~self.contact.flat):
+            pressed = self.strengths[:, k] > 0.0
+            if pressed.any():
+                gap = self.contact.gap(k, x[at[pressed]], self._shifts)
+                if np.abs(gap).max() > tolerance:
+                    return True
+        return False
+
+    def _join(self, joined: np.ndarray, x: np.ndarray) -> None:
+        """The candidates of the next round and the order of their walls: broken first, then the pressing ones."""
+        contact = self.contact
+        known = np.empty(0, dtype=np.int64) if self.candidates is None else self.candidates
+        nodes = np.union1d(known, joined)
+        concerned = contact.concerned(nodes, x[nodes], self._shifts)
+        rank = np.full((len(nodes), len(contact.walls)), np.inf)
+        if self.candidates is not None:
+            place = np.searchsorted(nodes, known)
+            concerned[place] |= self._concerned
+        normals, offsets = contact.planes(concerned, x[nodes], self._shifts)
+        rank = np.einsum("iwk,ik->iw", normals, x[nodes]) - offsets
+        if self.candidates is not None:
+            pressing = self.strengths > 0.0
+            largest = max(float(self.strengths.max(initial=0.0)), 1e-300)
+            held = rank[place]
+            held[pressing] = -1e-13 * self.model.length * (1.0 + self.strengths[pressing] / largest)
+            rank[place] = held
+        self.candidates, self._concerned, self._rank = nodes, concerned, rank
+
+    def forces(self, u: np.ndarray) -> tuple[np.ndarray, WallForces, np.ndarray]:
+        """Contact forces (owned, 3) [N], sums per wall, and which owned nodes are held, at the solution."""
+        total = np.zeros_like(u)
+        held = np.zeros(len(u), dtype=bool)
+        walls = self.contact.none()
+        if self._frames is not None:
+            at = self._frames.nodes
+            force, walls = self.contact.forces(self._frames, self.strengths, (self.balance.predictor + u)[at])
+            total[at] = force
+            held[at] = (self.strengths > 0.0).any(axis=1)
+        return total, walls, held

@@ -1,0 +1,38 @@
+"""Which nodes a wall can concern in a step: one compiled pass over all nodes for all flat walls."""
+
+from __future__ import annotations
+
+from ..mechanics.compiled import kernel
+
+__all__ = ["near_planes"]
+
+
+@kernel
+def near_planes(x, normals, offsets, everyone, members, reach, near):
+    """Mark nodes within reach of a plane.
+
+    Parameters
+    ----------
+    x : (n, 3) positions [m]
+    normals : (w, 3); offsets : (w,) [m]: planes n . x = d
+    everyone : (w,) bool, whether a plane concerns every node
+    members : (n, w) bool, whom it concerns where not
+    reach : (n,) or (1,) [m]: distance below which a node counts as near
+    near : (n,) bool, in and out
+
+    Returns
+    -------
+    int
+        Number of nodes marked here.
+    """
+    count = 0
+    per_node = len(reach) > 1
+    for i in range(len(x)):
+        limit = reach[i] if per_node else reach[0]
+        for k in range(len(offsets)):
+            gap = normals[k, 0] * x[i, 0] + normals[k, 1] * x[i, 1] + normals[k, 2] * x[i, 2] - offsets[k]
+            if gap < limit and (everyone[k] or members[i, k]):
+                near[i] = True
+                count += 1
+                break
+    return count

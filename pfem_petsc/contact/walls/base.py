@@ -1,0 +1,75 @@
+"""What every kind of wall shares: keys, surface at rest, and motion."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field, field_validator, model_validator
+
+from ...case.base import Finite, Vector3, WallParameters, listed
+
+__all__ = ["BaseWall", "WallKeys", "direction"]
+
+Row4 = Annotated[tuple[Finite, Finite, Finite, Finite], listed]
+
+
+class WallKeys(WallParameters):
+    """Keys of every wall beside its shape."""
+
+    velocity: Vector3 | None = None
+    """velocity of the wall [m/s], constant"""
+    motion: Annotated[tuple[Row4, ...], listed] | None = None
+    """rows [t, dx, dy, dz]: displacement of the wall [s, m], linear between rows, constant outside"""
+    adjust: bool = False
+    """true: nodes that start beyond the wall are moved onto it, unstressed bars included"""
+
+    @field_validator("motion")
+    @classmethod
+    def _times_increase(cls, rows: tuple | None) -> tuple | None:
+        if rows is not None and not rows:
+            raise ValueError("expected at least one row")
+        for k in range(1, len(rows or ())):
+            if rows[k][0] <= rows[k - 1][0]:
+                raise ValueError(f"times must increase, but row {k} has t = {rows[k][0]!r} after {rows[k - 1][0]!r}")
+        return rows
+
+    @model_validator(mode="after")
+    def _moves_one_way(self) -> WallKeys:
+        if self.velocity is not None and self.motion is not None:
+            raise ValueError("expected at most one of the keys velocity, motion")
+        return self
+
+
+class BaseWall(ABC):
+    """The surface of a wall where it is at rest.
+
+    Attributes
+    ----------
+    flat : whether the tangent plane is the same everywhere; then ``normal`` (3,) and ``offset`` [m] are that plane
+    partial : whether nodes can pass beside it, so that where a node comes from matters (:meth:`stops`)
+    centre : (3,) [m], the point whose position is recorded when the wall moves
+    """
+
+    flat = False
+    partial = False
+    centre: np.ndarray
+
+    @abstractmethod
+    def planes(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Tangent planes nearest to positions (m, 3) [m]: unit normals (m, 3) and offsets (m,) [m].
+
+        Allowed is n . x >= d; n . x - d is the distance of x from the surface, negative beyond it.
+        """
+
+    def stops(self, before: np.ndarray, x: np.ndarray, tolerance: float) -> np.ndarray:
+        """(m,) bool: nodes for which the wall is in the way from (m, 3) to (m, 3); for partial walls."""
+        return np.ones(len(x), dtype=bool)
+
+
+def direction(value: tuple[float, float, float], what: str) -> tuple[float, float, float]:
+    """A vector of any length but zero."""
+    if not np.linalg.norm(value) > 0.0:
+        raise ValueError(f"has zero length; give {what}")
+    return value

@@ -1,0 +1,70 @@
+"""A finite rectangle; it stops nodes that come from the side its normal points to, and nodes pass beside it."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+from pydantic import model_validator
+
+from ...case.base import PositiveFloat, Vector3, listed
+from .base import WallKeys, direction
+from .plane import Wall as Plane
+
+__all__ = ["Parameters", "Wall", "surface"]
+
+
+class Parameters(WallKeys):
+    """Keys of a rectangular wall."""
+
+    point: Vector3
+    """Centre of the rectangle [m]."""
+    normal: Vector3
+    """Points to the side that nodes come from; of any length but zero."""
+    along: Vector3
+    """Direction of the first edges; its part along the normal is left out."""
+    size: Annotated[tuple[PositiveFloat, PositiveFloat], listed]
+    """Lengths of the edges along ``along`` and across it [m]."""
+
+    @model_validator(mode="after")
+    def _spans(self) -> Parameters:
+        direction(self.normal, "the direction that nodes come from")
+        if not np.linalg.norm(np.cross(self.normal, self.along)) > 1e-9 * np.linalg.norm(self.along) * np.linalg.norm(
+            self.normal
+        ):
+            raise ValueError("along must not be parallel to normal, nor zero")
+        return self
+
+
+class Wall(Plane):
+    """A part of the plane n . x = d."""
+
+    partial = True
+
+    def __init__(self, parameters: Parameters) -> None:
+        super().__init__(parameters)
+        along = np.array(parameters.along)
+        along = along - (along @ self.normal) * self.normal
+        self.first = along / np.linalg.norm(along)
+        self.second = np.cross(self.normal, self.first)
+        self.half = 0.5 * np.array(parameters.size)
+
+    def stops(self, before: np.ndarray, x: np.ndarray, tolerance: float) -> np.ndarray:
+        start = before @ self.normal - self.offset
+        end = x @ self.normal - self.offset
+        # where the way crosses the plane; the foot of x where it does not
+        crossing = end < 0.0
+        part = np.where(crossing, np.clip(start, 0.0, None) / np.maximum(start - end, 1e-300), 1.0)
+        point = before + np.minimum(part, 1.0)[:, None] * (x - before) - self.centre
+        inside = (np.abs(point @ self.first) <= self.half[0]) & (np.abs(point @ self.second) <= self.half[1])
+        return inside & (start >= -tolerance)
+
+
+def surface(parameters: Parameters, bounds: np.ndarray):
+    """The rectangle as it is drawn."""
+    from ...post.walls import slab
+
+    wall = Wall(parameters)
+    a, b = wall.half[0] * wall.first, wall.half[1] * wall.second
+    face = np.array([wall.centre - a - b, wall.centre + a - b, wall.centre + a + b, wall.centre - a + b])
+    return slab(parameters.name, face, wall.normal, 0.05 * (np.linalg.norm(bounds[1] - bounds[0]) or 1.0))

@@ -6,6 +6,7 @@ import numpy as np
 
 from ..errors import SimulationFailure
 from ..integrators.base import Balance
+from .node_loops import explicit_increments
 from .stepper import Solution, Stepper
 
 __all__ = ["ExplicitStepper"]
@@ -14,6 +15,10 @@ __all__ = ["ExplicitStepper"]
 class ExplicitStepper(Stepper):
     """Solves (alpha m + eta c) u = f_ext - f_int - m a_hat - c v_hat node by node."""
 
+    def __init__(self, model, scheme, h: float) -> None:
+        super().__init__(model, scheme, h)
+        self._none = np.empty((0, 3))
+
     def accelerate(self, load: np.ndarray) -> np.ndarray:
         a = load / self.model.inertia.mass[:, None]
         a[self.model.supports.fixed] = 0.0
@@ -21,20 +26,25 @@ class ExplicitStepper(Stepper):
 
     def solve(self, balance: Balance) -> Solution:
         model, state = self.model, self.state
-        inertia, owned = model.inertia, model.mesh.n_owned
-        load = state.external - state.f[:owned]
-        if balance.a_hat is not None:
-            load -= inertia.mass[:, None] * balance.a_hat
-        if inertia.damped and balance.v_hat is not None:
-            load -= inertia.damping[:, None] * balance.v_hat
-        stiffness = balance.alpha * inertia.mass
-        if inertia.damped and balance.eta:
-            stiffness = stiffness + balance.eta * inertia.damping
-        u = load / stiffness[:, None]
+        inertia = model.inertia
+        u, stiffness = np.empty_like(state.v), np.empty_like(inertia.mass)
+        explicit_increments(
+            state.external if model.external.active else self._none,
+            state.f,
+            inertia.mass,
+            inertia.damping,
+            balance.alpha,
+            balance.eta,
+            balance.a_hat if balance.a_hat is not None else self._none,
+            balance.v_hat if inertia.damped else self._none,
+            stiffness,
+            u,
+        )
         supports = model.supports
-        state.contact = np.zeros_like(u)
+        state.contact = self.zero
         if supports.any:
             at = (supports.nodes, supports.components)
+            load = stiffness[supports.nodes] * u[at]
             u[at] = supports.positions(balance.time) - balance.predictor[at]
         walls, contacts = model.contact.none(), 0
         if model.contact.any:
@@ -42,13 +52,15 @@ class ExplicitStepper(Stepper):
                 nodes, correction, force, walls = model.contact.explicit(
                     balance.predictor + u, stiffness, balance.time, 1e-13 * model.length
                 )
-                u[nodes] += correction
-                state.contact[nodes] = force
+                if len(nodes):
+                    u[nodes] += correction
+                    state.contact = np.zeros_like(u)
+                    state.contact[nodes] = force
                 contacts = len(nodes)
             except SimulationFailure as failure:
                 if self.fault is None:
                     self.fault = SimulationFailure(f"step {state.step}: {failure}")
         if supports.any:
             state.support = np.zeros_like(u)
-            state.support[at] = stiffness[supports.nodes] * u[at] - load[at] - state.contact[at]
+            state.support[at] = stiffness[supports.nodes] * u[at] - load - state.contact[at]
         return Solution(u, state.f, walls, contacts=contacts)

@@ -14,28 +14,29 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..mechanics.bars import StrainEnergy
+from .node_loops import node_totals, node_works
 
-__all__ = ["Ledger", "Moment"]
+__all__ = ["TERMS", "Ledger", "Moment"]
 
 TERMS = ("external_work", "contact_work", "damping_dissipation", "numerical_dissipation", "thermal_work")
 
 
 @dataclass
 class Moment:
-    """What the ledger needs of a moment; arrays (owned, 3), forces in N."""
+    """What the ledger needs of a moment; arrays (owned, 3).
+
+    Where the mass is lumped, ``a`` and ``v`` are acceleration and velocity; where it is consistent, M a and C v [N].
+    """
 
     x: np.ndarray
-    kinetic: float
-    energy: StrainEnergy
-    inertial: np.ndarray
+    a: np.ndarray
+    v: np.ndarray
     internal: np.ndarray
-    damping: np.ndarray
     external: np.ndarray
+    support: np.ndarray
     contact: np.ndarray
-
-
-def _dot(a: np.ndarray, b: np.ndarray) -> float:
-    return float(np.dot(a.ravel(), b.ravel()))
+    kinetic: float = 0.0
+    energy: StrainEnergy = StrainEnergy(0.0, 0.0, 0.0, -1)
 
 
 class Ledger:
@@ -44,98 +45,115 @@ class Ledger:
     Attributes
     ----------
     work : (5,) sums since the start [J]: external (supports included), contact, damping, numerical, thermal
+    totals : (12,) of this rank's nodes at the present state: momentum [kg m/s], angular momentum [kg m2/s], mass times
+        position [kg m], support force [N]
     """
 
     def __init__(self, stepper) -> None:
         self.stepper = stepper
         self.model = stepper.model
         self.work = np.zeros(len(TERMS))
+        self.totals = np.zeros(12)
+        inertia = self.model.inertia
+        ones = np.ones_like(inertia.mass)
+        # the loops multiply by these: lumped values, or one where the products with the matrices are given
+        self._mass = ones if inertia.consistent else inertia.mass
+        self._damping = ones if inertia.consistent else inertia.damping
         self._before = self._moment()
-        if self.model.temperatures.varying:
-            self._stress = self.model.bars.fields(stepper.state.x)["stress"]
-            self._thermal = self.model.bars.thermal.copy()
+        self._thermal_before()
 
     def update(self) -> None:
         """Book the step just made."""
         after = self._moment()
         before, self._before = self._before, after
-        dx = after.x - before.x
         stored = after.kinetic - before.kinetic + sum(after.energy[:3]) - sum(before.energy[:3])
         heating = self._heating()
-        if self.stepper.scheme.at_ends:
-
-            def work(name):
-                return 0.5 * _dot(getattr(before, name) + getattr(after, name), dx)
-        else:
-            balanced = self._balanced(before)
-
-            def work(name):
-                return _dot(balanced[name], dx)
-
-        self.work[0] += work("external")
-        self.work[1] += work("contact")
-        self.work[2] += work("damping")
-        self.work[3] += work("inertial") + work("internal") + heating - stored
-        self.work[4] += heating
-
-    def _heating(self) -> float:
-        """Work that a changing temperature does on the counted bars: -A l0 (s0 + s1)/2 (change of thermal strain)."""
-        model = self.model
-        if not model.temperatures.varying:
-            return 0.0
-        stress = model.bars.fields(self.stepper.state.x)["stress"]
-        before, self._stress = self._stress, stress
-        change = model.bars.thermal - self._thermal
-        self._thermal = model.bars.thermal.copy()
-        total = 0.0
-        for block in model.bars.blocks:
-            part = slice(block.start, block.counted)
-            mean = 0.5 * (before[part] + stress[part])
-            total -= block.area * float((model.bars.rest[part] * mean * change[part]).sum())
-        return total
+        first, second = (before, after) if self.stepper.scheme.at_ends else 2 * (self._balanced(before),)
+        works = np.zeros(5)
+        node_works(
+            before.x,
+            after.x,
+            self._mass,
+            self._damping,
+            self.model.inertia.damped,
+            first.a,
+            second.a,
+            first.v,
+            second.v,
+            first.internal,
+            second.internal,
+            first.external,
+            second.external,
+            first.support,
+            second.support,
+            first.contact,
+            second.contact,
+            works,
+        )
+        external, contact, damping, inertial, internal = works
+        self.work += (external, contact, damping, inertial + internal + heating - stored, heating)
 
     @property
     def kinetic(self) -> float:
         """Kinetic energy of this rank's nodes [J]."""
         return self._before.kinetic
 
-    @property
-    def momentum(self) -> np.ndarray:
-        """M v of this rank's nodes (owned, 3) [kg m/s]."""
-        return self._momentum
-
     def _moment(self) -> Moment:
         state, inertia = self.stepper.state, self.model.inertia
         owned = self.model.mesh.n_owned
-        shape = state.v.shape
-        self._momentum = inertia.mass_times(state.v, np.empty(shape))
+        a, v, momentum = state.a, state.v, state.v
+        if inertia.consistent:
+            momentum = inertia.mass_times(state.v, np.empty_like(state.v))
+            a = inertia.mass_times(state.a, np.empty_like(state.a))
+            v = inertia.damping_times(state.v, np.empty_like(state.v))
+        kinetic = node_totals(inertia.mass, self._mass, state.position, state.v, momentum, state.support, self.totals)
         return Moment(
             x=state.position.copy(),
-            kinetic=0.5 * _dot(self._momentum, state.v),
-            energy=self.stepper.energy,
-            inertial=inertia.mass_times(state.a, np.empty(shape)),
+            a=a,
+            v=v,
             internal=state.f[:owned].copy(),
-            damping=inertia.damping_times(state.v, np.empty(shape)),
-            external=state.external + state.support,
+            external=state.external,
+            support=state.support,
             contact=state.contact,
+            kinetic=kinetic,
+            energy=self.stepper.energy,
         )
 
-    def _balanced(self, before: Moment) -> dict[str, np.ndarray]:
+    def _balanced(self, before: Moment) -> Moment:
         """The forces of the last balance, where it does not hold at the ends of steps."""
         stepper, inertia, balance = self.stepper, self.model.inertia, self.stepper.balance
         state, u = stepper.state, stepper.solution.u
         owned = self.model.mesh.n_owned
         a = balance.alpha * u
         if balance.a_hat is not None:
-            a = a + balance.a_hat
-        v = balance.eta * u + balance.v_hat
-        internal = (1.0 - balance.weight) * before.internal
-        if balance.weight:
-            internal = internal + balance.weight * stepper.solution.internal[:owned]
-        return {
-            "inertial": inertia.mass_times(a, np.empty(a.shape)),
-            "internal": internal,
-            "damping": inertia.damping_times(v, np.empty(a.shape)),
-            "external": state.external + state.support,
-            "contact": state.contact,
-        }
+            a += balance.a_hat
+        v = balance.eta * u + balance.v_hat if inertia.damped else u
+        if inertia.consistent:
+            a = inertia.mass_times(a, np.empty_like(a))
+            v = inertia.damping_times(v, np.empty_like(v))
+        internal = before.internal
+        if balance.weight == 1.0:
+            internal = stepper.solution.internal[:owned]
+        elif balance.weight:
+            internal = (1.0 - balance.weight) * internal + balance.weight * stepper.solution.internal[:owned]
+        return Moment(before.x, a, v, internal, state.external, state.support, state.contact)
+
+    def _thermal_before(self) -> None:
+        if self.model.temperatures.varying:
+            self._stress = self.model.bars.fields(self.stepper.state.x)["stress"]
+            self._thermal = self.model.bars.thermal.copy()
+
+    def _heating(self) -> float:
+        """Work that a changing temperature does on the counted bars: -A l0 (s0 + s1)/2 (change of thermal strain)."""
+        model = self.model
+        if not model.temperatures.varying:
+            return 0.0
+        stress, thermal = self._stress, self._thermal
+        self._thermal_before()
+        total = 0.0
+        for block in model.bars.blocks:
+            part = slice(block.start, block.counted)
+            mean = 0.5 * (stress[part] + self._stress[part])
+            change = self._thermal[part] - thermal[part]
+            total -= block.area * float((model.bars.rest[part] * mean * change).sum())
+        return total

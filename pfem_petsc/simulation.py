@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -10,12 +9,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from mpi4py import MPI
 
-from .errors import InputError, PfemError, SimulationFailure
+from .errors import EarlyStop, PfemError, SimulationFailure
 from .output.progress import Progress
 from .output.units import engineering
 from .output.vtkhdf import ResultWriter
-from .parallel.agreement import agreed, on_root
 from .parallel.natural import NaturalOrder
+from .restart.checkpoints import Checkpoints
+from .restart.folder import RESULT, Restart, find_restart, finished, prepare_folder
+from .restart.stop import Meetings, StopRequest
+from .stepping.blowup import BlowUp
 from .stepping.ledger import Ledger
 from .stepping.model import Model
 from .stepping.prepare import make_plan, make_stepper
@@ -25,7 +27,6 @@ __all__ = ["Simulation", "Step"]
 
 POINT_FIELDS = ("displacement", "velocity", "acceleration", "contact_force")
 CELL_FIELDS = ("strain", "stress", "axial_force", "plastic_strain", "temperature")
-_MEETING = 20  # steps between agreements on faults where no history row brings the ranks together
 
 
 class Step(NamedTuple):
@@ -49,11 +50,11 @@ class Simulation:
     output : Path or None
         Folder of the results; default ``results/<case name>``. Results found there are moved aside.
     restart : None, True or Path
-        Continue from the newest checkpoint of the output folder, or from a file.
+        Continue from the newest checkpoint of the output folder, or from a file; bit for bit on as many ranks.
     quiet : bool
         Print nothing on stdout.
     wall_time : float, optional
-        Stop with a checkpoint after so many seconds.
+        Stop with a checkpoint after so many seconds; SIGTERM, SIGINT and SIGUSR1 do so at any time during the run.
     check_only : bool
         Set the model up and write nothing.
 
@@ -73,19 +74,28 @@ class Simulation:
         wall_time: float | None = None,
         check_only: bool = False,
     ) -> None:
+        self._stop = StopRequest(wall_time)
         self.case = case
         self.comm = comm if comm is not None else MPI.COMM_WORLD
         self.folder = Path(output) if output is not None else Path("results") / case.name
         self.quiet = quiet
+        found = find_restart(case, self.comm, self.folder, None if check_only else restart)
+        self.restart = found if isinstance(found, Restart) else None
+        self._notes = [found] if isinstance(found, str) else []
         self.model = Model(case, self.comm)
-        self.plan = make_plan(self.model)
+        self.plan = make_plan(self.model, self.restart.attributes["plan"] if self.restart is not None else None)
+        self.finished = False
+        if self.restart is not None and self.restart.continues or self._notes:
+            self.finished = finished(case, self.comm, self.folder, self.plan.step * self.plan.steps)
         self.model.contact.check_start(self.model.mesh.points[: self.model.mesh.n_owned], self.model.length)
         self.stepper = make_stepper(self.model, self.plan)
         self.row: dict[str, Any] | None = None
         self._started = False
+        self._asked = 0  # code of a request to stop, zero for none
         self._writer: ResultWriter | None = None
         self._progress: Progress | None = None
-        self._next_meeting = _MEETING
+        minutes = case.output.checkpoint_minutes
+        self._meetings = Meetings(self.comm, self._stop, 60.0 * minutes if minutes else None)
 
     @property
     def state(self):  # noqa: ANN201
@@ -130,11 +140,16 @@ class Simulation:
         return f"{engineering(peak, 'B', 3)} in use on all ranks"
 
     def start(self) -> None:
-        """Complete the state at t = 0 and open the output. Collective; called by :meth:`run` and iteration."""
+        """Complete the state at the start and open the output. Collective; called by :meth:`run` and iteration."""
         if self._started:
             return
         self._started = True
-        self._prepare_folder()
+        self._stop.watch()
+        self._checkpoints = Checkpoints(self.case, self.stepper, self.plan, self.folder)
+        if self.restart is not None:
+            # before anything in the folder changes: it may be refused
+            checkpoint = self._checkpoints.take_back(self.restart)
+        prepare_folder(self.comm, self.folder, self.restart)
         self._progress = Progress(
             self.comm,
             self.case.title,
@@ -142,19 +157,34 @@ class Simulation:
             self.plan.step * self.plan.steps,
             self.quiet,
             self.folder / "log.txt",
+            start_step=self.state.step,
+            start_time=self.state.time,
         )
         self._progress.summary(self.summary())
         for warning in self.model.warnings:
             self._progress.warning(warning)
         if self.plan.scheme.notice:
             self._progress.message(self.plan.scheme.notice)
-        self.stepper.start()
-        self._agree_on_faults()
+        for note in self._notes:
+            self._progress.message(note)
+        if self.restart is None:
+            self.stepper.start()
+            self._meet()
         self.ledger = Ledger(self.stepper)
         self.stepper.booking = self.ledger.update
         if hasattr(self.stepper, "message"):
             self.stepper.message = self._progress.warning
         self.recorder = Recorder(self.stepper, self.ledger)
+        self.blow_up = BlowUp(self.model)
+        continues = False
+        if self.restart is not None:
+            continues = self.restart.continues
+            self.row = self._checkpoints.state.put_back_sums(checkpoint, self.ledger, self.recorder)
+            changes = f"; changed: {'; '.join(self.restart.changed)}" if self.restart.changed else ""
+            self._progress.message(
+                f"restart from {self.restart.path}: step {self.state.step}, t = {engineering(self.state.time, 's')}"
+                + changes
+            )
         fields = self.case.output.fields
         self.point_fields = [n for n in POINT_FIELDS if fields is None or n in fields]
         heated = self.model.temperatures.any
@@ -162,7 +192,7 @@ class Simulation:
             n for n in CELL_FIELDS if (n in fields if fields is not None else n != "temperature" or heated)
         ]
         self._writer = ResultWriter(
-            self.folder / "result.vtkhdf",
+            self.folder / RESULT,
             self.comm,
             self.mesh,
             point_fields=self.point_fields,
@@ -172,9 +202,11 @@ class Simulation:
             case_text=self.case.to_toml(),
             attributes=self._attributes(),
             precision=self.case.output.precision,
+            append_after_step=self.state.step if continues else None,
         )
-        self._record()
-        self._snapshot()
+        if not continues:
+            self._record()
+            self._snapshot()
 
     def _attributes(self) -> dict[str, Any]:
         plan = self.plan
@@ -192,12 +224,18 @@ class Simulation:
 
     def __iter__(self) -> Iterator[Step]:
         """Run step by step; the output is closed when the iteration ends."""
+        if self.finished:
+            return
         try:
             self.start()
+            self._stop_early(self._meet())
             while self.state.step < self.plan.steps:
                 yield self._advance()
+                self._stop_early(self._asked)
+            if self._checkpoints.wanted:
+                self._checkpoint()
             self._finish("done")
-        except GeneratorExit:
+        except (GeneratorExit, EarlyStop):
             self._finish("stopped")
             raise
         except PfemError:
@@ -208,15 +246,21 @@ class Simulation:
             if self._progress is not None:
                 self._progress.close("failed")
             raise
+        finally:
+            self._stop.release()
 
     def run(self) -> int:
         """Run to the end and give the exit status. Collective.
 
         Raises
         ------
+        EarlyStop
+            On all ranks, on a signal or when the wall time is over: a checkpoint is written.
         SimulationFailure
             On all ranks; what was recorded before is in the result file.
         """
+        if self.finished and self.comm.rank == 0 and not self.quiet:
+            print(f"{self.folder}: finished already: the results reach t = {engineering(self.case.time.end, 's')}")
         for _ in self:
             pass
         return 0
@@ -229,12 +273,18 @@ class Simulation:
         step = self.state.step
         last = step == self.plan.steps
         row = None
+        snapshot = last or bool(output.fields_every and step % output.fields_every == 0)
+        checkpoint = self._checkpoints.due(step)
         if step % output.history_every == 0 or last:
             row = self._record()
-        elif step >= self._next_meeting:
-            self._agree_on_faults()
-        if last or (output.fields_every and step % output.fields_every == 0):
+        elif snapshot or checkpoint:
+            self._asked = self._meet()
+        if self._meetings.due(step):
+            self._asked = self._meet()
+        if snapshot:
             self._snapshot()
+        if checkpoint or self._meetings.checkpoint_due:
+            self._checkpoint()
         drift = self.row["energy_imbalance"] / max(abs(self.recorder.start_energy), 1e-300)
         self._progress.update(
             step, self.state.time, stepper.h, solution.newton, solution.linear, self.row["active_contacts"], drift
@@ -242,22 +292,34 @@ class Simulation:
         return Step(step, self.state.time, solution.newton, solution.linear, row)
 
     def _record(self) -> dict[str, Any]:
-        self._agree_on_faults()
-        self.row = self.recorder.row()
-        energy = self.row["kinetic_energy"] + self.row["elastic_energy"]
-        if not np.isfinite(energy):
-            raise SimulationFailure(
-                f"step {self.state.step}, t = {self.state.time:.6g} s: the energy is not finite: the motion blew up; take "
-                "a smaller time.step"
-            )
-        self._writer.append_history(self.row if self.comm.rank == 0 else None)
-        return self.row
+        """A history row, unless a rank has a fault, which is raised on all."""
+        row = self.recorder.row(alarm=self.stepper.fault is not None or self._stop.code != 0)
+        if self.recorder.alarmed:
+            self._asked = self._meet()
+        self.blow_up.check(row, self.state)
+        self.row = row
+        self._writer.append_history(row if self.comm.rank == 0 else None)
+        return row
 
-    def _agree_on_faults(self) -> None:
-        self._next_meeting = self.state.step + _MEETING
-        with agreed(self.comm):
-            if self.stepper.fault is not None:
-                raise self.stepper.fault
+    def _meet(self) -> int:
+        """All ranks agree on faults, which are raised on all, and on a request to stop: its code, or zero."""
+        return self._meetings.meet(self.state.step, self.stepper.fault)
+
+    def _checkpoint(self) -> None:
+        """Results first: what the checkpoint goes on from must be in them."""
+        self._writer.flush_history()
+        self._checkpoints.write(self.ledger, self.recorder, self.row)
+        self._meetings.checkpoint_written()
+
+    def _stop_early(self, code: int) -> None:
+        """Leave with a checkpoint where a request says so, unless the run is at its end."""
+        if not code or self.state.step >= self.plan.steps:
+            return
+        self._checkpoint()
+        raise EarlyStop(
+            f"{self._stop.reason(code)}: stopped after step {self.state.step}, t = {self.state.time:.6g} s; a "
+            f"checkpoint is in {self.folder}: continue with --restart"
+        )
 
     def _snapshot(self) -> None:
         if not self.case.output.fields_every and 0 < self.state.step < self.plan.steps:
@@ -284,14 +346,14 @@ class Simulation:
         )
 
     def _finish(self, outcome: str) -> None:
-        if self._writer is not None:
+        writer, self._writer = self._writer, None
+        if writer is not None:
             try:
-                self._writer.flush_history()
+                writer.close()
             except SimulationFailure:
+                # after a failure, that one is told
                 if outcome == "done":
                     raise
-            self._writer.close()
-            self._writer = None
         if self._progress is not None:
             self._progress.close(outcome)
 
@@ -300,23 +362,3 @@ class Simulation:
         order = NaturalOrder(self.comm, self.mesh.node_ids[: self.mesh.n_owned], self.mesh.n_nodes)
         parts = self.comm.gather(order.to_slab(values))
         return np.concatenate(parts) if parts is not None else None
-
-    def _prepare_folder(self) -> None:
-        """Make the output folder; results found there are moved aside to a numbered name."""
-        on_root(self.comm, _prepare_folder, self.folder)
-
-
-def _prepare_folder(folder: Path) -> None:
-    try:
-        if (folder / "result.vtkhdf").exists():
-            number = 1
-            while (aside := folder.with_name(f"{folder.name}.{number}")).exists():
-                number += 1
-            folder.rename(aside)
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"{folder}: cannot write the results there: {error.strerror}; choose another with -o"
-        ) from error
-    if not os.access(folder, os.W_OK | os.X_OK):
-        raise InputError(f"{folder}: cannot write the results there: permission denied; choose another with -o")

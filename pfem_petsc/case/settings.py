@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, InstanceOf, field_validator
 
-from .base import Name, NonNegativeInt, PositiveFloat, PositiveInt, StrictModel, listed
+from .base import Name, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, StrictModel, listed
 
 __all__ = ["CELL_FIELDS", "POINT_FIELDS", "Output", "OutputKeys", "Probe", "Solver", "Time", "TimeKeys"]
 
@@ -65,6 +65,8 @@ class OutputKeys(StrictModel):
     """steps between rows of the history"""
     checkpoint_every: NonNegativeInt = 0
     """steps between checkpoints; 0: none"""
+    checkpoint_minutes: NonNegativeFloat = 0.0
+    """wall-clock time between checkpoints [min]; 0: none"""
     fields: Annotated[tuple[str, ...], listed] | None = None
     """names of the fields to write; default: all"""
     precision: Literal["float64", "float32"] = "float64"

@@ -2,8 +2,8 @@
 
 Nodal arrays are those of the state, of the scheme's memory and of the stepper; bar arrays are the plastic history and
 the thermal strains. Internal forces and energies are saved rather than computed again: of a bar that yields the second
-evaluation may differ from the first in the last digit. Sums that each rank has for itself (works, energies, wall forces)
-are saved rank by rank, and given back so on as many ranks; on others the total goes to rank 0.
+evaluation may differ from the first in the last digit. Sums that each rank has for itself (works, energies, wall
+forces) are saved rank by rank, and given back so on as many ranks; on others the total goes to rank 0.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class RunState:
         ).astype(np.int64)
         self.node_order = NaturalOrder(comm, mesh.node_ids[: mesh.n_owned], mesh.n_nodes)
         self.bar_order = NaturalOrder(comm, mesh.bar_ids[self.counted], mesh.n_bars)
-        self._columns = comm.allreduce(max((b.history.shape[1] for b in self.model.bars.blocks), default=0), op=MPI.MAX)
+        self._columns = comm.allreduce(2 * any(len(b.history) for b in self.model.bars.blocks), op=MPI.MAX)
 
     def arrays(self) -> dict[str, tuple[NaturalOrder, np.ndarray]]:
         """Name to (order, rows owned by this rank) of all arrays; the same names on all ranks."""
@@ -144,7 +144,8 @@ class RunState:
         if self._columns:
             history = np.zeros((len(bars.ends), self._columns))
             for block in bars.blocks:
-                history[block.start : block.stop, : block.history.shape[1]] = block.history
+                if len(block.history):
+                    history[block.start : block.stop] = block.history
             found["history"] = history
         if self.model.temperatures.any:
             found |= {"thermal_strain": bars.thermal, "temperature": self.model.temperatures.values}
@@ -159,7 +160,8 @@ class RunState:
             values = asking.reply(checkpoint.arrays[name][asked])
             if name == "history":
                 for block in bars.blocks:
-                    block.history[:] = values[block.start : block.stop, : block.history.shape[1]]
+                    if len(block.history):
+                        block.history[:] = values[block.start : block.stop]
             else:
                 target = bars.thermal if name == "thermal_strain" else self.model.temperatures.values
                 target[:] = values

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -39,9 +41,18 @@ class Plan:
     frequency: Frequency
     linear: LinearChoice | None
 
+    def record(self) -> dict[str, Any]:
+        """What a restart must not work out anew, in numbers that keep their last bit."""
+        return {"step": self.step, "frequency": list(self.frequency)}
 
-def make_plan(model) -> Plan:
+
+def make_plan(model, recorded: Mapping[str, Any] | None = None) -> Plan:
     """Resolve what the case leaves open. Collective.
+
+    Parameters
+    ----------
+    model : Model
+    recorded : :meth:`Plan.record` of the run that is continued, whose time step and frequencies are kept
 
     Raises
     ------
@@ -51,7 +62,10 @@ def make_plan(model) -> Plan:
     case = model.case
     time = case.time
     scheme = lookup("pfem_petsc.integrators", time.integrator, f"{case.source}: time.integrator").Scheme(time.scheme)
-    frequency = highest_frequency(model, model.mesh.points)
+    if recorded is None:
+        frequency = highest_frequency(model, model.mesh.points)
+    else:
+        frequency = Frequency(*recorded["frequency"])
     # mass-proportional damping: xi = c_m / (2 rho omega) is largest where c_m / rho is
     ratio = max(m.damping / m.density for m in case.material.values()) / (2.0 * max(frequency.lower, 1e-300))
     limit = scheme.limit(min(ratio, 1e3))
@@ -61,7 +75,10 @@ def make_plan(model) -> Plan:
         )
     critical = limit / frequency.upper if frequency.upper > 0.0 else np.inf
     certain = limit / frequency.lower if frequency.lower > 0.0 else np.inf
-    if time.step == "auto":
+    if recorded is not None:
+        step = float(recorded["step"])
+        steps = _steps_to(time.end, step)
+    elif time.step == "auto":
         if not np.isfinite(critical):
             raise InputError(
                 f'{case.source}: time.step = "auto": {time.integrator} has no critical step here; give time.step [s]'
@@ -75,7 +92,7 @@ def make_plan(model) -> Plan:
                 f"{case.source}: time.step = {step:g} s is above the limit of {time.integrator}, which is unstable "
                 f'beyond {critical:.6g} s for this model; take a smaller step or time.step = "auto"'
             )
-        steps = max(int(np.ceil(time.end / step * (1.0 - 1e-12) - 1e-9)), 1)
+        steps = _steps_to(time.end, step)
     linear = None
     if not scheme.explicit or model.inertia.consistent:
         over = step * frequency.upper / 2.0
@@ -83,6 +100,10 @@ def make_plan(model) -> Plan:
             case.solver.linear, 3 * model.mesh.n_nodes, 0.0 if scheme.explicit else over, scheme.symmetric
         )
     return Plan(scheme, step, steps, critical, frequency, linear)
+
+
+def _steps_to(end: float, step: float) -> int:
+    return max(int(np.ceil(end / step * (1.0 - 1e-12) - 1e-9)), 1)
 
 
 def make_stepper(model, plan: Plan) -> Stepper:

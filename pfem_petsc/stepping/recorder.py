@@ -21,6 +21,7 @@ class Recorder:
     ----------
     columns : name to shape of a row's value
     types : name to dtype where it is not float64
+    alarmed : whether any rank raised an alarm with the last row
     probe_nodes : probe name to the mesh numbers of its nodes, ascending: the order of rows in a probe's columns
     """
 
@@ -29,6 +30,7 @@ class Recorder:
         self.ledger = ledger
         self.model = stepper.model
         self.start_energy: float | None = None
+        self.alarmed = False
         self.iterations = np.zeros(2, dtype=np.int64)
         case, mesh, comm = self.model.case, self.model.mesh, self.model.comm
         self.columns: dict[str, tuple[int, ...]] = {"time": (), "step": (), "step_size": ()}
@@ -60,23 +62,23 @@ class Recorder:
         """Add the iterations of a step to those of the next row."""
         self.iterations += (newton, linear)
 
-    def row(self) -> dict[str, Any]:
-        """The history row of the present state. Collective."""
+    def row(self, alarm: bool = False) -> dict[str, Any]:
+        """The history row of the present state. Collective.
+
+        ``alarm``: this rank has something that all must speak about; :attr:`alarmed` is then true on all.
+        """
         stepper, state, model = self.stepper, self.stepper.state, self.model
-        momentum = self.ledger.momentum
         x = state.position
         walls = stepper.solution.walls
         energy = stepper.energy
         parts = [
             [self.ledger.kinetic, energy.elastic, energy.plastic_heat, energy.hardening],
             self.ledger.work,
-            momentum.sum(axis=0),
-            np.cross(x, momentum).sum(axis=0),
-            model.inertia.mass @ x,
-            state.support.sum(axis=0),
+            self.ledger.totals,
             [float(stepper.solution.contacts)],
             walls.force.ravel(),
             walls.contacts.astype(np.float64),
+            [float(alarm)],
         ]
         for name, local, place in self._probes:
             nodes = np.zeros((4, len(self.probe_nodes[name]), 3))
@@ -86,6 +88,7 @@ class Recorder:
             parts.append(nodes.ravel())
         sums = np.concatenate([np.asarray(part, dtype=np.float64) for part in parts])
         model.comm.Allreduce(MPI.IN_PLACE, sums)
+        self.alarmed = sums[22 + walls.force.size + walls.contacts.size] > 0.0
         return self._unpack(sums)
 
     def _unpack(self, sums: np.ndarray) -> dict[str, Any]:
@@ -123,7 +126,7 @@ class Recorder:
         for k, name in enumerate(names):
             row[f"wall/{name}/force"] = sums[at + 3 * k : at + 3 * k + 3]
             row[f"wall/{name}/contacts"] = round(sums[at + 3 * len(names) + k])
-        at += 4 * len(names)
+        at += 4 * len(names) + 1
         for name, nodes in self.probe_nodes.items():
             size = 12 * len(nodes)
             values = sums[at : at + size].reshape(4, len(nodes), 3)

@@ -1,0 +1,87 @@
+"""Writes the checkpoints of a run, and takes one back."""
+
+from __future__ import annotations
+
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from ..output.checkpoint import NAME, read_checkpoint, write_checkpoint
+from .compare import check_mesh_is_the_same, mesh_mark
+from .folder import Restart
+from .state import STATE_VERSION, RunState
+
+__all__ = ["Checkpoints"]
+
+
+class Checkpoints:
+    """Checkpoints of one run, in its output folder. Construction is collective.
+
+    Parameters
+    ----------
+    case : Case
+    stepper : Stepper
+    plan : Plan
+    folder : Path
+    """
+
+    def __init__(self, case, stepper, plan, folder: Path) -> None:
+        self.case, self.plan, self.path = case, plan, folder / NAME
+        self.comm = stepper.model.comm
+        self.state = RunState(stepper)
+        self.last_step = -1
+        state = self.state
+        self._mark = mesh_mark(stepper.model, state.node_order, state.bar_order, state.counted)
+
+    @property
+    def wanted(self) -> bool:
+        """Whether the case asks for checkpoints at all."""
+        return bool(self.case.output.checkpoint_every or self.case.output.checkpoint_minutes)
+
+    def due(self, step: int) -> bool:
+        """Whether the case wants one after this step."""
+        every = self.case.output.checkpoint_every
+        return bool(every) and step % every == 0
+
+    def write(self, ledger, recorder, row: dict[str, Any]) -> None:
+        """Write one, which becomes the newest. Collective.
+
+        Raises
+        ------
+        SimulationFailure
+            On all ranks; those before stay.
+        """
+        scalars = self.state.scalars(ledger, recorder, row)
+        if scalars["step"] == self.last_step:
+            return
+        attributes = {
+            "state_version": STATE_VERSION,
+            "pfem_petsc": _version(),
+            "case": self.case.to_dict(),
+            "plan": self.plan.record(),
+            "mesh_mark": self._mark,
+        }
+        write_checkpoint(self.path, self.comm, self.state.arrays(), scalars, attributes)
+        self.last_step = scalars["step"]
+
+    def take_back(self, restart: Restart):  # noqa: ANN201 - a Checkpoint
+        """Set the stepper to a checkpoint, instead of its start; give what was read. Collective.
+
+        Raises
+        ------
+        InputError
+            On all ranks: damaged, or of another mesh.
+        """
+        check_mesh_is_the_same(restart.path, self._mark, restart.attributes, self.case.source)
+        checkpoint = read_checkpoint(restart.path, self.comm, self.state.orders(restart.scalars))
+        self.state.put_back(checkpoint)
+        if restart.continues:
+            self.last_step = restart.step
+        return checkpoint
+
+
+def _version() -> str:
+    try:
+        return metadata.version("pfem_petsc")
+    except metadata.PackageNotFoundError:
+        return "not installed"

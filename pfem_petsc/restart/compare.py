@@ -1,0 +1,111 @@
+"""Is a checkpoint one of this case? What may have changed since it was written, and what may not."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+
+from ..case.toml import value_text
+from ..errors import InputError
+from ..output.integrity import checksum
+from ..parallel.natural import NaturalOrder
+from .state import STATE_VERSION
+
+__all__ = ["changed_keys", "check_mesh_is_the_same", "check_version", "mesh_mark"]
+
+FREE = ("title", "time.end", "output", "solver")
+"""Keys and tables that a restart may change: they do not change what is simulated."""
+
+
+def changed_keys(path: Path, before: Mapping[str, Any], now: Mapping[str, Any], source: str) -> list[str]:
+    """What a restart changes: ``time.end: 1.0 -> 2.0`` for every key that differs.
+
+    Parameters
+    ----------
+    path : the checkpoint
+    before, now : the case of the checkpoint and this one, as nested tables
+    source : this case's file, for the message
+
+    Raises
+    ------
+    InputError
+        Where a key differs that a restart cannot change.
+    """
+    # tuples become lists, as they are in the checkpoint
+    old, new = _flat(before), _flat(json.loads(json.dumps(now)))
+    keys = [key for key in dict.fromkeys([*old, *new]) if old.get(key) != new.get(key)]
+    lines = {key: f"{key}: {_text(old, key)} -> {_text(new, key)}" for key in keys}
+    refused = [key for key in keys if not any(key == free or key.startswith(free + ".") for free in FREE)]
+    if refused:
+        more = f" (and {len(refused) - 5} more)" if len(refused) > 5 else ""
+        raise InputError(
+            f"{path}: belongs to another case than {source}: {'; '.join(lines[key] for key in refused[:5])}{more}. A "
+            f"restart goes on with the same model and time step, and may change {', '.join(FREE)} alone: set the case "
+            "back, or start without --restart"
+        )
+    return list(lines.values())
+
+
+def check_version(path: Path, attributes: Mapping[str, Any]) -> None:
+    """Refuse a checkpoint whose content has another meaning than this program's.
+
+    Raises
+    ------
+    InputError
+    """
+    version = attributes.get("state_version")
+    if version != STATE_VERSION:
+        raise InputError(
+            f"{path}: holds version {version} of a run's state, this program reads {STATE_VERSION}: restart with the "
+            f"version of pfem_petsc that wrote it ({attributes.get('pfem_petsc', 'unknown')}), or start without "
+            "--restart"
+        )
+
+
+def check_mesh_is_the_same(path: Path, mark: int, attributes: Mapping[str, Any], source: str) -> None:
+    """Refuse a checkpoint of a mesh with other nodes or bars (a mesh file may change under the same name).
+
+    Raises
+    ------
+    InputError
+    """
+    if attributes.get("mesh_mark") != mark:
+        raise InputError(
+            f"{path}: the mesh of {source} is not the one that it was written with (other nodes or bars): bring the "
+            "mesh back, or start without --restart"
+        )
+
+
+def mesh_mark(model, node_order: NaturalOrder, bar_order: NaturalOrder, counted: np.ndarray) -> int:
+    """A number that any change of a coordinate or a bar's ends changes; the same on any number of ranks. Collective."""
+    mesh = model.mesh
+    points = node_order.to_slab(mesh.points[: mesh.n_owned])
+    ends = bar_order.to_slab(mesh.node_ids[mesh.bars[counted]].astype(np.int64).reshape(-1, 2))
+    comm: MPI.Comm = model.comm
+    return checksum(comm, points, node_order.first) ^ checksum(comm, ends, bar_order.first)
+
+
+def _flat(value: Any, prefix: str = "") -> dict[str, Any]:
+    """Nested tables and lists of tables as one level: {"wall[0].point": ...}."""
+    found: dict[str, Any] = {}
+    if isinstance(value, Mapping):
+        for key, item in value.items():
+            found |= _flat(item, f"{prefix}.{key}" if prefix else str(key))
+    elif isinstance(value, list | tuple) and value and all(isinstance(item, Mapping) for item in value):
+        for index, item in enumerate(value):
+            found |= _flat(item, f"{prefix}[{index}]")
+    else:
+        found[prefix] = list(value) if isinstance(value, tuple) else value
+    return found
+
+
+def _text(values: Mapping[str, Any], key: str) -> str:
+    if key not in values:
+        return "absent"
+    text = value_text(values[key])
+    return text if len(text) <= 60 else text[:56] + " ..."

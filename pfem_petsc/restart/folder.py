@@ -1,0 +1,122 @@
+"""The output folder at the start of a run: what is in it is moved aside, continued, or found to be finished."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mpi4py import MPI
+
+from ..errors import InputError
+from ..output import result as results
+from ..output.checkpoint import NAME, PREVIOUS, newest_checkpoint, read_checkpoint_header
+from ..parallel.agreement import on_root
+from .compare import changed_keys, check_version
+
+__all__ = ["RESULT", "Restart", "find_restart", "finished", "prepare_folder"]
+
+RESULT = "result.vtkhdf"
+ASIDE = "checkpoint-later.h5"
+
+
+@dataclass(frozen=True)
+class Restart:
+    """From where a run goes on.
+
+    Attributes
+    ----------
+    path : the checkpoint
+    scalars, attributes : its header
+    changed : keys of the case that differ, as lines
+    continues : whether the results in the output folder are continued; else they are moved aside and new ones begin
+    """
+
+    path: Path
+    scalars: dict[str, Any]
+    attributes: dict[str, Any]
+    changed: list[str]
+    continues: bool
+
+    @property
+    def step(self) -> int:
+        """The step after which it was written."""
+        return int(self.scalars["step"])
+
+
+def find_restart(case, comm: MPI.Comm, folder: Path, asked: bool | Path | None) -> Restart | str | None:
+    """What ``--restart`` means for an output folder. Collective.
+
+    Returns
+    -------
+    Restart, or a text for the user that says why the run starts from zero, or None where no restart was asked for
+
+    Raises
+    ------
+    InputError
+        A named file that is missing; any that is damaged, of another case or another version.
+    """
+    if asked is None or asked is False:
+        return None
+    path = on_root(comm, newest_checkpoint, folder) if asked is True else Path(asked)
+    if path is None:
+        return f"{folder}: no checkpoint there to restart from: starting from zero"
+    scalars, attributes = read_checkpoint_header(path, comm)
+    check_version(path, attributes)
+    changed = changed_keys(path, attributes["case"], case.to_dict(), case.source)
+    continues = on_root(comm, _continues, folder, path)
+    return Restart(path, scalars, attributes, changed, continues)
+
+
+def finished(case, comm: MPI.Comm, folder: Path, end: float) -> bool:
+    """Whether the output folder holds results of this case up to its end [s]. Collective."""
+    return on_root(comm, _finished, case, folder / RESULT, end)
+
+
+def _finished(case, path: Path, end: float) -> bool:
+    if not path.is_file():
+        return False
+    try:
+        with results.open_result(path) as result:
+            reached = float(result.history["time"][-1]) if len(result.history["time"]) else -1.0
+            changed_keys(path, result.case.to_dict(), case.to_dict(), case.source)
+    except InputError:
+        # of another case, or not readable: it is moved aside
+        return False
+    return reached >= end * (1.0 - 1e-9)
+
+
+def _continues(folder: Path, path: Path) -> bool:
+    return (folder / RESULT).is_file() and path.resolve().parent == folder.resolve()
+
+
+def prepare_folder(comm: MPI.Comm, folder: Path, restart: Restart | None) -> None:
+    """Make the output folder; what it holds is moved aside to a numbered name, unless a restart continues it.
+
+    Raises
+    ------
+    InputError
+        On all ranks, where the folder cannot be written.
+    """
+    on_root(comm, _prepare, folder, restart)
+
+
+def _prepare(folder: Path, restart: Restart | None) -> None:
+    try:
+        if restart is not None and restart.continues:
+            if restart.path.name == PREVIOUS and (folder / NAME).exists():
+                # A later one than the results will reach back to must not be taken for the newest.
+                os.replace(folder / NAME, folder / ASIDE)
+        elif any((folder / name).exists() for name in (RESULT, NAME, PREVIOUS)):
+            number = 1
+            while (aside := folder.with_name(f"{folder.name}.{number}")).exists():
+                number += 1
+            folder.rename(aside)
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"{folder}: cannot write the results there: {error.strerror}; choose another with -o"
+        ) from error
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise InputError(f"{folder}: cannot write the results there: permission denied; choose another with -o")

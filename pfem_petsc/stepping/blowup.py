@@ -1,0 +1,72 @@
+"""Motions that blow up: found by the energy, told with the first bar and node."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ..errors import SimulationFailure
+
+__all__ = ["BlowUp"]
+
+_CREATED = 1e3  # energy created by the integration, over all that was ever put in: far beyond any error of a sound run
+_ROWS = 10  # the first rows after a start from rest have nothing to compare with
+
+
+class BlowUp:
+    """Watches the history rows of a run. Collective where it speaks; the rows are the same on all ranks."""
+
+    def __init__(self, model) -> None:
+        self.model = model
+        self._rows = 0
+        self._most = 0.0
+
+    def check(self, row: dict[str, Any], state) -> None:
+        """Look at a row.
+
+        Raises
+        ------
+        SimulationFailure
+            On all ranks, when the energy is not finite, or a thousand times what was put in.
+        """
+        held = row["kinetic_energy"] + row["elastic_energy"]
+        when = f"step {state.step}, t = {state.time:.6g} s"
+        if not np.isfinite(held):
+            raise SimulationFailure(
+                f"{when}: the energy is not finite: the motion blew up{self._where(state)}; take a smaller time.step"
+            )
+        put_in = ("external_work", "contact_work", "thermal_work")
+        start = held + row["plastic_dissipation"] if self._rows == 0 else 0.0
+        self._most = max(self._most, abs(start), *(abs(row[name]) for name in put_in))
+        self._rows += 1
+        created = -row["numerical_dissipation"]
+        if self._rows > _ROWS and created > _CREATED * self._most:
+            raise SimulationFailure(
+                f"{when}: the integration has created {created:.3g} J, where {self._most:.3g} J were put in: the "
+                f"motion is unstable, fastest at {self._fastest(state)}; take a smaller time.step"
+            )
+
+    def _where(self, state) -> str:
+        """The first node and bar, by mesh number, whose positions or velocities are not finite."""
+        mesh = self.model.mesh
+        bad = ~(np.isfinite(state.position).all(axis=1) & np.isfinite(state.v).all(axis=1))
+        node = min(mesh.node_ids[: mesh.n_owned][bad], default=mesh.n_nodes)
+        lost = ~np.isfinite(state.x).all(axis=1)
+        bar = min(mesh.bar_ids[lost[mesh.bars].any(axis=1)], default=mesh.n_bars)
+        comm = self.model.comm
+        node, bar = min(comm.allgather(int(node))), min(comm.allgather(int(bar)))
+        text = f", first seen at node {node}" if node < mesh.n_nodes else ""
+        return text + (f" and bar {bar}" if bar < mesh.n_bars else "")
+
+    def _fastest(self, state) -> str:
+        """Node with the highest speed, and one of its bars."""
+        mesh = self.model.mesh
+        speed = np.linalg.norm(state.v, axis=1)
+        mine = (-1.0, -1, -1)
+        if len(speed):
+            at = int(np.argmax(speed))
+            bar = int(mesh.bar_ids[(mesh.bars == at).any(axis=1)].min())
+            mine = (float(speed[at]), int(mesh.node_ids[at]), bar)
+        fastest, node, bar = max(self.model.comm.allgather(mine))
+        return f"node {node} (bar {bar}), {fastest:.3g} m/s"

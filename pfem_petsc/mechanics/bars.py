@@ -128,6 +128,11 @@ class Bars:
                 *self._arguments(x, block), block.start, block.stop, m, weight, pattern.ptr, pattern.slots, values
             )
 
+    def linearise(self, x: np.ndarray, weight: float, stored: np.ndarray) -> None:
+        """Fill ``stored`` (b, 5) with n, dN/dl - N/l [N/m] and N/l [N/m], times ``weight``, of each bar at ``x``."""
+        for block in self.blocks:
+            block.kernels.linearise(*self._arguments(x, block), block.start, block.stop, weight, stored)
+
     def step_forces(self, x0: np.ndarray, x: np.ndarray, f: np.ndarray) -> None:
         """Discrete-gradient forces ``f`` (local nodes, 3) [N] of a step from ``x0`` to ``x``."""
         f[:] = 0.0

@@ -24,7 +24,7 @@ COLLAPSED_STRETCH = 1e-3  # a bar below this fraction of its rest length has bee
 
 @cache
 def make_kernels(response: Callable, remembers: bool) -> SimpleNamespace:
-    """Kernels of a material law: ``forces``, ``tangents``, ``product``, ``fields``.
+    """Kernels of a material law: ``forces``, ``tangents``, ``product``, ``linearise``, ``fields``.
 
     Common arguments: ``x`` (local nodes, 3) [m]; ``bars`` (b, 2) local ends; ``rest`` (b,) rest lengths [m]; ``thermal``
     (b,) thermal strains, or (0,) for none; ``p`` the law's parameters; ``area`` [m2]; ``measure`` of
@@ -167,6 +167,26 @@ def make_kernels(response: Callable, remembers: bool) -> SimpleNamespace:
             out[b, 2] += fz
 
     @kernel
+    def linearise(x, bars, rest, thermal, p, area, measure, history, start, stop, weight, stored):
+        """What a product with ``weight`` K_t needs of each bar: n, dN/dl - N/l and N/l, to ``stored`` (b, 5)."""
+        warm = len(thermal) > 0
+        for k in range(start, stop):
+            a = bars[k, 0]
+            b = bars[k, 1]
+            shift = thermal[k] if warm else 0.0
+            dx = x[b, 0] - x[a, 0]
+            dy = x[b, 1] - x[a, 1]
+            dz = x[b, 2] - x[a, 2]
+            plastic = history[k - start, 0] if remembers else 0.0
+            accumulated = history[k - start, 1] if remembers else 0.0
+            axial, geometric, inverse = stiffness(dx, dy, dz, rest[k], shift, p, area, measure, plastic, accumulated)
+            stored[k, 0] = dx * inverse
+            stored[k, 1] = dy * inverse
+            stored[k, 2] = dz * inverse
+            stored[k, 3] = weight * (axial - geometric)
+            stored[k, 4] = weight * geometric
+
+    @kernel
     def fields(x, bars, rest, thermal, p, area, measure, history, start, stop, strain_out, stress_out, force_out):
         """Total strain, stress [Pa] and axial force [N] of each bar."""
         warm = len(thermal) > 0
@@ -185,4 +205,4 @@ def make_kernels(response: Callable, remembers: bool) -> SimpleNamespace:
             stress_out[k] = stress
             force_out[k] = area * stress * slope
 
-    return SimpleNamespace(forces=forces, tangents=tangents, product=product, fields=fields)
+    return SimpleNamespace(forces=forces, tangents=tangents, product=product, linearise=linearise, fields=fields)

@@ -10,7 +10,7 @@ import numpy as np
 
 from .compiled import kernel
 
-__all__ = ["Inertia"]
+__all__ = ["Inertia", "consistent_product"]
 
 
 @kernel
@@ -22,7 +22,8 @@ def _lump(bars, rest, start, stop, density, out):
 
 
 @kernel
-def _consistent_product(bars, rest, start, stop, density, u, out):
+def consistent_product(bars, rest, start, stop, density, u, out):
+    """Add the consistent product of a line density [kg/m] with ``u`` to ``out``, both (local nodes, 3)."""
     for k in range(start, stop):
         a = bars[k, 0]
         b = bars[k, 1]
@@ -80,9 +81,7 @@ class Inertia:
         self._out[:] = 0.0
         for block in self.bars.blocks:
             coefficient = density(block) * block.area
-            _consistent_product(
-                self.bars.ends, self.bars.rest, block.start, block.stop, coefficient, self._u, self._out
-            )
+            consistent_product(self.bars.ends, self.bars.rest, block.start, block.stop, coefficient, self._u, self._out)
         out[:] = self._out[:owned]
         return out
 

@@ -6,24 +6,33 @@ from dataclasses import dataclass
 
 from petsc4py import PETSc
 
+from ..errors import InputError
+
 __all__ = ["LinearChoice", "choose_linear", "configure"]
 
 _DIRECT_BELOW = 6000  # unknowns; below, a factorisation costs no more than a few dozen Krylov iterations in any state
-_JACOBI_UP_TO = 5.0  # steps over the explicit limit; 101,376 bars: 13 iterations at 1 x, 102 at 10 x
-_CHOLESKY_UP_TO = 50.0  # incomplete Cholesky: 5, 31, 166 iterations at 1, 10, 100 x; multigrid 8, 13, 14 after a set-up
+# Steps over the explicit limit up to which each is fastest, 101,376 bars on one core: a product costs 0.5 ms without a
+# matrix and 3.4 ms with one; Jacobi takes 13, 102, 377 iterations at 1, 10, 100 x, incomplete Cholesky 5, 31, 166,
+# multigrid 8, 13, 14 after a set-up of 0.8 s.
+_MATRIX_FREE_UP_TO = 200.0
+_JACOBI_UP_TO = 5.0
+_CHOLESKY_UP_TO = 50.0
 
 
 @dataclass(frozen=True)
 class LinearChoice:
-    """A Krylov method and preconditioner, with the words that the log shows."""
+    """A Krylov method and preconditioner, with or without a matrix, and the words that the log shows."""
 
     krylov: str
     preconditioner: str
     why: str
+    matrix_free: bool = False
 
 
-def choose_linear(request: str, unknowns: int, step_ratio: float, symmetric: bool = True) -> LinearChoice:
-    """Resolve ``solver.linear``.
+def choose_linear(
+    request: str, unknowns: int, step_ratio: float, symmetric: bool = True, operator: str = "auto"
+) -> LinearChoice:
+    """Resolve ``solver.linear`` and ``solver.operator``.
 
     Parameters
     ----------
@@ -35,14 +44,27 @@ def choose_linear(request: str, unknowns: int, step_ratio: float, symmetric: boo
         Time step over the critical step of central differences: how much stiffness weighs against mass.
     symmetric : bool
         Whether the matrix is; GMRES and incomplete LU stand in for conjugate gradients and Cholesky where it is not.
+    operator : str
+        ``auto``, ``assembled`` or ``matrix_free``.
+
+    Raises
+    ------
+    InputError
+        Where an operator without matrix is asked for together with what needs one.
     """
-    if request == "mumps" or (request == "auto" and unknowns <= _DIRECT_BELOW):
+    if operator == "matrix_free" and (request in ("gamg", "mumps") or not symmetric):
+        needs = f'solver.linear = "{request}"' if request in ("gamg", "mumps") else "this integrator"
+        raise InputError(f'solver.operator = "matrix_free": {needs} needs a matrix; take "assembled" or "auto"')
+    free = operator != "assembled" and symmetric
+    if request == "mumps" or (request == "auto" and operator != "matrix_free" and unknowns <= _DIRECT_BELOW):
         why = "asked for" if request != "auto" else f"{unknowns} unknowns, at most {_DIRECT_BELOW}"
         return LinearChoice("preonly", "lu", f"direct ({why})")
     krylov, method = ("cg", "conjugate gradients") if symmetric else ("gmres", "GMRES")
     if request == "gamg":
         return LinearChoice(krylov, "gamg", f"{method}, multigrid (asked for)")
     ratio = f"step is {step_ratio:.3g} x the explicit limit"
+    if free and (operator == "matrix_free" or request == "cg" or step_ratio <= _MATRIX_FREE_UP_TO):
+        return LinearChoice(krylov, "jacobi", f"{method}, Jacobi, matrix-free ({ratio})", matrix_free=True)
     if request == "cg" or step_ratio <= _JACOBI_UP_TO:
         return LinearChoice(krylov, "pbjacobi", f"{method}, point-block Jacobi ({ratio})")
     if step_ratio <= _CHOLESKY_UP_TO:

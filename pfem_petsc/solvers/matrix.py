@@ -145,6 +145,10 @@ class HessianMatrix:
             self.mat.assemble()
         return self.mat
 
+    def update(self, problem, w: np.ndarray) -> None:
+        """Assemble the Hessian of a problem at ``w``. Collective."""
+        self.fill(lambda values: problem.hessian(w, self, values))
+
     def add_lumped(self, inertia: np.ndarray, values: np.ndarray) -> None:
         """Add a nodal inertia (owned,) to the diagonal."""
         _add_lumped(self.pattern.ptr, self.pattern.diagonal, inertia, values)

@@ -10,6 +10,7 @@ from petsc4py import PETSc
 
 from .linear import LinearChoice, configure
 from .matrix import HessianMatrix
+from .matrix_free import MatrixFreeHessian
 from .reasons import linear_reason, newton_reason
 
 __all__ = ["NewtonReport", "NewtonSolver", "Problem", "zero_tolerance"]
@@ -28,9 +29,6 @@ class Problem(Protocol):
     def residual(self, u: np.ndarray, g: np.ndarray) -> None:
         """Write g(u) (owned, 3) [N]."""
 
-    def hessian(self, u: np.ndarray, values: np.ndarray) -> None:
-        """Add dg/du to the values of the matrix pattern."""
-
 
 @dataclass(frozen=True)
 class NewtonReport:
@@ -46,10 +44,18 @@ class NewtonReport:
 class NewtonSolver:
     """Solves for the position increment of a step; made once for a run.
 
-    Options: prefix ``pfem_`` for free steps and ``pfem_contact_`` for steps with bounds.
+    Options: prefix ``pfem_`` for free steps, ``pfem_contact_`` for steps with bounds, and ``pfem_contact_full_`` where these
+    are tried again without a line search.
     """
 
-    def __init__(self, mesh, hessian: HessianMatrix, choice: LinearChoice, max_newton: int, length: float) -> None:
+    def __init__(
+        self,
+        mesh,
+        hessian: HessianMatrix | MatrixFreeHessian,
+        choice: LinearChoice,
+        max_newton: int,
+        length: float,
+    ) -> None:
         self.mesh = mesh
         self.hessian = hessian
         self.choice = choice
@@ -59,7 +65,7 @@ class NewtonSolver:
         self._g = self._u.duplicate()
         self._lower = self._u.duplicate()
         self._upper = self._u.duplicate()
-        self._solvers: dict[bool, PETSc.SNES] = {}
+        self._solvers: dict[tuple[bool, bool], PETSc.SNES] = {}
         self._problem: Problem | None = None
         self._previous = np.inf
 
@@ -95,6 +101,8 @@ class NewtonSolver:
         report = self._attempt(snes, start)
         if not report.converged and "INDEFINITE" in report.why or "BREAKDOWN" in report.why:
             report = self._without_definiteness(snes, start, report)
+        if not report.converged and bounds is not None and "LINE_SEARCH" in report.why:
+            report = self._with_full_steps(start, report)
         u[:] = self._u.array.reshape(u.shape)
         return report
 
@@ -131,11 +139,24 @@ class NewtonSolver:
             second.converged, first.newton + second.newton, first.linear + second.linear, second.norm, second.why
         )
 
-    def _solver(self, contact: bool) -> PETSc.SNES:
-        if contact in self._solvers:
-            return self._solvers[contact]
+    def _with_full_steps(self, start: np.ndarray, first: NewtonReport) -> NewtonReport:
+        """In oblique coordinates the residual need not fall on the way to the right active set: go there at once."""
+        snes = self._solver(True, full_steps=True)
+        snes.setVariableBounds(self._lower, self._upper)
+        second = self._attempt(snes, start)
+        return NewtonReport(
+            second.converged, first.newton + second.newton, first.linear + second.linear, second.norm, second.why
+        )
+
+    def _solver(self, contact: bool, full_steps: bool = False) -> PETSc.SNES:
+        key = contact, full_steps
+        if key in self._solvers:
+            return self._solvers[key]
         snes = PETSc.SNES().create(self.mesh.comm)
-        snes.setOptionsPrefix("pfem_contact_" if contact else "pfem_")
+        prefix = "pfem_contact_full_" if full_steps else "pfem_contact_" if contact else "pfem_"
+        snes.setOptionsPrefix(prefix)
+        if full_steps:
+            PETSc.Options(prefix)["snes_linesearch_type"] = "basic"
         snes.setType("vinewtonrsls" if contact else "newtonls")
         snes.setFunction(self._residual, self._g)
         snes.setJacobian(self._hessian, self.hessian.mat, self.hessian.mat)
@@ -148,7 +169,7 @@ class NewtonSolver:
                 options["snes_vi_zero_tolerance"] = zero_tolerance(self.length)
         configure(snes.getKSP(), self.choice, reduced=contact)
         snes.setFromOptions()
-        self._solvers[contact] = snes
+        self._solvers[key] = snes
         return snes
 
     def _residual(self, snes: PETSc.SNES, u: PETSc.Vec, g: PETSc.Vec) -> None:
@@ -158,7 +179,7 @@ class NewtonSolver:
 
     def _hessian(self, snes: PETSc.SNES, u: PETSc.Vec, matrix: PETSc.Mat, preconditioner: PETSc.Mat) -> None:
         array = u.getArray(readonly=True).reshape(self.mesh.n_owned, 3)
-        self.hessian.fill(lambda values: self._problem.hessian(array, values))
+        self.hessian.update(self._problem, array)
 
     def _converged(self, snes: PETSc.SNES, iteration: int, norms: tuple[float, float, float]) -> int:
         norm = norms[2]

@@ -12,6 +12,7 @@ from ..contact.rounds import ContactRounds
 from ..integrators.base import Balance
 from ..solvers.linear import LinearChoice
 from ..solvers.matrix import HessianMatrix
+from ..solvers.matrix_free import MatrixFreeHessian
 from ..solvers.newton import NewtonReport, NewtonSolver
 from .problem import StepProblem
 from .stepper import NotConverged, Solution, Stepper
@@ -29,7 +30,10 @@ class ImplicitStepper(Stepper):
 
     def __init__(self, model, scheme, h: float, choice: LinearChoice) -> None:
         super().__init__(model, scheme, h)
-        self.hessian = HessianMatrix(model.mesh, model.supports.fixed, model.supports.any, scheme.symmetric)
+        if choice.matrix_free:
+            self.hessian = MatrixFreeHessian(model)
+        else:
+            self.hessian = HessianMatrix(model.mesh, model.supports.fixed, model.supports.any, scheme.symmetric)
         self.newton = NewtonSolver(model.mesh, self.hessian, choice, model.case.solver.max_newton, model.length)
         self.level = 0  # the next step is made in 2**level parts
         self.message: Callable[[str], None] = lambda text: None
@@ -113,7 +117,7 @@ class ImplicitStepper(Stepper):
         newton = linear = 0
         while True:
             frames = contacts.frames(balance.predictor + guess)
-            problem = StepProblem(model, self.hessian, state, balance, state.external, frames)
+            problem = StepProblem(model, state, balance, state.external, frames)
             w, bounds = problem.coordinates(guess), None
             if frames is not None:
                 bounds = contacts.bounds()

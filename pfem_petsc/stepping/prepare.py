@@ -96,9 +96,13 @@ def make_plan(model, recorded: Mapping[str, Any] | None = None) -> Plan:
     linear = None
     if not scheme.explicit or model.inertia.consistent:
         over = step * frequency.upper / 2.0
-        linear = choose_linear(
-            case.solver.linear, 3 * model.mesh.n_nodes, 0.0 if scheme.explicit else over, scheme.symmetric
-        )
+        over = 0.0 if scheme.explicit else over
+        try:
+            linear = choose_linear(
+                case.solver.linear, 3 * model.mesh.n_nodes, over, scheme.symmetric, case.solver.operator
+            )
+        except InputError as error:
+            raise InputError(f"{case.source}: {error}") from error
     return Plan(scheme, step, steps, critical, frequency, linear)
 
 

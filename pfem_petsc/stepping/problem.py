@@ -51,14 +51,12 @@ class StepProblem:
     def __init__(
         self,
         model,
-        hessian: HessianMatrix,
         state: State,
         balance: Balance,
         external: np.ndarray,
         frames: NodalFrames | None,
     ) -> None:
         self.model = model
-        self.hessian_matrix = hessian
         self.state = state
         self.balance = balance
         self.external = external
@@ -79,8 +77,8 @@ class StepProblem:
         if balance.weight < 1.0:
             known = known + (1.0 - balance.weight) * state.f[: mesh.n_owned]
         self.known = known
-        self._oblique = frames is not None and model.comm.allreduce(int(frames.oblique)) > 0
-        if self._oblique:
+        self.oblique = frames is not None and model.comm.allreduce(int(frames.oblique)) > 0
+        if self.oblique:
             self._share_frames()
 
     def _share_frames(self) -> None:
@@ -97,7 +95,7 @@ class StepProblem:
     def increment(self, w: np.ndarray) -> np.ndarray:
         """u (owned, 3) for w."""
         self.u[:] = w
-        if self._oblique:
+        if self.oblique:
             at = self.frames.nodes
             self.u[at] = np.einsum("nij,nj->ni", self.frames.inverse, w[at])
         return self.u
@@ -105,7 +103,7 @@ class StepProblem:
     def coordinates(self, u: np.ndarray) -> np.ndarray:
         """w (owned, 3) for u."""
         w = u.copy()
-        if self._oblique:
+        if self.oblique:
             at = self.frames.nodes
             w[at] = np.einsum("nij,nj->ni", self.frames.basis, u[at])
         return w
@@ -122,7 +120,7 @@ class StepProblem:
             np.multiply(self.nodal[:, None], u, out=g)
         g += self.known
         if balance.weight:
-            self._place(u)
+            self.place(u)
             if balance.from_start:
                 self.model.bars.step_forces(self.state.x, self.x, self.f)
             else:
@@ -132,16 +130,16 @@ class StepProblem:
     def residual(self, w: np.ndarray, g: np.ndarray) -> None:
         """See :class:`~pfem_petsc.solvers.newton.Problem`."""
         self.imbalance(self.increment(w), g)
-        if self._oblique:
+        if self.oblique:
             at = self.frames.nodes
             g[at] = np.einsum("nji,nj->ni", self.frames.inverse, g[at])
         if self.model.supports.any:
             g[self.model.supports.fixed] = 0.0
 
-    def hessian(self, w: np.ndarray, values: np.ndarray) -> None:
-        """See :class:`~pfem_petsc.solvers.newton.Problem`."""
-        inertia, balance, matrix = self.model.inertia, self.balance, self.hessian_matrix
-        self._place(self.increment(w))
+    def hessian(self, w: np.ndarray, matrix: HessianMatrix, values: np.ndarray) -> None:
+        """Add dg/dw to the values of an assembled matrix. Collective."""
+        inertia, balance = self.model.inertia, self.balance
+        self.place(self.increment(w))
         if not inertia.consistent:
             matrix.add_lumped(self.nodal, values)
         coefficients = inertia.coefficients(balance.alpha, balance.eta)
@@ -151,11 +149,12 @@ class StepProblem:
                 bars.step_tangents(self.state.x, self.x, *arguments)
             else:
                 bars.tangents(self.x, *arguments)
-        if self._oblique:
+        if self.oblique:
             columns = local_columns(self.model.mesh, matrix.pattern.columns)
             _turn_blocks(matrix.pattern.ptr, columns, self._frame_of, self._frame_of, self._inverse, values)
         matrix.constrain(self.scale, values)
 
-    def _place(self, u: np.ndarray) -> None:
+    def place(self, u: np.ndarray) -> None:
+        """Put the positions of all local nodes at the predictor plus u. Collective."""
         np.add(self.balance.predictor, u, out=self.x[: self.model.mesh.n_owned])
         self.model.mesh.update_ghosts(self.x)

@@ -59,7 +59,7 @@ class Twin:
         state.external = self.stepper._load(self.balance)
         self.basis = np.tile(np.eye(3), (n, 1, 1))
         frames = self._frames(walls) if walls else None
-        self.problem = StepProblem(self.model, self.stepper.hessian, state, self.balance, state.external, frames)
+        self.problem = StepProblem(self.model, state, self.balance, state.external, frames)
         self.fixed = np.zeros((n, 3), dtype=bool)
         if supports:
             self.fixed[np.abs(self.truss.points[:, 2]) < 0.1] = (True, False, True)
@@ -129,7 +129,7 @@ class Twin:
     def program_hessian(self, w):
         """The assembled matrix, dense in mesh numbering; rows of prescribed components scaled to one."""
         mesh, mine = self.model.mesh, np.ascontiguousarray(w[self.owned])
-        matrix = self.stepper.hessian.fill(lambda values: self.problem.hessian(mine, values))
+        matrix = self.stepper.hessian.fill(lambda values: self.problem.hessian(mine, self.stepper.hessian, values))
         numbers = np.zeros(mesh.n_nodes, dtype=np.int64)
         numbers[mesh.first_node : mesh.first_node + mesh.n_owned] = self.owned
         numbers = self.model.comm.allreduce(numbers)

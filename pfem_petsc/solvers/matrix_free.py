@@ -1,0 +1,145 @@
+"""The Hessian as an operator: the bars' stiffness is applied bar by bar, and never assembled.
+
+Five numbers a bar are kept (n and the two stiffnesses), against 36 matrix entries and their columns: a product reads a
+quarter of the memory. Contact problems take the restriction of the operator to their inactive unknowns.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from petsc4py import PETSc
+
+from ..mechanics.compiled import kernel
+from ..mechanics.mass import consistent_product
+
+__all__ = ["MatrixFreeHessian"]
+
+
+@kernel
+def _product(bars, stored, u, out):
+    for k in range(len(bars)):
+        a = bars[k, 0]
+        b = bars[k, 1]
+        dx = u[b, 0] - u[a, 0]
+        dy = u[b, 1] - u[a, 1]
+        dz = u[b, 2] - u[a, 2]
+        nx = stored[k, 0]
+        ny = stored[k, 1]
+        nz = stored[k, 2]
+        along = stored[k, 3] * (nx * dx + ny * dy + nz * dz)
+        across = stored[k, 4]
+        fx = along * nx + across * dx
+        fy = along * ny + across * dy
+        fz = along * nz + across * dz
+        out[a, 0] -= fx
+        out[a, 1] -= fy
+        out[a, 2] -= fz
+        out[b, 0] += fx
+        out[b, 1] += fy
+        out[b, 2] += fz
+
+
+@kernel
+def _diagonal(bars, stored, blocks):
+    """Add the diagonal blocks (local nodes, 6): xx, xy, xz, yy, yz, zz."""
+    for k in range(len(bars)):
+        c = stored[k, 3]
+        g = stored[k, 4]
+        nx = stored[k, 0]
+        ny = stored[k, 1]
+        nz = stored[k, 2]
+        for end in range(2):
+            i = bars[k, end]
+            blocks[i, 0] += c * nx * nx + g
+            blocks[i, 1] += c * nx * ny
+            blocks[i, 2] += c * nx * nz
+            blocks[i, 3] += c * ny * ny + g
+            blocks[i, 4] += c * ny * nz
+            blocks[i, 5] += c * nz * nz + g
+
+
+class MatrixFreeHessian:
+    """Stands where :class:`~pfem_petsc.solvers.matrix.HessianMatrix` stands, for symmetric schemes.
+
+    Attributes
+    ----------
+    mat : PETSc matrix of type python
+    """
+
+    def __init__(self, model) -> None:
+        self.model = model
+        mesh = model.mesh
+        self.mesh = mesh
+        local, total = 3 * mesh.n_owned, 3 * mesh.n_nodes
+        self.mat = PETSc.Mat().createPython(((local, total), (local, total)), self, comm=mesh.comm)
+        self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+        self.mat.setUp()
+        self._stored = np.zeros((len(mesh.bars), 5))
+        self._u = np.zeros((mesh.n_local, 3))
+        self._out = np.zeros((mesh.n_local, 3))
+        self._fixed = model.supports.fixed
+        self._problem = None
+
+    def update(self, problem, w: np.ndarray) -> None:
+        """Linearise at ``w``. Collective."""
+        self._problem = problem
+        problem.place(problem.increment(w))
+        self.model.bars.linearise(problem.x, problem.balance.weight, self._stored)
+        self.mat.stateIncrease()
+
+    def mult(self, mat: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """Y = H x; called by PETSc."""
+        problem, owned = self._problem, self.mesh.n_owned
+        w = x.getArray(readonly=True).reshape(owned, 3)
+        u = self._u
+        u[:owned] = w
+        if self.model.supports.any:
+            u[:owned][self._fixed] = 0.0
+        if problem.oblique:
+            at = problem.frames.nodes
+            u[at] = np.einsum("nij,nj->ni", problem.frames.inverse, u[at])
+        self.mesh.update_ghosts(u)
+        self._out[:] = 0.0
+        _product(self.mesh.bars, self._stored, u, self._out)
+        inertia = self.model.inertia
+        if inertia.consistent:
+            bars = self.model.bars
+            coefficients = inertia.coefficients(problem.balance.alpha, problem.balance.eta)
+            for block, coefficient in zip(bars.blocks, coefficients, strict=True):
+                consistent_product(bars.ends, bars.rest, block.start, block.stop, 6.0 * coefficient, u, self._out)
+            out = self._out[:owned]
+        else:
+            out = self._out[:owned]
+            out += problem.nodal[:, None] * u[:owned]
+        if problem.oblique:
+            out[at] = np.einsum("nji,nj->ni", problem.frames.inverse, out[at])
+        if self.model.supports.any:
+            out[self._fixed] = problem.scale * w[self._fixed]
+        y.setArray(out.ravel())
+
+    def getDiagonal(self, mat: PETSc.Mat, d: PETSc.Vec) -> None:  # noqa: N802 - PETSc's name
+        """Diagonal of H; called by PETSc."""
+        problem, owned = self._problem, self.mesh.n_owned
+        blocks = np.zeros((self.mesh.n_local, 6))
+        _diagonal(self.mesh.bars, self._stored, blocks)
+        # consistent mass has two thirds of the lumped one on its diagonal
+        nodal = problem.nodal * (2.0 / 3.0 if self.model.inertia.consistent else 1.0)
+        diagonal = blocks[:owned][:, [0, 3, 5]] + nodal[:, None]
+        if problem.oblique:
+            at = problem.frames.nodes
+            full = blocks[at][:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3) + nodal[at, None, None] * np.eye(3)
+            inverse = problem.frames.inverse
+            diagonal[at] = np.einsum("nji,njk,nki->ni", inverse, full, inverse)
+        if self.model.supports.any:
+            diagonal[self._fixed] = problem.scale
+        d.setArray(diagonal.ravel())
+
+    def createSubMatrix(self, mat, rows, columns, out=None):  # noqa: ANN001, ANN201, N802 - PETSc's name
+        """The restriction of H to some unknowns; called by PETSc."""
+        return PETSc.Mat().createSubMatrixVirtual(mat, rows, columns)
+
+    def destroy(self, mat: PETSc.Mat | None = None) -> None:
+        """Free the PETSc matrix; PETSc calls it with the matrix when that goes."""
+        if mat is None and self.mat is not None:
+            matrix, self.mat = self.mat, None
+            matrix.destroy()

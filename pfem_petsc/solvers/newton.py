@@ -40,6 +40,12 @@ class NewtonReport:
     norm: float
     why: str
 
+    def then(self, later: NewtonReport) -> NewtonReport:
+        """The report of a later attempt, with the iterations of both."""
+        return NewtonReport(
+            later.converged, self.newton + later.newton, self.linear + later.linear, later.norm, later.why
+        )
+
 
 class NewtonSolver:
     """Solves for the position increment of a step; made once for a run.
@@ -143,10 +149,7 @@ class NewtonSolver:
         """In oblique coordinates the residual need not fall on the way to the right active set: go there at once."""
         snes = self._solver(True, full_steps=True)
         snes.setVariableBounds(self._lower, self._upper)
-        second = self._attempt(snes, start)
-        return NewtonReport(
-            second.converged, first.newton + second.newton, first.linear + second.linear, second.norm, second.why
-        )
+        return first.then(self._attempt(snes, start))
 
     def _solver(self, contact: bool, full_steps: bool = False) -> PETSc.SNES:
         key = contact, full_steps
@@ -165,10 +168,14 @@ class NewtonSolver:
         if contact:
             # PETSc's default 1e-8 is absolute: a node that near its bound would be held there, off it
             options = PETSc.Options(snes.getOptionsPrefix())
-            if not options.hasName("snes_vi_zero_tolerance"):
+            ours = not options.hasName("snes_vi_zero_tolerance")
+            if ours:
                 options["snes_vi_zero_tolerance"] = zero_tolerance(self.length)
         configure(snes.getKSP(), self.choice, reduced=contact)
         snes.setFromOptions()
+        if contact and ours:
+            # options belong to the process: the next model has a length of its own
+            options.delValue("snes_vi_zero_tolerance")
         self._solvers[key] = snes
         return snes
 

@@ -317,8 +317,8 @@ class Simulation:
             return
         self._checkpoint()
         raise EarlyStop(
-            f"{self._stop.reason(code)}: stopped after step {self.state.step}, t = {self.state.time:.6g} s; a "
-            f"checkpoint is in {self.folder}: continue with --restart"
+            f"{self._stop.reason(code)}; step {self.state.step} is finished, t = {self.state.time:.6g} s, and a "
+            f"checkpoint written: continue with --restart (results in {self.folder})"
         )
 
     def _snapshot(self) -> None:

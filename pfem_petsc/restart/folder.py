@@ -102,9 +102,23 @@ def prepare_folder(comm: MPI.Comm, folder: Path, restart: Restart | None) -> Non
     on_root(comm, _prepare, folder, restart)
 
 
+def _refuse_gap(path: Path, restart: Restart) -> None:
+    """Results that end before the checkpoint cannot be continued from it."""
+    every = int(restart.attributes["case"]["output"]["history_every"])
+    with results.open_result(path) as result:
+        steps = result.history["step"]
+        last = int(steps[-1]) if len(steps) else -1
+    if last < restart.step // every * every:
+        raise InputError(
+            f"{path}: the history ends at step {last}, before {restart.path}, written after step {restart.step}: they "
+            "belong to different runs; restart into another folder (-o), where new results begin at the checkpoint"
+        )
+
+
 def _prepare(folder: Path, restart: Restart | None) -> None:
     try:
         if restart is not None and restart.continues:
+            _refuse_gap(folder / RESULT, restart)
             if restart.path.name == PREVIOUS and (folder / NAME).exists():
                 # A later one than the results will reach back to must not be taken for the newest.
                 os.replace(folder / NAME, folder / ASIDE)

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from ..contact.contact import WallForces
 from ..mechanics.bars import StrainEnergy
 from ..mesh.exchange import Router
 from ..mesh.slab import slab_of
@@ -62,8 +61,7 @@ class RunState:
         mine = {
             "work": ledger.work.tolist(),
             "energy": list(energy[:3]),
-            "wall_force": walls.force.tolist(),
-            "wall_contacts": walls.contacts.tolist(),
+            "walls": {item.name: getattr(walls, item.name).tolist() for item in dataclasses.fields(walls)},
             "contacts": int(stepper.solution.contacts),
         }
         return {
@@ -93,10 +91,13 @@ class RunState:
             if name.startswith(_MEMORY):
                 state.memory[name.removeprefix(_MEMORY)] = values.copy()
             elif name.startswith(_KEPT):
-                array = getattr(stepper, name.removeprefix(_KEPT))
-                array[:] = values.astype(array.dtype)
-            else:
+                name = name.removeprefix(_KEPT)
+                setattr(stepper, name, values.astype(getattr(stepper, name).dtype))
+            elif name in ("x", "f"):
                 getattr(state, name)[:owned] = values
+            else:
+                # not in place: a force that does not act may be an array that others share
+                setattr(state, name, values.copy())
         self.model.mesh.update_ghosts(state.x)
         self._put_back_bars(checkpoint)
         state.step, state.time = int(scalars["step"]), float(scalars["time"])
@@ -105,11 +106,10 @@ class RunState:
         mine = self._share(scalars["ranks"])
         stepper.energy = StrainEnergy(*mine["energy"], -1)
         walls = stepper.solution.walls
-        shape = walls.force.shape
-        stepper.solution.walls = WallForces(
-            np.array(mine["wall_force"], dtype=float).reshape(shape), np.array(mine["wall_contacts"], dtype=np.int64)
-        )
-        stepper.solution.contacts = mine["contacts"]
+        for name, values in mine["walls"].items():
+            like = getattr(walls, name)
+            setattr(walls, name, np.array(values, dtype=like.dtype).reshape(like.shape))
+        stepper.solution.contacts = int(mine["contacts"])
 
     def put_back_sums(self, checkpoint: Checkpoint, ledger, recorder) -> dict[str, Any]:
         """Set ledger and recorder, both made after :meth:`put_back`; gives what is known of the last row."""
@@ -123,8 +123,7 @@ class RunState:
         """This rank's share of the sums: its own on as many ranks, else all on rank 0 and nothing elsewhere."""
         if len(ranks) == self.comm.size:
             return ranks[self.comm.rank]
-        total = {name: sum(np.array(share[name]) for share in ranks) for name in ranks[0]}
-        return {name: value if self.comm.rank == 0 else 0 * value for name, value in total.items()}
+        return _summed(ranks) if self.comm.rank == 0 else _summed(ranks[:1], 0.0)
 
     def _node_arrays(self) -> dict[str, np.ndarray]:
         """Rows of owned nodes, by name: every array of the state, so that none added later is forgotten."""
@@ -165,6 +164,13 @@ class RunState:
             else:
                 target = bars.thermal if name == "thermal_strain" else self.model.temperatures.values
                 target[:] = values
+
+
+def _summed(shares: list[Any], factor: float = 1.0) -> Any:
+    """Sums over ranks, times a factor, in the same nested dictionaries."""
+    if isinstance(shares[0], dict):
+        return {name: _summed([share[name] for share in shares], factor) for name in shares[0]}
+    return factor * sum(np.array(share) for share in shares)
 
 
 def _numbers(array: np.ndarray) -> np.ndarray:

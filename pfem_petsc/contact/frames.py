@@ -3,8 +3,8 @@
 At a node, y = B x with the normals of up to three independent planes as rows of B makes each plane a bound on one
 coordinate; opposite planes bound the same coordinate from both sides. Rows along the axes stay in their axis's slot,
 so that walls along the axes need no change of coordinates at all. Planes are taken in the order of a rank, nearest first;
-a plane that finds no row, or leans on the rows taken with less than :data:`MIN_SINE`, waits: whether it is kept is
-verified after the solve.
+a plane that finds no row, or would take the volume of the rows (the product of the sines of their angles) below
+:data:`MIN_VOLUME`, waits: whether it is kept is verified after the solve.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ import numpy as np
 
 from ..mechanics.compiled import kernel
 
-__all__ = ["MIN_SINE", "NodalFrames", "build_frames"]
+__all__ = ["MIN_VOLUME", "NodalFrames", "build_frames"]
 
-MIN_SINE = 0.04  # of the angle between a normal and the span of the rows before it: 2.3 degrees, cond(B) <= 50
+MIN_VOLUME = 0.04  # of the rows of B: cond(B) <= 2.6/0.04 = 65; two planes share a node from 2.3 degrees on
 _PARALLEL = 1e-14  # 1 - |cos| of normals that share a row
 
 
@@ -31,7 +31,7 @@ class NodalFrames:
     lower, upper : (m, 3) bounds on y [m], infinite where there is none
     rows : (m, w) int8: the coordinate (0, 1, 2) that wall k bounds at the node, -1 where it does not
     signs : (m, w) +1 for a lower bound, -1 for an upper one
-    normals : (m, w, 3) unit normals of the planes
+    normals, offsets : (m, w, 3), (m, w) planes that have a row; offset -inf for the others
     oblique : whether any basis is not the identity
     contradiction : index in ``nodes`` of a node whose bounds leave it no room, -1 for none
     """
@@ -46,6 +46,7 @@ class NodalFrames:
         self.rows = np.full((m, walls), -1, dtype=np.int8)
         self.signs = np.ones((m, walls))
         self.normals = np.zeros((m, walls, 3))
+        self.offsets = np.full((m, walls), -np.inf)
         self.oblique = False
         self.contradiction = -1
 
@@ -64,11 +65,12 @@ def build_frames(
     tolerance : opposite bounds that overlap by no more are met in their middle [m]
     """
     frames = NodalFrames(nodes, offsets.shape[1])
-    frames.normals = normals
     frames.oblique, frames.contradiction = _build(
         fixed, normals, offsets, rank, tolerance, frames.basis, frames.inverse, frames.lower, frames.upper, frames.rows,
         frames.signs,
     )
+    frames.normals = normals
+    frames.offsets = np.where(frames.rows >= 0, offsets, -np.inf)
     return frames
 
 
@@ -100,6 +102,7 @@ def _build(fixed, normals, offsets, rank, tolerance, basis, inverse, lower, uppe
     contradiction = -1
     for i in range(m):
         n = 0
+        volume = 1.0
         for c in range(3):
             taken[c] = fixed[i, c]
             if taken[c]:
@@ -133,8 +136,9 @@ def _build(fixed, normals, offsets, rank, tolerance, basis, inverse, lower, uppe
                 if n == 3:
                     continue
                 length = _rest(normal, spanned, n, part)
-                if length < MIN_SINE:
+                if length * volume < MIN_VOLUME:
                     continue
+                volume *= length
                 axis = 0
                 for c in range(3):
                     if abs(normal[c]) > abs(normal[axis]):

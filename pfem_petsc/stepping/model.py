@@ -35,6 +35,7 @@ class Model:
     mesh, nodes, bars, inertia, external, supports, temperatures, contact
     length : largest extent of the mesh [m]
     reach : largest coordinate magnitude [m], which sets the rounding of positions
+    nodal_stiffness : (owned,) sum of E A/l0 of a node's bars [N/m]
     rounding : 2-norm of the residual that rounding of positions leaves [N]
     warnings : of the mesh
     """
@@ -69,7 +70,8 @@ class Model:
         for block in self.bars.blocks:
             axial = block.area * block.parameters[0]
             _node_stiffness(mesh.bars, self.bars.rest, block.start, block.stop, axial, stiffness)
-        squares = comm.allreduce(float((stiffness[: mesh.n_owned] ** 2).sum()))
+        self.nodal_stiffness = stiffness[: mesh.n_owned].copy()
+        squares = comm.allreduce(float((self.nodal_stiffness**2).sum()))
         self.rounding = 4.0 * np.finfo(float).eps * self.reach * np.sqrt(squares)
         self.total_mass = comm.allreduce(float(self.inertia.mass.sum()))
         speeds = [np.sqrt(m.young_modulus / m.density) for m in case.material.values()]

@@ -1,0 +1,63 @@
+"""Oblique nodal coordinates: planes become bounds, rows stay independent, axes stay where they can."""
+
+import numpy as np
+import pytest
+
+from pfem_petsc.contact.frames import MIN_VOLUME, build_frames
+
+
+def frames_of(normals, offsets, fixed=(False, False, False), rank=None):
+    normals = np.asarray(normals, dtype=float)[None]
+    offsets = np.asarray(offsets, dtype=float)[None]
+    rank = offsets * 0.0 if rank is None else np.asarray(rank, dtype=float)[None]
+    return build_frames(np.array([0]), np.array([fixed]), normals.copy(), offsets, rank, 1e-12)
+
+
+@pytest.mark.parametrize("walls", [1, 2, 3, 5])
+def test_bounds_are_the_planes(walls):
+    """For planes that have a row, n . x - d equals the distance of y to its bound; B and its inverse are inverse."""
+    rng = np.random.default_rng(walls)
+    for _ in range(200):
+        normals = rng.normal(size=(walls, 3))
+        normals /= np.linalg.norm(normals, axis=1)[:, None]
+        offsets = rng.normal(size=walls)
+        fixed = rng.random(3) < 0.25
+        frames = frames_of(normals, offsets - 10.0, fixed, rng.random(walls))
+        basis, inverse = frames.basis[0], frames.inverse[0]
+        np.testing.assert_allclose(basis @ inverse, np.eye(3), atol=1e-13 / MIN_VOLUME)
+        assert np.linalg.cond(basis) < 2.6 / MIN_VOLUME
+        x = rng.normal(size=3)
+        y = basis @ x
+        for k in range(walls):
+            row, sign = frames.rows[0, k], frames.signs[0, k]
+            if row >= 0:
+                assert sign * y[row] == pytest.approx(normals[k] @ x, abs=1e-13)
+        for c in np.flatnonzero(fixed):
+            np.testing.assert_array_equal(basis[c], np.eye(3)[c])
+        given = (frames.rows[0] >= 0).sum()
+        assert given == min(walls, 3 - fixed.sum()) or walls > given
+
+
+def test_box_needs_no_turning():
+    """Six planes along the axes: two-sided bounds on the components as they are."""
+    normals = np.vstack([np.eye(3), -np.eye(3)])
+    frames = frames_of(normals, [0.0, 0.1, 0.2, -1.0, -1.1, -1.2])
+    assert not frames.oblique
+    np.testing.assert_array_equal(frames.lower[0], [0.0, 0.1, 0.2])
+    np.testing.assert_array_equal(frames.upper[0], [1.0, 1.1, 1.2])
+
+
+def test_nearly_parallel_planes_wait():
+    """Planes closer than the stated angle do not share coordinates: the nearer one has the row."""
+    angle = 0.5 * MIN_VOLUME
+    normals = [[0.0, 0.0, 1.0], [0.0, np.sin(angle), np.cos(angle)]]
+    frames = frames_of(normals, [0.0, 0.0], rank=[0.2, 0.1])
+    assert list(frames.rows[0] >= 0) == [False, True]
+
+
+def test_overlapping_bounds():
+    """Opposite planes that overlap by rounding meet in the middle; by more, the node is named."""
+    normals = [[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0]]
+    met = frames_of(normals, [1.0 + 4e-13, -1.0])
+    assert met.contradiction == -1 and met.lower[0, 0] == met.upper[0, 0]
+    assert frames_of(normals, [1.1, -1.0]).contradiction == 0

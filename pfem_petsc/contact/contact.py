@@ -10,6 +10,7 @@ from ..errors import InputError, SimulationFailure
 from ..parallel.agreement import agreed
 from ..registry import lookup
 from .frames import NodalFrames, build_frames
+from .log import ContactLog
 from .motion import WallMotion
 from .projection import project
 from .search import near_planes
@@ -22,18 +23,22 @@ _ZERO = np.zeros(1)
 
 @dataclass
 class WallForces:
-    """Per wall, sums over this rank's nodes.
+    """Per wall, sums over this rank's nodes, and these nodes.
 
     Attributes
     ----------
     force : (walls, 3) on the truss [N]
-    moment : (walls, 3) of that about the origin [N m]
     contacts : (walls,) nodes in contact
+    moment : (walls, 3) of the force about the origin [N m]
+    nodes : (m,) owned nodes near walls
+    touching : (m, walls) bool, what they touch
     """
 
     force: np.ndarray
-    moment: np.ndarray
     contacts: np.ndarray
+    moment: np.ndarray
+    nodes: np.ndarray
+    touching: np.ndarray
 
 
 class Contact:
@@ -44,6 +49,7 @@ class Contact:
     names : of the walls, in the case's order
     any : whether the case has walls
     moving : (walls,) bool
+    log : ContactLog
     state : of the nodes, for walls that must know where nodes come from; set by the stepper
     """
 
@@ -66,6 +72,7 @@ class Contact:
             if wall.node_set is not None:
                 self.members[:, k] = False
                 self.members[nodes[wall.node_set], k] = True
+        self.log = ContactLog(mesh.n_owned, len(walls))
         self.flat = np.array([wall.flat for wall in self.walls], dtype=bool)
         self.partial = any(wall.partial for wall in self.walls)
         self._normals = np.zeros((len(walls), 3))
@@ -78,7 +85,13 @@ class Contact:
     def none(self) -> WallForces:
         """No contact."""
         n = len(self.walls)
-        return WallForces(np.zeros((n, 3)), np.zeros((n, 3)), np.zeros(n, dtype=np.int64))
+        return WallForces(
+            np.zeros((n, 3)),
+            np.zeros(n, dtype=np.int64),
+            np.zeros((n, 3)),
+            np.empty(0, dtype=np.int64),
+            np.empty((0, n), dtype=bool),
+        )
 
     def positions(self, time: float) -> np.ndarray:
         """Where the walls' centres are (walls, 3) [m]."""
@@ -180,9 +193,8 @@ class Contact:
         """
         shifts = self.motion.shifts(time)
         nodes = np.flatnonzero(self.near(x, shifts))
-        walls = self.none()
         if len(nodes) == 0:
-            return nodes, np.empty((0, 3)), np.empty((0, 3)), walls
+            return nodes, np.empty((0, 3)), np.empty((0, 3)), self.none()
         free = x[nodes]
         concerned = self.concerned(nodes, free, shifts)
         at = free
@@ -203,15 +215,14 @@ class Contact:
             )
         strength = multipliers * stiffness[nodes][:, None]
         force = strength[:, :, None] * normals
-        self._sum(walls, force, moved, multipliers > 0.0)
+        walls = self._sum(nodes, force, moved, multipliers > 0.0)
         x[nodes] = moved
         return nodes, moved - free, force.sum(axis=1), walls
 
-    def _sum(self, walls: WallForces, force: np.ndarray, x: np.ndarray, touching: np.ndarray) -> None:
+    def _sum(self, nodes: np.ndarray, force: np.ndarray, x: np.ndarray, touching: np.ndarray) -> WallForces:
         """Sums of forces (m, w, 3) on nodes at (m, 3)."""
-        walls.force = force.sum(axis=0)
-        walls.moment = np.cross(x[:, None, :], force).sum(axis=0)
-        walls.contacts = touching.sum(axis=0)
+        moment = np.cross(x[:, None, :], force).sum(axis=0)
+        return WallForces(force.sum(axis=0), touching.sum(axis=0), moment, nodes, touching)
 
     def _no_room(self, node: int, offsets: np.ndarray, time: float) -> str:
         touched = [name for name, offset in zip(self.names, offsets, strict=True) if offset > -np.inf]
@@ -263,7 +274,5 @@ class Contact:
 
     def forces(self, frames: NodalFrames, strengths: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, WallForces]:
         """Forces (m, 3) on the frames' nodes at (m, 3) from normal forces (m, walls), and their sums per wall."""
-        walls = self.none()
         force = strengths[:, :, None] * frames.normals
-        self._sum(walls, force, x, strengths > 0.0)
-        return force.sum(axis=1), walls
+        return force.sum(axis=1), self._sum(frames.nodes, force, x, strengths > 0.0)

@@ -66,7 +66,16 @@ def build_frames(
     """
     frames = NodalFrames(nodes, offsets.shape[1])
     frames.oblique, frames.contradiction = _build(
-        fixed, normals, offsets, rank, tolerance, frames.basis, frames.inverse, frames.lower, frames.upper, frames.rows,
+        fixed,
+        normals,
+        offsets,
+        rank,
+        tolerance,
+        frames.basis,
+        frames.inverse,
+        frames.lower,
+        frames.upper,
+        frames.rows,
         frames.signs,
     )
     frames.normals = normals

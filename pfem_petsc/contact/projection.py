@@ -158,9 +158,7 @@ def project(x, fixed, normals, offsets, tolerance, multipliers):
                 count += 1
         found = 0
         while count > 0:
-            found = _best_set(
-                free, gap, among, count, tolerance, gram, rhs, factor, solution, chosen, strengths, move
-            )
+            found = _best_set(free, gap, among, count, tolerance, gram, rhs, factor, solution, chosen, strengths, move)
             if found == 0:
                 if stuck < 0:
                     stuck = i

@@ -70,6 +70,7 @@ class RunState:
             "stepper": {name: getattr(stepper, name) for name in stepper.kept_numbers},
             "iterations": recorder.iterations.tolist(),
             "start_energy": recorder.start_energy,
+            "contact_time": self.model.contact.log.time.tolist(),
             "row": {name: float(row[name]) for name in ("energy_imbalance", "active_contacts")},
             "node_arrays": sorted(self._node_arrays()),
             "bar_arrays": sorted(self._bar_arrays()),

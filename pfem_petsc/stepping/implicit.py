@@ -26,7 +26,7 @@ class ImplicitStepper(Stepper):
     """Newton's method on the free step; a variational inequality once a node can reach a wall."""
 
     kept_numbers = (*Stepper.kept_numbers, "level")
-    kept_arrays = ("held",)
+    kept_arrays = (*Stepper.kept_arrays, "held")
 
     def __init__(self, model, scheme, h: float, choice: LinearChoice) -> None:
         super().__init__(model, scheme, h)
@@ -118,11 +118,12 @@ class ImplicitStepper(Stepper):
         while True:
             frames = contacts.frames(balance.predictor + guess)
             problem = StepProblem(model, state, balance, state.external, frames)
-            w, bounds = problem.coordinates(guess), None
-            if frames is not None:
-                bounds = contacts.bounds()
-                np.clip(w, *bounds, out=w)
+            bounds = contacts.bounds() if frames is not None else None
+            w = contacts.clipped(problem.coordinates(contacts.feasible(guess)))
             report = self.newton.solve(problem, w, tolerance, model.rounding, bounds)
+            if not report.converged and problem.oblique:
+                w = contacts.clipped(problem.coordinates(contacts.approach(problem, guess)))
+                report = report.then(self.newton.solve(problem, w, tolerance, model.rounding, bounds))
             newton += report.newton
             linear += report.linear
             if not report.converged:

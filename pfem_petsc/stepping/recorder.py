@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
+from ..contact.history import contact_columns, contact_sums, contact_values
 from .ledger import Ledger
 
 __all__ = ["Recorder"]
@@ -43,10 +44,8 @@ class Recorder:
         self.types: dict[str, Any] = dict.fromkeys(
             ("step", "newton_iterations", "linear_iterations", "active_contacts"), np.int64
         )
-        for name in self.model.contact.names:
-            self.columns[f"wall/{name}/force"] = (3,)
-            self.columns[f"wall/{name}/contacts"] = ()
-            self.types[f"wall/{name}/contacts"] = np.int64
+        self.columns |= {name: shape for name, shape, _ in contact_columns(self.model.contact)}
+        self.types |= {name: kind for name, _, kind in contact_columns(self.model.contact) if kind is not float}
         self.probe_nodes: dict[str, np.ndarray] = {}
         self._probes: list[tuple[str, np.ndarray, np.ndarray]] = []
         for probe in case.output.probe:
@@ -76,9 +75,8 @@ class Recorder:
             self.ledger.work,
             self.ledger.totals,
             [float(stepper.solution.contacts)],
-            walls.force.ravel(),
-            walls.contacts.astype(np.float64),
             [float(alarm)],
+            contact_sums(model.contact, walls),
         ]
         for name, local, place in self._probes:
             nodes = np.zeros((4, len(self.probe_nodes[name]), 3))
@@ -88,7 +86,8 @@ class Recorder:
             parts.append(nodes.ravel())
         sums = np.concatenate([np.asarray(part, dtype=np.float64) for part in parts])
         model.comm.Allreduce(MPI.IN_PLACE, sums)
-        self.alarmed = sums[22 + walls.force.size + walls.contacts.size] > 0.0
+        self.alarmed = sums[22] > 0.0
+        model.contact.log.meet(model.comm)
         return self._unpack(sums)
 
     def _unpack(self, sums: np.ndarray) -> dict[str, Any]:
@@ -121,12 +120,8 @@ class Recorder:
             "support_force": sums[18:21],
         }
         self.iterations[:] = 0
-        at = 22
-        names = self.model.contact.names
-        for k, name in enumerate(names):
-            row[f"wall/{name}/force"] = sums[at + 3 * k : at + 3 * k + 3]
-            row[f"wall/{name}/contacts"] = round(sums[at + 3 * len(names) + k])
-        at += 4 * len(names) + 1
+        values, at = contact_values(self.model.contact, sums, 23, state.time)
+        row |= values
         for name, nodes in self.probe_nodes.items():
             size = 12 * len(nodes)
             values = sums[at : at + size].reshape(4, len(nodes), 3)

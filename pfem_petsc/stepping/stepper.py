@@ -58,7 +58,7 @@ class Stepper(ABC):
     """
 
     kept_numbers: tuple[str, ...] = ("part", "smallest")
-    kept_arrays: tuple[str, ...] = ()
+    kept_arrays: tuple[str, ...] = ("touching",)
 
     def __init__(self, model, scheme: Scheme, h: float) -> None:
         self.model = model
@@ -82,6 +82,7 @@ class Stepper(ABC):
             support=zeros(),
         )
         model.contact.state = self.state
+        self.touching = model.contact.log.touching
         self.solution = Solution(zeros(), self.state.f, model.contact.none())
 
     def start(self) -> None:
@@ -134,6 +135,8 @@ class Stepper(ABC):
         self.balance = self.scheme.balance(state, self.part)
         state.external = self._load(self.balance)
         self.solution = self.solve(self.balance)
+        if self.model.contact.any:
+            self.model.contact.log.book(self.solution.walls, self.part)
         self.scheme.finish(state, self.balance, self.solution.u, self.part)
 
     def _load(self, balance: Balance) -> np.ndarray:

@@ -11,8 +11,20 @@ def rotation(seed):
     return matrix * np.sign(np.linalg.det(matrix))
 
 
-def lattice_case(walls, *, velocity=(0.0, 0.0, 0.0), spin=(0.0, 0.0, 0.0), integrator="central_differences", step=2e-4,
-                 end=0.02, cells=(2, 1, 1), material=None, supports=(), gravity=None, **tables):
+def lattice_case(
+    walls,
+    *,
+    velocity=(0.0, 0.0, 0.0),
+    spin=(0.0, 0.0, 0.0),
+    integrator="central_differences",
+    step=2e-4,
+    end=0.02,
+    cells=(2, 1, 1),
+    material=None,
+    supports=(),
+    gravity=None,
+    **tables,
+):
     """An octet lattice of pitch 0.1 m with its corner at the origin; wave speed 31.6 m/s."""
     case = {
         "mesh": {"generator": "lattice", "kind": "octet", "cells": list(cells), "pitch": 0.1},

@@ -13,8 +13,10 @@ pytestmark = pytest.mark.parallel
 
 def wedge(angle, seed):
     half = 0.5 * angle
-    return planes(np.array([[np.cos(half), np.sin(half), 0.0], [-np.cos(half), np.sin(half), 0.0]]) @ rotation(seed).T,
-                  [-0.16, -0.16])
+    return planes(
+        np.array([[np.cos(half), np.sin(half), 0.0], [-np.cos(half), np.sin(half), 0.0]]) @ rotation(seed).T,
+        [-0.16, -0.16],
+    )
 
 
 def around(count, seed):
@@ -36,8 +38,9 @@ WALLS = {
     "twelve": around(12, 4),
     "sphere": [{"type": "sphere", "point": [0.1, 0.05, -0.31], "radius": 0.3}],
     "inside a sphere": [{"type": "sphere", "point": [0.1, 0.05, 0.05], "radius": 0.13, "side": "inside"}],
-    "inside a cylinder": [{"type": "cylinder", "point": [0.1, 0.05, 0.05], "axis": [1.0, 0.0, 0.0], "radius": 0.075,
-                           "side": "inside"}],
+    "inside a cylinder": [
+        {"type": "cylinder", "point": [0.1, 0.05, 0.05], "axis": [1.0, 0.0, 0.0], "radius": 0.075, "side": "inside"}
+    ],
     "cylinder and plane": [
         {"type": "cylinder", "point": [0.1, 0.05, -0.11], "axis": [0.2, 1.0, 0.1], "radius": 0.09},
         *planes([[0.0, 0.3, 1.0]], [-0.02]),
@@ -51,8 +54,15 @@ SETS = {"held": {"nearest": [0.0, 0.0, 0.0]}, "hinged": {"nearest": [0.2, 0.1, 0
 @pytest.mark.parametrize("name", WALLS)
 def test_steps_are_the_same(name, supported, comm, shared_tmp_path):
     tables = {"supports": SUPPORTS, "node_set": SETS} if supported else {}
-    case = lattice_case(WALLS[name], velocity=[3.0, -2.0, -8.0], spin=[40.0, 90.0, -60.0], step=2e-4, end=0.03,
-                        solver={"rtol": 1e-13}, **tables)
+    case = lattice_case(
+        WALLS[name],
+        velocity=[3.0, -2.0, -8.0],
+        spin=[40.0, 90.0, -60.0],
+        step=2e-4,
+        end=0.03,
+        solver={"rtol": 1e-13},
+        **tables,
+    )
     run = simulation(case, comm, shared_tmp_path)
     explicit = run.stepper
     implicit = ImplicitStepper(run.model, explicit.scheme, explicit.h, LinearChoice("preonly", "lu", "test"))

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from petsc4py import PETSc
 
 from pfem_petsc import Case, Simulation
 
@@ -16,9 +17,7 @@ def wall_force(comm, folder, name, *overrides):
 
 def test_tolerance_on_bounds_is_that_of_the_model(comm, shared_tmp_path):
     """A ring of 46 m takes a node 5e-13 m off its wall for touching; a rod of 1 m after it must not."""
-    rod = ("rod_impact", "time.end=0.9")
-    before = wall_force(comm, shared_tmp_path / "before", *rod)
     wall_force(comm, shared_tmp_path / "ring", "ring_impact", "time.step=5e-4", "time.end=0.007")
-    after = wall_force(comm, shared_tmp_path / "after", *rod)
-    assert np.array_equal(before, after)
-    assert (after[40:] < -0.4).all()
+    assert not PETSc.Options("pfem_contact_").hasName("snes_vi_zero_tolerance")
+    force = wall_force(comm, shared_tmp_path / "rod", "rod_impact", "time.end=0.9")
+    assert (force[40:] < -0.4).all()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -32,7 +33,10 @@ class WallForces:
     moment : (walls, 3) of the force about the origin [N m]
     nodes : (m,) owned nodes near walls
     touching : (m, walls) bool, what they touch
+    sums : names of those that are sums
     """
+
+    sums: ClassVar[tuple[str, ...]] = ("force", "contacts", "moment")
 
     force: np.ndarray
     contacts: np.ndarray

@@ -64,10 +64,11 @@ class ContactLog:
             "contact_changes": self.changes,
         }
 
-    def put_back(self, share: dict[str, Any], times: list[float]) -> None:
-        """Take this rank's sums, and the contact times, from a checkpoint; ``touching`` has been set."""
+    def put_back(self, share: dict[str, Any], times: list[float], touching: np.ndarray) -> None:
+        """Take this rank's sums, the contact times and who touches what from a checkpoint."""
         self.impulse[:] = np.array(share["wall_impulse"], dtype=float).reshape(self.impulse.shape)
         self.releases[:] = np.array(share["wall_releases"], dtype=np.int64)
         self.changes = int(share["contact_changes"])
         self.time[:] = times
-        self._before = np.flatnonzero(self.touching.any(axis=1))
+        self.touching = touching
+        self._before = np.flatnonzero(touching.any(axis=1))

@@ -61,7 +61,8 @@ class RunState:
         mine = {
             "work": ledger.work.tolist(),
             "energy": list(energy[:3]),
-            "walls": {item.name: getattr(walls, item.name).tolist() for item in dataclasses.fields(walls)},
+            "walls": {name: getattr(walls, name).tolist() for name in walls.sums},
+            "contact_log": self.model.contact.log.share(),
             "contacts": int(stepper.solution.contacts),
         }
         return {
@@ -111,6 +112,7 @@ class RunState:
             like = getattr(walls, name)
             setattr(walls, name, np.array(values, dtype=like.dtype).reshape(like.shape))
         stepper.solution.contacts = int(mine["contacts"])
+        self.model.contact.log.put_back(mine["contact_log"], scalars["contact_time"], stepper.touching)
 
     def put_back_sums(self, checkpoint: Checkpoint, ledger, recorder) -> dict[str, Any]:
         """Set ledger and recorder, both made after :meth:`put_back`; gives what is known of the last row."""

@@ -6,10 +6,9 @@ With tau = theta h the unknown is x_tau at t0 + tau:
     balance at t0 + tau with f_ext(t0) + theta [f_ext(t1) - f_ext(t0)],
     a1 = a0 + (a_tau - a0)/theta,   v1 = v0 + h (a0 + a1)/2,   x1 = x0 + h v0 + h^2 (2 a0 + a1)/6.
 
-Walls bound x_tau, not x1. A node held so moves as at infinite frequency: at theta = 1.4 by a factor -0.778 a step (-0.976
-at 1.37), so its reaction alternates, the wall lets go, and contact chatters and gains energy; from theta = 1.5 on a
-complex pair (0.533 in magnitude) decays without.
-Plastic strains are kept from x1, not from x_tau.
+Walls bound x_tau, not x1. A node held so moves as at infinite frequency: at theta = 1.4 by a factor -0.778 a step, so
+its reaction alternates, the wall lets go, and contact chatters and gains energy; from theta = 1.5 on a complex pair
+(0.533 in magnitude) dies out. Plastic strains are kept from x1, not from x_tau.
 """
 
 from __future__ import annotations

@@ -53,7 +53,7 @@ def test_momentum_over_a_thousand_steps(integrator, linear, angular, comm, share
     if angular is not None:
         assert turned < angular * moment
     else:  # Hu's method slows rotation down, visibly
-        assert turned > 1e-3 * moment
+        assert turned > 1e-4 * moment
     assert imbalance(history) < 1e-10
     centre = history["centre_of_mass"]
     path = centre[0] + np.outer(history["time"], [3.0, -1.0, 2.0])

@@ -64,11 +64,22 @@ class ContactLog:
             "contact_changes": self.changes,
         }
 
-    def put_back(self, share: dict[str, Any], times: list[float], touching: np.ndarray) -> None:
+    def times(self, comm: MPI.Comm) -> dict[str, Any]:
+        """Contact times, and the steps not yet added to them, for a checkpoint. Collective.
+
+        They are added by :meth:`meet` only: other partial sums would end in other last digits.
+        """
+        flags = np.array(self._flags, dtype=np.uint8).reshape(len(self._steps), len(self.time))
+        comm.Allreduce(MPI.IN_PLACE, flags, op=MPI.MAX)
+        return {"sum": self.time.tolist(), "steps": list(self._steps), "flags": flags.tolist()}
+
+    def put_back(self, share: dict[str, Any], times: dict[str, Any], touching: np.ndarray) -> None:
         """Take this rank's sums, the contact times and who touches what from a checkpoint."""
         self.impulse[:] = np.array(share["wall_impulse"], dtype=float).reshape(self.impulse.shape)
         self.releases[:] = np.array(share["wall_releases"], dtype=np.int64)
         self.changes = int(share["contact_changes"])
-        self.time[:] = times
+        self.time[:] = times["sum"]
+        self._steps = list(times["steps"])
+        self._flags = [np.array(flags, dtype=np.uint8) for flags in times["flags"]]
         self.touching = touching
         self._before = np.flatnonzero(touching.any(axis=1))

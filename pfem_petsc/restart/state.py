@@ -71,7 +71,7 @@ class RunState:
             "stepper": {name: getattr(stepper, name) for name in stepper.kept_numbers},
             "iterations": recorder.iterations.tolist(),
             "start_energy": recorder.start_energy,
-            "contact_time": self.model.contact.log.time.tolist(),
+            "contact_times": self.model.contact.log.times(self.comm),
             "row": {name: float(row[name]) for name in ("energy_imbalance", "active_contacts")},
             "node_arrays": sorted(self._node_arrays()),
             "bar_arrays": sorted(self._bar_arrays()),
@@ -112,7 +112,7 @@ class RunState:
             like = getattr(walls, name)
             setattr(walls, name, np.array(values, dtype=like.dtype).reshape(like.shape))
         stepper.solution.contacts = int(mine["contacts"])
-        self.model.contact.log.put_back(mine["contact_log"], scalars["contact_time"], stepper.touching)
+        self.model.contact.log.put_back(mine["contact_log"], scalars["contact_times"], stepper.touching)
 
     def put_back_sums(self, checkpoint: Checkpoint, ledger, recorder) -> dict[str, Any]:
         """Set ledger and recorder, both made after :meth:`put_back`; gives what is known of the last row."""
@@ -137,7 +137,9 @@ class RunState:
             if isinstance(value, np.ndarray):
                 found[item.name] = value[:owned]
         found |= {_MEMORY + name: array for name, array in state.memory.items()}
-        return found | {_KEPT + name: _numbers(getattr(self.stepper, name)) for name in self.stepper.kept_arrays}
+        found |= {_KEPT + name: _numbers(getattr(self.stepper, name)) for name in self.stepper.kept_arrays}
+        # a case without walls has no columns for them
+        return {name: array for name, array in found.items() if 0 not in array.shape[1:]}
 
     def _bar_arrays(self) -> dict[str, np.ndarray]:
         """Rows of all local bars, by name."""

@@ -6,6 +6,7 @@ import numpy as np
 from mpi4py import MPI
 
 from ..contact.contact import Contact
+from ..contact.start import adjust_start
 from ..mechanics.bars import Bars, section_of_bars
 from ..mechanics.compiled import kernel
 from ..mechanics.loads import ExternalForce
@@ -51,6 +52,9 @@ class Model:
         del slab, sections
         mesh = self.mesh
         self.nodes = resolve_node_sets(case, mesh)
+        adjusted = adjust_start(case, self.nodes, mesh)
+        if adjusted:
+            self.warnings.append(f"{adjusted} node{'s' * (adjusted > 1)} that started beyond walls moved onto them")
         self.bars = Bars(mesh, case)
         self.inertia = Inertia(mesh, self.bars, case.time.mass == "consistent")
         self.external = ExternalForce(case, self.nodes, self.inertia)

@@ -1,0 +1,51 @@
+"""Nodes that start beyond walls with ``adjust = true`` are moved onto them before anything is built on their places."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..errors import InputError, SimulationFailure
+from ..parallel.agreement import agreed
+from .contact import Contact
+
+__all__ = ["adjust_start"]
+
+
+def adjust_start(case, nodes: dict[str, np.ndarray], mesh) -> int:
+    """Move nodes of the mesh onto the walls that ask for it; the bars are unstressed there. Collective.
+
+    Returns
+    -------
+    int
+        Number of nodes moved on all ranks.
+
+    Raises
+    ------
+    InputError
+        On all ranks: walls that leave a node no room, or a bar that loses its length.
+    """
+    walls = [wall for wall in case.wall if wall.adjust]
+    if not walls:
+        return 0
+    owned = mesh.n_owned
+    contact = Contact(case, nodes, mesh, np.zeros((owned, 3), dtype=bool), walls)
+    points = mesh.points[:owned].copy()
+    moved = np.empty(0, dtype=np.int64)
+    with agreed(mesh.comm):
+        try:
+            moved, *_ = contact.explicit(points, np.ones(owned), 0.0, 1e-13 * contact.length)
+        except SimulationFailure as failure:
+            raise InputError(f"{case.source}: wall.adjust: {failure}") from failure
+    mesh.points[:owned] = points
+    mesh.update_ghosts(mesh.points)
+    a, b = mesh.bars.T
+    length = np.linalg.norm(mesh.points[b] - mesh.points[a], axis=1)
+    with agreed(mesh.comm):
+        if len(length) and length.min() <= 1e-9 * contact.length:
+            bar = int(np.argmin(length))
+            ends = mesh.node_ids[[a[bar], b[bar]]]
+            raise InputError(
+                f"{case.source}: wall.adjust: bar {mesh.bar_ids[bar]} between nodes {ends[0]} and {ends[1]} has no length "
+                "left once its nodes are on the wall; move the wall or the mesh"
+            )
+    return mesh.comm.allreduce(len(moved))

@@ -1,0 +1,195 @@
+"""Runs that are killed at any moment and restarted until they are done, and what must then be equal."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+import h5py
+import numpy as np
+
+from pfem_petsc.output.result import open_result
+
+PATIENCE = 300.0  # seconds that any single run may take, on a machine with other work
+
+
+class Kind(NamedTuple):
+    """A case, with what is set in it."""
+
+    case: str
+    overrides: tuple[str, ...]
+
+
+IMPACT = ("mesh.elements=200", "time.step=0.001")
+DROP = ("mesh.cells=[5,5,5]", "time.step=5e-7", "output.fields_every=20")
+KINDS = {
+    "explicit": Kind("rod_impact", (*IMPACT, "time.end=1.0", "output.fields_every=25")),
+    "explicit contact, plastic": Kind("lattice_drop", (*DROP, "time.end=3e-4")),
+    "implicit contact": Kind(
+        "rod_impact", ("time.integrator=newmark", "time.end=2.5", "mesh.elements=60", "output.fields_every=5")
+    ),
+    "multistep": Kind("pendulum", ("time.integrator=houbolt", "time.end=0.5", "time.step=1e-3")),
+    "implicit, plastic": Kind("bar_collision_plastic", ("time.integrator=wilson", "time.theta=1.5", "time.end=1.5e-4")),
+}
+"""One to a few seconds of steps each."""
+
+
+def environment() -> dict[str, str]:
+    """That of a process which no launcher has started."""
+    left = ("PMIX_", "PMI_", "OMPI_COMM_", "OMPI_MCA_orte_", "OMPI_MCA_ess_", "OMPI_UNIVERSE_", "OPAL_", "ORTE_")
+    variables = {name: value for name, value in os.environ.items() if not name.startswith(left)}
+    allowed = ("OMPI_ALLOW_RUN_AS_ROOT", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM", "OMPI_MCA_rmaps_base_oversubscribe")
+    variables |= dict.fromkeys((*allowed, "OMPI_MCA_mpi_yield_when_idle", "OMP_NUM_THREADS"), "1")
+    return variables | {"PRTE_MCA_rmaps_default_mapping_policy": ":oversubscribe"}
+
+
+def command(ranks: int, *words: str | Path) -> list[str]:
+    """Of the program on so many ranks."""
+    launcher = [] if ranks == 1 else ["mpirun", "-n", str(ranks)]
+    return [*launcher, sys.executable, "-m", "pfem_petsc", *map(str, words)]
+
+
+def words(kind: Kind, folder: Path, every: int, *more: str) -> list[str | Path]:
+    """Command line of a case with a checkpoint every so many steps."""
+    return [kind.case, "-o", folder, "--quiet", "--set", *kind.overrides, f"output.checkpoint_every={every}", *more]
+
+
+def run(kind: Kind, ranks: int, folder: Path, every: int, *more: str) -> subprocess.CompletedProcess:
+    """Run to the end."""
+    line = command(ranks, *words(kind, folder, every, *more))
+    return subprocess.run(line, env=environment(), capture_output=True, text=True, timeout=PATIENCE)
+
+
+def processes_of(process: subprocess.Popen, ranks: int) -> list[int]:
+    """The ranks: the process itself, or the children of the launcher."""
+    if ranks == 1:
+        return [process.pid]
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit():
+            try:
+                fields = (entry / "stat").read_text().rpartition(")")[2].split()
+            except OSError:
+                continue
+            if int(fields[1]) == process.pid:
+                found.append(int(entry.name))
+    return found
+
+
+def killed(kind: Kind, ranks: int, folder: Path, every: int, longest: float, chance: random.Random, *more: str) -> str:
+    """Start a run and kill all its ranks, or one of them, at a random moment; says when, or that it was done before."""
+    process = subprocess.Popen(
+        command(ranks, *words(kind, folder, every, *more)),
+        env=environment(),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+    try:
+        begin = time.monotonic()
+        steps_only = chance.random() < 0.8
+        log = folder / "log.txt"
+        before = log.stat().st_mtime_ns if log.exists() else None
+        # Most kills while steps are made, some while the model is set up.
+        while steps_only and process.poll() is None and time.monotonic() - begin < PATIENCE:
+            if log.exists() and log.stat().st_mtime_ns != before:
+                break
+            time.sleep(0.002)
+        started = time.monotonic() - begin
+        process_time = chance.uniform(0.0, longest)
+        deadline = time.monotonic() + process_time
+        while time.monotonic() < deadline and process.poll() is None:
+            time.sleep(0.001)
+        if process.poll() is not None:
+            return "done before"
+        pids = processes_of(process, ranks)
+        for pid in pids if chance.random() < 0.5 else pids[:1]:
+            os.kill(pid, signal.SIGKILL)
+        process.wait(timeout=60.0)
+        return f"killed {process_time:.3f} s after {'the first words' if steps_only else 'the start'} ({started:.2f} s)"
+    finally:
+        if process.poll() is None:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+
+
+VTK = """
+import sys
+from vtkmodules.vtkIOHDF import vtkHDFReader
+for line in sys.stdin:
+    reader = vtkHDFReader()
+    reader.SetFileName(line.strip())
+    reader.UpdateInformation()
+    n = reader.GetNumberOfSteps()
+    for i in sorted({0, n // 2, max(n - 1, 0)}):
+        if n:
+            reader.SetStep(i)
+            reader.Update()
+    print(n, flush=True)
+"""
+
+
+class VtkReader:
+    """VTK's own reader in a process of its own, which a file that it cannot read may end."""
+
+    def __enter__(self) -> VtkReader:
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", VTK], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=environment()
+        )
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.process.stdin.close()
+        self.process.wait()
+        self.process.stdout.close()
+
+    def steps(self, path: Path) -> int:
+        """How many time steps VTK sees; all that it was asked for was read."""
+        self.process.stdin.write(f"{path}\n")
+        self.process.stdin.flush()
+        answer = self.process.stdout.readline()
+        assert answer, f"VTK's reader ended on {path}"
+        return int(answer)
+
+
+def assert_readable(path: Path, vtk: VtkReader) -> int:
+    """Open what a kill has left, by VTK and by the package; gives its snapshots."""
+    with open_result(path) as result:
+        n = len(result.times)
+        assert list(result.times) == sorted(set(result.times))
+        steps = result.history["step"]
+        assert len(np.unique(steps)) == len(steps)
+        for name in result.history:
+            assert np.isfinite(np.asarray(result.history[name], dtype=float)).all(), name
+        for i in range(n):
+            assert np.isfinite(result.positions(i)).all(), i
+    assert vtk.steps(path) == n
+    return n
+
+
+def differences(one: Path, other: Path) -> dict[str, float]:
+    """Datasets of two results that are not equal bit for bit, with the largest difference over the largest value."""
+    found = {}
+    with h5py.File(one, "r", locking=False) as a, h5py.File(other, "r", locking=False) as b:
+        names = [_datasets(file) for file in (a, b)]
+        assert names[0] == names[1]
+        for name in names[0]:
+            x, y = a[name][()], b[name][()]
+            if x.shape != y.shape:
+                found[name] = np.inf
+            elif x.tobytes() != y.tobytes():
+                scale = max(float(np.abs(x).max()), np.finfo(float).tiny)
+                found[name] = float(np.abs(x - y).max()) / scale
+    return found
+
+
+def _datasets(file: h5py.File) -> list[str]:
+    names: list[str] = []
+    file.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None)
+    return [name for name in names if name != "case/text"]

@@ -57,6 +57,24 @@ def _rest_lengths(points, bars, rest):
         rest[k] = (dx * dx + dy * dy + dz * dz) ** 0.5
 
 
+@kernel
+def _first_inverted(x, before, bars, rest):
+    """First bar that is shortened and points back against where it pointed before, or -1."""
+    for k in range(len(bars)):
+        a = bars[k, 0]
+        b = bars[k, 1]
+        dx = x[b, 0] - x[a, 0]
+        dy = x[b, 1] - x[a, 1]
+        dz = x[b, 2] - x[a, 2]
+        if dx * dx + dy * dy + dz * dz < 0.8 * rest[k] * rest[k]:
+            back = dx * (before[b, 0] - before[a, 0])
+            back += dy * (before[b, 1] - before[a, 1])
+            back += dz * (before[b, 2] - before[a, 2])
+            if back < 0.0:
+                return k
+    return -1
+
+
 class Bars:
     """Internal forces, tangents and energies of the bars of this rank.
 
@@ -120,6 +138,13 @@ class Bars:
             if failed < 0:
                 failed = at
         return StrainEnergy(elastic_energy, heat, hardening, failed)
+
+    def first_inverted(self, x: np.ndarray, before: np.ndarray) -> int:
+        """First local bar that went through zero length from positions ``before`` to ``x``, or -1.
+
+        Its length alone does not tell: in one step a bar jumps over zero. Stretched bars are not looked at.
+        """
+        return _first_inverted(x, before, self.ends, self.rest)
 
     def tangents(self, x: np.ndarray, weight: float, inertia: list[float], pattern, values: np.ndarray) -> None:
         """Add ``weight`` K_t(x) and the consistent inertia (a coefficient per block) to a matrix's values."""

@@ -127,7 +127,7 @@ class ImplicitStepper(Stepper):
             newton += report.newton
             linear += report.linear
             if not report.converged:
-                raise NotConverged(self._failure(problem, w, report, tolerance))
+                raise NotConverged(self._failure(problem, w, bounds, report, tolerance))
             if frames is not None:
                 contacts.snap(w)
             u = problem.increment(w).copy()
@@ -166,11 +166,15 @@ class ImplicitStepper(Stepper):
             guess[at] = supports.positions(balance.time) - balance.predictor[at]
         return guess
 
-    def _failure(self, problem: StepProblem, w: np.ndarray, report: NewtonReport, tolerance: float) -> str:
+    def _failure(
+        self, problem: StepProblem, w: np.ndarray, bounds: tuple | None, report: NewtonReport, tolerance: float
+    ) -> str:
         """What to tell about a step that did not converge: worst node and residual, reasons, ways out. Collective."""
         model = self.model
         g = np.empty_like(w)
         problem.residual(w, g)
+        if bounds is not None:  # what walls bear is no error
+            g[((w <= bounds[0]) & (g > 0.0)) | ((w >= bounds[1]) & (g < 0.0))] = 0.0
         size = np.linalg.norm(np.nan_to_num(g, nan=np.inf), axis=1)
         worst = (0.0, -1)
         if len(size):

@@ -81,6 +81,7 @@ class Stepper(ABC):
             contact=zeros(),
             support=zeros(),
         )
+        self._before: np.ndarray | None = None  # positions at the last evaluation, with ghosts
         model.contact.state = self.state
         self.touching = model.contact.log.touching
         self.solution = Solution(zeros(), self.state.f, model.contact.none())
@@ -153,19 +154,28 @@ class Stepper(ABC):
         state, mesh = self.state, self.model.mesh
         mesh.update_ghosts(state.x)
         self.energy = self.model.bars.forces(state.x, state.f, commit)
-        if self.energy.failed >= 0 and self.fault is None:
-            self.fault = SimulationFailure(self._collapse(self.energy.failed))
+        failed = self.energy.failed
+        if self._before is None:
+            self._before = np.empty_like(state.x)
+        elif failed < 0:
+            failed = self.model.bars.first_inverted(state.x, self._before)
+        if failed >= 0 and self.fault is None:
+            self.fault = SimulationFailure(self._collapse(failed))
+        self._before[:] = state.x
 
     def _collapse(self, bar: int) -> str:
         mesh, state = self.model.mesh, self.state
         a, b = mesh.bars[bar]
-        when = f"step {state.step}, t = {state.time:.6g} s"
+        # the step is counted when it is complete, its time is set on arrival
+        step = state.step + (state.time > (state.step + 1e-9) * self.h)
+        when = f"step {step}, t = {state.time:.6g} s"
         name = f"bar {mesh.bar_ids[bar]} between nodes {mesh.node_ids[a]} and {mesh.node_ids[b]}"
         length = float(np.linalg.norm(state.x[b] - state.x[a]))
         if not np.isfinite(length):
             return f"{when}: the positions of {name} are not finite: the motion blew up; take a smaller time step"
+        how = f"collapsed to {length:.3g} m" if bar == self.energy.failed else "gone through zero length"
         return (
-            f"{when}: {name} has collapsed to {length:.3g} m, from {self.model.bars.rest[bar]:.3g} m; the impact is too "
+            f"{when}: {name} has {how}, from {self.model.bars.rest[bar]:.3g} m; the impact is too "
             "strong for a truss model: take a lower speed, a stronger material, or a smaller time step"
         )
 

@@ -1,0 +1,82 @@
+"""Runs that fail on their way: one message with step, node and reasons, on all ranks, and what came before is kept."""
+
+import re
+
+import numpy as np
+import pytest
+
+from pfem_petsc import Case, Simulation
+from pfem_petsc.errors import SimulationFailure
+from pfem_petsc.output.result import open_result
+
+pytestmark = pytest.mark.parallel
+
+COLLAPSE = r"step \d+, t = \S+ s: bar 19 between nodes 19 and 20 has gone through zero length, from 0\.05 m; .*take a"
+
+
+def failing(comm, folder, *overrides):
+    """Run rod_impact until it fails: the message, and the result on rank 0."""
+    simulation = Simulation(Case.load("rod_impact", overrides), comm, output=folder, quiet=True)
+    with pytest.raises(SimulationFailure) as failure:
+        simulation.run()
+    assert failure.value.exit_status == 3
+    messages = comm.allgather(str(failure.value))
+    assert messages == [messages[0]] * comm.size
+    comm.Barrier()
+    return messages[0], open_result(folder) if comm.rank == 0 else None
+
+
+@pytest.mark.parametrize("scheme", ["central_differences", "newmark", "chung_lee", "houbolt"])
+def test_bar_driven_through_zero_length(scheme, comm, shared_tmp_path):
+    """At three times the wave speed the last bar jumps over zero length within a step."""
+    keys = ["initial.velocity=[3.0, 0.0, 0.0]", f"time.integrator={scheme}", "output.fields_every=1", "time.end=0.5"]
+    message, result = failing(comm, shared_tmp_path / "it", *keys)
+    assert re.search(COLLAPSE, message), message
+    if result is not None:
+        steps = result.history["step"]
+        assert len(steps) >= 2
+        assert np.array_equal(steps, np.arange(len(steps)))
+        assert np.isfinite(result.history["kinetic_energy"]).all()
+        assert int(message.split("step ")[1].split(",")[0]) == len(steps)  # the next one
+        assert result.times[-1] == result.history["time"][-1]
+
+
+def test_strong_but_bearable_impact_runs_on(comm, shared_tmp_path):
+    """Half the wave speed: bars shorten to 0.4 of their length, and none is inverted."""
+    case = Case.load("rod_impact", ["time.end=0.6", "output.fields_every=10"])
+    Simulation(case, comm, output=shared_tmp_path / "it", quiet=True).run()
+    if comm.rank == 0:
+        result = open_result(shared_tmp_path / "it")
+        assert min(result.field("strain", i).min() for i in range(len(result.times))) < -0.5
+
+
+def test_no_convergence(comm, shared_tmp_path):
+    """One Newton iteration for a nonlinear step and a tolerance below rounding."""
+    keys = ["time.integrator=newmark", "solver.max_newton=1", "solver.rtol=1e-16", "time.step=0.2"]
+    message, result = failing(comm, shared_tmp_path / "it", *keys, "initial.velocity=[0.95, 0.3, 0.0]")
+    for part in (
+        "step 2, t = ",
+        "no convergence after 1 Newton iterations",
+        "the limit of Newton iterations was reached [DIVERGED_MAX_IT]",
+        "residual ",
+        "asked ",
+        "worst at node ",
+        "smaller time.step",
+    ):
+        assert part in message
+    # the residual of the worst node is an error, not what the wall bears
+    total = float(message.split("residual ")[1].split(" N")[0])
+    worst = float(message.split("worst at node ")[1].split("(")[1].split(" N")[0])
+    assert 0.0 < worst <= total * (1.0 + 1e-2)
+    if result is not None:
+        assert result.history["step"].tolist() == [0, 1]
+
+
+def test_step_above_the_limit_of_the_deformed_model_is_told(comm, shared_tmp_path):
+    """A green-strain rod stiffens as it is stretched: the limit at rest no longer holds, and the run blows up."""
+    keys = ["material.default.strain=green", "initial.velocity=[0.0, 0.0, 0.0]", "time.step=0.0495", "time.end=60.0"]
+    keys += ["support=[{node_set='base', fix='xyz'}]", "node_set.base.nearest=[0.0, 0.0, 0.0]", "wall=[]"]
+    keys += ["load=[{node_set='tip', force=[1.5, 0.0, 0.0]}]"]
+    message, _ = failing(comm, shared_tmp_path / "it", *keys)
+    assert "step" in message
+    assert "smaller time" in message

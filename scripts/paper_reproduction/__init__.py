@@ -1,0 +1,1 @@
+"""The paper's three impact examples, run, measured, drawn and judged."""

@@ -1,0 +1,47 @@
+"""The integrators of the comparison: how they are called, set and drawn."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+__all__ = ["IN_TABLES", "PAPER", "SCHEMES", "Integrator"]
+
+
+class Integrator(NamedTuple):
+    """One line of the comparison.
+
+    Attributes
+    ----------
+    name : label in figures and tables
+    overrides : settings of the case that choose it
+    colour, dash, width : of its curves; no colour where it is in tables only
+    """
+
+    name: str
+    overrides: tuple[str, ...]
+    colour: str = ""
+    dash: str = "-"
+    width: float = 1.3
+
+
+def _set(integrator: str, *parameters: str) -> tuple[str, ...]:
+    return (f"time.integrator={integrator}", *(f"time.{parameter}" for parameter in parameters))
+
+
+# In the order in which curves are drawn: the roughest first, so that the others stay visible.
+SCHEMES: dict[str, Integrator] = {
+    "wilson": Integrator("Wilson, θ = 1.5", _set("wilson", "theta=1.5"), "#e09f1f"),
+    "houbolt": Integrator("Houbolt", _set("houbolt"), "#8a4fbf"),
+    "souza_moura": Integrator("stand-in for Souza & Moura", _set("souza_moura"), "#3aa7c9"),
+    "chung_lee": Integrator("Chung & Lee, β = 28/27", _set("chung_lee"), "#2a9d5c"),
+    "newmark": Integrator("Newmark (Hu), β = 1, γ = 3/2", _set("newmark"), "#d9482b", "--"),
+    "central_differences": Integrator("Central differences", _set("central_differences"), "#2563b0", ":", 1.6),
+    # beyond the paper, or beyond what it can have used
+    "wilson_1.4": Integrator("Wilson, θ = 1.4", _set("wilson", "theta=1.4")),
+    "chung_lee_1": Integrator("Chung & Lee, β = 1", _set("chung_lee", "beta=1.0")),
+    "hulbert_chung": Integrator("Hulbert & Chung, ρ_b = 0", _set("hulbert_chung", "rho_b=0.0")),
+    "generalized_alpha": Integrator("Generalised-α, ρ∞ = 0.8", _set("generalized_alpha")),
+    "energy_momentum": Integrator("Energy-momentum", _set("energy_momentum")),
+}
+PAPER = ("central_differences", "newmark", "chung_lee", "souza_moura", "houbolt", "wilson")
+IN_TABLES = (*PAPER, *(scheme for scheme in SCHEMES if scheme not in PAPER))

@@ -21,6 +21,8 @@ export OMPI_MCA_hwloc_base_binding_policy=${OMPI_MCA_hwloc_base_binding_policy:-
 export OMPI_MCA_btl_vader_single_copy_mechanism=${OMPI_MCA_btl_vader_single_copy_mechanism:-none}
 # A rank that waits lets others run, and ranks that are ended have time for their last words.
 export OMPI_MCA_mpi_yield_when_idle=${OMPI_MCA_mpi_yield_when_idle:-1} OMPI_MCA_odls_base_sigkill_timeout=5
+# A process started without mpirun starts no daemon in case it launches others.
+export OMPI_MCA_ess_singleton_isolated=1
 export HWLOC_HIDE_ERRORS=2
 
 # Without a display, VTK draws in software where OSMesa is there, and looks for EGL itself where it is not.

@@ -1,0 +1,200 @@
+"""Tables of docs/integrators.md, from the schemes themselves on the linear oscillator.
+
+usage: python scripts/integrator_tables.py [--check]
+Rewrites what stands between <!-- table NAME --> and <!-- end --> in docs/integrators.md; with --check it changes nothing
+and fails where the file is not up to date.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from pfem_petsc.integrators.base import Scheme, State
+from pfem_petsc.registry import lookup
+
+DOCUMENT = Path(__file__).resolve().parent.parent / "docs" / "integrators.md"
+SHARES = (0.05, 0.1, 0.2)  # h/T
+MEMORY = {"central_differences": ("half_velocity",), "houbolt": ("d0", "d1")}
+
+
+class Row(NamedTuple):
+    """A line of the tables."""
+
+    label: str
+    integrator: str
+    parameters: dict[str, float]
+
+
+ROWS = (
+    Row("`central_differences`", "central_differences", {}),
+    Row("`chung_lee`, β = 1", "chung_lee", {"beta": 1.0}),
+    Row("`chung_lee`, β = 28/27", "chung_lee", {"beta": 28.0 / 27.0}),
+    Row("`hulbert_chung`, ρ_b = 0", "hulbert_chung", {"rho_b": 0.0}),
+    Row("`souza_moura` (stand-in: `hulbert_chung`, ρ_b = 0.3)", "souza_moura", {}),
+    Row("`hulbert_chung`, ρ_b = 0.8", "hulbert_chung", {"rho_b": 0.8}),
+    Row("`newmark`, β = 1, γ = 3/2 (Hu)", "newmark", {"beta": 1.0, "gamma": 1.5}),
+    Row("`newmark`, β = 1/4, γ = 1/2", "newmark", {"beta": 0.25, "gamma": 0.5}),
+    Row("`houbolt`", "houbolt", {}),
+    Row("`wilson`, θ = 1.4", "wilson", {"theta": 1.4}),
+    Row("`wilson`, θ = 1.5", "wilson", {"theta": 1.5}),
+    Row("`generalized_alpha`, ρ∞ = 0.8", "generalized_alpha", {"rho_inf": 0.8}),
+    Row("`generalized_alpha`, ρ∞ = 0", "generalized_alpha", {"rho_inf": 0.0}),
+    Row("`energy_momentum`", "energy_momentum", {}),
+)
+
+
+def make(row: Row) -> Scheme:
+    """The scheme of a line."""
+    module = lookup("pfem_petsc.integrators", row.integrator, "table")
+    return module.Scheme(module.Parameters(**row.parameters))
+
+
+def advance(scheme: Scheme, state: State, h: float, held: bool) -> None:
+    """One step of a unit mass on a unit spring (omega = 1), or of a node whose position is held at x = 0, in place.
+
+    The balance is solved as the program does: M a + (1 - w) f(x0) + w f(x) = 0, or x = 0.
+    """
+    if scheme.leads:
+        scheme.advance(state, h)
+    balance = scheme.balance(state, h)
+    known = 0.0 if balance.a_hat is None else float(balance.a_hat[0, 0])
+    predictor, x0 = float(balance.predictor[0, 0]), float(state.x[0, 0])
+    if held:
+        u = -predictor
+    elif balance.from_start:  # the discrete gradient of a quadratic energy: the force at the middle
+        u = -(known + 0.5 * (x0 + predictor)) / (balance.alpha + 0.5)
+    else:
+        weight = balance.weight
+        u = -(known + weight * predictor + (1.0 - weight) * x0) / (balance.alpha + weight)
+    scheme.finish(state, balance, np.full((1, 3), u), h)
+
+
+def amplification(row: Row, h: float, held: bool = False) -> np.ndarray:
+    """The matrix of one step, on (x, v h, a h^2) and the scheme's memory; column by column from unit states."""
+    names = MEMORY.get(row.integrator, ())
+    size = 3 + len(names)
+    scales = np.array([1.0, 1.0 / h, 1.0 / h**2] + [1.0 / h if name == "half_velocity" else 1.0 for name in names])
+    columns = []
+    for unit in np.eye(size) * scales:
+        arrays = [np.full((1, 3), value) for value in unit]
+        zero = np.zeros((1, 3))
+        state = State(arrays[0], arrays[1], arrays[2], zero, zero, zero, zero)
+        state.memory = dict(zip(names, arrays[3:]))
+        advance(make(row), state, h, held)
+        after = [state.x, state.v, state.a, *(state.memory[name] for name in names)]
+        columns.append(np.array([part[0, 0] for part in after]) / scales)
+    return np.array(columns).T
+
+
+def radius(row: Row, h: float, held: bool = False) -> float:
+    """Spectral radius of a step; an oscillator's without the root 1 that holds for no initial state."""
+    return float(np.abs(np.linalg.eigvals(amplification(row, h, held))).max())
+
+
+def principal(row: Row, h: float) -> complex:
+    """The eigenvalue that approximates exp(i omega h)."""
+    values = np.linalg.eigvals(amplification(row, h))
+    return complex(values[np.argmin(np.abs(values - np.exp(1j * h)))])
+
+
+def damping_and_period(row: Row, share: float) -> tuple[float, float]:
+    """Algorithmic damping ratio, and relative error of the period, at h/T."""
+    omega = 2.0 * np.pi * share
+    value = principal(row, omega)
+    angle = abs(np.angle(value))
+    return float(-np.log(abs(value)) / angle), float(omega / angle - 1.0)
+
+
+def order(row: Row) -> int:
+    """Of the principal eigenvalue: the local error falls with h^(order + 1)."""
+    errors = [abs(principal(row, h) - np.exp(1j * h)) for h in (0.02, 0.01)]
+    return round(np.log2(errors[0] / errors[1])) - 1
+
+
+def limit(row: Row) -> float:
+    """Largest stable omega h by bisection; infinite where 10^4 is stable."""
+    stable = lambda h: radius(row, h) <= 1.0 + 1e-6  # noqa: E731 - double roots on the circle are off by 1e-8
+    if stable(1e4):
+        return np.inf
+    low, high = 0.5, 4.0
+    while high - low > 1e-5:
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if stable(middle) else (low, middle)
+    return low
+
+
+def _lines(head: list[str], rows: list[list[str]]) -> str:
+    return "\n".join("| " + " | ".join(line) + " |" for line in (head, ["---"] * len(head), *rows))
+
+
+def accuracy_table() -> str:
+    """Order, limit, high frequencies, damping ratio and period error."""
+    rows = []
+    for row in ROWS:
+        bound = limit(row)
+        ends = f"{radius(row, 1e4):.3f}" if np.isinf(bound) else f"{radius(row, bound):.3f} at the limit"
+        cells = []
+        for share in SHARES:
+            damping, period = damping_and_period(row, share)
+            cells.append(f"{damping + 0.0:.4f}, {100 * period:+.2f} %".replace("-0.0000", "0.0000"))
+        rows.append([row.label, str(order(row)), "∞" if np.isinf(bound) else f"{bound:.4f}", ends, *cells])
+    head = ["scheme", "order", "limit Ω", "ρ(∞)", *(f"h/T = {share:g}: ξ, period" for share in SHARES)]
+    return _lines(head, rows)
+
+
+def held_table() -> str:
+    """Velocities of a node that flies at v and is then held at a wall that it has just reached."""
+    rows = []
+    for row in ROWS:
+        scheme, h = make(row), 1.0
+        names = MEMORY.get(row.integrator, ())
+        one, zero = np.ones((1, 3)), np.zeros((1, 3))
+        state = State(zero.copy(), one.copy(), zero.copy(), zero, zero, zero, zero)
+        state.memory = {name: one.copy() for name in names}
+        shown = []
+        if scheme.leads:  # the position has come from the velocity before: at the wall by then
+            state.x = -one
+        for _ in range(6):
+            advance(scheme, state, h, held=True)
+            shown.append(f"{state.v[0, 0] + 0.0:.3f}".replace("-0.000", "0.000"))
+        matrix = amplification(row, h, held=True)
+        size = np.abs(np.linalg.eigvals(matrix)).max()
+        # a nilpotent matrix has eigenvalues of the size of rounding to a fraction of a power
+        nilpotent = np.abs(np.linalg.matrix_power(matrix, len(matrix) + 1)).max() < 1e-12
+        rows.append([row.label, "0" if nilpotent else f"{size:.3f}", *shown])
+    return _lines(["scheme", "ρ held", *(f"step {n}" for n in range(1, 7))], rows)
+
+
+TABLES = {"accuracy": accuracy_table, "held": held_table}
+
+
+def filled(text: str) -> str:
+    """The document with its tables computed anew."""
+    for name, table in TABLES.items():
+        start = f"<!-- table {name} -->\n"
+        before, found, after = text.partition(start)
+        if not found:
+            raise SystemExit(f"{DOCUMENT}: has no line {start.strip()}")
+        text = before + start + "\n" + table() + "\n\n" + after[after.index("<!-- end -->") :]
+    return text
+
+
+def main() -> None:
+    """Write or check the document."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--check", action="store_true", help="change nothing; status 1 where the tables are old")
+    check = parser.parse_args().check
+    old = DOCUMENT.read_text(encoding="utf-8")
+    new = filled(old)
+    if check:
+        sys.exit(old != new)
+    DOCUMENT.write_text(new, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -16,7 +16,7 @@ from .parser import PROGRAM, Parser, add_debug
 
 __all__ = ["main"]
 
-VERBS = ("run", "list", "check", "render", "plot", "info")
+VERBS = ("run", "list", "check", "render", "plot", "info", "bench")
 """Modules of this package: ``EXAMPLE``, ``RANKS``, ``add_arguments(parser)`` and ``run(arguments[, comm])``."""
 
 EXAMPLES = f"""\
@@ -26,6 +26,7 @@ examples:
   {PROGRAM} check my_case.toml
   mpirun -n 2 {PROGRAM} my_case.toml -o results/fine --set time.step=1e-5 -- -log_view
   {PROGRAM} info results/rod_impact
+  mpirun -n 2 {PROGRAM} bench --sizes 100000
 
 CASE alone means run. Everything after -- goes to PETSc. VERB --help tells more."""
 

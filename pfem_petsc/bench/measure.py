@@ -1,0 +1,135 @@
+"""Time the steps of a job on a lattice through the public interface."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from dataclasses import dataclass
+from statistics import median
+from time import perf_counter, process_time
+from typing import TYPE_CHECKING
+
+from .bandwidth import Bandwidth
+from .cases import PITCH, WAVE_SPEED, Job, bars_of, make_case
+from .memory import PeakMemory
+from .traffic import bytes_per_step
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
+__all__ = ["Record", "time_job"]
+
+_FEWEST = 4  # steps timed, even if each takes longer than the time given
+
+
+@dataclass(frozen=True)
+class Record:
+    """A job on a lattice, timed. Times in seconds, over steps after the first; memory in bytes.
+
+    Attributes
+    ----------
+    median, best : of a step, wall clock on rank 0
+    cpu : processor time of a step, all ranks together
+    setup, first : wall clock of the set-up, and from there to the end of the first step (with output opened)
+    newton, linear : iterations of a step, mean
+    traffic : bytes that a step moves at least
+    share : percent of the bandwidth of all ranks that this traffic needs at the median
+    memory : highest growth of resident memory, all ranks together
+    """
+
+    job: str
+    kind: str
+    bars: int
+    nodes: int
+    ranks: int
+    steps: int
+    median: float
+    best: float
+    cpu: float
+    setup: float
+    first: float
+    newton: float
+    linear: float
+    traffic: float
+    share: float
+    memory: float
+    solver: str
+
+    @property
+    def rate(self) -> float:
+        """Bar updates a second: bars over the median step."""
+        return self.bars / self.median
+
+
+def time_job(
+    job: Job, kind: str, cells: int, comm: MPI.Comm, bandwidth: Bandwidth | None, seconds: float, most: int = 100_000
+) -> Record:
+    """Run a job for about ``seconds``, at most ``most`` steps. Collective."""
+    from ..simulation import Simulation
+
+    # while the front of an elastic impact runs to the far side and back, the foot stays on the floor
+    lasting = int(2.0 * cells * PITCH / WAVE_SPEED / job.step) if job.contact else most
+    steps = max(min(most, lasting), _FEWEST + 2)
+    case = make_case(job, kind, cells, steps)
+    folder = comm.bcast(tempfile.mkdtemp(prefix="pfem_bench_") if comm.rank == 0 else None)
+    memory = PeakMemory()
+    try:
+        start = perf_counter()
+        simulation = Simulation(case, comm, output=folder, quiet=True)
+        ready = perf_counter()
+        times, cpu, newton, linear = [], 0.0, 0, 0
+        count = steps
+        running = iter(simulation)
+        next(running)
+        first = perf_counter() - ready
+        before, cpu_before = perf_counter(), process_time()
+        for step in running:
+            now = perf_counter()
+            times.append(now - before)
+            newton += step.newton
+            linear += step.linear
+            if len(times) == 2:  # the same on all ranks
+                count = comm.bcast(max(int(seconds / max(min(times), 1e-9)), _FEWEST))
+            if len(times) >= count:
+                break
+            before = perf_counter()
+        cpu = (process_time() - cpu_before) / len(times)
+        running.close()
+        grown = comm.allreduce(memory.growth())
+        plan, mesh = simulation.plan, simulation.mesh
+        if hasattr(simulation.stepper, "destroy"):
+            simulation.stepper.destroy()
+    finally:
+        comm.Barrier()
+        if comm.rank == 0:
+            shutil.rmtree(folder, ignore_errors=True)
+    middle = median(times)
+    implicit = plan.linear is not None
+    traffic = bytes_per_step(
+        mesh.n_bars,
+        mesh.n_nodes,
+        implicit=implicit,
+        assembled=implicit and not plan.linear.matrix_free,
+        plastic=job.plastic,
+        newton=newton / len(times),
+        linear=linear / len(times),
+    )
+    return Record(
+        job=job.name,
+        kind=kind,
+        bars=bars_of(kind, cells),
+        nodes=mesh.n_nodes,
+        ranks=comm.size,
+        steps=len(times),
+        median=comm.bcast(middle),
+        best=comm.bcast(min(times)),
+        cpu=comm.allreduce(cpu),
+        setup=comm.bcast(ready - start),
+        first=comm.bcast(first),
+        newton=newton / len(times),
+        linear=linear / len(times),
+        traffic=traffic,
+        share=100.0 * traffic / bandwidth.together / comm.bcast(middle) if bandwidth else 0.0,
+        memory=grown,
+        solver=plan.linear.why if plan.linear is not None else "none",
+    )

@@ -1,0 +1,108 @@
+"""The bench's table and its JSON."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from .bandwidth import BYTES_PER_ELEMENT, Bandwidth
+from .measure import Record
+from .traffic import ASSUMED
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
+__all__ = ["HEADER", "bandwidth_line", "document", "line", "memory_slopes", "processor"]
+
+_FORMAT = "{:18} {:>11} {:>9} {:>9} {:>9} {:>8} {:>6} {:>6} {:>6} {:>7} {:>6} {:>6}"
+_NAMES = (
+    "job",
+    "bars",
+    "step ms",
+    "best ms",
+    "cpu ms",
+    "bars/s",
+    "moved",
+    "bound",
+    "memory",
+    "newton",
+    "setup",
+    "first",
+)
+_UNITS = ("", "", "median", "", "", "", "B/bar", "%", "B/bar", "/cg", "s", "step s")
+HEADER = f"{_FORMAT.format(*_NAMES)}\n{_FORMAT.format(*_UNITS)}"
+"""Two lines over the table."""
+
+
+def line(record: Record) -> str:
+    """A row of the table."""
+    iterations = f"{record.newton:.1f}/{record.linear:.0f}" if record.newton or record.linear else "-"
+    return _FORMAT.format(
+        record.job,
+        f"{record.bars:,}",
+        f"{1e3 * record.median:.4g}",
+        f"{1e3 * record.best:.4g}",
+        f"{1e3 * record.cpu:.4g}",
+        f"{record.rate:.3g}",
+        f"{record.traffic / record.bars:.0f}",
+        f"{record.share:.0f}" if record.share else "-",
+        f"{record.memory / record.bars:.0f}",
+        iterations,
+        f"{record.setup:.2f}",
+        f"{record.first:.2f}",
+    )
+
+
+def bandwidth_line(bandwidth: Bandwidth) -> str:
+    """The bandwidth in words."""
+    text = f"STREAM triad ({BYTES_PER_ELEMENT} B an element): one process {bandwidth.alone / 1e9:.1f} GB/s"
+    if bandwidth.ranks > 1:
+        text += f", {bandwidth.ranks} at once {bandwidth.together / 1e9:.1f} GB/s ({bandwidth.ratio:.2f} x)"
+    return text
+
+
+def memory_slopes(records: list[Record]) -> dict[str, float]:
+    """Bytes a bar between the two largest sizes of each job, where it was run at two."""
+    slopes = {}
+    for name in dict.fromkeys(record.job for record in records):
+        sized = sorted((r for r in records if r.job == name), key=lambda r: r.bars)
+        if len(sized) > 1 and sized[-1].bars > sized[-2].bars:
+            slopes[name] = (sized[-1].memory - sized[-2].memory) / (sized[-1].bars - sized[-2].bars)
+    return slopes
+
+
+def processor() -> str:
+    """Name of the processor."""
+    try:
+        for text in Path("/proc/cpuinfo").read_text().splitlines():
+            if text.startswith("model name"):
+                return text.partition(":")[2].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()
+
+
+def document(comm: MPI.Comm, bandwidth: Bandwidth, records: list[Record], tiny: list[Record]) -> str:
+    """All that was measured, as JSON."""
+    from ..output.provenance import describe_run
+
+    content: dict[str, Any] = {
+        "machine": {"processor": processor(), "cores": os.cpu_count(), "system": platform.platform()},
+        "program": describe_run(comm, {}),
+        "ranks": bandwidth.ranks,
+        "bandwidth": {
+            "alone": bandwidth.alone,
+            "together": bandwidth.together,
+            "ratio": bandwidth.ratio,
+            "bytes_per_element": BYTES_PER_ELEMENT,
+        },
+        "bytes_assumed": ASSUMED,
+        "runs": [asdict(record) | {"bars_per_second": record.rate} for record in records],
+        "memory_slopes": memory_slopes(records),
+        "overhead": [asdict(record) for record in tiny],
+    }
+    return json.dumps(content, indent=1) + "\n"

@@ -22,7 +22,7 @@ def highest_frequency(model, x: np.ndarray, steps: int = 60, accuracy: float = 1
     The bar's own limit l/c is a safe bound on the critical step for unstressed bars only and often too small; the
     largest Ritz value is a lower bound of the square of the frequency, and its residual bounds the distance to an
     eigenvalue. With consistent mass each bar's share of it is at least a third of its lumped mass, so the square of the
-    frequency is at most three times as high.
+    frequency is at most three times as high; it is at least the Rayleigh quotient of the Ritz vector.
 
     Parameters
     ----------
@@ -54,7 +54,10 @@ def highest_frequency(model, x: np.ndarray, steps: int = 60, accuracy: float = 1
     diagonal: list[float] = []
     beside: list[float] = []
     low = high = 0.0
+    basis: list[np.ndarray] = []
     for _ in range(min(steps, 3 * mesh.n_nodes)):
+        if model.inertia.consistent:
+            basis.append(q)
         local[:owned] = scale * q
         mesh.update_ghosts(local)
         model.bars.product(x, local, product)
@@ -73,5 +76,8 @@ def highest_frequency(model, x: np.ndarray, steps: int = 60, accuracy: float = 1
             break
         beside.append(beta)
         previous, q = q, w / beta
-    factor = np.sqrt(3.0) if model.inertia.consistent else 1.0
-    return Frequency(float(np.sqrt(low)), factor * float(np.sqrt(high)))
+    if model.inertia.consistent and low > 0.0:
+        shape = scale * sum(weight * vector for weight, vector in zip(vectors[:, -1], basis))
+        low /= comm.allreduce(float((shape * model.inertia.mass_times(shape, np.empty_like(shape))).sum()))
+        high *= 3.0
+    return Frequency(float(np.sqrt(low)), float(np.sqrt(high)))

@@ -11,7 +11,7 @@ from ..errors import SimulationFailure
 __all__ = ["BlowUp"]
 
 _CREATED = 1e3  # energy created by the integration, over all that was ever put in: far beyond any error of a sound run
-_ROWS = 10  # the first rows after a start from rest have nothing to compare with
+_ROWS = 10  # rows in succession; after a start from rest, or when a wall first strikes, there is nothing to compare with
 
 
 class BlowUp:
@@ -20,6 +20,7 @@ class BlowUp:
     def __init__(self, model) -> None:
         self.model = model
         self._rows = 0
+        self._strange = 0
         self._most = 0.0
 
     def check(self, row: dict[str, Any], state) -> None:
@@ -41,7 +42,8 @@ class BlowUp:
         self._most = max(self._most, abs(start), *(abs(row[name]) for name in put_in))
         self._rows += 1
         created = -row["numerical_dissipation"]
-        if self._rows > _ROWS and created > _CREATED * self._most:
+        self._strange = self._strange + 1 if created > _CREATED * self._most else 0
+        if self._strange > _ROWS:
             raise SimulationFailure(
                 f"{when}: the integration has created {created:.3g} J, where {self._most:.3g} J were put in: the "
                 f"motion is unstable, fastest at {self._fastest(state)}; take a smaller time.step"

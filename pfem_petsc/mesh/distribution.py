@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from mpi4py import MPI
 
+from ..parallel.natural import NaturalOrder
 from .exchange import GhostExchange, Router
 from .ordering import bar_order, node_order, sweep_keys
 from .partition import partition
@@ -53,7 +55,7 @@ class DistributedMesh:
     bars: np.ndarray
     """(b, 2) int32: local ends, in the mesh's own order of ends."""
     bar_ids: np.ndarray
-    """(b,) int64: mesh numbers."""
+    """(b,) mesh numbers: int64, or the smallest integers that the distribution worked with."""
     blocks: list[Block]
     """By section, ascending; only sections that have bars here."""
     node_groups: dict[str, np.ndarray]
@@ -64,6 +66,24 @@ class DistributedMesh:
     """What decided ownership, for the log."""
 
     _exchange: GhostExchange
+
+    @cached_property
+    def counted(self) -> slice | np.ndarray:
+        """Local bars that count on this rank: an index for arrays of local bars."""
+        if len(self.blocks) == 1:
+            return slice(self.blocks[0].start, self.blocks[0].counted)
+        parts = [np.arange(block.start, block.counted) for block in self.blocks]
+        return np.concatenate(parts) if parts else np.empty(0, dtype=np.int64)
+
+    @cached_property
+    def node_order(self) -> NaturalOrder:
+        """Between owned nodes and slabs in mesh numbering. Collective at first use."""
+        return NaturalOrder(self.comm, self.node_ids[: self.n_owned], self.n_nodes)
+
+    @cached_property
+    def bar_order(self) -> NaturalOrder:
+        """Between counted bars and slabs in mesh numbering. Collective at first use."""
+        return NaturalOrder(self.comm, self.bar_ids[self.counted], self.n_bars)
 
     @property
     def n_neighbours(self) -> int:
@@ -214,7 +234,7 @@ def _arrange_bars(
     del borrowed
     order = bar_order(ends, kind, mesh.n_local)
     mesh.bars = ends[order]
-    mesh.bar_ids = order.astype(np.int64, copy=False) if bar_ids is None else bar_ids[order]
+    mesh.bar_ids = order if bar_ids is None else bar_ids[order]
     mesh.bar_groups = {name: np.flatnonzero(mask[order]).astype(np.int32) for name, mask in groups.items()}
     counts = np.bincount(kind) if kind is not None else np.array([len(ends)])
     counts = np.append(counts, np.zeros(len(counts) % 2, counts.dtype)).reshape(-1, 2)

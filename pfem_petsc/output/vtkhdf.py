@@ -13,7 +13,6 @@ from mpi4py import MPI
 
 from ..errors import PfemError, SimulationFailure
 from ..parallel.agreement import on_root
-from ..parallel.natural import NaturalOrder
 from .hdf5 import (
     create_new,
     grow,
@@ -33,6 +32,8 @@ if TYPE_CHECKING:
     from ..mesh.distribution import DistributedMesh
 
 __all__ = ["ResultWriter"]
+
+_PIECE = 2**20  # bars whose connectivity is written at once on one rank
 
 
 class ResultWriter:
@@ -94,11 +95,9 @@ class ResultWriter:
         self.n_nodes, self.n_bars = int(mesh.n_nodes), int(mesh.n_bars)
         self._precision = np.dtype(precision)
         # Bars evaluated on two ranks are written by the one that counts them.
-        self.counted = np.concatenate(
-            [np.arange(block.start, block.counted) for block in mesh.blocks] or [np.empty(0, dtype=np.int64)]
-        ).astype(np.int64)
-        self.node_order = NaturalOrder(comm, mesh.node_ids[: mesh.n_owned], self.n_nodes)
-        self.bar_order = NaturalOrder(comm, mesh.bar_ids[self.counted], self.n_bars)
+        self.counted = mesh.counted
+        self.node_order = mesh.node_order
+        self.bar_order = mesh.bar_order
         self._fields = {"PointData": sorted(point_fields), "CellData": sorted(cell_fields)}
         self._file: h5py.File | None = None
         # Why no more can be written, and whether the open file can still be closed.
@@ -268,16 +267,22 @@ class ResultWriter:
         return n_rows * self._row_type(name, slab).itemsize * int(np.prod(slab.shape[1:], dtype=np.int64))
 
     def _write_connectivity(self, mesh: DistributedMesh) -> None:
-        ends = mesh.node_ids[mesh.bars[self.counted]].astype(np.int64).reshape(-1, 2)
-        ends = self.bar_order.to_slab(ends)
         vtk, first, count = self._file["VTKHDF"], self.bar_order.first, self.bar_order.count
-        # One offset more than bars: the last rank's.
-        stop = first + count + (self.comm.rank == self.comm.size - 1)
         together = self.comm.size > 1
-        with writing(self.comm, self.path):
-            write_rows(vtk["Connectivity"], 2 * first, ends.ravel(), collective=together)
-        with writing(self.comm, self.path):
-            write_rows(vtk["Offsets"], first, 2 * np.arange(first, stop), collective=together)
+        # one rank holds all bars: pieces keep the working arrays small
+        piece = count if together else min(count, _PIECE)
+        for start in range(0, max(count, 1), max(piece, 1)):
+            stop = min(start + piece, count)
+            if together:
+                ends = self.bar_order.to_slab(mesh.node_ids[mesh.bars[self.counted]].astype(np.int64).reshape(-1, 2))
+            else:
+                ends = mesh.node_ids[mesh.bars[self.bar_order.owned_rows(start, stop)]].astype(np.int64)
+            with writing(self.comm, self.path):
+                write_rows(vtk["Connectivity"], 2 * (first + start), ends.ravel(), collective=together)
+            # one offset more than bars: the last rank's
+            end = first + stop + (stop == count and self.comm.rank == self.comm.size - 1)
+            with writing(self.comm, self.path):
+                write_rows(vtk["Offsets"], first + start, 2 * np.arange(first + start, end), collective=together)
         with writing(self.comm, self.path):
             self._file.flush()
 

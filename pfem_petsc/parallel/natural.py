@@ -28,6 +28,7 @@ class NaturalOrder:
     first, count : int
         The slab of this rank: mesh numbers first to first + count - 1.
     n_owned, n_global : int
+    alone : whether there is one rank
 
     Raises
     ------
@@ -38,15 +39,32 @@ class NaturalOrder:
     def __init__(self, comm: MPI.Comm, ids: np.ndarray, n_global: int) -> None:
         self.comm = comm
         self.n_global = int(n_global)
-        ids = np.ascontiguousarray(ids, dtype=np.int64)
         self.n_owned = len(ids)
         share, rest = divmod(self.n_global, comm.size)
         self.first = comm.rank * share + min(comm.rank, rest)
         self.count = share + (comm.rank < rest)
+        self.alone = comm.size == 1
+        self._identity = False
 
         in_range = not len(ids) or (ids.min() >= 0 and ids.max() < self.n_global)
         if not comm.allreduce(bool(in_range), op=MPI.LAND):
             raise ValueError(f"mesh numbers outside 0..{self.n_global - 1}")
+        once = self._order_alone(ids) if self.alone else self._order_among_ranks(ids, share, rest)
+        if not comm.allreduce(once, op=MPI.LAND):
+            raise ValueError(f"the {self.n_global} mesh numbers are not owned exactly once each")
+
+    def _order_alone(self, ids: np.ndarray) -> bool:
+        """One rank: the row of each number, in the smallest integers that hold it."""
+        kind = np.int32 if self.n_global < 2**31 else np.int64
+        self._owned_rows = np.full(self.n_global, -1, dtype=kind)
+        self._owned_rows[ids] = np.arange(self.n_owned, dtype=kind)
+        once = self.n_owned == self.n_global and (not self.n_global or int(self._owned_rows.min()) >= 0)
+        self._identity = once and bool((np.diff(self._owned_rows) == 1).all())
+        return once
+
+    def _order_among_ranks(self, ids: np.ndarray, share: int, rest: int) -> bool:
+        comm = self.comm
+        ids = np.ascontiguousarray(ids, dtype=np.int64)
         # Sorted by number, rows are also sorted by the rank of their slab.
         self._owned_rows = np.argsort(ids, kind="stable")
         bounds = np.array([r * share + min(r, rest) for r in range(comm.size + 1)])
@@ -55,15 +73,14 @@ class NaturalOrder:
         comm.Alltoall(self._owned_counts, self._slab_counts)
         self._owned_starts = np.cumsum(self._owned_counts) - self._owned_counts
         self._slab_starts = np.cumsum(self._slab_counts) - self._slab_counts
-
         self._slab_rows = self._exchange(ids[self._owned_rows], to_slab=True) - self.first
-        once = len(self._slab_rows) == self.count and bool(
+        return len(self._slab_rows) == self.count and bool(
             (np.bincount(self._slab_rows, minlength=self.count) == 1).all()
         )
-        if not comm.allreduce(once, op=MPI.LAND):
-            raise ValueError(f"the {self.n_global} mesh numbers are not owned exactly once each")
-        self._alone = comm.size == 1
-        self._identity = self._alone and bool((ids == np.arange(self.n_global)).all())
+
+    def owned_rows(self, first: int, last: int) -> np.ndarray:
+        """On one rank: rows of the numbers first to last - 1."""
+        return self._owned_rows[first:last]
 
     def to_slab(self, array: np.ndarray) -> np.ndarray:
         """Owned rows (n_owned, ...) to this rank's slab (count, ...). Collective.
@@ -73,10 +90,8 @@ class NaturalOrder:
         self._check(array, self.n_owned)
         if self._identity:
             return array
-        if self._alone:
-            slab = np.empty_like(array, order="C")
-            slab[self._slab_rows] = array[self._owned_rows]
-            return slab
+        if self.alone:
+            return array[self._owned_rows]
         received = self._exchange(array[self._owned_rows], to_slab=True)
         slab = np.empty_like(received)
         slab[self._slab_rows] = received
@@ -87,9 +102,7 @@ class NaturalOrder:
         self._check(slab, self.count)
         if self._identity:
             return slab
-        received = slab[self._slab_rows]
-        if not self._alone:
-            received = self._exchange(received, to_slab=False)
+        received = slab if self.alone else self._exchange(slab[self._slab_rows], to_slab=False)
         array = np.empty_like(received)
         array[self._owned_rows] = received
         return array

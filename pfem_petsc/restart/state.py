@@ -42,12 +42,14 @@ class RunState:
         self.model = stepper.model
         mesh, comm = self.model.mesh, self.model.comm
         self.comm = comm
-        self.counted = np.concatenate(
-            [np.arange(block.start, block.counted) for block in mesh.blocks] or [np.empty(0, dtype=np.int64)]
-        ).astype(np.int64)
-        self.node_order = NaturalOrder(comm, mesh.node_ids[: mesh.n_owned], mesh.n_nodes)
-        self.bar_order = NaturalOrder(comm, mesh.bar_ids[self.counted], mesh.n_bars)
+        self.counted = mesh.counted
+        self.node_order = mesh.node_order
         self._columns = comm.allreduce(2 * any(len(b.history) for b in self.model.bars.blocks), op=MPI.MAX)
+
+    @property
+    def bar_order(self) -> NaturalOrder:
+        """Made at the first checkpoint: it takes memory of the order of the bars."""
+        return self.model.mesh.bar_order
 
     def arrays(self) -> dict[str, tuple[NaturalOrder, np.ndarray]]:
         """Name to (order, rows owned by this rank) of all arrays; the same names on all ranks."""

@@ -71,20 +71,19 @@ class Stepper(ABC):
         self.fault: SimulationFailure | None = None
         self.balance: Balance | None = None
         self.zero = np.zeros((owned, 3))  # stands for forces that do not act: never written
-        zeros = lambda: np.zeros((owned, 3))  # noqa: E731
         self.state = State(
             x=mesh.points.copy(),
-            v=np.zeros((owned, 3)),
-            a=zeros(),
+            v=self.zero,
+            a=self.zero,
             f=np.zeros((mesh.n_local, 3)),
-            external=zeros(),
-            contact=zeros(),
-            support=zeros(),
+            external=self.zero,
+            contact=self.zero,
+            support=self.zero,
         )
         self._before: np.ndarray | None = None  # positions at the last evaluation, with ghosts
         model.contact.state = self.state
         self.touching = model.contact.log.touching
-        self.solution = Solution(zeros(), self.state.f, model.contact.none())
+        self.solution = Solution(self.zero, self.state.f, model.contact.none())
 
     def start(self) -> None:
         """Complete the state at the start: velocity, internal force, acceleration. Collective."""
@@ -97,12 +96,15 @@ class Stepper(ABC):
             rate = (supports.positions(tick) - supports.positions(0.0)) / tick
             state.v[supports.nodes, supports.components] = rate
         self.evaluate(commit=True)
-        model.external.at(0.0, state.external)
+        if model.external.active:
+            state.external = model.external.at(0.0, np.empty_like(state.v))
         load = state.external - state.f[: model.mesh.n_owned]
         if model.inertia.damped:
             load -= model.inertia.damping_times(state.v, np.zeros_like(load))
         state.a = self.accelerate(load)
-        state.support[supports.fixed] = -load[supports.fixed]
+        if supports.any:
+            state.support = np.zeros_like(state.v)
+            state.support[supports.fixed] = -load[supports.fixed]
         self.scheme.start(state, self.h)
         if self.scheme.leads:
             self._solve_and_finish()

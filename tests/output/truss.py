@@ -5,6 +5,8 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from pfem_petsc.mesh.distribution import DistributedMesh
+
 COLUMNS = {"time": (), "step": (), "newton_iterations": (), "momentum": (3,), "wall/floor/force": (3,)}
 COLUMNS |= {"probe/tip/position": (2, 3)}
 TYPES = {"step": np.int64, "newton_iterations": np.int32}
@@ -38,7 +40,9 @@ class Truss:
             start = sum(map(len, bar_ids[:-2]))
             blocks.append(SimpleNamespace(section=s, start=start, counted=start + len(bar_ids[-2])))
             blocks[-1].stop = blocks[-1].counted + len(bar_ids[-1])
-        self.mesh = SimpleNamespace(comm=comm, n_nodes=n_nodes, n_bars=n_bars, n_owned=len(owned), blocks=blocks)
+        self.mesh = DistributedMesh()
+        self.mesh.comm, self.mesh.n_nodes, self.mesh.n_bars = comm, n_nodes, n_bars
+        self.mesh.n_owned, self.mesh.blocks = len(owned), blocks
         self.mesh.node_ids, self.mesh.bar_ids = node_ids, np.concatenate(bar_ids).astype(np.int64)
         self.mesh.bars = local[self.ends[self.mesh.bar_ids]].astype(np.int32)
         self.owned, self.local_bars = owned, self.mesh.bar_ids

@@ -7,6 +7,8 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from pfem_petsc.mesh.distribution import DistributedMesh
+
 WALL = SimpleNamespace(type="plane", name="wall", node_set=None, point=(1.2, 0.0, 0.0), normal=(-1.0, 0.0, 0.0))
 
 
@@ -110,7 +112,8 @@ def write_result(folder: Path, snapshots: int = 5) -> Path:
     points, bars = rod(20)
     made_up = SyntheticResult(folder / "result.vtkhdf", points, bars, case.wall, snapshots, end=5.0)
     block = SimpleNamespace(section=0, start=0, counted=len(bars), stop=len(bars))
-    mesh = SimpleNamespace(comm=MPI.COMM_SELF, n_nodes=len(points), n_bars=len(bars), n_owned=len(points))
+    mesh = DistributedMesh()
+    mesh.comm, mesh.n_nodes, mesh.n_bars, mesh.n_owned = MPI.COMM_SELF, len(points), len(bars), len(points)
     mesh.blocks, mesh.node_ids = [block], np.arange(len(points))
     mesh.bars, mesh.bar_ids = bars.astype(np.int32), np.arange(len(bars))
     columns = {name: np.shape(values)[1:] for name, values in made_up.history.items()}

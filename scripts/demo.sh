@@ -24,5 +24,5 @@ mpirun -n "${PFEM_RANKS:-2}" "$python" -m pfem_petsc "$case" -o "$result" "$@"
 
 echo
 echo "The result, for ParaView: $result/result.vtkhdf"
-echo "Pictures, video and curves:"
-find "$result" -type f -regextype posix-extended -regex '.*\.(png|mp4|gif|svg|pdf)' -printf '  %p\n' | sort
+echo "Pictures, video and curves (single frames: $result/frames):"
+find "$result" -maxdepth 1 -type f -regextype posix-extended -regex '.*\.(png|mp4|gif|svg|pdf)' -printf '  %p\n' | sort

@@ -12,6 +12,7 @@ from bar_twins import STEP, Law, shaken, whole_truss  # noqa: E402
 
 from pfem_petsc import Case  # noqa: E402
 from pfem_petsc.contact.frames import build_frames  # noqa: E402
+from pfem_petsc.solvers.matrix_free import MatrixFreeHessian  # noqa: E402
 from pfem_petsc.stepping.model import Model  # noqa: E402
 from pfem_petsc.stepping.prepare import make_plan, make_stepper  # noqa: E402
 from pfem_petsc.stepping.problem import StepProblem  # noqa: E402
@@ -162,7 +163,27 @@ class Twin:
         assert np.abs(self.program_residual(w) - expected).max() < 1e-11 * np.abs(expected).max()
         expected, found = self.hessian(w), self.program_hessian(w)
         assert np.abs(found - expected).max() < 1e-10 * np.abs(expected).max()
+        self.check_matrix_free(w, found)
         return w, found
+
+    def check_matrix_free(self, w, dense):
+        """The operator that assembles nothing: its products and its diagonal are those of the matrix."""
+        operator = MatrixFreeHessian(self.model)
+        operator.update(self.problem, np.ascontiguousarray(w[self.owned]))
+        dense = dense.copy()
+        held = np.flatnonzero(self.fixed)
+        dense[held, held] = self.problem_scale()
+        vector = np.random.default_rng(11).normal(size=w.shape)
+        right, left = operator.mat.createVecs()
+        right.array[:] = vector[self.owned].ravel()
+        operator.mat.mult(right, left)
+        found, expected = self.whole(left.array.reshape(-1, 3)), (dense @ vector.ravel()).reshape(-1, 3)
+        assert np.abs(found - expected).max() < 1e-12 * np.abs(expected).max()
+        operator.mat.getDiagonal(left)
+        found = self.whole(left.array.reshape(-1, 3)).ravel()
+        assert np.abs(found - np.diag(dense)).max() < 1e-12 * np.abs(np.diag(dense)).max()
+        for thing in (right, left, operator):
+            thing.destroy()
 
 
 @pytest.mark.parametrize("strain", STRAINS)

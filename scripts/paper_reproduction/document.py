@@ -13,9 +13,9 @@ from .claims_rod import rod_claims
 from .exact import BAR, PLASTIC_BAR, ROD, Rod
 from .measures import RodImpact
 from .schemes import IN_TABLES, SCHEMES
-from .studies import BAR_STEPS, OTHER_RINGS, OTHER_SCHEMES, RING_STEPS, bar_key
+from .studies import BAR_STEPS, OTHER_RINGS, OTHER_SCHEMES, RING_STEPS, bar_key, rod_key
 
-__all__ = ["all_claims", "write_document"]
+__all__ = ["all_claims", "impact_row", "write_document"]
 
 TEMPLATE = Path(__file__).with_name("paper.md")
 
@@ -65,7 +65,8 @@ def _claims_table(claims: list[Claim]) -> str:
     return _table(["Where", "The paper", "Measured here", "Verdict"], rows)
 
 
-def _impact_row(name: str, bar: RodImpact, exact: Rod) -> list[str]:
+def impact_row(name: str, bar: RodImpact, exact: Rod) -> list[str]:
+    """Cells of a line of the tables of rods and bars."""
     since = (bar.end - exact.impact) / exact.duration
     return [
         name,
@@ -83,7 +84,12 @@ _HEAD = ["scheme", "contact end", "contacts", "F max", "F median", "undershoot",
 
 
 def _rod_table(m: Measures) -> str:
-    rows = [_impact_row(SCHEMES[scheme].name, m.rod[scheme], ROD) for scheme in IN_TABLES]
+    rows = []
+    for scheme in IN_TABLES:
+        row, run = impact_row(SCHEMES[scheme].name, m.rod[scheme], ROD), m.runs[rod_key(scheme)]
+        if run.failure:
+            row[1], row[4], row[6:] = f"ended at t = {run.time[-1]:.2f}", "", ["", ""]
+        rows.append(row)
     return _table(_HEAD, [["exact", "1", "1", "1", "1", "0", "1", "1"], *rows])
 
 
@@ -93,7 +99,7 @@ def _bar_table(m: Measures, step: str, plastic: bool) -> str:
     for scheme in IN_TABLES:
         entry = SCHEMES[scheme]
         if (scheme, step, plastic) in m.bars:
-            rows.append(_impact_row(entry.name, m.bars[scheme, step, plastic], exact))
+            rows.append(impact_row(entry.name, m.bars[scheme, step, plastic], exact))
         else:
             reason = m.runs[bar_key(scheme, step, plastic)].failure
             rows.append([entry.name, "refused: " + _limit(reason), *[""] * 6])

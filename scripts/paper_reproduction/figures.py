@@ -19,7 +19,7 @@ from .running import Run
 from .schemes import PAPER, SCHEMES
 from .studies import BAR_STEPS, bar_key, refined_key, rod_key
 
-__all__ = ["new_figure", "draw_rods", "legend", "save", "styled"]
+__all__ = ["draw_bars", "draw_rod", "draw_rods", "legend", "new_figure", "save", "styled"]
 
 EXACT = {"color": "#111418", "linewidth": 2.2, "alpha": 0.55, "linestyle": "-"}
 FINE = {"color": "#6b7280", "linewidth": 1.8, "alpha": 0.8, "linestyle": (0, (4, 1.5))}
@@ -80,7 +80,7 @@ def _curves(
 
 
 @styled
-def _rod(runs: dict[str, Run], file: Path, force: bool) -> None:
+def draw_rod(runs: dict[str, Run], file: Path, force: bool) -> None:
     """Figure 3 or 4: the whole history, and the first moments of contact."""
     figure = new_figure(9.4, 4.3)
     wide, close = figure.subplots(1, 2, width_ratios=[1.7, 1.0])
@@ -107,7 +107,7 @@ def _rod(runs: dict[str, Run], file: Path, force: bool) -> None:
 
 
 @styled
-def _bars(runs: dict[str, Run], file: Path, number: int, plastic: bool, force: bool) -> None:
+def draw_bars(runs: dict[str, Run], file: Path, number: int, plastic: bool, force: bool) -> None:
     """Figures 7 to 10: panel (a) the small, (b) the large step."""
     exact: Rod = PLASTIC_BAR if plastic else BAR
     figure = new_figure(9.4, 6.4)
@@ -150,10 +150,10 @@ def draw_rods(runs: dict[str, Run], folder: Path) -> list[Path]:
     """Draw figures 3, 4 and 7 to 10."""
     assert set(BAR_STEPS) == {"0.5", "2"}
     files = [folder / f"figure_{n:02d}.png" for n in (3, 4, 7, 8, 9, 10)]
-    _rod(runs, files[0], False)
-    _rod(runs, files[1], True)
-    _bars(runs, files[2], 7, False, False)
-    _bars(runs, files[3], 8, True, False)
-    _bars(runs, files[4], 9, False, True)
-    _bars(runs, files[5], 10, True, True)
+    draw_rod(runs, files[0], False)
+    draw_rod(runs, files[1], True)
+    draw_bars(runs, files[2], 7, False, False)
+    draw_bars(runs, files[3], 8, True, False)
+    draw_bars(runs, files[4], 9, False, True)
+    draw_bars(runs, files[5], 10, True, True)
     return files

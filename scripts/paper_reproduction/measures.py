@@ -57,6 +57,8 @@ def _episodes(run: Run) -> list[tuple[float, float]]:
 class RodImpact:
     """A rod against a wall. Speeds are relative to that of arrival, forces to the exact one, energies to the first.
 
+    What a run that ended early has not reached is not a number.
+
     Attributes
     ----------
     end : last contact [s]
@@ -119,10 +121,10 @@ def measure_rod(run: Run, exact: Rod) -> RodImpact:
         undershoot=float(max(-jump.min(), 0.0)),
         excess=float(np.abs(np.diff(jump)).sum() - 1.0),
         rest_steps=int(moving[-1]) + 1 if len(moving) else 0,
-        held=float(np.abs(velocity[middle]).max()),
-        mean_rebound=float(after.mean()),
-        rebound_std=float(after.std()),
-        rebound_rms=float(np.sqrt(((after + 1.0) ** 2).mean())),
+        held=float(np.abs(velocity[middle]).max()) if middle.any() else np.nan,
+        mean_rebound=float(after.mean()) if len(after) else np.nan,
+        rebound_std=float(after.std()) if len(after) else np.nan,
+        rebound_rms=float(np.sqrt(((after + 1.0) ** 2).mean())) if len(after) else np.nan,
         whole_rebound=float(history["momentum"][-1, 0] / history["momentum"][0, 0]),
         energy=float((history["kinetic_energy"][-1] + history["elastic_energy"][-1]) / kinetic),
         dissipated=float(history["plastic_dissipation"][-1] / kinetic),

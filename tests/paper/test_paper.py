@@ -1,0 +1,186 @@
+"""The reproduction of the paper: its runs, measures, verdicts, figure and document, on the quickest of its runs."""
+
+from __future__ import annotations
+
+import re
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT / "scripts"))
+
+import integrator_tables  # noqa: E402
+from paper_reproduction import claims, document, figures, studies  # noqa: E402
+from paper_reproduction.claims_rod import rod_claims  # noqa: E402
+from paper_reproduction.exact import BAR, PLASTIC_BAR, ROD  # noqa: E402
+from paper_reproduction.measures import contact_episodes, measure_ring, measure_rod  # noqa: E402
+from paper_reproduction.running import read, run_all  # noqa: E402
+from paper_reproduction.schemes import PAPER, SCHEMES  # noqa: E402
+
+RODS = [studies.rod_key(scheme) for scheme in (*PAPER, "wilson_1.4")]
+BARS = [studies.bar_key("central_differences", "0.5", plastic) for plastic in (False, True)]
+WILD = studies.bar_key("wilson_1.4", "0.5", False)
+REFUSED = studies.bar_key("hulbert_chung", "2", False)
+RINGS = {s: studies.ring_key(s, "0.5") for s in ("central_differences", "chung_lee", "newmark", "houbolt", "wilson")}
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """The quick runs, by name."""
+    folder = tmp_path_factory.mktemp("paper")
+    wanted = {*RODS, *BARS, WILD, REFUSED, *RINGS.values()}
+    run_all([study for study in studies.all_studies() if study.key in wanted], folder, 2)
+    return {key: read(key, folder) for key in wanted}
+
+
+@pytest.fixture(scope="module")
+def measures(runs):
+    rods = {key.split("/")[1]: measure_rod(runs[key], ROD) for key in RODS}
+    return claims.Measures(runs, rod=rods, bars={("wilson_1.4", "0.5", False): measure_rod(runs[WILD], BAR)})
+
+
+def numbers(text):
+    return np.array([float(n) for n in re.findall(r"-?\d+\.\d+|-?\b\d+\b", text)])
+
+
+def test_episodes():
+    assert contact_episodes(np.arange(6.0), np.array([0, 1, 1, 0, 0, 2])) == [(1.0, 2.0), (5.0, 5.0)]
+    assert contact_episodes(np.arange(2.0), np.zeros(2)) == []
+
+
+def test_exact_solutions():
+    assert (ROD.impact, ROD.duration, ROD.force) == pytest.approx((0.1, 2.0, 0.5))
+    assert BAR.force == pytest.approx(133.5e3, rel=1e-3)
+    assert BAR.duration == pytest.approx(98.9e-6, rel=1e-3)
+    assert PLASTIC_BAR.force == pytest.approx(60.48e3, rel=1e-3)
+    np.testing.assert_allclose(ROD.mean_velocity(np.array([0.0, 0.6, 1.1, 3.0])), [0.5, 0.25, 0.0, -0.5])
+
+
+def test_study_names_are_distinct():
+    names = [study.key for study in studies.all_studies()]
+    assert len(set(names)) == len(names)
+
+
+@pytest.mark.parametrize(
+    ("scheme", "end", "peak", "releases", "rebound", "energy", "undershoot"),
+    [
+        ("central_differences", 2.13, 2.50, 1, 0.958, 0.975, 0.0),
+        ("chung_lee", 2.14, 2.41, 1, 0.958, 0.974, 0.446),
+        ("newmark", 2.11, 2.69, 1, 0.884, 0.806, 0.5),
+        ("houbolt", 2.13, 5.20, 2, 0.950, 0.947, 0.833),
+        ("wilson", 2.12, 3.43, 2, 0.955, 0.964, 0.205),
+    ],
+)
+def test_rod(measures, scheme, end, peak, releases, rebound, energy, undershoot):
+    """Close to the values at v0 = 0.1: the problem is linear, only the moment of impact within a step differs."""
+    rod = measures.rod[scheme]
+    assert rod.end == pytest.approx(end, abs=0.011)
+    assert rod.releases == releases
+    assert (rod.peak, rod.median, rod.undershoot) == pytest.approx((peak, 1.0, undershoot), abs=0.01)
+    assert (-rod.whole_rebound, rod.energy) == pytest.approx((rebound, energy), abs=2e-3)
+
+
+def test_run_that_ends_early_is_measured_as_far_as_it_went(runs, measures):
+    """Wilson with theta = 1.4 chatters until a bar is driven through zero length."""
+    assert "zero length" in runs[studies.rod_key("wilson_1.4")].failure
+    assert measures.rod["wilson_1.4"].peak > 8.0
+    assert np.isnan(measures.rod["wilson_1.4"].mean_rebound)
+
+
+def test_bars(runs):
+    elastic, plastic = (measure_rod(runs[key], exact) for key, exact in zip(BARS, (BAR, PLASTIC_BAR)))
+    assert elastic.median == pytest.approx(1.0, abs=5e-3)
+    assert elastic.duration == pytest.approx(98.9e-6, rel=0.035)
+    assert plastic.median == pytest.approx(1.0, abs=0.02)
+    assert plastic.end == pytest.approx(173e-6, abs=1e-6)
+    assert plastic.dissipated == pytest.approx(0.896, abs=0.01)
+    assert plastic.whole_rebound > elastic.whole_rebound
+
+
+def test_step_above_the_limit_is_refused_and_said(runs):
+    run = runs[REFUSED]
+    assert not run.history
+    assert "1.91497e-06" in run.failure
+
+
+def test_ring(runs):
+    """Explicit schemes and Newmark hit twice, for long; Houbolt and Wilson leave after the first step of contact."""
+    ring = {scheme: measure_ring(runs[key]) for scheme, key in RINGS.items()}
+    for scheme in ("central_differences", "chung_lee", "newmark"):
+        (start, end), (again, left) = ring[scheme].phases
+        assert (start, end, again) == pytest.approx((5e-3, 35e-3, 122.5e-3), abs=1.1e-3)
+        assert left == pytest.approx(155e-3, abs=5e-3)
+        assert ring[scheme].left == pytest.approx(0.145, abs=3e-3)
+        assert ring[scheme].thrown < 1e-9
+    for scheme in ("houbolt", "wilson"):
+        start, end = ring[scheme].phases[0]
+        assert (start, end) == pytest.approx((5e-3, 5.5e-3), abs=1e-6)
+        assert ring[scheme].thrown > 0.03
+        assert len(ring[scheme].phases) > 2
+
+
+def test_verdicts(measures):
+    """Those of section 5.1, and that they follow the measurements."""
+    verdicts = [claim.verdict for claim in rod_claims(measures)]
+    assert verdicts == [
+        claims.REPRODUCED,
+        claims.PARTLY,
+        claims.REPRODUCED,
+        claims.REPRODUCED,
+        claims.OPEN,
+        claims.PARTLY,
+        claims.REPRODUCED,
+        claims.PARTLY,
+        claims.REPRODUCED,
+        claims.REPRODUCED,
+        claims.PARTLY,
+    ]
+    calm = replace(measures.rod["houbolt"], excess=0.1, roughness=0.05, releases=1, peak=1.0)
+    changed = replace(measures, rod={**measures.rod, "houbolt": calm})
+    flipped = [new.verdict != old for new, old in zip(rod_claims(changed), verdicts)]
+    assert np.flatnonzero(flipped).tolist() == [2, 5, 8, 9]
+
+
+def test_figure(runs, tmp_path):
+    figures.draw_rod(runs, tmp_path / "figure.png", False)
+    from PIL import Image
+
+    picture = np.asarray(Image.open(tmp_path / "figure.png").convert("RGB"))
+    assert picture.shape[1] > 1000
+    assert picture.std() > 10.0
+    assert (tmp_path / "figure.png").stat().st_size < 150e3
+
+
+def test_document_has_the_measured_numbers(measures):
+    text = (ROOT / "docs" / "paper.md").read_text(encoding="utf-8")
+    table = text[text.index("| exact | 1 | 1 |") :]
+    for scheme in PAPER:
+        cells = document.impact_row(SCHEMES[scheme].name, measures.rod[scheme], ROD)
+        (line,) = [line for line in table.splitlines()[:15] if line.startswith(f"| {cells[0]} |")]
+        np.testing.assert_allclose(
+            numbers(line.split("|", 2)[2]), [float(cell) for cell in cells[1:]], atol=6e-3, err_msg=line
+        )
+    assert "$" not in text
+
+
+def test_pictures_of_the_document_are_there():
+    text = (ROOT / "docs" / "paper.md").read_text(encoding="utf-8")
+    pictures = re.findall(r"\]\((images/[^)]+)\)", text)
+    assert len(pictures) == 9
+    for picture in pictures:
+        assert 10e3 < (ROOT / "docs" / picture).stat().st_size < 150e3
+
+
+@pytest.mark.parametrize("name", list(integrator_tables.TABLES))
+def test_tables_of_integrators_are_up_to_date(name):
+    text = integrator_tables.DOCUMENT.read_text(encoding="utf-8")
+    start = text.index(f"<!-- table {name} -->")
+    old = text[start : text.index("<!-- end -->", start)].strip().splitlines()[2:]
+    new = integrator_tables.TABLES[name]().splitlines()
+    assert [line.split("|")[1] for line in old] == [line.split("|")[1] for line in new]
+    values = [numbers("\n".join(line.split("|", 2)[2] for line in lines)) for lines in (old, new)]
+    np.testing.assert_allclose(*values, atol=2e-3)

@@ -1,0 +1,181 @@
+"""Time this program and its peers on the same lattice, in one go, and print processor seconds a step and ratios.
+
+usage: python scripts/compare_peers.py [--sizes 10230 101706] [--only kratos openseespy] [--repeats 3]
+
+OpenSeesPy and Kratos are installed into an environment of their own (results/peers-venv, or --venv); what does not
+install is left out. One thread each. Every round runs all codes in turn, ratios are made within a round, and the median
+of the rounds is shown, so that a machine that is shared slows all of them. docs/performance.md says what is compared.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import venv
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+
+ROOT = Path(__file__).resolve().parent.parent
+DRIVERS = ROOT / "scripts" / "peers"
+PACKAGES = {
+    "openseespy": ("openseespy.opensees", ["openseespy"]),
+    "kratos": (
+        "KratosMultiphysics.StructuralMechanicsApplication, KratosMultiphysics.LinearSolversApplication",
+        ["KratosMultiphysics", "KratosStructuralMechanicsApplication", "KratosLinearSolversApplication"],
+    ),
+}
+"""Peer: what its driver imports, and the packages that bring it."""
+
+
+@dataclass(frozen=True)
+class Code:
+    """A code as it is run: ``largest`` number of bars for which it is worth waiting."""
+
+    label: str
+    package: str
+    driver: str
+    solver: str = ""
+    largest: int = 2_000_000
+
+
+OURS = Code("pfem_petsc", "ours", "run_ours.py")
+ASSEMBLED = Code("pfem_petsc, assembled", "ours", "run_ours.py", "assembled")
+FREE = Code("pfem_petsc, matrix-free", "ours", "run_ours.py", "matrix_free")
+BARE = Code("bare loop (Numba)", "bare", "run_bare_loop.py")
+OPENSEES = Code("OpenSeesPy", "openseespy", "run_openseespy.py")
+MUMPS = Code("OpenSeesPy, MUMPS", "openseespy", "run_openseespy.py", "Mumps", 200_000)
+UMFPACK = Code("OpenSeesPy, UmfPack", "openseespy", "run_openseespy.py", "UmfPack", 20_000)
+KRATOS = Code("Kratos", "kratos", "run_kratos.py")
+AMGCL = Code("Kratos, AMGCL", "kratos", "run_kratos.py")
+
+MODES = {
+    "explicit": ("explicit, elastic, foot held", (OURS, BARE, KRATOS, OPENSEES)),
+    "explicit_contact": ("explicit, elastoplastic, wall", (OURS, BARE, OPENSEES)),
+    "implicit": ("implicit at 2 l/c, elastic, foot held", (OURS, FREE, ASSEMBLED, AMGCL, MUMPS, UMFPACK)),
+    "implicit_contact": ("implicit at 2 l/c, elastoplastic, wall", (OURS, MUMPS, UMFPACK)),
+}
+TIME_LIMIT = 1200.0  # [s] for one run
+
+
+def main() -> int:
+    """Install, run, print."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--sizes", type=int, nargs="+", default=[10_230, 101_706], help="bars; the nearest lattices")
+    parser.add_argument("--modes", nargs="+", choices=list(MODES), default=list(MODES), help="what to compare")
+    parser.add_argument("--only", nargs="+", choices=["bare", *PACKAGES], help="the peers to run; default: all")
+    parser.add_argument("--repeats", type=int, default=3, help="rounds (default %(default)s)")
+    parser.add_argument("--venv", type=Path, default=ROOT / "results" / "peers-venv", help="environment of the peers")
+    parser.add_argument("-o", "--output", type=Path, help="write all runs as JSON")
+    arguments = parser.parse_args()
+    wanted = arguments.only if arguments.only is not None else ["bare", *PACKAGES]
+    pythons = {"ours": sys.executable, "bare": sys.executable}
+    for name in wanted:
+        if name in PACKAGES:
+            python = install(name, arguments.venv)
+            if python is not None:
+                pythons[name] = python
+    runs: list[dict] = []
+    for size in sorted(arguments.sizes):
+        cells = cells_for(size)
+        for mode in arguments.modes:
+            codes = [c for c in MODES[mode][1] if c.package in pythons and size <= c.largest]
+            codes = [c for c in codes if c.package == "ours" or c.package in wanted]
+            runs += compare(mode, cells, codes, pythons, arguments.repeats)
+    if arguments.output is not None:
+        arguments.output.parent.mkdir(parents=True, exist_ok=True)
+        arguments.output.write_text(json.dumps(runs, indent=1) + "\n", encoding="utf-8")
+    return 0
+
+
+def cells_for(bars: int) -> int:
+    """Cells along an edge of the cubic lattice nearest to a number of bars."""
+    return min(range(1, 500), key=lambda n: abs(3 * n * (n + 1) * (3 * n + 1) - bars))
+
+
+def install(name: str, folder: Path) -> str | None:
+    """Python of the environment with a peer in it; None where it does not install."""
+    modules, packages = PACKAGES[name]
+    python = folder / "bin" / "python"
+    if not python.exists():
+        venv.create(folder, with_pip=True)
+    works = [str(python), "-c", f"import {modules}"]
+    if subprocess.run(works, capture_output=True, timeout=120).returncode == 0:
+        return str(python)
+    print(f"installing {', '.join(packages)} into {folder}", flush=True)
+    command = [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "numpy", *packages]
+    installed = subprocess.run(command, capture_output=True, text=True)
+    if installed.returncode == 0:
+        installed = subprocess.run(works, capture_output=True, text=True, timeout=120)
+    if installed.returncode == 0:
+        return str(python)
+    last = (installed.stderr.strip().splitlines() or ["no message"])[-1]
+    print(f"{name} is left out, it does not install here: {last}", flush=True)
+    return None
+
+
+def steps_of(mode: str, bars: int) -> int:
+    """Steps that are timed: enough for the clock, few enough for the slowest."""
+    if mode.startswith("implicit"):
+        return 5 if bars < 50_000 else 3
+    return 200 if bars < 50_000 else 40 if bars < 500_000 else 8
+
+
+def compare(mode: str, cells: int, codes: list[Code], pythons: dict[str, str], repeats: int) -> list[dict]:
+    """Run all codes ``repeats`` times in turn, print a table, and give the runs."""
+    bars = 3 * cells * (cells + 1) * (3 * cells + 1)
+    rounds: dict[str, list[dict]] = {code.label: [] for code in codes}
+    left_out: dict[str, str] = {}
+    for _ in range(repeats):
+        for code in codes:
+            if code.label in left_out:
+                continue
+            result = run(code, pythons[code.package], cells, mode, steps_of(mode, bars))
+            if isinstance(result, str):
+                left_out[code.label] = result
+            else:
+                rounds[code.label].append(result)
+    print(f"\n### {bars:,} bars, {MODES[mode][0]}\n")
+    print("| code | CPU ms/step | x ours | range | Newton/step | memory MB | top mm |")
+    print("|---|---|---|---|---|---|---|")
+    ours = [r["cpu"] for r in rounds[OURS.label]]
+    for code in codes:
+        results = rounds[code.label]
+        if code.label in left_out:
+            print(f"| {code.label} | {left_out[code.label]} | | | | | |")
+            continue
+        ratios = [r["cpu"] / mine for r, mine in zip(results, ours)]
+        newton = f"{results[0]['iterations']:.1f}" if results[0]["iterations"] else "-"
+        spread = f"{median(ratios):.3g} | {min(ratios):.3g} to {max(ratios):.3g}" if ratios else "- | -"
+        cpu, memory = 1e3 * median(r["cpu"] for r in results), max(r["memory"] for r in results) / 1e6
+        top = 1e3 * results[0]["top"]
+        print(f"| {code.label} | {cpu:.4g} | {spread} | {newton} | {memory:.0f} | {top:.6f} |", flush=True)
+    return [
+        {"code": label, "mode": mode, "round": n, **result}
+        for label, rs in rounds.items()
+        for n, result in enumerate(rs)
+    ]
+
+
+def run(code: Code, python: str, cells: int, mode: str, steps: int) -> dict | str:
+    """The result of one run, or why there is none."""
+    command = [python, str(DRIVERS / code.driver), str(cells), mode, str(steps), code.solver]
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+    if code.package == "ours":
+        environment["PYTHONPATH"] = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=TIME_LIMIT, env=environment)
+    except subprocess.TimeoutExpired:
+        return f"more than {TIME_LIMIT:.0f} s"
+    for text in done.stdout.splitlines():
+        if text.startswith("RESULT "):
+            return json.loads(text.removeprefix("RESULT "))
+    last = (done.stderr.strip().splitlines() or ["no message"])[-1]
+    return f"failed: {last[:100]}"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,71 @@
+"""The lattice that all codes are timed on; needs NumPy alone, so that every environment can import it.
+
+Cubic cells of edge PITCH with both diagonals on every face, thrown at the plane z = 0 where its foot starts. SI units.
+"""
+
+from __future__ import annotations
+
+import json
+import resource
+import sys
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+YOUNG_MODULUS, DENSITY, AREA, PITCH = 110e9, 4500.0, 1e-6, 0.01
+SPEED = -20.0  # [m/s] along z
+YIELD_STRESS, HARDENING_RATIO = 900e6, 0.01  # [Pa]; tangent over Young's modulus beyond yield
+WAVE_SPEED = (YOUNG_MODULUS / DENSITY) ** 0.5
+EXPLICIT_STEP = 0.1 * PITCH / WAVE_SPEED  # [s]
+IMPLICIT_STEP = 2.0 * PITCH / WAVE_SPEED  # [s]
+
+
+def lattice(cells: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points (nodes, 3) [m] and ends of bars (bars, 2) of a block of ``cells`` x ``cells`` x ``cells`` cells."""
+    edge = cells + 1
+    place = np.indices((edge, edge, edge)).reshape(3, -1).T
+    points = PITCH * place.astype(float)
+    strides = np.array([edge * edge, edge, 1])
+    bars = []
+    # from the node ``at`` of a cell's face or edge to the node ``to``, wherever both lie in the block
+    unit = np.eye(3, dtype=int)
+    zero = np.zeros(3, dtype=int)
+    pairs = [(zero, axis) for axis in unit]
+    for one, other in ((0, 1), (0, 2), (1, 2)):
+        pairs += [(zero, unit[one] + unit[other]), (unit[one], unit[other])]
+    for at, to in pairs:
+        reach = np.maximum(at, to)
+        start = place[(place + reach <= cells).all(axis=1)]
+        bars.append(np.column_stack([(start + at) @ strides, (start + to) @ strides]))
+    return points, np.concatenate(bars)
+
+
+def lumped_mass(points: np.ndarray, bars: np.ndarray) -> np.ndarray:
+    """Mass (nodes,) [kg]: half of each bar at each end."""
+    length = np.linalg.norm(points[bars[:, 1]] - points[bars[:, 0]], axis=1)
+    half = 0.5 * DENSITY * AREA * length
+    return np.bincount(bars.ravel(), np.repeat(half, 2), len(points))
+
+
+def time_steps(step: Callable[[], float], steps: int) -> dict[str, float]:
+    """Make a step that is not timed, then ``steps`` that are: seconds a step, and the mean of what steps return."""
+    step()
+    total = 0.0
+    wall, cpu = time.perf_counter(), time.process_time()
+    for _ in range(steps):
+        total += step()
+    cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
+    return {"cpu": cpu / steps, "wall": wall / steps, "iterations": total / steps}
+
+
+def report(times: dict[str, float], bars: int, top: float, **further: float) -> None:
+    """Print the result as one line of JSON: ``top`` is the displacement of the last node along z [m]."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    print("RESULT " + json.dumps({**times, "bars": bars, "top": top, "memory": peak, **further}), flush=True)
+
+
+def arguments() -> tuple[int, str, int, str]:
+    """Cells, mode (explicit, explicit_contact, implicit, implicit_contact), steps and solver of the command line."""
+    cells, mode, steps = int(sys.argv[1]), sys.argv[2], int(sys.argv[3])
+    return cells, mode, steps, sys.argv[4] if len(sys.argv) > 4 else ""

@@ -1,0 +1,99 @@
+"""Kratos on the lattice: elastic trusses, the foot held along z; usage: run_kratos.py CELLS explicit|implicit STEPS."""
+
+from __future__ import annotations
+
+import json
+
+import KratosMultiphysics as Kratos
+import KratosMultiphysics.StructuralMechanicsApplication as Structures
+import model as m
+from KratosMultiphysics.StructuralMechanicsApplication import python_solvers_wrapper_structural as solvers
+
+PART = "lattice"
+
+
+def settings(explicit: bool, h: float) -> Kratos.Parameters:
+    """Of the structural solver."""
+    values = {
+        "solver_type": "dynamic",
+        "model_part_name": PART,
+        "domain_size": 3,
+        "echo_level": 0,
+        "rotation_dofs": False,
+        "model_import_settings": {"input_type": "use_input_model_part"},
+        "material_import_settings": {"materials_filename": ""},
+        "time_stepping": {"time_step": h},
+    }
+    if explicit:
+        values |= {
+            "time_integration_method": "explicit",
+            "scheme_type": "central_differences",
+            "time_step_prediction_level": 0,
+            "max_delta_time": h,
+        }
+    else:
+        values |= {
+            "time_integration_method": "implicit",
+            "scheme_type": "newmark",
+            "analysis_type": "non_linear",
+            "convergence_criterion": "residual_criterion",
+            "residual_relative_tolerance": 1e-6,
+            "residual_absolute_tolerance": 1e-9,
+            "linear_solver_settings": {"solver_type": "amgcl", "tolerance": 1e-8},
+        }
+    return Kratos.Parameters(json.dumps(values))
+
+
+def main() -> None:
+    """Run and report."""
+    cells, mode, steps, _ = m.arguments()
+    explicit = mode == "explicit"
+    h = m.EXPLICIT_STEP if explicit else m.IMPLICIT_STEP
+    Kratos.Logger.GetDefaultOutput().SetSeverity(Kratos.Logger.Severity.WARNING)
+    points, bars = m.lattice(cells)
+    solver = solvers.CreateSolverByParameters(Kratos.Model(), settings(explicit, h), "OpenMP")
+    solver.AddVariables()
+    part = solver.main_model_part
+    for node, point in enumerate(points.tolist(), start=1):
+        part.CreateNewNode(node, *point)
+    strut = part.CreateNewProperties(1)
+    strut.SetValue(Kratos.YOUNG_MODULUS, m.YOUNG_MODULUS)
+    strut.SetValue(Kratos.DENSITY, m.DENSITY)
+    strut.SetValue(Kratos.POISSON_RATIO, 0.3)
+    strut.SetValue(Kratos.COMPUTE_LUMPED_MASS_MATRIX, True)
+    strut.SetValue(Kratos.CONSTITUTIVE_LAW, Structures.TrussConstitutiveLaw())
+    strut.SetValue(Structures.CROSS_AREA, m.AREA)
+    for zero in (Structures.TRUSS_PRESTRESS_PK2, Structures.RAYLEIGH_ALPHA, Structures.RAYLEIGH_BETA):
+        strut.SetValue(zero, 0.0)
+    for bar, ends in enumerate((bars + 1).tolist(), start=1):
+        part.CreateNewElement("TrussElement3D2N", bar, ends, strut)
+    solver.ImportModelPart()
+    solver.PrepareModelPart()
+    solver.AddDofs()
+    for node in part.Nodes:
+        if node.Z0 == 0.0:
+            node.Fix(Kratos.DISPLACEMENT_Z)
+            continue
+        for buffer in (0, 1):
+            node.SetSolutionStepValue(Kratos.VELOCITY, buffer, [0.0, 0.0, m.SPEED])
+    solver.Initialize()
+    solver.Check()
+    time = 0.0
+
+    def step() -> float:
+        nonlocal time
+        time = solver.AdvanceInTime(time)
+        solver.InitializeSolutionStep()
+        solver.Predict()
+        converged = solver.SolveSolutionStep()
+        solver.FinalizeSolutionStep()
+        if not explicit and not converged:
+            raise RuntimeError("Kratos did not converge")
+        return 0.0 if explicit else float(part.ProcessInfo[Kratos.NL_ITERATION_NUMBER])
+
+    times = m.time_steps(step, steps)
+    top = part.Nodes[len(points)].GetSolutionStepValue(Kratos.DISPLACEMENT_Z)
+    m.report(times, len(bars), top, threads=float(Kratos.ParallelUtilities.GetNumThreads()))
+
+
+main()

@@ -1,0 +1,69 @@
+"""This program on the lattice, with a row of history every step; usage: run_ours.py CELLS MODE STEPS [OPERATOR].
+
+With contact the bars are elastoplastic (kinematic hardening) and the wall is rigid. Without, bars are elastic and the
+foot is held along z.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import model as m
+
+from pfem_petsc import Case, Simulation
+
+
+def table(cells: int, mode: str, steps: int, operator: str) -> dict:
+    """The case."""
+    explicit, contact = mode.startswith("explicit"), mode.endswith("contact")
+    material = {"young_modulus": m.YOUNG_MODULUS, "density": m.DENSITY}
+    if contact:
+        # tangent E H / (E + H)
+        hardening = m.YOUNG_MODULUS * m.HARDENING_RATIO / (1.0 - m.HARDENING_RATIO)
+        material |= {"yield_stress": m.YIELD_STRESS, "kinematic_hardening": hardening}
+    h = m.EXPLICIT_STEP if explicit else m.IMPLICIT_STEP
+    if explicit:
+        time = {"integrator": "central_differences"}
+    else:
+        time = {"integrator": "newmark", "beta": 0.25, "gamma": 0.5}
+    case = {
+        "title": "peers",
+        "mesh": {"generator": "lattice", "kind": "cubic", "cells": [cells] * 3, "pitch": m.PITCH},
+        "node_set": {"foot": {"group": "bottom"}, "top": {"nearest": [cells * m.PITCH] * 3}},
+        "material": {"strut": material},
+        "section": {"strut": {"area": m.AREA, "material": "strut"}},
+        "initial": {"velocity": [0.0, 0.0, m.SPEED]},
+        "time": {**time, "step": h, "end": h * (steps + 1)},
+        "output": {"fields_every": 0, "fields": [], "probe": [{"name": "top", "node_set": "top"}]},
+        "solver": {"operator": operator or "auto"},
+    }
+    if contact:
+        case["wall"] = [{"name": "floor", "type": "plane", "point": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0]}]
+    else:
+        case["support"] = [{"node_set": "foot", "fix": "z"}]
+    return case
+
+
+def main() -> None:
+    """Run and report."""
+    cells, mode, steps, operator = m.arguments()
+    with tempfile.TemporaryDirectory() as folder:
+        case = Case.from_dict(table(cells, mode, steps, operator), source="peers", folder=Path(folder))
+        simulation = Simulation(case, output=folder, quiet=True)
+        running = iter(simulation)
+        linear = 0
+
+        def step() -> float:
+            nonlocal linear
+            done = next(running)
+            linear += done.linear
+            return float(done.newton)
+
+        times = m.time_steps(step, steps)
+        top = simulation.row["probe/top/position"][0, 2] - cells * m.PITCH
+        m.report(times, simulation.mesh.n_bars, float(top), linear=linear / (steps + 1))
+        running.close()
+
+
+main()

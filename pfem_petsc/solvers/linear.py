@@ -84,7 +84,8 @@ def configure(ksp: PETSc.KSP, choice: LinearChoice, reduced: bool) -> None:
     ksp.setType(choice.krylov)
     if choice.krylov != "preonly":
         ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
-        ksp.setTolerances(rtol=1e-5, max_it=2000)
+        # 101,706 bars at 2 x the explicit limit: 1e-5, 1e-4, 1e-3, 1e-2 took 30.0, 29.4, 27.0, 35.7 ms a step
+        ksp.setTolerances(rtol=1e-3, max_it=2000)
     kind = choice.preconditioner
     if kind == "gamg" and reduced and PETSc.Sys.getVersion() < (3, 19):
         kind = "icc"  # PETSc 3.18's multigrid cannot follow an active set that changes

@@ -107,6 +107,11 @@ class HessianMatrix:
     """Assembled Hessian of the owned rows; one interface over the two ways PETSc takes values into a fixed pattern.
 
     ``fill(callback)`` zeroes the values, lets the callback add to them and hands them to PETSc.
+
+    Attributes
+    ----------
+    mat : PETSc matrix
+    rigid : whether the matrix carries the rigid motions, for multigrid
     """
 
     def __init__(self, mesh, fixed: np.ndarray, any_fixed: bool, symmetric: bool = True) -> None:
@@ -128,6 +133,7 @@ class HessianMatrix:
             self.mat.setPreallocationCSR((pointers, columns))
         self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
         self.any_fixed = any_fixed
+        self.rigid = False
         if any_fixed:
             self._fixed = np.zeros((mesh.n_local, 3))
             self._fixed[: mesh.n_owned] = fixed
@@ -148,10 +154,31 @@ class HessianMatrix:
     def update(self, problem, w: np.ndarray) -> None:
         """Assemble the Hessian of a problem at ``w``. Collective."""
         self.fill(lambda values: problem.hessian(w, self, values))
+        if self.rigid:
+            self._attach_rigid_motions(problem.x)
+
+    def _attach_rigid_motions(self, x: np.ndarray) -> None:
+        """Tell multigrid the rigid motions of the nodes where they are now: what it must not damp."""
+        coordinates = self.mat.createVecRight()
+        coordinates.setBlockSize(3)
+        coordinates.setArray(x[: self.mesh.n_owned].ravel())
+        motions = PETSc.NullSpace().createRigidBody(coordinates)
+        self.mat.setNearNullSpace(motions)
+        motions.destroy()
+        coordinates.destroy()
 
     def add_lumped(self, inertia: np.ndarray, values: np.ndarray) -> None:
         """Add a nodal inertia (owned,) to the diagonal."""
         _add_lumped(self.pattern.ptr, self.pattern.diagonal, inertia, values)
+
+    def add_blocks(self, nodes: np.ndarray, blocks: np.ndarray, values: np.ndarray) -> None:
+        """Add blocks (k, 3, 3) to the diagonal blocks of owned nodes (k,), each there once."""
+        ptr = self.pattern.ptr.astype(np.int64)
+        start = 6 * ptr[nodes] + 3 * self.pattern.diagonal[nodes]
+        width = 3 * (ptr[nodes + 1] - ptr[nodes])
+        for i in range(3):
+            for j in range(3):
+                values[start + i * width + j] += blocks[:, i, j]
 
     def constrain(self, scale: float, values: np.ndarray) -> None:
         """Replace rows and columns of prescribed components by ``scale`` on the diagonal."""

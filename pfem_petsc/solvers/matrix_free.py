@@ -58,6 +58,31 @@ def _diagonal(bars, stored, blocks):
             blocks[i, 5] += c * nz * nz + g
 
 
+class _Restriction:
+    """H restricted to some of the unknowns of each rank: what is left of a contact problem's inactive set."""
+
+    def __init__(self, whole: MatrixFreeHessian, kept: np.ndarray) -> None:
+        self.whole = whole
+        self.kept = kept.astype(np.int64)
+        n = len(kept)
+        self.mat = PETSc.Mat().createPython(((n, None), (n, None)), self, comm=whole.mesh.comm)
+        self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+        self.mat.setUp()
+
+    def mult(self, mat: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """Y = H x with zeros for the unknowns left out; called by PETSc."""
+        whole = self.whole
+        u = whole._u[: whole.mesh.n_owned].reshape(-1)
+        u[:] = 0.0
+        u[self.kept] = x.getArray(readonly=True)
+        whole.apply()
+        y.setArray(whole._out[: whole.mesh.n_owned].reshape(-1)[self.kept])
+
+    def getDiagonal(self, mat: PETSc.Mat, d: PETSc.Vec) -> None:  # noqa: N802 - PETSc's name
+        """Diagonal of the restriction; called by PETSc."""
+        d.setArray(self.whole.diagonal().reshape(-1)[self.kept])
+
+
 class MatrixFreeHessian:
     """Stands where :class:`~pfem_petsc.solvers.matrix.HessianMatrix` stands, for symmetric schemes.
 
@@ -89,36 +114,44 @@ class MatrixFreeHessian:
 
     def mult(self, mat: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Y = H x; called by PETSc."""
+        owned = self.mesh.n_owned
+        self._u[:owned] = x.getArray(readonly=True).reshape(owned, 3)
+        self.apply()
+        y.setArray(self._out[:owned].ravel())
+
+    def apply(self) -> None:
+        """Apply H to the owned rows of :attr:`_u`, giving those of :attr:`_out`. Collective."""
         problem, owned = self._problem, self.mesh.n_owned
-        w = x.getArray(readonly=True).reshape(owned, 3)
-        u = self._u
-        u[:owned] = w
-        if self.model.supports.any:
-            u[:owned][self._fixed] = 0.0
+        u, out = self._u, self._out
+        fixed = self._fixed if self.model.supports.any else None
+        if fixed is not None:
+            held = problem.scale * u[:owned][fixed]
+            u[:owned][fixed] = 0.0
         if problem.oblique:
             at = problem.frames.nodes
             u[at] = np.einsum("nij,nj->ni", problem.frames.inverse, u[at])
         self.mesh.update_ghosts(u)
-        self._out[:] = 0.0
-        _product(self.mesh.bars, self._stored, u, self._out)
-        inertia = self.model.inertia
+        inertia, bars = self.model.inertia, self.model.bars
         if inertia.consistent:
-            bars = self.model.bars
+            out[:] = 0.0
             coefficients = inertia.coefficients(problem.balance.alpha, problem.balance.eta)
             for block, coefficient in zip(bars.blocks, coefficients, strict=True):
-                consistent_product(bars.ends, bars.rest, block.start, block.stop, 6.0 * coefficient, u, self._out)
-            out = self._out[:owned]
+                consistent_product(bars.ends, bars.rest, block.start, block.stop, 6.0 * coefficient, u, out)
         else:
-            out = self._out[:owned]
-            out += problem.nodal[:, None] * u[:owned]
+            np.multiply(problem.nodal[:, None], u[:owned], out=out[:owned])
+            out[owned:] = 0.0
+        _product(self.mesh.bars, self._stored, u, out)
         if problem.oblique:
             out[at] = np.einsum("nji,nj->ni", problem.frames.inverse, out[at])
-        if self.model.supports.any:
-            out[self._fixed] = problem.scale * w[self._fixed]
-        y.setArray(out.ravel())
+        if fixed is not None:
+            out[:owned][fixed] = held
 
     def getDiagonal(self, mat: PETSc.Mat, d: PETSc.Vec) -> None:  # noqa: N802 - PETSc's name
         """Diagonal of H; called by PETSc."""
+        d.setArray(self.diagonal().ravel())
+
+    def diagonal(self) -> np.ndarray:
+        """Diagonal of H (owned, 3)."""
         problem, owned = self._problem, self.mesh.n_owned
         blocks = np.zeros((self.mesh.n_local, 6))
         _diagonal(self.mesh.bars, self._stored, blocks)
@@ -132,11 +165,11 @@ class MatrixFreeHessian:
             diagonal[at] = np.einsum("nji,njk,nki->ni", inverse, full, inverse)
         if self.model.supports.any:
             diagonal[self._fixed] = problem.scale
-        d.setArray(diagonal.ravel())
+        return diagonal
 
     def createSubMatrix(self, mat, rows, columns, out=None):  # noqa: ANN001, ANN201, N802 - PETSc's name
         """The restriction of H to some unknowns; called by PETSc."""
-        return PETSc.Mat().createSubMatrixVirtual(mat, rows, columns)
+        return _Restriction(self, rows.getIndices() - 3 * self.mesh.first_node).mat
 
     def destroy(self, mat: PETSc.Mat | None = None) -> None:
         """Free the PETSc matrix; PETSc calls it with the matrix when that goes."""

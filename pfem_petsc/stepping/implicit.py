@@ -34,6 +34,7 @@ class ImplicitStepper(Stepper):
             self.hessian = MatrixFreeHessian(model)
         else:
             self.hessian = HessianMatrix(model.mesh, model.supports.fixed, model.supports.any, scheme.symmetric)
+            self.hessian.rigid = choice.preconditioner == "gamg"
         self.newton = NewtonSolver(model.mesh, self.hessian, choice, model.case.solver.max_newton, model.length)
         self.level = 0  # the next step is made in 2**level parts
         self.message: Callable[[str], None] = lambda text: None
@@ -82,6 +83,11 @@ class ImplicitStepper(Stepper):
         inertia, fixed = self.model.inertia, self.model.supports.fixed
         if not inertia.consistent:
             a = load / inertia.mass[:, None]
+            if inertia.redistribution is not None:
+                at, tensors = inertia.redistribution.touched, inertia.redistribution.tensors
+                matrices = inertia.mass[at, None, None] * np.eye(3) + tensors
+                inverse = np.linalg.pinv(matrices, rcond=1e-10, hermitian=True)
+                a[at] = np.einsum("kij,kj->ki", inverse, load[at])
             a[fixed] = 0.0
             return a
         mass = HessianMatrix(self.model.mesh, fixed, self.model.supports.any)

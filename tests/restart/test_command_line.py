@@ -1,0 +1,247 @@
+"""What --restart, signals and the wall time do on the command line."""
+
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+
+import h5py
+import numpy as np
+import pytest
+from kills import KINDS, command, differences, environment, processes_of
+
+from pfem_petsc.cli.main import main
+from pfem_petsc.output.result import open_result
+
+ROD = ["rod_impact", "--quiet", "--set", "output.checkpoint_every=20"]
+
+
+def rod(folder, *more, end=0.5):
+    return [*ROD, f"time.end={end}", "-o", str(folder), *more]
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("finished") / "rod"
+    assert main(rod(folder)) == 0
+    return folder
+
+
+@pytest.fixture
+def copy(finished, tmp_path):
+    return shutil.copytree(finished, tmp_path / "rod")
+
+
+def steps(folder):
+    with open_result(folder) as result:
+        return result.history["step"], result.steps
+
+
+def test_nothing_to_restart_from(tmp_path, capsys):
+    words = rod(tmp_path / "new", "--restart")
+    words.remove("--quiet")
+    assert main(words) == 0
+    assert "no checkpoint there to restart from: starting from zero" in capsys.readouterr().out
+    assert len(steps(tmp_path / "new")[0]) == 51
+
+
+@pytest.mark.parametrize("every", [0, 20])
+def test_finished_run(tmp_path, capsys, every):
+    words = rod(tmp_path / "done", f"--set=output.checkpoint_every={every}")
+    words.remove("--quiet")
+    assert main(words) == 0
+    before = (tmp_path / "done" / "result.vtkhdf").read_bytes()
+    capsys.readouterr()
+    assert main([*words, "--restart"]) == 0
+    assert "finished already: the results reach t = 500.0 ms" in capsys.readouterr().out
+    assert (tmp_path / "done" / "result.vtkhdf").read_bytes() == before
+    assert [path.name for path in tmp_path.iterdir()] == ["done"]
+
+
+def test_finished_run_of_another_case_is_moved_aside(tmp_path):
+    folder = tmp_path / "done"
+    assert main(rod(folder, "--set=output.checkpoint_every=0")) == 0
+    assert main(rod(folder, "--restart", "--set", "output.checkpoint_every=0", "initial.velocity=[0.4,0,0]")) == 0
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["done", "done.1"]
+
+
+def test_longer_end_goes_on_without_gap_or_duplicate(copy, capsys):
+    words = rod(copy, "--restart", "--set", "output.history_every=2", "solver.rtol=1e-8", end=0.9)
+    words.remove("--quiet")
+    assert main(words) == 0
+    said = capsys.readouterr().out
+    assert "restart from" in said
+    assert "step 50" in said
+    for change in ("time.end: 0.5 -> 0.9", "output.history_every: 1 -> 2", "solver.rtol: 1e-09 -> 1e-08"):
+        assert change in said
+    rows, snapshots = steps(copy)
+    np.testing.assert_array_equal(rows, [*range(51), *range(52, 91, 2)])
+    np.testing.assert_array_equal(snapshots, range(0, 91, 10))
+    assert (copy / "checkpoint.h5").is_file()
+    assert (copy / "checkpoint-previous.h5").is_file()
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        ("time.step=0.02", "time.step: 0.01 -> 0.02"),
+        ("time.integrator=newmark", 'time.integrator: "central_differences" -> "newmark"'),
+        ("mesh.elements=21", "mesh.elements: 20 -> 21"),
+        ("wall.0.point=[1.06,0,0]", "wall[0].point: [1.05, 0.0, 0.0] -> [1.06, 0.0, 0.0]"),
+        ("initial.velocity=[0.4,0,0]", "initial.velocity"),
+        ("output.fields=['velocity']", "keep [output] fields as it was"),
+    ],
+)
+def test_other_case_is_refused(copy, change, text, capsys):
+    before = {path.name: path.read_bytes() for path in copy.iterdir() if path.suffix in (".h5", ".vtkhdf")}
+    assert main(rod(copy, "--restart", f"--set={change}", end=0.9)) == 2
+    said = capsys.readouterr().err
+    assert text in said
+    assert said.count("error:") == 1
+    assert {name: (copy / name).read_bytes() for name in before} == before
+
+
+def test_missing_and_damaged_files(copy, capsys):
+    assert main(rod(copy, "--restart", str(copy / "no.h5"), end=0.9)) == 2
+    assert "no.h5: there is no such checkpoint" in capsys.readouterr().err
+    damaged = bytearray((copy / "checkpoint.h5").read_bytes())
+    damaged[len(damaged) // 2] ^= 1
+    (copy / "checkpoint.h5").write_bytes(damaged)
+    assert main(rod(copy, "--restart", end=0.9)) == 2
+    said = capsys.readouterr().err
+    assert "damaged" in said
+    assert "checkpoint-previous.h5" in said
+    # the way out that it names
+    assert main(rod(copy, "--restart", str(copy / "checkpoint-previous.h5"), end=0.9)) == 0
+    np.testing.assert_array_equal(steps(copy)[0], range(91))
+
+
+def test_mesh_file_that_changed(tmp_path, capsys):
+    points = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0.1]])
+
+    def write(points):
+        with h5py.File(tmp_path / "mesh.h5", "w") as file:
+            file["points"], file["bars"] = points, np.array([[0, 1], [1, 2]])
+
+    write(points)
+    (tmp_path / "case.toml").write_text(
+        '[mesh]\nfile = "mesh.h5"\n[material.m]\nyoung_modulus = 1.0\ndensity = 1.0\n'
+        '[section.s]\narea = 1.0\nmaterial = "m"\n[time]\nintegrator = "newmark"\nstep = 0.1\nend = 1.0\n'
+        "[output]\ncheckpoint_every = 5\n"
+    )
+    words = [str(tmp_path / "case.toml"), "-o", str(tmp_path / "out"), "--quiet"]
+    assert main(words) == 0
+    write(points + [[0, 0, 0], [0, 0, 0], [0, 0, 1e-15]])
+    assert main([*words, "--restart", "--set", "time.end=2.0"]) == 2
+    assert "other nodes or bars" in capsys.readouterr().err
+
+
+def test_state_of_another_version(copy, capsys):
+    """A file that is whole, but whose state has another meaning."""
+    from mpi4py import MPI
+
+    from pfem_petsc.output.checkpoint import read_checkpoint_header, write_checkpoint
+
+    scalars, attributes = read_checkpoint_header(copy / "checkpoint.h5", MPI.COMM_SELF)
+    write_checkpoint(copy / "checkpoint.h5", MPI.COMM_SELF, {}, scalars, {**attributes, "state_version": 0})
+    assert main(rod(copy, "--restart", end=0.9)) == 2
+    assert "version 0 of a run's state" in capsys.readouterr().err
+
+
+def test_another_folder_gets_results_from_the_checkpoint_on(copy, tmp_path):
+    assert main(rod(tmp_path / "new", "--restart", str(copy / "checkpoint-previous.h5"), end=0.9)) == 0
+    rows, snapshots = steps(tmp_path / "new")
+    np.testing.assert_array_equal(rows, range(40, 91))
+    np.testing.assert_array_equal(snapshots, range(40, 91, 10))
+
+
+def test_wall_time(tmp_path, capsys):
+    folder = tmp_path / "slow"
+    words = ["rod_impact", "-o", str(folder), "--quiet", "--set", "time.end=1000"]
+    begin = time.monotonic()
+    assert main([*words, "--wall-time", "0.5"]) == 4
+    assert time.monotonic() - begin < 10.0
+    said = capsys.readouterr().err
+    assert said.startswith("stopped: the wall time of 0.50 s is over")
+    assert "continue with --restart" in said
+    reached = steps(folder)[0][-1]
+    assert 0 < reached < 100_000
+    assert main([*words, "--restart", "--wall-time", "0.2"]) == 4
+    rows = steps(folder)[0]
+    assert rows[-1] > reached
+    np.testing.assert_array_equal(rows, range(rows[-1] + 1))
+
+
+def test_checkpoints_by_the_clock(tmp_path):
+    folder = tmp_path / "minutes"
+    words = ["rod_impact", "-o", str(folder), "--quiet", "--set", "time.end=1000", "output.checkpoint_minutes=0.002"]
+    assert main([*words, "--wall-time", "1.0"]) == 4
+    assert (folder / "checkpoint-previous.h5").is_file()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("ranks", "number"), [(1, signal.SIGTERM), (1, signal.SIGINT), (1, signal.SIGUSR1), (2, signal.SIGTERM)]
+)
+def test_signal_stops_with_a_checkpoint_and_the_restart_is_bitwise(tmp_path, ranks, number):
+    kind = KINDS["explicit contact, plastic"]
+    words = [kind.case, "--quiet", "--set", *kind.overrides, "time.end=2e-4", "-o"]
+    folder = tmp_path / "stopped"
+    line = command(ranks, *words, folder)
+    process = subprocess.Popen(line, env=environment(), stderr=subprocess.PIPE, text=True)
+    while not (folder / "log.txt").exists() and process.poll() is None:
+        time.sleep(0.01)
+    os.kill(processes_of(process, ranks)[-1], number)
+    said = process.communicate(timeout=60)[1]
+    assert process.returncode == 4, said
+    assert f"stopped: {signal.Signals(number).name} received" in said
+    assert said.count("stopped: ") == 1
+    done = subprocess.run([*line, "--restart"], env=environment(), capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    done = subprocess.run(
+        command(ranks, *words, tmp_path / "whole"), env=environment(), capture_output=True, text=True, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
+    assert differences(folder / "result.vtkhdf", tmp_path / "whole" / "result.vtkhdf") == {}
+
+
+def test_second_interrupt_ends_at_once(tmp_path):
+    """Also where the first one is not looked at any more: here in a step that never ends."""
+    script = tmp_path / "stuck.py"
+    script.write_text(
+        "import ctypes, sys\n"
+        "from pfem_petsc import Case, Simulation\n"
+        "from pfem_petsc.stepping.explicit import ExplicitStepper\n"
+        "def stuck(self):\n"
+        "    print('stuck', flush=True)\n"
+        "    while ctypes.CDLL(None).sleep(100): pass\n"
+        "ExplicitStepper.step = stuck\n"
+        f"Simulation(Case.load('rod_impact'), output={str(tmp_path / 'out')!r}, quiet=True).run()\n"
+    )
+
+    process = subprocess.Popen(
+        [sys.executable, str(script)], env=environment(), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    )
+    assert process.stdout.readline() == "stuck\n"
+    process.send_signal(signal.SIGINT)
+    time.sleep(0.3)
+    assert process.poll() is None
+    begin = time.monotonic()
+    process.send_signal(signal.SIGINT)
+    assert process.wait(timeout=20) == -signal.SIGINT
+    assert time.monotonic() - begin < 5.0
+    process.stdout.close()
+
+
+def test_checkpoint_says_what_it_was_written_by(copy):
+    raw = (copy / "checkpoint.h5").read_bytes()
+    assert raw.startswith(b"pfem_petsc checkpoint")
+    with h5py.File(copy / "checkpoint.h5") as file:
+        state = json.loads(file["state"][()])
+    assert re.fullmatch(r"\d+\.\d+\.\d+.*|not installed", state["attributes"]["pfem_petsc"])
+    assert state["attributes"]["case"]["mesh"]["elements"] == 20
+    assert state["scalars"]["step"] == 50

@@ -233,7 +233,7 @@ def section_of_bars(case, slab) -> np.ndarray:
     bare = np.flatnonzero(chosen < 0)
     if len(bare):
         raise InputError(
-            f"{case.source}: section: bar {bare[0] + slab.first_bar} of {slab.source} (and {len(bare) - 1} more here) has "
-            "no section; add a section without 'bars' as the default"
+            f"{case.source}: section: bar {bare[0] + slab.first_bar} of {slab.source} (and {len(bare) - 1} more here) "
+            "has no section; add a section without 'bars' as the default"
         )
     return chosen

@@ -26,8 +26,8 @@ COLLAPSED_STRETCH = 1e-3  # a bar below this fraction of its rest length has bee
 def make_kernels(response: Callable, remembers: bool) -> SimpleNamespace:
     """Kernels of a material law: ``forces``, ``tangents``, ``product``, ``linearise``, ``fields``.
 
-    Common arguments: ``x`` (local nodes, 3) [m]; ``bars`` (b, 2) local ends; ``rest`` (b,) rest lengths [m]; ``thermal``
-    (b,) thermal strains, or (0,) for none; ``p`` the law's parameters; ``area`` [m2]; ``measure`` of
+    Common arguments: ``x`` (local nodes, 3) [m]; ``bars`` (b, 2) local ends; ``rest`` (b,) rest lengths [m];
+    ``thermal`` (b,) thermal strains, or (0,) for none; ``p`` the law's parameters; ``area`` [m2]; ``measure`` of
     :mod:`~pfem_petsc.mechanics.strain`; ``history`` of the bars of this block, whose row is ``k - start``: plastic and
     accumulated plastic strain, (0, 2) for a law that does not remember. No array goes into an inner function: counting
     its references costs more than the bar.
@@ -35,7 +35,7 @@ def make_kernels(response: Callable, remembers: bool) -> SimpleNamespace:
 
     @kernel
     def forces(x, bars, rest, thermal, p, area, measure, history, start, counted, stop, commit, f):
-        """Add internal forces to ``f``; sums over counted bars: elastic, heat, hardening [J]; first failed bar or -1."""
+        """Add internal forces to ``f``; sums over counted bars: elastic, heat, hardening [J]; first failed or -1."""
         elastic = 0.0
         heat = 0.0
         hardening = 0.0

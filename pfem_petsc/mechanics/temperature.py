@@ -32,7 +32,7 @@ class Temperatures:
                     known = sorted(mesh.bar_groups)
                     hint = nearest(entry.bars, known) if known else "; the mesh has no bar groups"
                     raise InputError(
-                        f"{case.source}: temperature[{index}].bars = {entry.bars!r}: no such bar group in the mesh{hint}"
+                        f"{case.source}: temperature[{index}].bars = {entry.bars!r}: no such group of bars{hint}"
                     )
                 members = mesh.bar_groups[entry.bars]
             self._entries.append((members, entry.value, Table(entry.table) if entry.table is not None else None))

@@ -11,8 +11,8 @@ __all__ = ["explicit_increments", "node_totals", "node_works"]
 def explicit_increments(external, f, mass, damping, alpha, eta, a_hat, v_hat, stiffness, u):
     """Solve (alpha m + eta c) u = f_ext - f_int - m a_hat - c v_hat for every node.
 
-    ``external``, ``a_hat``, ``v_hat`` are (owned, 3), or (0, 3) for zero; ``stiffness`` (owned,) and ``u`` (owned, 3) are
-    written.
+    ``external``, ``a_hat``, ``v_hat`` are (owned, 3), or (0, 3) for zero; ``stiffness`` (owned,) and ``u`` (owned, 3)
+    are written.
     """
     loaded = len(external) > 0
     carried = len(a_hat) > 0

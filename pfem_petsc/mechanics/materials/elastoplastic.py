@@ -1,8 +1,8 @@
 """Elastoplastic bar with mixed linear hardening, isotropic (K) and kinematic (H).
 
-Yield function f = |s - H e_p| - (s_Y + K a) with the accumulated plastic strain a. The return mapping of a linear law is
-closed: da = f_trial / (E + H + K). On the yield surface s = sign (s_Y + K a) + H e_p, so the plastic work is the function
-of state s_Y a + K a^2/2 + H e_p^2/2: its first term is heat, the rest is stored by the hardening.
+Yield function f = |s - H e_p| - (s_Y + K a) with the accumulated plastic strain a. The return mapping of a linear law
+is closed: da = f_trial / (E + H + K). On the yield surface s = sign (s_Y + K a) + H e_p, so the plastic work is the
+function of state s_Y a + K a^2/2 + H e_p^2/2: its first term is heat, the rest is stored by the hardening.
 """
 
 from __future__ import annotations

@@ -138,7 +138,7 @@ def _once(m: Measures) -> Claim:
     return Claim(
         "5.3",
         "Houbolt and Wilson impact only once.",
-        "Both leave the wall right after the first step of contact, as in the paper's figures, but come back [ms]: "
+        "Both leave the wall right after the first step of contact but come back [ms]: "
         f"{text}. In three other geometries with Houbolt and with Wilson (θ = 1.5 and 1.4) there are "
         f"{min(len(r.phases) for r in others)} to {max(len(r.phases) for r in others)} contacts. How often they come "
         "back depends on the geometry, which we do not have.",

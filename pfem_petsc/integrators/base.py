@@ -114,6 +114,9 @@ class Scheme(ABC):
     def start(self, state: State, h: float) -> None:
         """Set memory up from the complete state at the start (x, v, a); nothing by default."""
 
+    def restart(self, state: State, nodes: np.ndarray, h: float) -> None:
+        """Make what is remembered of some owned nodes agree with their v and a, which contact changed. Nothing by default."""
+
     def step_changed(self, state: State) -> None:
         """Forget what holds for the old step only; the state (x, v, a) is complete. Nothing by default."""
 
@@ -140,4 +143,6 @@ def lagged_limit(alpha_m: float, beta: float, gamma: float, damping_ratio: float
     quadratic = 0.5 * (2.0 * beta - gamma)
     linear = damping_ratio * (2.0 * gamma - 1.0)
     constant = 1.0 - 2.0 * alpha_m
+    if constant == linear == quadratic == 0.0:
+        return 2.0  # rho_b = 1 of Hulbert and Chung: Omega^2 = 12 (1 + rho_b)(2 - rho_b)/(10 - 5 rho_b + rho_b^2)
     return 2.0 * constant / (linear + np.sqrt(linear * linear + 4.0 * quadratic * constant))

@@ -148,6 +148,7 @@ SCHEMES = {
     "chung_lee 28/27": ("chung_lee", {}, 3, chung_lee(28 / 27)),
     "hulbert_chung 0": ("hulbert_chung", {"rho_b": 0.0}, 3, explicit_alpha(0.0)),
     "hulbert_chung 0.8": ("hulbert_chung", {}, 3, explicit_alpha(0.8)),
+    "hulbert_chung 1": ("hulbert_chung", {"rho_b": 1.0}, 3, explicit_alpha(1.0)),
     "souza_moura": ("souza_moura", {}, 3, explicit_alpha(0.3)),
     "newmark": ("newmark", {}, 2, newmark_family(1.0, 1.5)),
     "trapezoid": ("newmark", {"beta": 0.25, "gamma": 0.5}, 2, newmark_family(0.25, 0.5)),

@@ -39,6 +39,7 @@ LIMITS = {
     "chung_lee 1.02": 1.9245,
     "chung_lee 28/27": 1.8665,
     "hulbert_chung 0": 1.549,
+    "hulbert_chung 1": 2.0,
     "souza_moura": 1.757,
 }
 DAMPED_LIMITS = {"central_differences": 2.0, "chung_lee 1": 1.640, "chung_lee 1.02": 1.589, "chung_lee 28/27": 1.550}

@@ -169,7 +169,9 @@ def assert_readable(path: Path, vtk: VtkReader) -> int:
             assert np.isfinite(np.asarray(result.history[name], dtype=float)).all(), name
         for i in range(n):
             assert np.isfinite(result.positions(i)).all(), i
-    assert vtk.steps(path) == n
+    seen = vtk.steps(path)
+    # without a snapshot VTK finds nothing to show, and says so
+    assert seen == n or n == 0
     return n
 
 

@@ -14,6 +14,7 @@ from .output.progress import Progress
 from .output.units import engineering
 from .output.vtkhdf import ResultWriter
 from .parallel.natural import NaturalOrder
+from .parallel.petsc_log import lay_over, staged
 from .restart.checkpoints import Checkpoints
 from .restart.folder import RESULT, Restart, find_restart, finished, prepare_folder
 from .restart.stop import Meetings, StopRequest
@@ -64,6 +65,7 @@ class Simulation:
         On all ranks.
     """
 
+    @staged
     def __init__(
         self,
         case,
@@ -139,6 +141,7 @@ class Simulation:
         peak = self.comm.allreduce(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024.0)
         return f"{engineering(peak, 'B', 3)} in use on all ranks"
 
+    @staged
     def start(self) -> None:
         """Complete the state at the start and open the output. Collective; called by :meth:`run` and iteration."""
         if self._started:
@@ -176,6 +179,7 @@ class Simulation:
             self.stepper.message = self._progress.warning
         self.recorder = Recorder(self.stepper, self.ledger)
         self.blow_up = BlowUp(self.model)
+        lay_over(self)
         continues = False
         if self.restart is not None:
             continues = self.restart.continues

@@ -1,0 +1,86 @@
+"""Stages and events of a run for PETSc's ``-log_view``.
+
+They are laid over the methods of one simulation when PETSc logs, and only then: a run that does not ask for them calls
+its methods directly.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+__all__ = ["EVENTS", "STAGES", "lay_over", "staged"]
+
+SET_UP, STEPS = "pfem set-up", "pfem steps"
+
+STAGES = (SET_UP, STEPS)
+
+EVENTS: dict[str, tuple[str, ...]] = {
+    "pfemForces": ("model.bars.forces", "model.bars.step_forces"),
+    "pfemGhosts": ("mesh.update_ghosts",),
+    "pfemSolve": ("stepper.solve",),
+    "pfemResidual": ("stepper.newton._residual",),
+    "pfemHessian": ("stepper.newton._hessian",),
+    "pfemContact": ("model.contact.explicit", "model.contact.near", "model.contact.frames"),
+    "pfemLedger": ("stepper.booking",),
+    "pfemHistory": ("_record",),
+    "pfemSnapshot": ("_snapshot",),
+    "pfemCheckpoint": ("_checkpoint",),
+}
+"""Event: the methods of a simulation that it covers. Those within another are counted in both."""
+
+Method = TypeVar("Method", bound=Callable[..., Any])
+
+
+def staged(method: Method) -> Method:
+    """Decorate a method that belongs to the set-up."""
+
+    @functools.wraps(method)
+    def in_stage(*arguments: Any, **keywords: Any) -> Any:
+        from petsc4py import PETSc
+
+        if not PETSc.Log.isActive():
+            return method(*arguments, **keywords)
+        stage = PETSc.Log.Stage(SET_UP)
+        stage.push()
+        try:
+            return method(*arguments, **keywords)
+        finally:
+            stage.pop()
+
+    return in_stage  # type: ignore[return-value]
+
+
+def lay_over(simulation: Any) -> None:
+    """Lay the stage of the steps and all events over a simulation that is set up, if PETSc logs."""
+    from petsc4py import PETSc
+
+    if not PETSc.Log.isActive():
+        return
+    for name, paths in EVENTS.items():
+        event = PETSc.Log.Event(name)
+        for path in paths:
+            _cover(simulation, path, event.begin, event.end)
+    stage = PETSc.Log.Stage(STEPS)
+    _cover(simulation, "_advance", stage.push, stage.pop)
+
+
+def _cover(root: Any, path: str, begin: Callable[[], None], end: Callable[[], None]) -> None:
+    """Put a method of one object between ``begin`` and ``end``; what this run does not have is passed by."""
+    *way, name = path.split(".")
+    for step in way:
+        root = getattr(root, step, None)
+    method = getattr(root, name, None)
+    if method is None:
+        return
+
+    @functools.wraps(method)
+    def covered(*arguments: Any, **keywords: Any) -> Any:
+        begin()
+        try:
+            return method(*arguments, **keywords)
+        finally:
+            end()
+
+    setattr(root, name, covered)

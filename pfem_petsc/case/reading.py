@@ -25,7 +25,7 @@ M = TypeVar("M", bound=StrictModel)
 
 KEYS = [
     *("title", "mesh", "node_set", "material", "section", "initial", "support"),
-    *("load", "gravity", "temperature", "wall", "time", "output", "solver"),
+    *("load", "gravity", "temperature", "wall", "contact", "time", "output", "solver"),
 ]
 """Keys of a case file at its top."""
 
@@ -77,6 +77,7 @@ def read_tables(data: Mapping[str, Any], folder: Path, problems: Problems) -> di
         "gravity": problems.read(t.Gravity, data["gravity"], ("gravity",)) if "gravity" in data else None,
         "temperature": _listed(t.Temperature, data.get("temperature"), ("temperature",), problems),
         "wall": _walls(data.get("wall"), problems),
+        "contact": problems.read(s.ContactSettings, data.get("contact", {}), ("contact",)),
         "time": _time(data, problems),
         "output": _output(data.get("output", {}), problems),
         "solver": problems.read(s.Solver, data.get("solver", {}), ("solver",)),

@@ -34,7 +34,7 @@ class Case:
     node_set, material, section : tables by name, in the file's order
     initial, support, load, temperature, wall : lists of tables
     gravity : :class:`~pfem_petsc.case.tables.Gravity` or None
-    time, output, solver : tables of :mod:`~pfem_petsc.case.settings`
+    contact, time, output, solver : tables of :mod:`~pfem_petsc.case.settings`
 
     Notes
     -----
@@ -127,6 +127,7 @@ class Case:
             "gravity": _table(self.gravity),
             "temperature": [_table(entry) for entry in self.temperature],
             "wall": [_table(entry) for entry in self.wall],
+            "contact": _table(self.contact),
             "time": {**time, **_table(self.time.scheme)},
             "output": _table(self.output),
             "solver": _table(self.solver),

@@ -9,7 +9,7 @@ from pydantic import Field, InstanceOf, field_validator
 
 from .base import Name, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, StrictModel, listed
 
-__all__ = ["CELL_FIELDS", "POINT_FIELDS", "Output", "OutputKeys", "Probe", "Solver", "Time", "TimeKeys"]
+__all__ = ["CELL_FIELDS", "ContactSettings", "POINT_FIELDS", "Output", "OutputKeys", "Probe", "Solver", "Time", "TimeKeys"]
 
 POINT_FIELDS = ("displacement", "velocity", "acceleration", "contact_force")
 CELL_FIELDS = ("strain", "stress", "axial_force", "plastic_strain", "temperature")
@@ -77,6 +77,13 @@ class Output(OutputKeys):
     """What is written, and how often."""
 
     probe: tuple[Probe, ...] = ()
+
+
+class ContactSettings(StrictModel):
+    """How contact is treated."""
+
+    treatment: Literal["scheme", "stick", "conserving", "mass_redistribution"] = "scheme"
+    """what velocity and acceleration a node has on impact"""
 
 
 class Solver(StrictModel):

@@ -53,6 +53,7 @@ class Contact:
     names : of the walls, in the case's order
     any : whether the case has walls
     moving : (walls,) bool
+    normals : (walls, 3) of flat walls, zero for the others
     log : ContactLog
     state : of the nodes, for walls that must know where nodes come from; set by the stepper
     """
@@ -79,10 +80,10 @@ class Contact:
         self.log = ContactLog(mesh.n_owned, len(walls))
         self.flat = np.array([wall.flat for wall in self.walls], dtype=bool)
         self.partial = any(wall.partial for wall in self.walls)
-        self._normals = np.zeros((len(walls), 3))
+        self.normals = np.zeros((len(walls), 3))
         self._offsets = np.zeros(len(walls))
         for k in np.flatnonzero(self.flat):
-            self._normals[k], self._offsets[k] = self.walls[k].normal, self.walls[k].offset
+            self.normals[k], self._offsets[k] = self.walls[k].normal, self.walls[k].offset
         extent = np.ptp(mesh.points, axis=0).max() if len(mesh.points) else 0.0
         self.length = max(mesh.comm.allgather(float(extent)))
 
@@ -101,14 +102,18 @@ class Contact:
         """Where the walls' centres are (walls, 3) [m]."""
         return np.array([wall.centre for wall in self.walls]).reshape(-1, 3) + self.motion.shifts(time)
 
-    def gaps(self, x: np.ndarray, time: float) -> np.ndarray:
-        """Distances (owned, walls) [m] of positions (owned, 3) from the walls, infinite where a wall is no concern."""
+    def gaps(self, x: np.ndarray, time: float, nodes: np.ndarray | None = None) -> np.ndarray:
+        """Distances (m, walls) [m] of owned nodes at (m, 3) from the walls, infinite where a wall is no concern.
+
+        ``nodes`` (m,) says which they are; default: all of them.
+        """
+        members = self.members if nodes is None else self.members[nodes]
         shifts = self.motion.shifts(time)
         gaps = np.full((len(x), len(self.walls)), np.inf)
         for k in range(len(self.walls)):
             gaps[:, k] = self.gap(k, x, shifts)
             if not self.everyone[k]:
-                gaps[~self.members[:, k], k] = np.inf
+                gaps[~members[:, k], k] = np.inf
         return gaps
 
     def gap(self, k: int, x: np.ndarray, shifts: np.ndarray) -> np.ndarray:
@@ -121,9 +126,9 @@ class Contact:
         near = np.zeros(len(x), dtype=bool)
         if self.flat.any():
             at = self.flat
-            offsets = self._offsets[at] + np.einsum("ij,ij->i", self._normals[at], shifts[at])
+            offsets = self._offsets[at] + np.einsum("ij,ij->i", self.normals[at], shifts[at])
             members = self.members if self.flat.all() else np.ascontiguousarray(self.members[:, at])
-            near_planes(x, self._normals[at], offsets, self.everyone[at], members, reach, near)
+            near_planes(x, self.normals[at], offsets, self.everyone[at], members, reach, near)
         for k in np.flatnonzero(~self.flat):
             near |= (self.gap(k, x, shifts) < reach) & self.members[:, k]
         return near
@@ -219,11 +224,11 @@ class Contact:
             )
         strength = multipliers * stiffness[nodes][:, None]
         force = strength[:, :, None] * normals
-        walls = self._sum(nodes, force, moved, multipliers > 0.0)
+        walls = self.sums(nodes, force, moved, multipliers > 0.0)
         x[nodes] = moved
         return nodes, moved - free, force.sum(axis=1), walls
 
-    def _sum(self, nodes: np.ndarray, force: np.ndarray, x: np.ndarray, touching: np.ndarray) -> WallForces:
+    def sums(self, nodes: np.ndarray, force: np.ndarray, x: np.ndarray, touching: np.ndarray) -> WallForces:
         """Sums of forces (m, w, 3) on nodes at (m, 3)."""
         moment = np.cross(x[:, None, :], force).sum(axis=0)
         return WallForces(force.sum(axis=0), touching.sum(axis=0), moment, nodes, touching)
@@ -279,4 +284,4 @@ class Contact:
     def forces(self, frames: NodalFrames, strengths: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, WallForces]:
         """Forces (m, 3) on the frames' nodes at (m, 3) from normal forces (m, walls), and their sums per wall."""
         force = strengths[:, :, None] * frames.normals
-        return force.sum(axis=1), self._sum(frames.nodes, force, x, strengths > 0.0)
+        return force.sum(axis=1), self.sums(frames.nodes, force, x, strengths > 0.0)

@@ -52,7 +52,12 @@ class NodalFrames:
 
 
 def build_frames(
-    nodes: np.ndarray, fixed: np.ndarray, normals: np.ndarray, offsets: np.ndarray, rank: np.ndarray, tolerance: float = 0.0
+    nodes: np.ndarray,
+    fixed: np.ndarray,
+    normals: np.ndarray,
+    offsets: np.ndarray,
+    rank: np.ndarray,
+    tolerance: float = 0.0,
 ) -> NodalFrames:
     """Frames of nodes from their planes, lowest rank first.
 

@@ -31,3 +31,14 @@ class WallMotion:
             if table is not None:
                 shifts[k] = table(time)
         return shifts
+
+    def rates(self, time: float) -> np.ndarray:
+        """Velocities (w, 3) [m/s] at a time [s]; in a table's kinks, that before."""
+        rates = self._velocities.copy()
+        for k, table in enumerate(self._tables):
+            if table is not None:
+                row = np.searchsorted(table.times, time) - 1
+                inside = 0 <= row < len(table.times) - 1
+                if inside:
+                    rates[k] = np.diff(table.values[row : row + 2], axis=0)[0] / np.diff(table.times[row : row + 2])
+        return rates

@@ -25,6 +25,12 @@ class Scheme(Base):
         state.memory.pop("d0", None)
         state.memory.pop("d1", None)
 
+    def restart(self, state: State, nodes: np.ndarray, h: float) -> None:
+        if "d0" in state.memory:
+            v, a = state.v[nodes], state.a[nodes]
+            state.memory["d0"][nodes] = h * v - (0.5 * h * h) * a
+            state.memory["d1"][nodes] = h * v - (1.5 * h * h) * a
+
     def balance(self, state: State, h: float) -> Balance:
         common = {"a_hat": None, "time": state.time + h, "loads": ((1.0, state.time + h),), "weight": 1.0}
         if "d0" not in state.memory:

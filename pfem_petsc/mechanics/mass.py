@@ -47,6 +47,7 @@ class Inertia:
         self.mesh = mesh
         self.bars = bars
         self.consistent = consistent
+        self.redistribution = None  # of contact nodes' masses; see pfem_petsc.contact.treatments.mass_redistribution
         mass = np.zeros(mesh.n_local)
         damping = np.zeros(mesh.n_local)
         for block in bars.blocks:
@@ -59,6 +60,11 @@ class Inertia:
         if consistent:
             self._u = np.zeros((mesh.n_local, 3))
             self._out = np.zeros((mesh.n_local, 3))
+
+    @property
+    def products(self) -> bool:
+        """Whether M is more than one number for a node, so that it must be multiplied by :meth:`mass_times`."""
+        return self.consistent or self.redistribution is not None
 
     def mass_times(self, a: np.ndarray, out: np.ndarray) -> np.ndarray:
         """``out`` = M a for owned nodes, both (owned, 3). Collective where the mass is consistent."""
@@ -74,6 +80,9 @@ class Inertia:
     def _times(self, u, out, lumped, density):
         if not self.consistent:
             np.multiply(lumped[:, None], u, out=out)
+            if self.redistribution is not None and lumped is self.mass:
+                at = self.redistribution.touched
+                out[at] += np.einsum("kij,kj->ki", self.redistribution.tensors, u[at])
             return out
         owned = self.mesh.n_owned
         self._u[:owned] = u

@@ -9,7 +9,7 @@ The sum of all changes is then the work of the residual, zero up to the solver's
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -57,8 +57,8 @@ class Ledger:
         inertia = self.model.inertia
         ones = np.ones_like(inertia.mass)
         # the loops multiply by these: lumped values, or one where the products with the matrices are given
-        self._mass = ones if inertia.consistent else inertia.mass
-        self._damping = ones if inertia.consistent else inertia.damping
+        self._mass = ones if inertia.products else inertia.mass
+        self._damping = ones if inertia.products else inertia.damping
         self._before = self._moment()
         self._thermal_before()
 
@@ -66,6 +66,9 @@ class Ledger:
         """Book the step just made."""
         after = self._moment()
         before, self._before = self._before, after
+        jumped = 0.0
+        if self.stepper.treatment is not None and self.stepper.treatment.jump is not None:
+            after, jumped = self._before_jump(after)
         stored = after.kinetic - before.kinetic + sum(after.energy[:3]) - sum(before.energy[:3])
         heating = self._heating()
         first, second = (before, after) if self.stepper.scheme.at_ends else 2 * (self._balanced(before),)
@@ -91,7 +94,15 @@ class Ledger:
             works,
         )
         external, contact, damping, inertial, internal = works
+        contact += jumped
         self.work += (external, contact, damping, inertial + internal + heating - stored, heating)
+
+    def _before_jump(self, after: Moment) -> tuple[Moment, float]:
+        """The end of the step before contact changed velocities, and the energy that it gave [J]: work of contact."""
+        jump = self.stepper.treatment.jump
+        a, v = after.a.copy(), after.v.copy()
+        a[jump.nodes], v[jump.nodes] = jump.a, jump.v
+        return replace(after, a=a, v=v, contact=self.stepper.state.contact, kinetic=after.kinetic - jump.energy), jump.energy
 
     @property
     def kinetic(self) -> float:
@@ -102,7 +113,7 @@ class Ledger:
         state, inertia = self.stepper.state, self.model.inertia
         owned = self.model.mesh.n_owned
         a, v, momentum = state.a, state.v, state.v
-        if inertia.consistent:
+        if inertia.products:
             momentum = inertia.mass_times(state.v, np.empty_like(state.v))
             a = inertia.mass_times(state.a, np.empty_like(state.a))
             v = inertia.damping_times(state.v, np.empty_like(state.v))
@@ -114,7 +125,7 @@ class Ledger:
             internal=state.f[:owned].copy(),
             external=state.external,
             support=state.support,
-            contact=state.contact,
+            contact=state.contact + state.memory["contact_change"] if "contact_change" in state.memory else state.contact,
             kinetic=kinetic,
             energy=self.stepper.energy,
         )
@@ -128,7 +139,7 @@ class Ledger:
         if balance.a_hat is not None:
             a += balance.a_hat
         v = balance.eta * u + balance.v_hat if inertia.damped else u
-        if inertia.consistent:
+        if inertia.products:
             a = inertia.mass_times(a, np.empty_like(a))
             v = inertia.damping_times(v, np.empty_like(v))
         internal = before.internal

@@ -8,16 +8,22 @@ from typing import Any
 
 import numpy as np
 
+from ..contact.held_node import held_growth
+from ..contact.treatments.mass_redistribution import redistribute
 from ..errors import InputError
 from ..integrators.base import Scheme
 from ..registry import lookup
 from ..solvers.linear import LinearChoice, choose_linear
 from .explicit import ExplicitStepper
 from .implicit import ImplicitStepper
+from .redistributed import RedistributedStepper
 from .stability import Frequency, highest_frequency
 from .stepper import Stepper
 
 __all__ = ["Plan", "make_plan", "make_stepper"]
+
+CONSERVING = ("newmark", "houbolt", "energy_momentum")
+"""Schemes whose contact force of a step acts in that step alone once its acceleration is taken away."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +117,41 @@ def _steps_to(end: float, step: float) -> int:
 
 
 def make_stepper(model, plan: Plan) -> Stepper:
-    """The stepper of a plan."""
+    """The stepper of a plan, with the case's treatment of impact. Collective.
+
+    Raises
+    ------
+    InputError
+        On all ranks, where the scheme does not go with the treatment.
+    """
+    name = model.case.contact.treatment
+    if name == "scheme" and model.contact.any and (growth := held_growth(plan.scheme)) > 1.0 + 1e-9:
+        model.warnings.append(
+            f"walls: with contact.treatment = \"scheme\" {model.case.time.integrator} with these parameters amplifies the "
+            f"motion of a node that a wall holds (by {growth:.3f} a step): contact chatters and gains energy; take "
+            'contact.treatment = "stick"'
+        )
+    if name == "scheme" or not model.contact.any:
+        return _stepper(model, plan, ExplicitStepper)
+    key = f'{model.case.source}: contact.treatment = "{name}"'
+    if model.inertia.consistent:
+        raise InputError(f'{key}: needs time.mass = "lumped"')
+    if name == "conserving" and model.case.time.integrator not in CONSERVING:
+        raise InputError(f"{key}: goes with the integrators {', '.join(CONSERVING)}")
+    explicit: type[Stepper] = ExplicitStepper
+    if name == "mass_redistribution":
+        if plan.scheme.explicit and not plan.scheme.leads:
+            raise InputError(f"{key}: of the explicit schemes only central_differences can have nodes without mass")
+        if plan.linear is not None and plan.linear.matrix_free:
+            raise InputError(f'{key}: needs solver.operator = "assembled"')
+        model.inertia.redistribution = redistribute(model)
+        explicit = RedistributedStepper
+    stepper = _stepper(model, plan, explicit)
+    stepper.treatment = lookup("pfem_petsc.contact.treatments", name, "contact.treatment").Treatment(stepper)
+    return stepper
+
+
+def _stepper(model, plan: Plan, explicit: type[Stepper]) -> Stepper:
     if plan.linear is None:
-        return ExplicitStepper(model, plan.scheme, plan.step)
+        return explicit(model, plan.scheme, plan.step)
     return ImplicitStepper(model, plan.scheme, plan.step, plan.linear)

@@ -118,6 +118,9 @@ class StepProblem:
                 g += inertia.damping_times(balance.eta * u, self._work)
         else:
             np.multiply(self.nodal[:, None], u, out=g)
+            if inertia.redistribution is not None:
+                moved = inertia.redistribution
+                g[moved.touched] += balance.alpha * np.einsum("kij,kj->ki", moved.tensors, u[moved.touched])
         g += self.known
         if balance.weight:
             self.place(u)
@@ -142,6 +145,8 @@ class StepProblem:
         self.place(self.increment(w))
         if not inertia.consistent:
             matrix.add_lumped(self.nodal, values)
+            if inertia.redistribution is not None:
+                matrix.add_blocks(inertia.redistribution.touched, balance.alpha * inertia.redistribution.tensors, values)
         coefficients = inertia.coefficients(balance.alpha, balance.eta)
         if balance.weight or inertia.consistent:
             bars, arguments = self.model.bars, (balance.weight, coefficients, matrix.pattern, values)

@@ -52,6 +52,7 @@ class Stepper(ABC):
     balance : the last balance
     fault : a failure that only this rank has met yet; raised on all when ranks next meet
     h : the case's time step [s]; ``part`` the part of it being made, ``smallest`` the smallest part of the last step
+    treatment : of impact, None for the scheme's own formulas
     booking : called after each part of a step
     kept_numbers, kept_arrays : names of attributes that, with the state, determine what comes: numbers, and arrays with
         a row for each owned node
@@ -64,6 +65,7 @@ class Stepper(ABC):
         self.model = model
         self.scheme = scheme
         self.h = self.part = self.smallest = h
+        self.treatment = None  # of impact; see pfem_petsc.contact.treatments
         self.booking: Callable[[], None] = lambda: None
         mesh = model.mesh
         owned = mesh.n_owned
@@ -118,6 +120,8 @@ class Stepper(ABC):
         """Advance by ``part``, to the time ``end``."""
         if self.model.temperatures.varying:
             self.model.bars.thermal_at_start[:] = self.model.bars.thermal
+        if self.treatment is not None:
+            self.treatment.before()
         if self.scheme.leads:
             self.scheme.advance(self.state, self.part)
             self._arrive(end)
@@ -125,6 +129,8 @@ class Stepper(ABC):
         else:
             self._solve_and_finish()
             self._arrive(end)
+        if self.treatment is not None:
+            self.treatment.after()
         self.booking()
 
     def _arrive(self, end: float) -> None:

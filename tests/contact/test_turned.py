@@ -50,8 +50,16 @@ def plastic(integrator, parameters):
     material = {"yield_stress": 2e3, "isotropic_hardening": 1e5, "kinematic_hardening": 5e4}
     walls = planes([[0.2, 0.1, 1.0], [1.0, 0.0, 0.5]], [-0.03, -0.04])
     walls.append({"type": "sphere", "point": [0.2, 0.05, -0.25], "radius": 0.2})
-    case = lattice_case(walls, velocity=[-0.5, 0.3, -3.0], spin=[3.0, 10.0, -5.0], integrator=integrator, step=2e-4,
-                        end=0.03, material=material, solver={"rtol": 1e-13})
+    case = lattice_case(
+        walls,
+        velocity=[-0.5, 0.3, -3.0],
+        spin=[3.0, 10.0, -5.0],
+        integrator=integrator,
+        step=2e-4,
+        end=0.03,
+        material=material,
+        solver={"rtol": 1e-13},
+    )
     case["time"] |= parameters
     return case
 

@@ -37,15 +37,20 @@ def test_curved_surfaces_are_distances():
             arm = arm - np.outer(arm @ tube.axis, tube.axis)
         np.testing.assert_allclose(gap, sign * (np.linalg.norm(arm, axis=1) - 0.7), atol=1e-14)
         foot = x - gap[:, None] * normals
-        np.testing.assert_allclose(np.einsum("ij,ij->i", wall.planes(foot)[0], foot) - wall.planes(foot)[1], 0, atol=1e-14)
+        np.testing.assert_allclose(
+            np.einsum("ij,ij->i", wall.planes(foot)[0], foot) - wall.planes(foot)[1], 0, atol=1e-14
+        )
     normals, offsets = ball.planes(np.array([common["point"]]))  # the very centre has no direction of its own
-    assert np.linalg.norm(normals[0]) == 1.0 and normals[0] @ np.array(common["point"]) - offsets[0] == pytest.approx(-0.7)
+    assert np.linalg.norm(normals[0]) == 1.0 and normals[0] @ np.array(common["point"]) - offsets[0] == pytest.approx(
+        -0.7
+    )
 
 
 def test_rectangle_stops_what_comes_through_it():
     wall = rectangle.Wall(
-        rectangle.Parameters(name="w", type="rectangle", point=(0, 0, 1.0), normal=(0, 0, 2.0), along=(1.0, 0, 5.0),
-                             size=(2.0, 1.0))
+        rectangle.Parameters(
+            name="w", type="rectangle", point=(0, 0, 1.0), normal=(0, 0, 2.0), along=(1.0, 0, 5.0), size=(2.0, 1.0)
+        )
     )
     before = np.array([[0.0, 0, 2], [0.9, 0.4, 1.1], [1.1, 0, 2], [0.0, 0.0, 0.5], [0.0, 0, 1.0], [1.9, 0, 2]])
     after = np.array([[0.0, 0, 0], [0.95, 0.45, 0.9], [1.1, 0, 0], [0.0, 0.0, 0.4], [0.0, 0, 0.9], [-0.1, 0, 0]])
@@ -56,8 +61,14 @@ def test_rectangle_stops_what_comes_through_it():
 @pytest.mark.parametrize("integrator, parameters", [EXPLICIT, IMPLICIT])
 def test_rectangle_beside_the_truss(integrator, parameters, comm, shared_tmp_path):
     """A lattice falls on a plate under its left half: only nodes over it are held, the others fall past."""
-    wall = {"type": "rectangle", "name": "plate", "point": [0.0, 0.05, -0.02], "normal": [0, 0, 1.0], "along": [1.0, 0, 0],
-            "size": [0.15, 0.3]}
+    wall = {
+        "type": "rectangle",
+        "name": "plate",
+        "point": [0.0, 0.05, -0.02],
+        "normal": [0, 0, 1.0],
+        "along": [1.0, 0, 0],
+        "size": [0.15, 0.3],
+    }
     case = lattice_case([wall], velocity=[0, 0, -3.0], integrator=integrator, step=2e-4, end=0.05)
     rows, x, _ = run_of(case, comm, shared_tmp_path)
     assert max(row["wall/plate/contacts"] for row in rows) >= 2
@@ -70,8 +81,15 @@ def test_rectangle_beside_the_truss(integrator, parameters, comm, shared_tmp_pat
 def test_ball_stays_on_the_surface(integrator, parameters, comm, shared_tmp_path):
     """While a lattice lies on a sphere, no node is inside of it, and those pressed are on it to 1e-12."""
     wall = {"type": "sphere", "name": "ball", "point": [0.1, 0.05, -0.32], "radius": 0.3}
-    case = lattice_case([wall], velocity=[0.3, 0, -2.0], integrator=integrator, step=2e-4, end=0.02, cells=[2, 2, 1],
-                        solver={"rtol": 1e-12})
+    case = lattice_case(
+        [wall],
+        velocity=[0.3, 0, -2.0],
+        integrator=integrator,
+        step=2e-4,
+        end=0.02,
+        cells=[2, 2, 1],
+        solver={"rtol": 1e-12},
+    )
     run = simulation(case, comm, shared_tmp_path)
     centre, most = np.array(wall["point"]), 0
     for step in run:
@@ -129,8 +147,9 @@ def test_starting_beyond_a_wall_is_refused(comm, shared_tmp_path):
 def test_starting_exactly_on_walls(integrator, parameters, comm, shared_tmp_path):
     """Nodes on a wall at the start stay there under gravity, and the wall carries the weight."""
     walls = planes([[0.0, 0.0, 1.0]], [0.0])
-    case = lattice_case(walls, integrator=integrator, gravity=[0.0, 0.0, -9.81], step=2e-4, end=0.2,
-                        material={"damping": 2e5})
+    case = lattice_case(
+        walls, integrator=integrator, gravity=[0.0, 0.0, -9.81], step=2e-4, end=0.2, material={"damping": 2e5}
+    )
     rows, x, run = run_of(case, comm, shared_tmp_path)
     force = np.array([row["wall/wall1/force"] for row in rows])
     assert force[-1] == pytest.approx([0, 0, 9.81 * run.model.total_mass], rel=1e-3, abs=1e-6)

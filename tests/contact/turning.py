@@ -26,7 +26,17 @@ def with_mesh_file(case, file, turn=None, shake=0.0):
     case["mesh"] = {"file": str(file)}
     tables = [case.get("initial", {}), *case.get("initial", {}).get("on", []), case.get("gravity", {})]
     for table in [*tables, *case.get("wall", []), *case.get("load", [])]:
-        for key in ("velocity", "angular_velocity", "centre", "acceleration", "point", "normal", "axis", "along", "force"):
+        for key in (
+            "velocity",
+            "angular_velocity",
+            "centre",
+            "acceleration",
+            "point",
+            "normal",
+            "axis",
+            "along",
+            "force",
+        ):
             if key in table:
                 table[key] = (turn @ np.array(table[key])).tolist()
     for wall in case.get("wall", []):

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from typing import Annotated
 
 import numpy as np
-from pydantic import Field, field_validator, model_validator
+from pydantic import field_validator, model_validator
 
 from ...case.base import Finite, Vector3, WallParameters, listed
 

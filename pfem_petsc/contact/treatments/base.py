@@ -1,0 +1,89 @@
+"""What treatments of impact share: a hook after each part of a step, and how a jump of velocities is booked.
+
+The treatment ``scheme`` is none at all: velocity and acceleration of held nodes follow the integrator's own formulas.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+
+__all__ = ["Jump", "Treatment"]
+
+
+@dataclass
+class Jump:
+    """Velocities and accelerations of nodes just before a treatment changed them, for the energy ledger.
+
+    Attributes
+    ----------
+    nodes : (m,) owned local indices
+    v, a : (m, 3) before the jump [m/s], [m/s2]
+    energy : kinetic energy that this rank's nodes gained [J]
+    """
+
+    nodes: np.ndarray
+    v: np.ndarray
+    a: np.ndarray
+    energy: float
+
+
+class Treatment(ABC):
+    """Changes what the integrator makes of nodes that walls hold.
+
+    Attributes
+    ----------
+    jump : of the part of a step just made, None where nothing jumped
+    """
+
+    def __init__(self, stepper) -> None:
+        self.stepper = stepper
+        self.jump: Jump | None = None
+
+    def before(self) -> None:
+        """Called before each part of a step; nothing by default."""
+
+    @abstractmethod
+    def after(self) -> None:
+        """Called after each part of a step, before it is booked: changes v, a and memory of the state."""
+
+    def held(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Nodes that walls hold (m,), projections (m, 3, 3) onto their normals, and the walls' velocities (m, 3) [m/s]."""
+        stepper = self.stepper
+        contact, walls = stepper.model.contact, stepper.solution.walls
+        touched = walls.touching.any(axis=1)
+        nodes, touching = walls.nodes[touched], walls.touching[touched]
+        shifts = contact.motion.shifts(stepper.state.time)
+        normals, _ = contact.planes(touching, stepper.state.position[nodes], shifts)
+        normals = np.where(touching[:, :, None], normals, 0.0)
+        # the normals' pseudo-inverse serves any number of walls at a node, parallel ones too
+        inverse = np.linalg.pinv(normals, rcond=1e-8) if len(nodes) else np.zeros((0, 3, normals.shape[1]))
+        speeds = np.einsum("mwi,wi->mw", normals, contact.motion.rates(stepper.state.time))
+        return nodes, inverse @ normals, np.einsum("miw,mw->mi", inverse, speeds)
+
+    def set(self, nodes: np.ndarray, v: np.ndarray, a: np.ndarray) -> None:
+        """Give nodes new velocities and accelerations (m, 3), and keep what they were for the ledger."""
+        stepper, state = self.stepper, self.stepper.state
+        inertia = stepper.model.inertia
+        fixed = stepper.model.supports.fixed[nodes]
+        old_v, old_a = state.v[nodes], state.a[nodes]
+        v, a = np.where(fixed, old_v, v), np.where(fixed, old_a, a)
+        energy = 0.5 * float((inertia.mass[nodes, None] * (v * v - old_v * old_v)).sum())
+        self.jump = Jump(nodes, old_v, old_a, energy)
+        memory = state.memory.setdefault("contact_change", np.zeros_like(state.v))
+        memory[nodes] = inertia.mass[nodes, None] * (a - old_a)
+        if inertia.damped:
+            memory[nodes] += inertia.damping[nodes, None] * (v - old_v)
+        memory[nodes] = np.where(fixed, 0.0, memory[nodes])
+        state.v, state.a = state.v.copy(), state.a.copy()
+        state.v[nodes], state.a[nodes] = v, a
+        stepper.scheme.restart(state, nodes, stepper.part)
+
+    def clear(self) -> None:
+        """Forget the last jump."""
+        self.jump = None
+        change = self.stepper.state.memory.get("contact_change")
+        if change is not None:
+            change[:] = 0.0

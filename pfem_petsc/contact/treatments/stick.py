@@ -1,0 +1,28 @@
+"""Held nodes move with the wall: their normal velocity is the wall's, and they are not accelerated.
+
+On closure a node loses the kinetic energy of its approach, m v_n^2/2, an O(element length) part of the whole; on release
+it starts from rest. Energy never grows by contact with a wall at rest.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .base import Treatment as Base
+
+__all__ = ["Treatment"]
+
+
+class Treatment(Base):
+    """Velocity and acceleration of held nodes as those of the wall."""
+
+    def after(self) -> None:
+        self.clear()
+        state = self.stepper.state
+        nodes, normal, speed = self.held()
+        if len(nodes) == 0:
+            return
+        v, a = state.v[nodes], state.a[nodes]
+        v = v - np.einsum("mij,mj->mi", normal, v) + speed
+        a = a - np.einsum("mij,mj->mi", normal, a)
+        self.set(nodes, v, a)

@@ -1,0 +1,150 @@
+"""Treatments of impact: what each keeps, on the rod whose exact force is constant and which loses no energy."""
+
+import numpy as np
+import pytest
+from lattices import lattice_case, planes, simulation
+
+from pfem_petsc import Case, Simulation
+from pfem_petsc.contact.held_node import held_growth
+from pfem_petsc.errors import InputError
+from pfem_petsc.registry import lookup
+
+TRAPEZOID = {"beta": 0.25, "gamma": 0.5}
+FORCE, ENERGY = 0.1, 0.005  # rho c A v and m v^2/2 of the rod at v = 0.1
+
+
+def rod(treatment, integrator, comm, folder, step=0.01, **parameters):
+    """Largest force over the exact one, energies over that of the start, and the rows."""
+    overrides = [
+        f"time.integrator={integrator}",
+        f"time.step={step}",
+        "output.fields_every=0",
+        f'contact.treatment="{treatment}"',
+        "initial.velocity=[0.1, 0, 0]",
+        "time.end=4.0",
+    ]
+    overrides += [f"time.{name}={value}" for name, value in parameters.items()]
+    run = Simulation(Case.load("rod_impact", overrides), comm, output=folder / "rod", quiet=True)
+    rows = [s.row for s in run]
+    force = max(abs(row["wall/wall/force"][0]) for row in rows) / FORCE
+    energy = np.array([row["kinetic_energy"] + row["elastic_energy"] for row in rows]) / ENERGY
+    assert max(abs(row["energy_imbalance"]) for row in rows) < 1e-10 * ENERGY
+    return force, energy, rows
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("step", [0.005, 0.01, 0.02])
+def test_no_mass_no_spike_explicit(step, comm, shared_tmp_path):
+    """The force spike no longer grows as 1/h, and impact takes no energy."""
+    force, energy, rows = rod("mass_redistribution", "central_differences", comm, shared_tmp_path, step)
+    assert force < 1.35 and energy[-1] == pytest.approx(1.0, abs=3e-3)
+    assert rows[-1]["wall/wall/releases"] == 1
+
+
+@pytest.mark.parametrize("step", [0.01, 0.05])
+@pytest.mark.parametrize("integrator, parameters", [("newmark", TRAPEZOID), ("energy_momentum", {})])
+def test_no_mass_no_spike_implicit(integrator, parameters, step, comm, shared_tmp_path):
+    force, energy, _ = rod("mass_redistribution", integrator, comm, shared_tmp_path, step, **parameters)
+    assert force < 1.35 and energy[-1] == pytest.approx(1.0, abs=3e-3)
+
+
+@pytest.mark.parametrize("integrator, parameters", [("newmark", TRAPEZOID), ("energy_momentum", {})])
+def test_conserving_keeps_energy(integrator, parameters, comm, shared_tmp_path):
+    _, energy, rows = rod("conserving", integrator, comm, shared_tmp_path, **parameters)
+    np.testing.assert_allclose(energy, 1.0, atol=1e-6)
+    assert abs(rows[-1]["contact_work"]) < 1e-9 * ENERGY
+
+
+@pytest.mark.parametrize(
+    "integrator, parameters",
+    [
+        ("newmark", TRAPEZOID),
+        ("newmark", {}),
+        ("houbolt", {}),
+        ("wilson", {"theta": 1.4}),
+        ("chung_lee", {}),
+        ("central_differences", {}),
+        ("generalized_alpha", {}),
+        ("energy_momentum", {}),
+    ],
+)
+def test_stick_never_gains_energy(integrator, parameters, comm, shared_tmp_path):
+    """Also where the scheme's own formulas blow up (trapezoid, wilson 1.4); contact takes the tip's energy, 2.5 %."""
+    _, energy, rows = rod("stick", integrator, comm, shared_tmp_path, **parameters)
+    assert energy.max() <= 1.0 + 1e-6
+    assert rows[-1]["contact_work"] < 0.0
+    if parameters == TRAPEZOID:
+        assert energy[-1] == pytest.approx(0.975, abs=1e-3)
+        assert rows[-1]["contact_work"] == pytest.approx(-0.025 * ENERGY, rel=0.02)
+
+
+def test_own_formulas_of_the_trapezoid_gain_energy(comm, shared_tmp_path):
+    """What the other treatments are for: energy grows tenfold, and the run says so before it starts."""
+    _, energy, _ = rod("scheme", "newmark", comm, shared_tmp_path, **TRAPEZOID)
+    assert energy[-1] > 5.0
+    case = Case.load("rod_impact", ["time.integrator=newmark", "time.beta=0.25", "time.gamma=0.5"])
+    run = Simulation(case, comm, output=shared_tmp_path / "b", quiet=True)
+    assert any("amplifies" in warning for warning in run.model.warnings)
+
+
+@pytest.mark.parametrize(
+    "integrator, parameters, radius",
+    [
+        ("newmark", {}, 0.0),
+        ("wilson", {"theta": 1.4}, 0.778),
+        ("newmark", {"beta": 1 / 6}, None),
+        ("newmark", {"beta": 0.3025, "gamma": 0.6}, 0.82),
+        ("chung_lee", {}, 0.189),
+        ("central_differences", {}, 0.0),
+    ],
+)
+def test_held_node(integrator, parameters, radius):
+    """Spectral radii of the recursion of a held node, by the amplification matrices."""
+    module = lookup("pfem_petsc.integrators", integrator, "")
+    growth = held_growth(module.Scheme(module.Parameters(**parameters)))
+    if radius is None:
+        assert growth > 1.5
+    else:
+        assert growth == pytest.approx(radius, abs=0.03) or (radius < 0.2 and growth < 0.2)
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("integrator", ["central_differences", "newmark"])
+def test_mass_redistribution_of_a_lattice(integrator, comm, shared_tmp_path):
+    """Flat impact on an oblique wall: momentum of the truss changes by the walls' impulse, energy comes back."""
+    walls = planes([[0.0, 0.2, 1.0]], [-0.01], node_set="foot")
+    case = lattice_case(
+        walls,
+        velocity=[0.2, 0.1, -1.0],
+        integrator=integrator,
+        step=2e-4,
+        end=0.03,
+        cells=[2, 2, 1],
+        node_set={"foot": {"box": [[-1, -1, -1e-6], [1, 1, 1e-6]]}},
+        solver={"rtol": 1e-12},
+        contact={"treatment": "mass_redistribution"},
+    )
+    if integrator == "newmark":
+        case["time"] |= TRAPEZOID
+    run = simulation(case, comm, shared_tmp_path)
+    rows = [step.row for step in run]
+    change = rows[-1]["momentum"] - run.model.total_mass * np.array([0.2, 0.1, -1.0])
+    np.testing.assert_allclose(rows[-1]["wall/wall1/impulse"], change, atol=0.02 * abs(change[2]))
+    energy = np.array([row["kinetic_energy"] + row["elastic_energy"] for row in rows])
+    assert np.abs(energy / energy[0] - 1.0).max() < 0.02
+    assert max(abs(row["energy_imbalance"]) for row in rows) < 1e-10 * energy[0]
+    assert max(row["active_contacts"] for row in rows) >= 3
+
+
+@pytest.mark.parametrize(
+    "tables, message",
+    [
+        ({"contact": {"treatment": "conserving"}}, "goes with the integrators newmark"),
+        ({"contact": {"treatment": "mass_redistribution"}}, "must be plane and name a node_set"),
+        ({"contact": {"treatment": "sticky"}}, "contact.treatment"),
+    ],
+)
+def test_refusals(tables, message, comm, shared_tmp_path):
+    case = lattice_case(planes([[0.0, 0.0, 1.0]], [-0.01]), **tables)
+    with pytest.raises(InputError, match=message):
+        simulation(case, comm, shared_tmp_path)

@@ -1,0 +1,33 @@
+"""The energy-momentum scheme keeps energy and both momenta of a tumbling elastic truss."""
+
+import numpy as np
+import pytest
+from runs import energy, imbalance, run
+
+from pfem_petsc import Case
+
+pytestmark = pytest.mark.parallel
+
+
+@pytest.mark.parametrize("strain", ["engineering", "green", "logarithmic"])
+def test_conservation(strain, shared_tmp_path, comm):
+    case = Case.load("tumbling_lattice")
+    material = next(iter(case.material))
+    case = Case.load(
+        "tumbling_lattice",
+        [
+            "time.integrator=energy_momentum",
+            "time.step=2e-4",
+            "time.end=0.04",
+            "solver.rtol=1e-13",
+            "output.fields_every=0",
+            f"material.{material}.strain={strain}",
+        ],
+    )
+    history = run(case, shared_tmp_path)
+    assert history["elastic_energy"].max() > 0.1 * energy(history)[0]
+    assert np.abs(energy(history) / energy(history)[0] - 1.0).max() < 1e-12
+    for name in ("momentum", "angular_momentum"):
+        scale = max(np.linalg.norm(history["angular_momentum"][0]), np.linalg.norm(history[name][0]))
+        assert np.abs(history[name] - history[name][0]).max() < 1e-12 * scale
+    assert imbalance(history) < 1e-12

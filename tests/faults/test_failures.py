@@ -1,0 +1,212 @@
+"""Failures provoked on the way, on two ranks: all end within seconds, with status 3, one message, readable results."""
+
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pfem_petsc.output.result import open_result
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "restart"))
+from kills import environment  # noqa: E402
+
+pytestmark = pytest.mark.slow
+
+SCRIPT = """
+import os, signal, shutil, sys, time
+import numpy as np
+from mpi4py import MPI
+from pfem_petsc.cli.main import main
+from pfem_petsc.stepping import prepare
+from pfem_petsc.stepping.stepper import Stepper
+from pfem_petsc.stepping.explicit import ExplicitStepper
+from pfem_petsc.stepping.implicit import ImplicitStepper
+rank = MPI.COMM_WORLD.rank
+folder = sys.argv[sys.argv.index("-o") + 1]
+
+{before}
+def provoke(stepper):
+    state = stepper.state
+{body}
+
+def watched(step):
+    def wrapper(self):
+        if self.state.step == {at}:
+            if rank == 0:
+                print("provoked", time.time(), flush=True)
+            provoke(self)
+        step(self)
+    return wrapper
+
+for kind in (ExplicitStepper, ImplicitStepper):
+    kind.step = watched(kind.step)
+sys.exit(main(sys.argv[1:]))
+"""
+
+ROD = ["rod_impact", "--quiet", "--set", "time.end=1000", "mesh.elements=40"]
+LIMIT = 10.0  # seconds from the fault to the end of the last rank
+
+
+def fail(on_ranks, tmp_path, body, *words, at=57, folder=None, before=""):
+    """Run with a fault before step ``at`` + 1; gives the finished process and the seconds it took from there."""
+    script, folder = tmp_path / "fault.py", folder or tmp_path / "out"
+    lines = "\n".join(f"    {line}" for line in body.splitlines())
+    script.write_text(SCRIPT.format(body=lines, at=at, before=before))
+    done = on_ranks(2, script, *words, "-o", folder, timeout=150.0, cwd=tmp_path)
+    end = time.time()
+    provoked = [line for line in done.stdout.splitlines() if line.startswith("provoked")]
+    assert provoked, done.stderr
+    return done, end - float(provoked[0].split()[1])
+
+
+def run_on_ranks(ranks, *arguments, timeout, cwd):
+    """As ``on_ranks``, where a killed rank is no time-out."""
+    line = ["mpirun", "-n", str(ranks), sys.executable, *map(str, arguments)]
+    return subprocess.run(line, env=environment(), capture_output=True, text=True, timeout=timeout, cwd=cwd)
+
+
+def assert_told(done, seconds, *texts, status=3):
+    assert done.returncode == status, done.stderr
+    said = [line for line in done.stderr.splitlines() if "error: " in line]
+    assert len(said) == 1, done.stderr
+    for text in texts:
+        assert text in said[0]
+    assert "Traceback" not in done.stderr
+    assert seconds < LIMIT
+
+
+def assert_results(folder, last):
+    """Readable, with sound numbers up to about the step of the fault."""
+    with open_result(folder) as result:
+        assert len(result.times) >= 1
+        assert np.isfinite(result.positions(-1)).all()
+        steps = result.history["step"]
+        np.testing.assert_array_equal(np.diff(steps), steps[1] - steps[0])
+        assert last - 10 <= steps[-1] <= last + 100
+        for name in result.history:
+            assert np.isfinite(np.asarray(result.history[name], dtype=float)).all(), name
+
+
+@pytest.mark.parametrize("failing", [0, 1])
+def test_exception_on_one_rank(on_ranks, tmp_path, failing):
+    """The other rank waits in an exchange of ghosts that never ends."""
+    body = f"if rank == {failing}: raise ZeroDivisionError('surprise')"
+    done, seconds = fail(on_ranks, tmp_path, body, *ROD)
+    assert_told(done, seconds, f"rank {failing}: ", "ZeroDivisionError: surprise")
+    with open_result(tmp_path / "out") as result:
+        assert result.times[-1] == pytest.approx(0.5)
+
+
+def test_killed_rank(tmp_path):
+    """The launcher ends the others; the status is its own."""
+    body = "if rank == 1: os.kill(os.getpid(), signal.SIGKILL)"
+    done, seconds = fail(run_on_ranks, tmp_path, body, *ROD)
+    assert done.returncode not in (0, 2, 4)
+    assert seconds < LIMIT
+    with open_result(tmp_path / "out") as result:
+        assert result.times[-1] == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("every", [1, 100_000])
+def test_positions_that_are_no_numbers(on_ranks, tmp_path, every):
+    """Found also where no history row is written, and told with the bar."""
+    body = "if rank == 1: state.memory['half_velocity'][0] = np.nan"
+    words = (f"output.history_every={every}", "output.fields_every=0")
+    done, seconds = fail(on_ranks, tmp_path, body, *ROD, *words)
+    assert_told(done, seconds, "blew up", "bar ", "nodes ", "take a smaller time step", "step ")
+    said = done.stderr.partition("step ")[2]
+    assert 57 <= int(said.partition(",")[0]) <= 57 + 101
+    with open_result(tmp_path / "out") as result:
+        assert len(result.times) == 1
+        assert np.isfinite(result.positions(-1)).all()
+        assert result.history["step"][-1] == (57 if every == 1 else 0)
+
+
+def test_unstable_step(on_ranks, tmp_path):
+    """The frequency is taken for half of what it is, as where a structure stiffens far beyond its first state."""
+    halved = "found = prepare.highest_frequency\nprepare.highest_frequency = lambda *given: type(found(*given))("
+    halved += "*(0.5 * frequency for frequency in found(*given)))\n"
+    # two per cent above the limit, so that it takes some steps; stiff, so that the bar is far from zero length then
+    words = ["pendulum", "--quiet", "--set", "material.default.young_modulus=1e10", "time.step=4.56e-4"]
+    done, seconds = fail(on_ranks, tmp_path, "pass", *words, at=1, before=halved)
+    assert_told(done, seconds, "the integration has created", "the motion is unstable", "at node", "smaller time.step")
+    with open_result(tmp_path / "out") as result:
+        kinetic = result.history["kinetic_energy"]
+        assert np.isfinite(kinetic).all()
+        assert 10 < len(kinetic) < 200
+
+
+@pytest.mark.parametrize("integrator", ["central_differences", "newmark"])
+def test_collapsed_bar(on_ranks, tmp_path, integrator):
+    """The rod hits the wall at five times its wave speed."""
+    words = ("initial.velocity=[5,0,0]", "time.step=0.002", f"time.integrator={integrator}", "time.end=1")
+    done, seconds = fail(on_ranks, tmp_path, "pass", *ROD, *words, at=3)
+    assert_told(done, seconds, "step ", "bar 39 between nodes 39 and 40", "the impact is too strong")
+    with open_result(tmp_path / "out") as result:
+        assert np.isfinite(result.positions(-1)).all()
+
+
+def test_singular_system(on_ranks, tmp_path):
+    """Neither stiffness nor mass: no step, however small, has a solution."""
+    body = "stepper.hessian.fill = lambda write: (stepper.hessian.mat.zeroEntries(), stepper.hessian.mat.assemble())"
+    done, seconds = fail(on_ranks, tmp_path, body, *ROD, "time.integrator=newmark", "time.end=2")
+    assert_told(done, seconds, "step 58", "no convergence", "halved 10 times")
+    assert_results(tmp_path / "out", 57)
+
+
+def test_folder_that_vanishes(on_ranks, tmp_path):
+    done, seconds = fail(on_ranks, tmp_path, "if rank == 0: os.rename(folder, folder + '-gone')", *ROD)
+    assert_told(done, seconds, "result.vtkhdf: gone or unreachable during the run")
+    assert_results(tmp_path / "out-gone", 57)
+
+
+def test_full_disk(on_ranks, tmp_path):
+    folder = tmp_path / "small"
+    folder.mkdir()
+    try:
+        subprocess.run(["mount", "-t", "tmpfs", "-o", "size=4m", "tmpfs", folder], check=True, capture_output=True)
+    except (FileNotFoundError, subprocess.CalledProcessError) as error:
+        pytest.skip(f"cannot mount a small file system: {error}")
+    try:
+        begin = time.monotonic()
+        done, _ = fail(on_ranks, tmp_path, "pass", *ROD, "output.fields_every=1", at=1, folder=folder / "out")
+        assert time.monotonic() - begin < 120.0
+        assert_told(done, 0.0, "disk full", "make room and continue with --restart")
+        shutil.copytree(folder / "out", tmp_path / "kept")
+    finally:
+        subprocess.run(["umount", "-l", folder], check=True)
+    with open_result(tmp_path / "kept") as result:
+        assert len(result.times) > 10
+        np.testing.assert_array_equal(result.steps, range(len(result.times)))
+        assert np.isfinite(result.positions(-1)).all()
+
+
+def test_full_disk_at_a_checkpoint(on_ranks, tmp_path):
+    """The results are whole, and the checkpoint before stays."""
+    folder = tmp_path / "small"
+    folder.mkdir()
+    try:
+        subprocess.run(["mount", "-t", "tmpfs", "-o", "size=4m", "tmpfs", folder], check=True, capture_output=True)
+    except (FileNotFoundError, subprocess.CalledProcessError) as error:
+        pytest.skip(f"cannot mount a small file system: {error}")
+    try:
+        body = (
+            "import shutil as s\n"
+            "if rank == 0:\n"
+            "    free = s.disk_usage(folder).free\n"
+            "    with open(os.path.join(folder, 'filler'), 'wb') as file: file.write(bytes(max(0, free - 700_000)))"
+        )
+        words = ("output.fields_every=0", "output.history_every=100000", "output.checkpoint_every=50")
+        done, seconds = fail(on_ranks, tmp_path, body, *ROD, *words, folder=folder / "out")
+        assert_told(done, seconds, "checkpoint", "disk full")
+        (folder / "out" / "filler").unlink()
+        again = on_ranks(
+            2, "-m", "pfem_petsc", *ROD, *words, "time.end=2", "-o", folder / "out", "--restart", timeout=120.0
+        )
+        assert again.returncode == 0, again.stderr
+    finally:
+        subprocess.run(["umount", "-l", folder], check=True)

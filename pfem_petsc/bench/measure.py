@@ -35,6 +35,8 @@ class Record:
     traffic : bytes that a step moves at least
     share : percent of the bandwidth of all ranks that this traffic needs at the median
     memory : highest growth of resident memory, all ranks together
+    ghosts, neighbours : nodes of others and ranks to exchange with, most of any rank
+    evaluated : bars evaluated on all ranks together; those between two ranks are evaluated on both
     """
 
     job: str
@@ -53,6 +55,9 @@ class Record:
     traffic: float
     share: float
     memory: float
+    ghosts: int
+    neighbours: int
+    evaluated: int
     solver: str
 
     @property
@@ -131,5 +136,8 @@ def time_job(
         traffic=traffic,
         share=100.0 * traffic / bandwidth.together / comm.bcast(middle) if bandwidth else 0.0,
         memory=grown,
+        ghosts=max(comm.allgather(mesh.n_local - mesh.n_owned)),
+        neighbours=max(comm.allgather(mesh.n_neighbours)),
+        evaluated=comm.allreduce(len(mesh.bars)),
         solver=plan.linear.why if plan.linear is not None else "none",
     )

@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING, Any
 
 from .bandwidth import BYTES_PER_ELEMENT, Bandwidth
 from .measure import Record
+from .messages import Messages
 from .traffic import ASSUMED
 
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-__all__ = ["HEADER", "bandwidth_line", "document", "line", "memory_slopes", "processor"]
+__all__ = ["HEADER", "bandwidth_line", "document", "line", "memory_slopes", "messages_line", "processor"]
 
 _FORMAT = "{:18} {:>11} {:>9} {:>9} {:>9} {:>8} {:>6} {:>6} {:>6} {:>7} {:>6} {:>6}"
 _NAMES = (
@@ -65,6 +66,14 @@ def bandwidth_line(bandwidth: Bandwidth) -> str:
     return text
 
 
+def messages_line(messages: Messages) -> str:
+    """What messages cost, in words."""
+    return (
+        f"messages: latency {1e6 * messages.latency:.1f} us, {messages.bandwidth / 1e9:.1f} GB/s, "
+        f"a sum over all ranks {1e6 * messages.reduction:.1f} us"
+    )
+
+
 def memory_slopes(records: list[Record]) -> dict[str, float]:
     """Bytes a bar between the two largest sizes of each job, where it was run at two."""
     slopes = {}
@@ -86,7 +95,9 @@ def processor() -> str:
     return platform.processor() or platform.machine()
 
 
-def document(comm: MPI.Comm, bandwidth: Bandwidth, records: list[Record], tiny: list[Record]) -> str:
+def document(
+    comm: MPI.Comm, bandwidth: Bandwidth, messages: Messages | None, records: list[Record], tiny: list[Record]
+) -> str:
     """All that was measured, as JSON."""
     from ..output.provenance import describe_run
 
@@ -100,6 +111,7 @@ def document(comm: MPI.Comm, bandwidth: Bandwidth, records: list[Record], tiny: 
             "ratio": bandwidth.ratio,
             "bytes_per_element": BYTES_PER_ELEMENT,
         },
+        "messages": messages._asdict() if messages is not None else None,
         "bytes_assumed": ASSUMED,
         "runs": [asdict(record) | {"bars_per_second": record.rate} for record in records],
         "memory_slopes": memory_slopes(records),

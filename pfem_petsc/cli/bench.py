@@ -63,7 +63,8 @@ def run(arguments: argparse.Namespace, comm: MPI.Comm) -> int:
     from ..bench.cases import cells_for
     from ..bench.jobs import jobs, tiny_jobs
     from ..bench.measure import time_job
-    from ..bench.report import HEADER, bandwidth_line, document, line, memory_slopes, processor
+    from ..bench.messages import measure_messages
+    from ..bench.report import HEADER, bandwidth_line, document, line, memory_slopes, messages_line, processor
 
     if not 0.0 < arguments.seconds < float("inf"):
         raise InputError(f"--seconds {arguments.seconds}: give a positive time")
@@ -75,7 +76,9 @@ def run(arguments: argparse.Namespace, comm: MPI.Comm) -> int:
 
     say(f"{processor()}, {comm.size} rank{'s' if comm.size > 1 else ''}, {arguments.kind} lattices")
     bandwidth = measure_bandwidth(comm)
-    say(bandwidth_line(bandwidth) + "\n")
+    say(bandwidth_line(bandwidth))
+    messages = measure_messages(comm)
+    say(messages_line(messages) + "\n" if messages is not None else "")
     chosen = jobs(
         arguments.jobs,
         arguments.explicit,
@@ -100,7 +103,7 @@ def run(arguments: argparse.Namespace, comm: MPI.Comm) -> int:
     for record in tiny:
         say(f"outside the loops over bars and nodes: {1e6 * record.median:.0f} us a step ({record.job})")
     if arguments.output is not None and comm.rank == 0:
-        arguments.output.write_text(document(comm, bandwidth, records, tiny), encoding="utf-8")
+        arguments.output.write_text(document(comm, bandwidth, messages, records, tiny), encoding="utf-8")
     return 0
 
 

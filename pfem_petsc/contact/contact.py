@@ -10,6 +10,7 @@ import numpy as np
 from ..errors import InputError, SimulationFailure
 from ..parallel.agreement import agreed
 from ..registry import lookup
+from .friction import add_friction
 from .frames import NodalFrames, build_frames
 from .log import ContactLog
 from .motion import WallMotion
@@ -55,6 +56,7 @@ class Contact:
     moving : (walls,) bool
     normals : (walls, 3) of flat walls, zero for the others
     log : ContactLog
+    restitution, friction, static_friction : (walls,); rough : whether any wall has friction
     state : of the nodes, for walls that must know where nodes come from; set by the stepper
     """
 
@@ -78,6 +80,11 @@ class Contact:
                 self.members[:, k] = False
                 self.members[nodes[wall.node_set], k] = True
         self.log = ContactLog(mesh.n_owned, len(walls))
+        self.friction = np.array([wall.friction for wall in walls], dtype=np.float64)
+        static = [wall.friction if wall.static_friction is None else wall.static_friction for wall in walls]
+        self.static_friction = np.array(static, dtype=np.float64)
+        self.restitution = np.array([wall.restitution for wall in walls], dtype=np.float64)
+        self.rough = bool(self.static_friction.any())
         self.flat = np.array([wall.flat for wall in self.walls], dtype=bool)
         self.partial = any(wall.partial for wall in self.walls)
         self.normals = np.zeros((len(walls), 3))
@@ -201,14 +208,19 @@ class Contact:
         (nodes, correction (m, 3) [m], force (m, 3) [N] by the walls, WallForces)
         """
         shifts = self.motion.shifts(time)
-        nodes = np.flatnonzero(self.near(x, shifts))
+        near = self.near(x, shifts)
+        if self.restitution.any():
+            near |= self._returning()
+        nodes = np.flatnonzero(near)
         if len(nodes) == 0:
             return nodes, np.empty((0, 3)), np.empty((0, 3)), self.none()
         free = x[nodes]
         concerned = self.concerned(nodes, free, shifts)
         at = free
+        rebound = self._rebound(nodes)
         for _ in range(_CURVED_ROUNDS):
             normals, offsets = self.planes(concerned, at, shifts)
+            offsets += rebound
             moved, multipliers = free.copy(), np.zeros(offsets.shape)
             stuck = project(moved, self.fixed[nodes], normals, offsets, tolerance, multipliers)
             if stuck >= 0:
@@ -224,9 +236,62 @@ class Contact:
             )
         strength = multipliers * stiffness[nodes][:, None]
         force = strength[:, :, None] * normals
-        walls = self.sums(nodes, force, moved, multipliers > 0.0)
+        if self.rough:
+            moved, force = self._rub(nodes, free, shifts, (normals, offsets), stiffness[nodes], moved, strength, time)
+        if self.restitution.any():
+            self._remember_approach(nodes, free, shifts, normals, strength)
+        walls = self.sums(nodes, force, moved, np.einsum("mwi,mwi->mw", force, normals) > 0.0)
         x[nodes] = moved
         return nodes, moved - free, force.sum(axis=1), walls
+
+    def _returning(self) -> np.ndarray:
+        """(owned,) bool: nodes that hit a wall with restitution in the last step."""
+        rebound = self.state.memory.get("rebound")
+        return (rebound > 0.0).any(axis=1) if rebound is not None else np.zeros(len(self.members), dtype=bool)
+
+    def _rebound(self, nodes: np.ndarray) -> np.ndarray:
+        """Distances (m, walls) [m] from walls that nodes get to in this step, having hit them in the last."""
+        rebound = self.state.memory.get("rebound") if self.restitution.any() else None
+        return rebound[nodes] if rebound is not None else np.zeros((len(nodes), len(self.walls)))
+
+    def _remember_approach(self, nodes, free, shifts, normals, strength) -> None:
+        """Who hits a wall with restitution in this step, and how far it gets from it in the next [m]."""
+        state = self.state
+        rebound = state.memory.setdefault("rebound", np.zeros((len(self.members), len(self.walls))))
+        way = shifts - self.motion.shifts(state.time)
+        approach = -np.einsum("mwi,mwi->mw", normals, (free - state.position[nodes])[:, None, :] - way)
+        fresh = (strength > 0.0) & ~self.log.touching[nodes]
+        rebound[:] = 0.0
+        rebound[nodes] = np.where(fresh, self.restitution * np.maximum(approach, 0.0), 0.0)
+
+    def _rub(self, nodes, free, shifts, planes, stiffness, moved, strength, time) -> tuple[np.ndarray, np.ndarray]:
+        """Positions and forces (m, w, 3) with friction, from those without; curved walls by tangent planes at the result."""
+        state = self.state
+        way = shifts - self.motion.shifts(state.time)
+        before, fixed = state.position[nodes], self.fixed[nodes]
+        normals, offsets = planes
+        concerned = offsets > -np.inf
+        tolerance = 1e-13 * self.length
+        for _ in range(_CURVED_ROUNDS):
+            at, pressing, drag = moved.copy(), strength.copy(), np.zeros(normals.shape)
+            unsettled = add_friction(
+                at, before, way, fixed, normals, offsets, self.friction, self.static_friction, stiffness, pressing, drag
+            )
+            if unsettled >= 0:
+                raise SimulationFailure(
+                    f"the friction of node {self.mesh.node_ids[nodes[unsettled]]} at time {time:.6g} s on several walls was "
+                    "not settled; take a smaller time step"
+                )
+            if self.flat.all():
+                break
+            normals_there, offsets = self.planes(concerned, at, shifts)
+            if np.abs(normals_there - normals).max() <= 1e-14:
+                break
+            normals = normals_there
+            moved, multipliers = free.copy(), np.zeros(offsets.shape)
+            project(moved, fixed, normals, offsets, tolerance, multipliers)
+            strength = multipliers * stiffness[:, None]
+        return at, pressing[:, :, None] * normals + drag
 
     def sums(self, nodes: np.ndarray, force: np.ndarray, x: np.ndarray, touching: np.ndarray) -> WallForces:
         """Sums of forces (m, w, 3) on nodes at (m, 3)."""

@@ -124,6 +124,7 @@ def make_stepper(model, plan: Plan) -> Stepper:
     InputError
         On all ranks, where the scheme does not go with the treatment.
     """
+    _check_walls(model, plan)
     name = model.case.contact.treatment
     if name == "scheme" and model.contact.any and (growth := held_growth(plan.scheme)) > 1.0 + 1e-9:
         model.warnings.append(
@@ -149,6 +150,19 @@ def make_stepper(model, plan: Plan) -> Stepper:
     stepper = _stepper(model, plan, explicit)
     stepper.treatment = lookup("pfem_petsc.contact.treatments", name, "contact.treatment").Treatment(stepper)
     return stepper
+
+
+def _check_walls(model, plan: Plan) -> None:
+    """Refuse what a wall asks for and the scheme cannot do."""
+    for k, name in enumerate(model.contact.names):
+        key = f"{model.case.source}: wall {name!r}"
+        if model.contact.static_friction[k] and plan.linear is not None:
+            raise InputError(f"{key}: friction needs an explicit integrator with lumped mass")
+        if model.contact.restitution[k] and not (plan.linear is None and plan.scheme.leads):
+            raise InputError(f"{key}: restitution needs central_differences with lumped mass")
+        explicit_only = model.contact.static_friction[k] or model.contact.restitution[k]
+        if explicit_only and model.case.contact.treatment != "scheme":
+            raise InputError(f'{key}: friction and restitution need contact.treatment = "scheme"')
 
 
 def _stepper(model, plan: Plan, explicit: type[Stepper]) -> Stepper:

@@ -6,9 +6,9 @@ from abc import ABC, abstractmethod
 from typing import Annotated
 
 import numpy as np
-from pydantic import field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
-from ...case.base import Finite, Vector3, WallParameters, listed
+from ...case.base import Finite, NonNegativeFloat, Vector3, WallParameters, listed
 
 __all__ = ["BaseWall", "WallKeys", "direction"]
 
@@ -25,6 +25,14 @@ class WallKeys(WallParameters):
     adjust: bool = False
     """true: nodes that start beyond the wall are moved onto it, unstressed bars included"""
 
+    friction: NonNegativeFloat = 0.0
+    """coefficient of Coulomb friction"""
+    static_friction: NonNegativeFloat | None = None
+    """coefficient below which a node sticks; default: as friction, and no less"""
+
+    restitution: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    """part of the normal velocity with which a node leaves that hits the wall"""
+
     @field_validator("motion")
     @classmethod
     def _times_increase(cls, rows: tuple | None) -> tuple | None:
@@ -39,6 +47,8 @@ class WallKeys(WallParameters):
     def _moves_one_way(self) -> WallKeys:
         if self.velocity is not None and self.motion is not None:
             raise ValueError("expected at most one of the keys velocity, motion")
+        if self.static_friction is not None and self.static_friction < self.friction:
+            raise ValueError(f"static_friction must be no less than friction = {self.friction!r}")
         return self
 
 

@@ -1,0 +1,112 @@
+"""Coulomb friction of nodes on walls in explicit steps.
+
+Each wall k presses a node with lambda_k >= 0 along its normal and drags it by tau_k in its plane. With the slip s_k of the
+step, which is the node's motion relative to the wall in the wall's plane: the node sticks (s_k = 0) where
+|tau_k| <= mu_static lambda_k does it, else it slips and tau_k = -mu lambda_k s_k/|s_k|. On one wall this is solved exactly;
+several walls at a node are swept until nothing changes.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ..mechanics.compiled import kernel
+
+__all__ = ["add_friction"]
+
+_SWEEPS = 2000
+
+
+@kernel
+def add_friction(x, before, way, fixed, normals, offsets, dynamic, static, stiffness, pressing, drag):
+    """Drag the nodes that walls with friction press.
+
+    Parameters
+    ----------
+    x : (m, 3) positions as the walls' normal forces leave them, changed in place [m]
+    before : (m, 3) positions at the start of the step [m]
+    way : (w, 3) motion of the walls in the step [m]
+    fixed : (m, 3) bool, components that supports prescribe
+    normals, offsets : (m, w, 3), (m, w) planes n . x >= d; -inf where a wall is no concern
+    dynamic, static : (w,) coefficients of friction
+    stiffness : (m,) force for a displacement of the node [N/m]
+    pressing : (m, w) normal forces [N], changed in place
+    drag : (m, w, 3) tangential forces, out [N]
+
+    Returns
+    -------
+    int
+        First node whose walls were not settled, or -1.
+    """
+    m, w = offsets.shape
+    trial = np.zeros(3)
+    unsettled = -1
+    for i in range(m):
+        rubbing = False
+        for k in range(w):
+            for c in range(3):
+                drag[i, k, c] = 0.0
+            if pressing[i, k] > 0.0:
+                rubbing = rubbing or static[k] > 0.0
+        if not rubbing:
+            continue
+        soft = 1.0 / stiffness[i]
+        reach = stiffness[i] * (
+            abs(x[i, 0]) + abs(x[i, 1]) + abs(x[i, 2])
+        )  # what rounding of positions makes of forces
+        settled = False
+        for _ in range(_SWEEPS):
+            change = 0.0
+            largest = 0.0
+            for k in range(w):
+                if offsets[i, k] == -math.inf:
+                    continue
+                length = 0.0
+                gap = -offsets[i, k]
+                for c in range(3):
+                    gap += normals[i, k, c] * x[i, c]
+                    if not fixed[i, c]:
+                        length += normals[i, k, c] * normals[i, k, c]
+                if length < 1e-12:
+                    continue
+                # normal
+                old = pressing[i, k]
+                new = max(0.0, old - gap * stiffness[i] / length)
+                if new == 0.0 and old == 0.0:
+                    continue
+                for c in range(3):
+                    if not fixed[i, c]:
+                        x[i, c] += (new - old) * normals[i, k, c] * soft
+                pressing[i, k] = new
+                change = max(change, abs(new - old))
+                largest = max(largest, new)
+                # tangential: the force that would end the slip, and what the wall can give of it
+                if static[k] == 0.0:
+                    continue
+                slip = 0.0
+                for c in range(3):
+                    trial[c] = x[i, c] - before[i, c] - way[k, c]
+                    slip += trial[c] * normals[i, k, c]
+                size = 0.0
+                for c in range(3):
+                    trial[c] = drag[i, k, c] - stiffness[i] * (trial[c] - slip * normals[i, k, c])
+                    size += trial[c] * trial[c]
+                size = math.sqrt(size)
+                factor = 1.0
+                if size > static[k] * new:
+                    factor = dynamic[k] * new / size
+                for c in range(3):
+                    force = factor * trial[c]
+                    move = force - drag[i, k, c]
+                    drag[i, k, c] = force
+                    if not fixed[i, c]:
+                        x[i, c] += move * soft
+                    change = max(change, abs(move))
+            if change <= 1e-15 * (largest + reach) or largest == 0.0:
+                settled = True
+                break
+        if not settled and unsettled < 0:
+            unsettled = i
+    return unsettled

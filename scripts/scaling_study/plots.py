@@ -17,7 +17,7 @@ def plot_study(rows: list[dict], study: str, path: Path) -> None:
     series = {key: value for key, value in series_of(rows).items() if key[0] == study}
     if not series:
         return
-    figure, axes = plt.subplots(figsize=(7.5, 5.0), constrained_layout=True)
+    figure, axes = plt.subplots(figsize=(7.5, 6.0), constrained_layout=True)
     for number, ((_, kind, job, integrator, size), points) in enumerate(series.items()):
         colour = f"C{number % 10}"
         ranks = [row["ranks"] for row in points]
@@ -41,6 +41,6 @@ def plot_study(rows: list[dict], study: str, path: Path) -> None:
     axes.set_xticks(every, [str(r) for r in every])
     axes.minorticks_off()
     axes.grid(True, which="major", alpha=0.3)
-    axes.legend(fontsize=7)
+    figure.legend(loc="outside lower center", ncols=2, fontsize=7)
     figure.savefig(path, dpi=150)
     plt.close(figure)

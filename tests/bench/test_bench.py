@@ -1,0 +1,108 @@
+"""The bench: its lattices, its bytes, its memory, its verb."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from pfem_petsc.bench.cases import KINDS, PITCH, WAVE_SPEED, Job, bars_of, cells_for, make_case
+from pfem_petsc.bench.memory import PeakMemory
+from pfem_petsc.bench.traffic import bytes_per_step
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("cells", [1, 3])
+def test_bars_are_those_of_the_generator(kind, cells):
+    from pfem_petsc.mesh.generators import lattice
+
+    slab = lattice.generate(lattice.Parameters(kind=kind, cells=(cells, cells, cells), pitch=1.0), 0, 1)
+    assert len(slab.bars) == bars_of(kind, cells)
+
+
+def test_nearest_lattice():
+    assert [cells_for("cubic", bars) for bars in (1, 10_000, 100_000, 1_000_000)] == [1, 10, 22, 48]
+    for kind in KINDS:
+        found = bars_of(kind, cells_for(kind, 5000))
+        assert all(abs(found - 5000) <= abs(bars_of(kind, n) - 5000) for n in range(1, 20))
+
+
+def test_explicit_bytes_by_hand():
+    # ends 2 x 4 B and rest length 8 B a bar; x, v, f read and written and mass read a node
+    assert bytes_per_step(
+        100, 10, implicit=False, assembled=False, plastic=False, newton=0, linear=0
+    ) == 100 * 16 + 10 * (2 * 3 * 24 + 8)
+
+
+def test_a_matrix_moves_more_than_bars():
+    # a product on the cubic lattice: 9 x (1 + 2 x 8.8)/8.8 entries of 12 B a bar against 48 B
+    counts = {"implicit": True, "plastic": False, "newton": 0.0}
+    per_product = [
+        bytes_per_step(8800, 1000, assembled=assembled, linear=1.0, **counts)
+        - bytes_per_step(8800, 1000, assembled=assembled, linear=0.0, **counts)
+        for assembled in (False, True)
+    ]
+    assert per_product[1] - per_product[0] == pytest.approx(9 * (1000 + 2 * 8800) * 12 - 48 * 8800)
+
+
+def test_memory_sees_what_was_used_and_freed():
+    size = 200_000_000
+    array = np.ones(size // 8)  # a peak before the one that is measured
+    del array
+    memory = PeakMemory()
+    array = np.ones(size // 16)
+    # the kernel counts pages with an error of some dozen
+    assert 0.49 * size <= memory.growth() < 0.6 * size
+    del array
+    assert 0.49 * size <= memory.growth() < 0.6 * size
+
+
+def test_contact_jobs_touch_the_floor_in_every_step(tmp_path):
+    from pfem_petsc import Simulation
+
+    job = Job("contact", "central_differences", contact=True, plastic=True, step=0.02 * PITCH / WAVE_SPEED)
+    simulation = Simulation(make_case(job, "cubic", 3, 100), output=tmp_path, quiet=True)
+    assert all(simulation.row["active_contacts"] == 16 for _ in simulation)
+
+
+def bench(*options):
+    command = [sys.executable, "-m", "pfem_petsc", "bench", *options]
+    return subprocess.run(command, capture_output=True, text=True, timeout=240)
+
+
+def test_the_verb_writes_what_it_measured(tmp_path):
+    path = tmp_path / "bench.json"
+    done = bench("--sizes", "100", "1000", "--seconds", "0.05", "-o", str(path))
+    assert done.returncode == 0, done.stderr
+    found = json.loads(path.read_text())
+    assert found["bandwidth"]["alone"] > 1e8
+    assert [run["job"] for run in found["runs"]] == 2 * [
+        "explicit",
+        "explicit_contact",
+        "matrix_free",
+        "assembled",
+        "implicit_contact",
+    ]
+    for run in found["runs"]:
+        assert run["best"] <= run["median"]
+        assert run["bars_per_second"] == pytest.approx(run["bars"] / run["median"])
+        assert run["share"] == pytest.approx(100 * run["traffic"] / found["bandwidth"]["together"] / run["median"])
+        assert (run["newton"] > 0) == (run["job"] in ("matrix_free", "assembled", "implicit_contact"))
+        assert f"{run['bars']:,}" in done.stdout
+    assert {record["job"] for record in found["overhead"]} == {"tiny", "tiny, history every 10", "tiny, contact"}
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--sizes", "0"), "not a positive whole number"),
+        (("--seconds", "-1"), "positive"),
+        (("--sizes", "10", "--implicit", "newmrk", "--jobs", "assembled"), "newmark"),
+        (("-o", "/nowhere/bench.json"), "cannot be written"),
+    ],
+)
+def test_refusals(options, said):
+    done = bench(*options)
+    assert done.returncode == 2
+    assert said in done.stderr

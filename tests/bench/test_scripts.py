@@ -1,0 +1,86 @@
+"""The scaling study's model and resumption, and the lattice and the bare loop of the comparison with peers."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
+sys.path[:0] = [str(SCRIPTS), str(SCRIPTS / "peers")]
+
+import model as peers  # noqa: E402
+from scaling_study.model import Parts, step_time  # noqa: E402
+from scaling_study.points import Point, points_of, run_point  # noqa: E402
+from scaling_study.tables import rows_of  # noqa: E402
+
+
+def driver(name, *options):
+    """What a driver of the comparison reports."""
+    command = [sys.executable, str(SCRIPTS / "peers" / name), *map(str, options)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=240)
+    assert done.returncode == 0, done.stderr
+    line = next(text for text in done.stdout.splitlines() if text.startswith("RESULT "))
+    return json.loads(line.removeprefix("RESULT "))
+
+
+def test_peers_lattice_is_the_generators():
+    from pfem_petsc.mesh.generators import lattice
+
+    points, bars = peers.lattice(3)
+    slab = lattice.generate(lattice.Parameters(kind="cubic", cells=(3, 3, 3), pitch=peers.PITCH), 0, 1)
+
+    def as_set(points, bars):
+        places = np.round(points / peers.PITCH).astype(int)
+        return {frozenset(map(tuple, places[ends])) for ends in bars}
+
+    assert as_set(points, bars) == as_set(slab.points, slab.bars)
+    assert len(bars) == len(slab.bars)
+
+
+@pytest.mark.parametrize("mode", ["explicit", "explicit_contact"])
+def test_bare_loop_moves_as_the_program_does(mode):
+    ours, bare = (driver(name, 4, mode, 60) for name in ("run_ours.py", "run_bare_loop.py"))
+    assert ours["top"] == pytest.approx(bare["top"], rel=1e-10)
+    assert ours["bars"] == bare["bars"]
+
+
+def test_implicit_operators_agree():
+    tops = [driver("run_ours.py", 3, "implicit", 4, operator)["top"] for operator in ("matrix_free", "assembled")]
+    assert tops[0] == pytest.approx(tops[1], rel=1e-8)
+
+
+def test_model_of_one_rank_and_of_many():
+    parts = Parts(bar=1e-8, overhead=5e-5, latency=1e-6, bandwidth=1e10, reduction=4e-6, nodes_per_bar=0.125)
+    alone = step_time(parts, 1e6, np.array([1]))
+    assert alone["step"][0] == pytest.approx(1e-2 + 5e-5)
+    # 1,000 ranks with 8,000 bars, a cube of 10 nodes: 600 nodes on its faces, 12^3 - 10^3 ghosts
+    many = step_time(parts, 8e6, np.array([1000]))
+    assert many["loops"][0] == pytest.approx(1e-8 * (8000 + 0.5 * 5 * 600))
+    assert many["halo"][0] == pytest.approx(26 * 1e-6 + 24 * 728 / 1e10)
+    assert many["sums"][0] == pytest.approx(10e-6)
+    assert many["step"][0] == pytest.approx(sum(many[name][0] for name in ("loops", "halo", "sums", "python")))
+
+
+def test_points_of_both_studies_share_runs():
+    sizes = {"strong": [1000], "weak": [500]}
+    points = points_of(["strong", "weak"], ["cubic"], ["explicit"], sizes, [1, 2], lambda job: "central_differences")
+    files = [(p.study, p.ranks, p.file) for p in points]
+    assert len(files) == 4
+    assert len({name for _, _, name in files}) == 3
+
+
+def test_a_study_goes_on_where_it_stopped(tmp_path):
+    point = Point("strong", "cubic", "explicit", "central_differences", 126, 1)
+    launcher = "env pfem_ranks={ranks}"  # alone, without mpirun
+    assert run_point(point, tmp_path, launcher, 0.02, 120.0) == "done"
+    written = (tmp_path / point.file).stat().st_mtime_ns
+    assert run_point(point, tmp_path, launcher, 0.02, 120.0) == "kept"
+    assert (tmp_path / point.file).stat().st_mtime_ns == written
+    missing = Point("strong", "cubic", "explicit", "no_such_scheme", 126, 1)
+    assert "no_such_scheme" in run_point(missing, tmp_path, launcher, 0.02, 120.0)
+    (row,) = rows_of([point, missing], tmp_path)
+    assert (row["bars"], row["speedup"], row["efficiency"]) == (126, 1.0, 1.0)
+    assert not list(tmp_path.glob("*.part"))

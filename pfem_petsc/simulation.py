@@ -15,19 +15,20 @@ from .output.units import engineering
 from .output.vtkhdf import ResultWriter
 from .parallel.natural import NaturalOrder
 from .parallel.petsc_log import lay_over, staged
+from .preflight.forecast import forecast
+from .preflight.inspection import inspect, warnings_before
+from .preflight.summary import summarise
 from .restart.checkpoints import Checkpoints
 from .restart.folder import RESULT, Restart, find_restart, finished, prepare_folder
 from .restart.stop import Meetings, StopRequest
 from .stepping.blowup import BlowUp
+from .stepping.fields import Fields
 from .stepping.ledger import Ledger
 from .stepping.model import Model
 from .stepping.prepare import make_plan, make_stepper
 from .stepping.recorder import Recorder
 
 __all__ = ["Simulation", "Step"]
-
-POINT_FIELDS = ("displacement", "velocity", "acceleration", "contact_force")
-CELL_FIELDS = ("strain", "stress", "axial_force", "plastic_strain", "temperature")
 
 
 class Step(NamedTuple):
@@ -91,6 +92,7 @@ class Simulation:
             self.finished = finished(case, self.comm, self.folder, self.plan.step * self.plan.steps)
         self.model.contact.check_start(self.model.mesh.points[: self.model.mesh.n_owned], self.model.length)
         self.stepper = make_stepper(self.model, self.plan)
+        self.fields = Fields(self.model)
         self.row: dict[str, Any] | None = None
         self._started = False
         self._asked = 0  # code of a request to stop, zero for none
@@ -111,35 +113,14 @@ class Simulation:
 
     def summary(self) -> dict[str, str]:
         """Label and text of what a user checks before a run. Collective."""
-        model, plan, case = self.model, self.plan, self.case
-        mesh = model.mesh
-        counts = self.comm.allgather((mesh.n_owned, mesh.n_local - mesh.n_owned))
-        critical = engineering(plan.critical_step, "s") if np.isfinite(plan.critical_step) else "none (implicit)"
-        parameters = ", ".join(f"{k} = {v:g}" for k, v in case.time.scheme.model_dump().items())
-        entries = {
-            "nodes": f"{mesh.n_nodes:,}",
-            "bars": f"{mesh.n_bars:,}",
-            "ranks": f"{self.comm.size}, owning {min(c[0] for c in counts):,} to {max(c[0] for c in counts):,} nodes "
-            f"({mesh.partitioner}), at most {max(c[1] for c in counts):,} ghosts",
-            "extent": " x ".join(engineering(float(d), "m") for d in model.high - model.low),
-            "mass": engineering(model.total_mass, "kg") + f" ({case.time.mass})",
-            "wave speed": engineering(model.wave_speed, "m/s"),
-            "integrator": case.time.integrator + (f" ({parameters})" if parameters else ""),
-            "critical step": critical,
-            "time step": f"{engineering(plan.step, 's', 6)}, {plan.steps:,} steps to "
-            f"{engineering(plan.step * plan.steps, 's')}",
-            "linear solver": plan.linear.why if plan.linear is not None else "none: every node on its own",
-            "walls": ", ".join(model.contact.names) or "none",
-            "memory": self._memory(),
-        }
-        return entries
+        return summarise(self.case, self.model, self.plan)
 
-    def _memory(self) -> str:
-        import resource
-
-        # kibibytes on Linux
-        peak = self.comm.allreduce(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024.0)
-        return f"{engineering(peak, 'B', 3)} in use on all ranks"
+    def inspect(self) -> tuple[dict[str, str], list[str]]:
+        """Label and text of a closer look at the truss and a forecast of the run; and what looks wrong. Collective."""
+        recorder = Recorder(self.stepper, None)
+        entries = inspect(self.case, self.model)
+        entries |= forecast(self.case, self.model, self.plan, self.fields, recorder.columns, recorder.types)
+        return entries, self.model.warnings + warnings_before(self.case, self.model, self.plan)
 
     @staged
     def start(self) -> None:
@@ -164,7 +145,7 @@ class Simulation:
             start_time=self.state.time,
         )
         self._progress.summary(self.summary())
-        for warning in self.model.warnings:
+        for warning in self.model.warnings + warnings_before(self.case, self.model, self.plan):
             self._progress.warning(warning)
         if self.plan.scheme.notice:
             self._progress.message(self.plan.scheme.notice)
@@ -189,18 +170,12 @@ class Simulation:
                 f"restart from {self.restart.path}: step {self.state.step}, t = {engineering(self.state.time, 's')}"
                 + changes
             )
-        fields = self.case.output.fields
-        self.point_fields = [n for n in POINT_FIELDS if fields is None or n in fields]
-        heated = self.model.temperatures.any
-        self.cell_fields = [
-            n for n in CELL_FIELDS if (n in fields if fields is not None else n != "temperature" or heated)
-        ]
         self._writer = ResultWriter(
             self.folder / RESULT,
             self.comm,
             self.mesh,
-            point_fields=self.point_fields,
-            cell_fields=self.cell_fields,
+            point_fields=self.fields.points,
+            cell_fields=self.fields.cells,
             columns=self.recorder.columns,
             column_types=self.recorder.types,
             case_text=self.case.to_toml(),
@@ -328,25 +303,9 @@ class Simulation:
     def _snapshot(self) -> None:
         if not self.case.output.fields_every and 0 < self.state.step < self.plan.steps:
             return
-        state, owned = self.state, self.mesh.n_owned
-        position = state.position
-        points = {
-            "displacement": lambda: position - self.mesh.points[:owned],
-            "velocity": lambda: state.v,
-            "acceleration": lambda: state.a,
-            "contact_force": lambda: state.contact,
-        }
-        bars = self.model.bars.fields(state.x) if self.cell_fields else {}
-        if "temperature" in self.cell_fields:
-            bars["temperature"] = (
-                self.model.temperatures.values if self.model.temperatures.any else 0.0 * bars["strain"]
-            )
+        state, fields = self.state, self.fields
         self._writer.write_snapshot(
-            state.time,
-            state.step,
-            position,
-            {name: points[name]() for name in self.point_fields},
-            {name: bars[name] for name in self.cell_fields},
+            state.time, state.step, state.position, fields.at_nodes(state), fields.at_bars(state)
         )
 
     def _finish(self, outcome: str) -> None:

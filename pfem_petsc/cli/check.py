@@ -32,12 +32,14 @@ def run(arguments: argparse.Namespace, comm: MPI.Comm) -> int:
 
     simulation = Simulation(case, comm, check_only=True)
     summary = simulation.summary()
+    closer, warnings = simulation.inspect()
+    summary |= closer
     if comm.rank == 0:
         width = max(map(len, summary), default=0)
         print(case.title)
         for label, text in summary.items():
             print(f"  {label:{width}}  {text}")
-        for text in simulation.model.warnings:
+        for text in warnings:
             print(f"warning: {text}")
         if simulation.plan.scheme.notice:
             print(f"note: {simulation.plan.scheme.notice}")

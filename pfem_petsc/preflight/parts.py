@@ -1,0 +1,54 @@
+"""Parts of a truss that no bar connects."""
+
+from __future__ import annotations
+
+import numpy as np
+from mpi4py import MPI
+
+from ..mechanics.compiled import kernel
+
+__all__ = ["count_parts"]
+
+
+@kernel
+def _spread(bars, label):
+    """Give both ends of each bar the lower of their labels until nothing changes; sweeps forth and back."""
+    changed = True
+    while changed:
+        changed = False
+        for sweep in range(2):
+            for i in range(len(bars)):
+                k = i if sweep == 0 else len(bars) - 1 - i
+                a = label[bars[k, 0]]
+                b = label[bars[k, 1]]
+                if a < b:
+                    label[bars[k, 1]] = a
+                    changed = True
+                elif b < a:
+                    label[bars[k, 0]] = b
+                    changed = True
+
+
+def count_parts(mesh) -> tuple[int, int, int]:
+    """Number of connected parts, nodes of the smallest, and its lowest mesh number of a node. Collective.
+
+    Every node takes the lowest mesh number that it is connected to: within a rank in compiled sweeps, between ranks by
+    the exchange of ghosts, repeated until no rank changes anything.
+    """
+    comm, owned = mesh.comm, mesh.n_owned
+    label = mesh.node_ids[: mesh.n_local].astype(np.float64).reshape(-1, 1)  # whole numbers, exact to 2^53
+    while True:
+        before = label[:owned].copy()
+        _spread(mesh.bars, label[:, 0])
+        mesh.update_ghosts(label)
+        # a ghost may have brought a lower number; and this rank's own may still have to travel
+        if comm.allreduce(int(not np.array_equal(before, label[:owned])), op=MPI.MAX) == 0:
+            break
+    names, sizes = np.unique(label[:owned, 0].astype(np.int64), return_counts=True)
+    total: dict[int, int] = {}
+    # one entry a part and rank: few, unless the truss is in pieces
+    for some in comm.allgather(dict(zip(names.tolist(), sizes.tolist(), strict=True))):
+        for name, size in some.items():
+            total[name] = total.get(name, 0) + size
+    smallest = min(total, key=lambda name: (total[name], name))
+    return len(total), total[smallest], smallest

@@ -1,0 +1,70 @@
+"""Numbers out of any engineering range: mostly another unit than SI. Told, never refused."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+
+from ..output.units import engineering
+
+__all__ = ["odd_numbers"]
+
+_HINT = "case files are in SI units (m, kg, s, N, Pa)"
+
+
+def odd_numbers(case, model) -> list[str]:
+    """One text for each value that looks wrong: key, value, why. Collective."""
+    texts = [*_materials(case), *_sections(case), *_mesh(case, model)]
+    return [f"{case.source}: {text}" for text in texts]
+
+
+def _materials(case) -> Iterator[str]:
+    for name, material in case.material.items():
+        key = f"material.{name}"
+        speed = math.sqrt(material.young_modulus / material.density)
+        if not 0.1 <= material.density <= 3e4:
+            yield f"{key}.density = {material.density:g} kg/m3: no solid has that; {_HINT}"
+        if not 0.5 <= speed <= 2e4 or (speed < 10.0 and material.density > 100.0):
+            yield (
+                f"{key}.young_modulus = {material.young_modulus:g} Pa gives a wave speed of "
+                f"{engineering(speed, 'm/s')}: that of steel is 5 km/s, of rubber 30 m/s; {_HINT}"
+            )
+        if material.yield_stress is not None and material.yield_stress > 0.2 * material.young_modulus:
+            yield (
+                f"{key}.yield_stress = {material.yield_stress:g} Pa is reached at a strain of "
+                f"{material.yield_stress / material.young_modulus:.3g}; {_HINT}"
+            )
+
+
+def _sections(case) -> Iterator[str]:
+    for name, section in case.section.items():
+        if not 1e-18 <= section.area <= 10.0:
+            yield f"section.{name}.area = {section.area:g} m2: no bar has that; 1 mm2 is 1e-6 m2"
+
+
+def _mesh(case, model) -> Iterator[str]:
+    mesh, comm = model.mesh, model.comm
+    rest = model.bars.rest
+    longest = max(comm.allgather(float(rest.max(initial=0.0))))
+    shortest = min(comm.allgather(float(rest.min(initial=np.inf))))
+    if longest > 1e5 or shortest < 1e-9:
+        yield (
+            f"the bars are {engineering(shortest, 'm')} to {engineering(longest, 'm')} long, the truss "
+            f"{engineering(model.length, 'm')}; {_HINT}"
+        )
+    if model.reach > 1e6 * max(model.length, np.finfo(float).tiny):
+        yield (
+            f"the truss is {engineering(model.length, 'm')} in size and {engineering(model.reach, 'm')} away from the "
+            "origin: strains lose that ratio in digits; move it to the origin"
+        )
+    v = model.initial_velocity()
+    speed = np.linalg.norm(v, axis=1)
+    mine = (float(speed.max()), int(mesh.node_ids[int(speed.argmax())])) if len(speed) else (0.0, -1)
+    fastest, node = max(comm.allgather(mine))
+    if fastest > model.wave_speed:
+        yield (
+            f"node {node} starts at {engineering(fastest, 'm/s')}, faster than waves in the bars "
+            f"({engineering(model.wave_speed, 'm/s')}): an impact at that speed crushes bars to nothing"
+        )

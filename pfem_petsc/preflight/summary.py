@@ -1,0 +1,37 @@
+"""What a user checks before a run: sizes, distribution, time step, solver."""
+
+from __future__ import annotations
+
+import resource
+
+import numpy as np
+
+from ..output.units import engineering
+
+__all__ = ["summarise"]
+
+
+def summarise(case, model, plan) -> dict[str, str]:
+    """Label and text. Collective."""
+    mesh, comm = model.mesh, model.comm
+    counts = comm.allgather((mesh.n_owned, mesh.n_local - mesh.n_owned))
+    critical = engineering(plan.critical_step, "s") if np.isfinite(plan.critical_step) else "none (implicit)"
+    parameters = ", ".join(f"{k} = {v:g}" for k, v in case.time.scheme.model_dump().items())
+    # kibibytes on Linux
+    peak = comm.allreduce(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024.0)
+    return {
+        "nodes": f"{mesh.n_nodes:,}",
+        "bars": f"{mesh.n_bars:,}",
+        "ranks": f"{comm.size}, owning {min(c[0] for c in counts):,} to {max(c[0] for c in counts):,} nodes "
+        f"({mesh.partitioner}), at most {max(c[1] for c in counts):,} ghosts",
+        "extent": " x ".join(engineering(float(d), "m") for d in model.high - model.low),
+        "mass": engineering(model.total_mass, "kg") + f" ({case.time.mass})",
+        "wave speed": engineering(model.wave_speed, "m/s"),
+        "integrator": case.time.integrator + (f" ({parameters})" if parameters else ""),
+        "critical step": critical,
+        "time step": f"{engineering(plan.step, 's', 6)}, {plan.steps:,} steps to "
+        f"{engineering(plan.step * plan.steps, 's')}",
+        "linear solver": plan.linear.why if plan.linear is not None else "none: every node on its own",
+        "walls": ", ".join(model.contact.names) or "none",
+        "memory": f"{engineering(peak, 'B', 3)} in use on all ranks",
+    }

@@ -1,0 +1,179 @@
+"""What is found before a run, against counts made by hand (Maxwell's rule) and against what a run then takes."""
+
+import numpy as np
+import pytest
+
+from pfem_petsc import Case, Simulation
+from pfem_petsc.preflight.forecast import checkpoint_bytes
+from pfem_petsc.preflight.inspection import warnings_before
+from pfem_petsc.preflight.parts import count_parts
+from pfem_petsc.preflight.rigidity import global_rigidity, unbraced_nodes
+
+pytestmark = pytest.mark.parallel
+
+CUBE = [[x, y, z] for z in (0.0, 1.0) for y in (0.0, 1.0) for x in (0.0, 1.0)]
+CUBE_EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if bin(a ^ b).count("1") == 1]
+TRUSSES = {
+    # points, bars, fixed nodes; free unknowns, rigid motions, mechanisms, states of self-stress, unbraced nodes
+    "triangle": ([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [(0, 1), (1, 2), (2, 0)], [], (6, 3, 0, 0, 0)),
+    "square": ([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [(0, 1), (1, 2), (2, 3), (3, 0)], [], (8, 3, 1, 0, 0)),
+    "square, both diagonals": (
+        [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]],
+        [(0, 1), (1, 2), (2, 3), (3, 0), (0, 2), (1, 3)],
+        [],
+        (8, 3, 0, 1, 0),
+    ),
+    "square with a whip": (
+        [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [3, 1, 0]],
+        [(0, 1), (1, 2), (2, 3), (3, 0), (0, 2), (2, 4)],
+        [],
+        (10, 3, 1, 0, 1),
+    ),
+    "hinged square": (
+        [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]],
+        [(0, 1), (1, 2), (2, 3), (3, 0), (0, 2)],
+        [0, 1],
+        (4, 0, 0, 1, 0),
+    ),
+    "tetrahedron": (
+        [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]],
+        [(0, 1), (0, 2), (0, 3), (1, 2), (2, 3), (3, 1)],
+        [],
+        (12, 6, 0, 0, 0),
+    ),
+    "cube of edges": (CUBE, CUBE_EDGES, [], (24, 6, 6, 0, 0)),
+    "tetrahedron, one bar short": (
+        [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]],
+        [(0, 1), (0, 2), (0, 3), (1, 2), (2, 3)],
+        [],
+        (12, 6, 1, 0, 2),
+    ),
+    "chain": ([[0, 0, 0], [1, 0, 0], [2, 0, 0]], [(0, 1), (1, 2)], [], (3, 1, 0, 0, 0)),
+}
+
+
+def case_of(tmp_path, comm, points, bars, fixed=(), **tables):
+    """A case whose mesh is written to a file."""
+    import h5py
+
+    if comm.rank == 0:
+        with h5py.File(tmp_path / "mesh.h5", "w") as file:
+            file["points"], file["bars"] = np.asarray(points, dtype=float), np.asarray(bars)
+    comm.Barrier()
+    data = {
+        "mesh": {"file": "mesh.h5"},
+        "material": {"steel": {"young_modulus": 2.1e11, "density": 7850.0}},
+        "section": {"default": {"area": 1e-4, "material": "steel"}},
+        "time": {"integrator": "newmark", "step": 1e-4, "end": 1e-2},
+        **tables,
+    }
+    if fixed:
+        data["node_set"] = {"base": {"indices": list(fixed)}}
+        data["support"] = [{"node_set": "base", "fix": "xyz"}]
+    return Case.from_dict(data, source="truss.toml", folder=tmp_path)
+
+
+@pytest.mark.parametrize("name", TRUSSES)
+def test_mechanisms_and_self_stress(comm, shared_tmp_path, name):
+    points, bars, fixed, (unknowns, rigid, mechanisms, stresses, loose) = TRUSSES[name]
+    model = Simulation(case_of(shared_tmp_path, comm, points, bars, fixed), comm, check_only=True).model
+    found = global_rigidity(model)
+    assert found[:1] + found[2:] == (unknowns, rigid, mechanisms, stresses)
+    # Maxwell's rule: bars - unknowns = self-stresses - free motions
+    assert len(bars) - found.unknowns == found.self_stresses - found.mechanisms - found.rigid_motions
+    assert unbraced_nodes(model)[0] == loose
+
+
+def test_unbraced_node_is_named(comm, shared_tmp_path):
+    points, bars, _, _ = TRUSSES["square with a whip"]
+    simulation = Simulation(case_of(shared_tmp_path, comm, points, bars), comm, check_only=True)
+    (text,) = warnings_before(simulation.case, simulation.model, simulation.plan)
+    assert text.startswith("1 node can move freely")
+    assert text.endswith("the first is node 4")
+
+
+def test_parts(comm, shared_tmp_path):
+    """Rings of bars whose numbers wander, one of them apart."""
+    random = np.random.default_rng(4)
+    sizes = [60, 41, 7]
+    numbers = random.permutation(sum(sizes))
+    points = random.random((sum(sizes), 3))
+    bars, at = [], 0
+    for size in sizes:
+        ring = numbers[at : at + size]
+        bars += list(zip(ring, np.roll(ring, 1), strict=True))
+        at += size
+    model = Simulation(case_of(shared_tmp_path, comm, points, bars), comm, check_only=True).model
+    assert count_parts(model.mesh) == (3, 7, int(numbers[-7:].min()))
+    simulation = Simulation(case_of(shared_tmp_path, comm, points, bars), comm, check_only=True)
+    texts = warnings_before(simulation.case, simulation.model, simulation.plan)
+    assert any("in 3 parts that no bar connects" in text for text in texts)
+
+
+@pytest.mark.parametrize(
+    ("override", "texts"),
+    [
+        ("material.steel.young_modulus=210000", ["material.steel.young_modulus = 210000 Pa", "5.172 m/s"]),
+        ("material.steel.density=7.85e-9 time.step=auto", ["material.steel.density = 7.85e-09 kg/m3"]),
+        ("material.steel.yield_stress=1e12", ["material.steel.yield_stress = 1e+12 Pa"]),
+        ("section.default.area=100.0", ["section.default.area = 100 m2"]),
+        ("initial.velocity=[6000,0,0]", ["node ", "starts at 6.000 km/s, faster than waves"]),
+        ("wall.0.normal=[1,0,0] wall.0.point=[-30,0,0]", ["no node moves towards wall 'wall'"]),
+    ],
+)
+def test_odd_values_are_told(comm, override, texts):
+    simulation = Simulation(Case.load("ring_impact", override.split()), comm, check_only=True)
+    told = warnings_before(simulation.case, simulation.model, simulation.plan)
+    assert told
+    for text in texts:
+        assert text in told[0]
+
+
+def test_far_from_the_origin(comm, shared_tmp_path):
+    points, bars, _, _ = TRUSSES["tetrahedron"]
+    simulation = Simulation(case_of(shared_tmp_path, comm, np.add(points, 1e7), bars), comm, check_only=True)
+    (text,) = warnings_before(simulation.case, simulation.model, simulation.plan)
+    assert "away from the origin" in text
+
+
+@pytest.mark.parametrize("name", ["rod_impact", "ring_impact", "lattice_drop", "pendulum", "tumbling_lattice"])
+def test_sound_cases_have_no_warnings(comm, name):
+    overrides = ["mesh.cells=[3,3,3]"] if name == "lattice_drop" else []
+    simulation = Simulation(Case.load(name, overrides), comm, check_only=True)
+    assert warnings_before(simulation.case, simulation.model, simulation.plan) == []
+
+
+def test_memory_that_the_machine_lacks(comm, monkeypatch):
+    from pfem_petsc.preflight import forecast
+
+    simulation = Simulation(Case.load("rod_impact"), comm, check_only=True)
+    assert forecast.memory_warning(simulation.case, simulation.model, simulation.plan) == []
+    monkeypatch.setattr(forecast, "memory_of_machine", lambda: 1e8)
+    (text,) = forecast.memory_warning(simulation.case, simulation.model, simulation.plan)
+    assert "and it has 100 MB" in text
+
+
+@pytest.mark.parametrize(
+    ("name", "overrides"),
+    [
+        ("rod_impact", ["mesh.elements=2000", "time.step=1e-4", "time.end=0.05"]),
+        ("ring_impact", ["time.end=0.1", "output.history_every=3"]),
+        ("lattice_drop", ["mesh.cells=[8,8,8]", "time.end=1e-4"]),
+        ("rod_impact", ["output.fields_every=0", "time.end=30"]),
+    ],
+)
+def test_files_are_as_large_as_forecast(comm, shared_tmp_path, name, overrides):
+    case = Case.load(name, [*overrides, "output.checkpoint_every=100"])
+    simulation = Simulation(case, comm, output=shared_tmp_path / "out", quiet=True)
+    from pfem_petsc.preflight.forecast import result_bytes
+    from pfem_petsc.stepping.recorder import Recorder
+
+    recorder, fields = Recorder(simulation.stepper, None), simulation.fields
+    forecast = result_bytes(
+        case, simulation.mesh, simulation.plan.steps, fields.points, fields.cells, recorder.columns, recorder.types
+    )
+    assert simulation.run() == 0
+    comm.Barrier()
+    assert (shared_tmp_path / "out" / "result.vtkhdf").stat().st_size == pytest.approx(forecast, rel=0.25)
+    held = (shared_tmp_path / "out" / "checkpoint.h5").stat().st_size
+    assert held == pytest.approx(checkpoint_bytes(simulation.model), rel=0.5)

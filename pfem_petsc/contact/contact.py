@@ -34,6 +34,7 @@ class WallForces:
     moment : (walls, 3) of the force about the origin [N m]
     nodes : (m,) owned nodes near walls
     touching : (m, walls) bool, what they touch
+    places : (m, 3) where they are [m]
     sums : names of those that are sums
     """
 
@@ -44,6 +45,7 @@ class WallForces:
     moment: np.ndarray
     nodes: np.ndarray
     touching: np.ndarray
+    places: np.ndarray
 
 
 class Contact:
@@ -103,6 +105,7 @@ class Contact:
             np.zeros((n, 3)),
             np.empty(0, dtype=np.int64),
             np.empty((0, n), dtype=bool),
+            np.empty((0, 3)),
         )
 
     def positions(self, time: float) -> np.ndarray:
@@ -207,6 +210,36 @@ class Contact:
         -------
         (nodes, correction (m, 3) [m], force (m, 3) [N] by the walls, WallForces)
         """
+        if self.motion.free is not None:
+            self._push_walls(x, stiffness, time, tolerance)
+        return self._project(x, stiffness, time, tolerance)
+
+    def _push_walls(self, x: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float) -> None:
+        """Find where walls with mass end in an explicit step. Collective."""
+        free = self.motion.free
+        failure: SimulationFailure | None = None
+
+        def forces() -> tuple[np.ndarray, np.ndarray]:
+            nonlocal failure
+            try:
+                nodes, _, _, walls = self._project(x.copy(), stiffness, time, tolerance, booked=False)
+            except SimulationFailure as met:  # told once all ranks have left the iteration
+                failure = failure or met
+                return np.zeros((len(free.at), 3)), np.zeros((len(free.at), 3, 3))
+            normals, _ = self.planes(walls.touching, walls.places, self.motion.shifts(time))
+            active = np.where(walls.touching[:, :, None] & ~self.fixed[nodes][:, None, :], normals, 0.0)
+            inverse = np.linalg.pinv(active, rcond=1e-8) if len(nodes) else np.zeros((0, 3, len(self.walls)))
+            weight = stiffness[nodes][:, None] * (inverse * inverse).sum(axis=1)  # k (N N^T)^-1 on its diagonal
+            slope = np.einsum("mw,mwi,mwj->wij", np.where(walls.touching, weight, 0.0), normals, normals)
+            return walls.force[free.at], slope[free.at]
+
+        free.solve(forces, 1e-15 * self.length)
+        if failure is not None:
+            raise failure
+
+    def _project(
+        self, x: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float, booked: bool = True
+    ) -> tuple:
         shifts = self.motion.shifts(time)
         near = self.near(x, shifts)
         if self.restitution.any():
@@ -238,7 +271,7 @@ class Contact:
         force = strength[:, :, None] * normals
         if self.rough:
             moved, force = self._rub(nodes, free, shifts, (normals, offsets), stiffness[nodes], moved, strength, time)
-        if self.restitution.any():
+        if booked and self.restitution.any():
             self._remember_approach(nodes, free, shifts, normals, strength)
         walls = self.sums(nodes, force, moved, np.einsum("mwi,mwi->mw", force, normals) > 0.0)
         x[nodes] = moved
@@ -259,6 +292,8 @@ class Contact:
         state = self.state
         rebound = state.memory.setdefault("rebound", np.zeros((len(self.members), len(self.walls))))
         way = shifts - self.motion.shifts(state.time)
+        if self.motion.free is not None:  # how they would meet, not how the wall gives way
+            way[self.motion.free.at] = self.motion.free.unpushed() - self.motion.free.state.x
         approach = -np.einsum("mwi,mwi->mw", normals, (free - state.position[nodes])[:, None, :] - way)
         fresh = (strength > 0.0) & ~self.log.touching[nodes]
         rebound[:] = 0.0
@@ -296,7 +331,7 @@ class Contact:
     def sums(self, nodes: np.ndarray, force: np.ndarray, x: np.ndarray, touching: np.ndarray) -> WallForces:
         """Sums of forces (m, w, 3) on nodes at (m, 3)."""
         moment = np.cross(x[:, None, :], force).sum(axis=0)
-        return WallForces(force.sum(axis=0), touching.sum(axis=0), moment, nodes, touching)
+        return WallForces(force.sum(axis=0), touching.sum(axis=0), moment, nodes, touching, x)
 
     def _no_room(self, node: int, offsets: np.ndarray, time: float) -> str:
         touched = [name for name, offset in zip(self.names, offsets, strict=True) if offset > -np.inf]

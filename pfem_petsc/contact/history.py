@@ -24,7 +24,7 @@ def contact_columns(contact: Contact) -> list[tuple[str, tuple[int, ...], type]]
             (f"wall/{name}/releases", (), np.int64),
         ]
         if contact.moving[k]:
-            columns.append((f"wall/{name}/position", (3,), float))
+            columns += [(f"wall/{name}/{what}", (3,), float) for what in ("position", "velocity")]
     return columns
 
 
@@ -46,7 +46,7 @@ def contact_values(contact: Contact, sums: np.ndarray, at: int, time: float) -> 
     values: dict[str, Any] = {}
     if contact.any:
         values["active_set_changes"] = round(sums[at + 11 * n])
-        positions = contact.positions(time)
+        positions, rates = contact.positions(time), contact.motion.rates(time)
     for k, name in enumerate(contact.names):
         for i, column in enumerate(("force", "moment", "impulse")):
             values[f"wall/{name}/{column}"] = vectors[k, i]
@@ -55,5 +55,6 @@ def contact_values(contact: Contact, sums: np.ndarray, at: int, time: float) -> 
         values[f"wall/{name}/releases"] = round(releases[k])
         if contact.moving[k]:
             values[f"wall/{name}/position"] = positions[k]
+            values[f"wall/{name}/velocity"] = rates[k]
     contact.log.changes = 0
     return values, at + 11 * n + 1

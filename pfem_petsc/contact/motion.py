@@ -15,6 +15,7 @@ class WallMotion:
     Attributes
     ----------
     moving : (w,) bool, walls that move at all
+    free : FreeWalls where some have mass, else None
     """
 
     def __init__(self, walls) -> None:
@@ -22,7 +23,8 @@ class WallMotion:
         self._velocities = np.array(
             [wall.velocity if wall.velocity is not None else (0.0, 0.0, 0.0) for wall in walls], dtype=np.float64
         ).reshape(-1, 3)
-        self.moving = np.array([wall.velocity is not None or wall.motion is not None for wall in walls], dtype=bool)
+        self.free = None
+        self.moving = np.array([wall.velocity is not None or wall.motion is not None or wall.mass is not None for wall in walls], dtype=bool)
 
     def shifts(self, time: float) -> np.ndarray:
         """Displacements (w, 3) [m] at a time [s]."""
@@ -30,6 +32,8 @@ class WallMotion:
         for k, table in enumerate(self._tables):
             if table is not None:
                 shifts[k] = table(time)
+        if self.free is not None:
+            shifts[self.free.at] = self.free.displacements(time)
         return shifts
 
     def rates(self, time: float) -> np.ndarray:
@@ -41,4 +45,6 @@ class WallMotion:
                 inside = 0 <= row < len(table.times) - 1
                 if inside:
                     rates[k] = np.diff(table.values[row : row + 2], axis=0)[0] / np.diff(table.times[row : row + 2])
+        if self.free is not None:
+            rates[self.free.at] = self.free.state.v
         return rates

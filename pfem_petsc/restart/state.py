@@ -73,6 +73,7 @@ class RunState:
             "stepper": {name: getattr(stepper, name) for name in stepper.kept_numbers},
             "iterations": recorder.iterations.tolist(),
             "start_energy": recorder.start_energy,
+            "free_walls": free.kept() if (free := self.model.contact.motion.free) is not None else None,
             "contact_times": self.model.contact.log.times(self.comm),
             "row": {name: float(row[name]) for name in ("energy_imbalance", "active_contacts")},
             "node_arrays": sorted(self._node_arrays()),
@@ -114,6 +115,8 @@ class RunState:
             like = getattr(walls, name)
             setattr(walls, name, np.array(values, dtype=like.dtype).reshape(like.shape))
         stepper.solution.contacts = int(mine["contacts"])
+        if scalars["free_walls"] is not None:
+            self.model.contact.motion.free.put_back(scalars["free_walls"])
         self.model.contact.log.put_back(mine["contact_log"], scalars["contact_times"], stepper.touching)
 
     def put_back_sums(self, checkpoint: Checkpoint, ledger, recorder) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from mpi4py import MPI
@@ -114,11 +115,25 @@ class ImplicitStepper(Stepper):
         matrix.constrain(float(model.inertia.mass.max(initial=1.0)), values)
 
     def solve(self, balance: Balance) -> Solution:
+        free = self.model.contact.motion.free
+        guess = self._guess(balance)
+        if free is None:
+            return self._solve(balance, guess)
+        found: list[Solution] = []
+
+        def forces() -> tuple[np.ndarray, None]:
+            found.append(self._solve(balance, found[-1].u if found else guess))
+            return found[-1].walls.force[free.at], None
+
+        free.solve(forces, 1e-12 * self.model.length)
+        newton, linear = sum(s.newton for s in found), sum(s.linear for s in found)
+        return replace(found[-1], newton=newton, linear=linear)
+
+    def _solve(self, balance: Balance, guess: np.ndarray) -> Solution:
         model, state = self.model, self.state
         if model.temperatures.varying:
             model.temperatures.apply(balance.time)
         tolerance = self._tolerance(balance)
-        guess = self._guess(balance)
         contacts = ContactRounds(model, self.state, balance, self.held)
         newton = linear = 0
         while True:

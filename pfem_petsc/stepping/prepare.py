@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ..contact.free import FreeWalls
 from ..contact.held_node import held_growth
 from ..contact.treatments.mass_redistribution import redistribute
 from ..errors import InputError
@@ -154,6 +155,11 @@ def make_stepper(model, plan: Plan) -> Stepper:
 
 def _check_walls(model, plan: Plan) -> None:
     """Refuse what a wall asks for and the scheme cannot do."""
+    walls = model.case.wall
+    if any(wall.mass is not None for wall in walls):
+        if model.case.contact.treatment != "scheme":
+            raise InputError(f'{model.case.source}: wall.mass needs contact.treatment = "scheme": walls cannot jump')
+        model.contact.motion.free = FreeWalls(walls, plan.scheme, model.comm)
     for k, name in enumerate(model.contact.names):
         key = f"{model.case.source}: wall {name!r}"
         if model.contact.static_friction[k] and plan.linear is not None:

@@ -108,6 +108,8 @@ class Stepper(ABC):
             state.support = np.zeros_like(state.v)
             state.support[supports.fixed] = -load[supports.fixed]
         self.scheme.start(state, self.h)
+        if model.contact.motion.free is not None:
+            model.contact.motion.free.start(self.h)
         if self.scheme.leads:
             self._solve_and_finish()
 
@@ -142,11 +144,16 @@ class Stepper(ABC):
     def _solve_and_finish(self) -> None:
         state = self.state
         self.balance = self.scheme.balance(state, self.part)
+        free = self.model.contact.motion.free
+        if free is not None:
+            free.begin(state.time, self.part)
         state.external = self._load(self.balance)
         self.solution = self.solve(self.balance)
         if self.model.contact.any:
             self.model.contact.log.book(self.solution.walls, self.part)
         self.scheme.finish(state, self.balance, self.solution.u, self.part)
+        if free is not None:
+            free.finish(self.part)
 
     def _load(self, balance: Balance) -> np.ndarray:
         if not self.model.external.active:

@@ -8,7 +8,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from ...case.base import Finite, NonNegativeFloat, Vector3, WallParameters, listed
+from ...case.base import Finite, NonNegativeFloat, PositiveFloat, Vector3, WallParameters, listed
 
 __all__ = ["BaseWall", "WallKeys", "direction"]
 
@@ -19,7 +19,9 @@ class WallKeys(WallParameters):
     """Keys of every wall beside its shape."""
 
     velocity: Vector3 | None = None
-    """velocity of the wall [m/s], constant"""
+    """velocity of the wall [m/s]: constant, or that at the start for a wall with mass"""
+    mass: PositiveFloat | None = None
+    """mass [kg] of a wall that the forces of contact push about; it does not turn"""
     motion: Annotated[tuple[Row4, ...], listed] | None = None
     """rows [t, dx, dy, dz]: displacement of the wall [s, m], linear between rows, constant outside"""
     adjust: bool = False
@@ -47,6 +49,8 @@ class WallKeys(WallParameters):
     def _moves_one_way(self) -> WallKeys:
         if self.velocity is not None and self.motion is not None:
             raise ValueError("expected at most one of the keys velocity, motion")
+        if self.mass is not None and self.motion is not None:
+            raise ValueError("expected at most one of the keys mass, motion")
         if self.static_friction is not None and self.static_friction < self.friction:
             raise ValueError(f"static_friction must be no less than friction = {self.friction!r}")
         return self

@@ -1,0 +1,128 @@
+"""Walls with mass, which the forces of contact push about.
+
+A wall of mass M is one more node of the scheme, without bars: M (alpha u + a_hat) = -F(u), where F is the sum of its
+forces on the truss with the wall displaced by predictor + u. F is a monotone function of u, piecewise linear for plane
+walls in explicit steps: Newton's method ends after a few active sets. The acceleration is then taken from F itself, so
+that truss and walls together keep their momentum to rounding. Walls do not turn, and no gravity acts on them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+
+from ..integrators.base import Balance, Scheme, State
+
+__all__ = ["FreeWalls"]
+
+_ITERATIONS = 200
+
+Answer = tuple[np.ndarray, np.ndarray | None]
+
+
+class FreeWalls:
+    """The walls of a case that have a mass; the same on all ranks.
+
+    Attributes
+    ----------
+    at : (f,) which walls of the case
+    state : of the walls: x is the displacement from where the case puts them (f, 3)
+    """
+
+    def __init__(self, walls, scheme: Scheme, comm: MPI.Comm) -> None:
+        self.at = np.array([k for k, wall in enumerate(walls) if wall.mass is not None], dtype=np.int64)
+        self.mass = np.array([walls[k].mass for k in self.at])
+        self.scheme, self.comm = scheme, comm
+        speeds = np.array([walls[k].velocity or (0.0, 0.0, 0.0) for k in self.at])
+        n = len(self.at)
+        self.state = State(np.zeros((n, 3)), speeds, *(np.zeros((n, 3)) for _ in range(5)))
+        self._balance: Balance | None = None
+        self._u = np.zeros((n, 3))
+
+    def start(self, h: float) -> None:
+        """Set the scheme's memory up."""
+        self.scheme.start(self.state, h)
+
+    def begin(self, time: float, h: float) -> None:
+        """The balance of a step from ``time``; for schemes that lead, the walls move first."""
+        if self.scheme.leads and time > self.state.time:
+            self.scheme.advance(self.state, h)
+        self.state.time = time
+        self._balance = self.scheme.balance(self.state, h)
+
+    def finish(self, h: float) -> None:
+        """Complete the walls' state with the solution."""
+        self.scheme.finish(self.state, self._balance, self._u, h)
+        if not self.scheme.leads:
+            self.state.time = self._balance.time if self.scheme.solves_end else self.state.time + h
+
+    def displacements(self, time: float) -> np.ndarray:
+        """Displacements (f, 3) [m] at the state's time, or at the end of the step that is being solved."""
+        if self._balance is None or time == self.state.time:
+            return self.state.x
+        return self._balance.predictor + self._u
+
+    def unpushed(self) -> np.ndarray:
+        """Displacements (f, 3) [m] at the end of the step that is being solved if nothing touched the walls."""
+        balance = self._balance
+        free = 0.0 if balance.a_hat is None else balance.a_hat / balance.alpha
+        return balance.predictor - free
+
+    def solve(self, forces: Callable[[], Answer], tolerance: float) -> None:
+        """Find the walls' increments. Collective.
+
+        Parameters
+        ----------
+        forces : gives, for the :meth:`displacements` of the moment, this rank's sums of the walls' forces on the truss
+            (f, 3) [N] and of their derivatives dF/du (f, 3, 3) [N/m], or None where these are not known
+        tolerance : of the walls' places [m]
+        """
+        balance = self._balance
+        n = 3 * len(self.at)
+        weight = np.repeat(balance.alpha * self.mass, 3)
+        rest = np.zeros((len(self.at), 3)) if balance.a_hat is None else self.mass[:, None] * balance.a_hat
+        u = (-rest / (balance.alpha * self.mass[:, None])).ravel()
+        matrix, earlier = np.diag(weight), None
+        for _ in range(_ITERATIONS):
+            self._u = u.reshape(-1, 3)
+            force, slope = forces()
+            force = force.copy()
+            self.comm.Allreduce(MPI.IN_PLACE, force)
+            residual = weight * u + rest.ravel() + force.ravel()
+            if slope is not None:
+                slope = slope.copy()
+                self.comm.Allreduce(MPI.IN_PLACE, slope)
+                matrix = np.diag(weight)
+                for k in range(len(self.at)):
+                    matrix[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += slope[k]
+            elif earlier is not None:
+                # Broyden: the matrix that explains the last move and is nearest to the one before
+                du, dr = u - earlier[0], residual - earlier[1]
+                size = float(du @ du)
+                if size > 0.0:
+                    matrix = matrix + np.outer(dr - matrix @ du, du) / size
+            earlier = u, residual
+            move = np.linalg.solve(matrix, -residual) if n else np.zeros(0)
+            if np.abs(move).max(initial=0.0) <= tolerance:
+                break
+            u = u + move
+        # momentum is kept to rounding: the acceleration is that of the force, whatever the last digit of the place
+        self._u = (-force - rest) / (balance.alpha * self.mass[:, None])
+
+    def kept(self) -> dict[str, Any]:
+        """What a checkpoint must hold."""
+        state = self.state
+        memory = {name: array.tolist() for name, array in state.memory.items()}
+        return {"x": state.x.tolist(), "v": state.v.tolist(), "a": state.a.tolist(), "time": state.time, "memory": memory}
+
+    def put_back(self, kept: dict[str, Any]) -> None:
+        """Take the state from a checkpoint."""
+        shape = self.state.x.shape
+        for name in ("x", "v", "a"):
+            setattr(self.state, name, np.array(kept[name], dtype=float).reshape(shape))
+        self.state.time = kept["time"]
+        for name, array in kept["memory"].items():
+            self.state.memory[name] = np.array(array, dtype=float).reshape(shape)

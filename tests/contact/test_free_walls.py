@@ -1,0 +1,102 @@
+"""Walls with mass: momentum of truss and walls together, and a collision with a closed form."""
+
+import numpy as np
+import pytest
+from lattices import lattice_case, planes, simulation
+
+from pfem_petsc import Case, Simulation
+from pfem_petsc.errors import InputError
+
+pytestmark = pytest.mark.parallel
+
+SCHEMES = [("central_differences", {}), ("chung_lee", {}), ("newmark", {}), ("houbolt", {})]
+SPEED = np.array([1.0, -0.5, -4.0])
+
+
+def walls_of(kind):
+    if kind == "plane":
+        return planes([[0.2, 0.1, 1.0]], [-0.02], mass=0.05, velocity=[0.0, 0.0, 0.5])
+    if kind == "corner":
+        return planes([[0.2, 0.1, 1.0], [1.0, 0.3, 0.4]], [-0.015, -0.02], mass=0.02)
+    return [{"type": "sphere", "point": [0.1, 0.05, -0.12], "radius": 0.1, "mass": 0.03, "velocity": [0.0, 0.1, 1.0]}]
+
+
+@pytest.mark.parametrize("integrator, parameters", SCHEMES)
+@pytest.mark.parametrize("kind", ["plane", "corner", "sphere"])
+def test_momentum_is_shared(kind, integrator, parameters, comm, shared_tmp_path):
+    """Momentum of truss plus walls stays to 1e-12, and the walls are moved."""
+    walls = walls_of(kind)
+    case = lattice_case(walls, velocity=SPEED.tolist(), integrator=integrator, end=0.02, solver={"rtol": 1e-12})
+    case["time"] |= parameters
+    run = simulation(case, comm, shared_tmp_path)
+    rows = [step.row for step in run]
+    names = run.model.contact.names
+    start = run.model.total_mass * SPEED + sum(w["mass"] * np.array(w.get("velocity", (0, 0, 0))) for w in walls)
+    for row in rows:
+        total = row["momentum"] + sum(w["mass"] * row[f"wall/{n}/velocity"] for w, n in zip(walls, names, strict=True))
+        np.testing.assert_allclose(total, start, atol=1e-12 * np.abs(start).max())
+    moved = rows[-1][f"wall/{names[0]}/velocity"] - np.array(walls[0].get("velocity", (0, 0, 0)))
+    assert np.abs(moved).max() > 0.1
+    # nobody is beyond a wall where it is at the end
+    x = run.state.position
+    if integrator != "wilson":
+        gaps = run.model.contact.gaps(x, run.state.time)
+        assert gaps.min(initial=0.0) > -2e-12 * 0.2
+
+
+def test_point_mass_hits_a_wall_with_mass(comm, shared_tmp_path):
+    """A bar hits flat: with restitution e the relative velocity is turned round and multiplied by e."""
+    step, e, mass = 1e-4, 0.6, 4e-3
+    case = {
+        "mesh": {"generator": "rod", "length": 0.2, "elements": 2},
+        "material": {"m": {"young_modulus": 1e6, "density": 1000.0}},
+        "section": {"s": {"area": 1e-5, "material": "m"}},
+        "initial": {"velocity": [0.0, 0.0, -1.0]},
+        "wall": [{"type": "plane", "name": "plate", "point": [0, 0, -0.05], "normal": [0, 0, 1.0], "mass": mass,
+                  "velocity": [0, 0, 0.2], "restitution": e}],
+        "time": {"integrator": "central_differences", "step": step, "end": 0.1},
+        "output": {"fields_every": 0},
+    }
+    run = simulation(case, comm, shared_tmp_path)
+    last = [s.row for s in run][-1]
+    truss = run.model.total_mass
+    common = (truss * -1.0 + mass * 0.2) / (truss + mass)
+    assert last["momentum"][2] / truss == pytest.approx(common + e * 1.2 * mass / (truss + mass), rel=0.02)
+    assert last["wall/plate/velocity"][2] == pytest.approx(common - e * 1.2 * truss / (truss + mass), rel=0.02)
+
+
+def test_heavy_wall_is_a_fixed_one(comm, shared_tmp_path):
+    """The heavier the wall, the less it differs from one at rest."""
+    found = {}
+    for name, keys in (("fixed", {}), ("heavy", {"mass": 1e9})):
+        run = simulation(lattice_case(planes([[0.2, 0.1, 1.0]], [-0.02], **keys), velocity=SPEED.tolist(), end=0.02),
+                         comm, shared_tmp_path, name)
+        for _ in run:
+            pass
+        found[name] = run.gather(run.state.position)
+    if comm.rank == 0:
+        np.testing.assert_allclose(found["heavy"], found["fixed"], atol=1e-8)
+
+
+def test_refused(comm, shared_tmp_path):
+    with pytest.raises(InputError, match="at most one of the keys mass, motion"):
+        simulation(lattice_case(planes([[0, 0, 1.0]], [-0.1], mass=1.0, motion=[[0.0, 0, 0, 0]])), comm, shared_tmp_path)
+    with pytest.raises(InputError, match="walls cannot jump"):
+        case = lattice_case(planes([[0, 0, 1.0]], [-0.1], mass=1.0), contact={"treatment": "stick"})
+        simulation(case, comm, shared_tmp_path)
+
+
+def test_restart_keeps_the_walls(comm, shared_tmp_path):
+    """A run in two parts is the run in one, bit for bit: walls with mass, restitution and friction included."""
+    walls = planes([[0.2, 0.1, 1.0]], [-0.01], mass=0.05, restitution=0.3, name="free")
+    walls += planes([[0.0, 0.1, 1.0]], [-0.012], friction=0.3, name="rough")
+    rows = {}
+    for name, end in (("one", 0.04), ("two", 0.02), ("two", 0.04)):
+        case = lattice_case(walls, velocity=[0.5, 0.0, -4.0], end=end)
+        case["output"]["checkpoint_every"] = 50
+        restart = name == "two" and end > 0.03
+        run = Simulation(Case.from_dict(case, name="it"), comm, output=shared_tmp_path / name, quiet=True, restart=restart)
+        rows[name] = [s.row for s in run][-1]
+    for column, value in rows["one"].items():
+        np.testing.assert_array_equal(rows["two"][column], value, err_msg=column)
+    assert rows["one"]["wall/free/releases"] > 0 and rows["one"]["wall/rough/impulse"][2] > 0.0

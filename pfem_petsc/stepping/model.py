@@ -7,6 +7,7 @@ from mpi4py import MPI
 
 from ..contact.contact import Contact
 from ..contact.start import adjust_start
+from ..errors import InputError
 from ..mechanics.bars import Bars, section_of_bars
 from ..mechanics.compiled import kernel
 from ..mechanics.loads import ExternalForce
@@ -44,7 +45,11 @@ class Model:
     def __init__(self, case, comm: MPI.Comm) -> None:
         self.case = case
         self.comm = comm
-        slab = load_slab(case.mesh, comm)
+        try:
+            slab = load_slab(case.mesh, comm)
+        except InputError as error:
+            # a generator knows its keys, but not the file that they are in
+            raise error if case.mesh.generator is None else InputError(f"{case.source}: {error}") from error
         self.warnings = list(slab.warnings)
         with agreed(comm):
             sections = section_of_bars(case, slab)

@@ -1,0 +1,169 @@
+"""Case and mesh files with mistakes put in by chance, and what ``check`` makes of them."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import random
+import re
+import signal
+import sys
+from pathlib import Path
+
+import pfem_petsc
+from pfem_petsc.case.builtin import built_in_cases
+from pfem_petsc.cli.main import main
+
+sys.path.insert(0, str(Path(__file__).parent.parent / "mesh"))
+from samples import GMSH, write_hdf5, write_vtk  # noqa: E402
+
+LIMIT = 60  # seconds that a check may take, on a machine with other work
+
+ODD = (
+    "-1 0 -0.0 1 2 3.5 nan inf -inf 1e308 -1e308 1e-308 5e-324 1e400 99999999999999999999 9223372036854775807 "
+    "2147483648 true false [] {} [[]] [1] [1,2] [0,0,0] [nan,0,0] '' 'x' 'x\\u0000' \"\"\"a\nb\"\"\" 1979-05-27 0x10 1_000"
+).split(" ")
+
+CASE_OF_A_MESH = """
+title = "mesh"
+[mesh]
+file = "{name}"
+[material.m]
+young_modulus = 2.1e11
+density = 7850.0
+[section.s]
+area = 1e-4
+material = "m"
+[time]
+integrator = "newmark"
+step = 1e-5
+end = 1e-3
+"""
+
+
+def mutated_bytes(raw: bytes, chance: random.Random) -> bytes:
+    """One to four changes of bytes: flipped, removed, repeated, moved, cut off, put in."""
+    raw = bytearray(raw)
+    for _ in range(chance.choice([1, 1, 2, 4])):
+        n = max(len(raw), 1)
+        at, length = chance.randrange(n), min(chance.choice([1, 1, 2, 8, 64, 500]), n)
+        kind = chance.randrange(7)
+        if kind == 0:
+            raw[at : at + 1] = bytes([chance.randrange(256)])
+        elif kind == 1:
+            del raw[at : at + length]
+        elif kind == 2:
+            raw[at:at] = raw[at : at + length]
+        elif kind == 3:
+            del raw[at:]
+        elif kind == 4:
+            raw[at : at + length] = bytes(chance.randrange(256) for _ in range(length))
+        elif kind == 5:
+            piece = bytes(raw[at : at + length])
+            del raw[at : at + length]
+            there = chance.randrange(len(raw) + 1)
+            raw[there:there] = piece
+        elif raw:
+            raw[at % len(raw)] ^= 1 << chance.randrange(8)
+    return bytes(raw)
+
+
+def mutated_text(text: str, chance: random.Random) -> str:
+    """One to three changes of what a user types: values, keys, lines."""
+    for _ in range(chance.choice([1, 1, 1, 2, 3])):
+        lines = text.split("\n")
+        at = chance.randrange(len(lines))
+        kind = chance.randrange(8)
+        if kind <= 2:
+            numbers = list(re.finditer(r"-?\d[\d.eE+-]*|\"[^\"\n]*\"|\[[^\]\n]*\]", text))
+            if numbers:
+                one = chance.choice(numbers)
+                text = text[: one.start()] + chance.choice(ODD) + text[one.end() :]
+            continue
+        if kind == 3:
+            del lines[at]
+        elif kind == 4:
+            lines.insert(chance.randrange(len(lines) + 1), lines[at])
+        elif kind == 5:
+            other = chance.randrange(len(lines))
+            lines[at], lines[other] = lines[other], lines[at]
+        elif kind == 6 and lines[at]:
+            k = chance.randrange(len(lines[at]))
+            lines[at] = (
+                lines[at][:k] + chance.choice(["", "x", " ", "[", "]", '"', "=", ".", "\\"]) + lines[at][k + 1 :]
+            )
+        elif kind == 7:
+            lines[at] = f"{chance.choice(['zz', 'time.end', 'name', 'step'])} = {chance.choice(ODD)}"
+        text = "\n".join(lines)
+    return text
+
+
+def small_cases() -> list[str]:
+    """Texts of the built-in cases, with meshes that are made at once."""
+    folder = Path(pfem_petsc.__file__).parent / "cases"
+    texts = [(folder / f"{name}.toml").read_text() for name in built_in_cases()]
+    return [re.sub(r"cells = \[[^\]]*\]", "cells = [2, 2, 2]", text) for text in texts]
+
+
+def sound_meshes(folder: Path) -> list[Path]:
+    """Small mesh files of every kind that is read."""
+    folder.mkdir(parents=True, exist_ok=True)
+    found = []
+    for name, raw in GMSH.items():
+        found.append(folder / f"{name.replace(' ', '-')}.msh")
+        found[-1].write_bytes(raw)
+    for name, write in (("mesh.h5", write_hdf5), ("mesh.vtu", write_vtk), ("mesh.vtkhdf", write_vtk)):
+        write(folder / name)
+        found.append(folder / name)
+    return found
+
+
+class TooSlow(BaseException):
+    """The check did not end in time; no Exception, so that nothing catches it."""
+
+
+def _ring(*_: object) -> None:
+    raise TooSlow
+
+
+def verdict(path: Path) -> str:
+    """Check a case; empty where it is accepted or refused as it should be, else what went wrong."""
+    out, err = io.StringIO(), io.StringIO()
+    signal.signal(signal.SIGALRM, _ring)
+    signal.alarm(LIMIT)
+    try:
+        with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+            status = main(["check", str(path)])
+    except TooSlow:
+        return f"hangs: no answer in {LIMIT} s"
+    except BaseException as error:  # noqa: BLE001 - nothing may come out of main
+        return f"raises {type(error).__name__}: {error}"
+    finally:
+        signal.alarm(0)
+    said = err.getvalue()
+    if "Traceback" in said or "internal error" in said:
+        return f"status {status}: {said}"
+    if status == 0:
+        return "" if "error" not in said else f"status 0, but: {said}"
+    if status != 2:
+        return f"status {status}: {said}"
+    if not said.startswith("error: ") or str(path.parent) not in said:
+        return f"does not name the file: {said}"
+    return ""
+
+
+def try_one(seed: int, folder: Path, texts: list[str], meshes: list[Path]) -> str:
+    """Write the mutant of a seed and check it; two thirds are cases, the rest meshes."""
+    chance = random.Random(seed)
+    path = folder / "case.toml"
+    if seed % 3 < 2:
+        text = chance.choice(texts)
+        if chance.random() < 0.8:
+            path.write_bytes(mutated_text(text, chance).encode("utf-8", "surrogateescape"))
+        else:
+            path.write_bytes(mutated_bytes(text.encode(), chance))
+    else:
+        sound = chance.choice(meshes)
+        (folder / sound.name).write_bytes(mutated_bytes(sound.read_bytes(), chance))
+        path.write_text(CASE_OF_A_MESH.format(name=sound.name))
+    return verdict(path)

@@ -116,7 +116,13 @@ class FreeWalls:
         """What a checkpoint must hold."""
         state = self.state
         memory = {name: array.tolist() for name, array in state.memory.items()}
-        return {"x": state.x.tolist(), "v": state.v.tolist(), "a": state.a.tolist(), "time": state.time, "memory": memory}
+        return {
+            "x": state.x.tolist(),
+            "v": state.v.tolist(),
+            "a": state.a.tolist(),
+            "time": state.time,
+            "memory": memory,
+        }
 
     def put_back(self, kept: dict[str, Any]) -> None:
         """Take the state from a checkpoint."""

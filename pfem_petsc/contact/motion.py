@@ -24,7 +24,10 @@ class WallMotion:
             [wall.velocity if wall.velocity is not None else (0.0, 0.0, 0.0) for wall in walls], dtype=np.float64
         ).reshape(-1, 3)
         self.free = None
-        self.moving = np.array([wall.velocity is not None or wall.motion is not None or wall.mass is not None for wall in walls], dtype=bool)
+        self.moving = np.array(
+            [wall.velocity is not None or wall.motion is not None or wall.mass is not None for wall in walls],
+            dtype=bool,
+        )
 
     def shifts(self, time: float) -> np.ndarray:
         """Displacements (w, 3) [m] at a time [s]."""

@@ -52,8 +52,17 @@ def test_point_mass_hits_a_wall_with_mass(comm, shared_tmp_path):
         "material": {"m": {"young_modulus": 1e6, "density": 1000.0}},
         "section": {"s": {"area": 1e-5, "material": "m"}},
         "initial": {"velocity": [0.0, 0.0, -1.0]},
-        "wall": [{"type": "plane", "name": "plate", "point": [0, 0, -0.05], "normal": [0, 0, 1.0], "mass": mass,
-                  "velocity": [0, 0, 0.2], "restitution": e}],
+        "wall": [
+            {
+                "type": "plane",
+                "name": "plate",
+                "point": [0, 0, -0.05],
+                "normal": [0, 0, 1.0],
+                "mass": mass,
+                "velocity": [0, 0, 0.2],
+                "restitution": e,
+            }
+        ],
         "time": {"integrator": "central_differences", "step": step, "end": 0.1},
         "output": {"fields_every": 0},
     }
@@ -69,8 +78,12 @@ def test_heavy_wall_is_a_fixed_one(comm, shared_tmp_path):
     """The heavier the wall, the less it differs from one at rest."""
     found = {}
     for name, keys in (("fixed", {}), ("heavy", {"mass": 1e9})):
-        run = simulation(lattice_case(planes([[0.2, 0.1, 1.0]], [-0.02], **keys), velocity=SPEED.tolist(), end=0.02),
-                         comm, shared_tmp_path, name)
+        run = simulation(
+            lattice_case(planes([[0.2, 0.1, 1.0]], [-0.02], **keys), velocity=SPEED.tolist(), end=0.02),
+            comm,
+            shared_tmp_path,
+            name,
+        )
         for _ in run:
             pass
         found[name] = run.gather(run.state.position)
@@ -80,7 +93,9 @@ def test_heavy_wall_is_a_fixed_one(comm, shared_tmp_path):
 
 def test_refused(comm, shared_tmp_path):
     with pytest.raises(InputError, match="at most one of the keys mass, motion"):
-        simulation(lattice_case(planes([[0, 0, 1.0]], [-0.1], mass=1.0, motion=[[0.0, 0, 0, 0]])), comm, shared_tmp_path)
+        simulation(
+            lattice_case(planes([[0, 0, 1.0]], [-0.1], mass=1.0, motion=[[0.0, 0, 0, 0]])), comm, shared_tmp_path
+        )
     with pytest.raises(InputError, match="walls cannot jump"):
         case = lattice_case(planes([[0, 0, 1.0]], [-0.1], mass=1.0), contact={"treatment": "stick"})
         simulation(case, comm, shared_tmp_path)
@@ -95,7 +110,9 @@ def test_restart_keeps_the_walls(comm, shared_tmp_path):
         case = lattice_case(walls, velocity=[0.5, 0.0, -4.0], end=end)
         case["output"]["checkpoint_every"] = 50
         restart = name == "two" and end > 0.03
-        run = Simulation(Case.from_dict(case, name="it"), comm, output=shared_tmp_path / name, quiet=True, restart=restart)
+        run = Simulation(
+            Case.from_dict(case, name="it"), comm, output=shared_tmp_path / name, quiet=True, restart=restart
+        )
         rows[name] = [s.row for s in run][-1]
     for column, value in rows["one"].items():
         np.testing.assert_array_equal(rows["two"][column], value, err_msg=column)

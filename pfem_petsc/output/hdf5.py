@@ -39,6 +39,9 @@ __all__ = [
 HDF5_ERRORS = (OSError, RuntimeError, ValueError, KeyError)
 
 CHUNK_BYTES = 1 << 20
+# Bytes of chunks that HDF5 keeps in memory for each dataset: its own 1 MiB, times all columns and fields, would fill up
+# over a long run, and rows are never written a second time.
+CHUNK_CACHE = 1 << 16
 # Seconds in which the other ranks must report on an operation that failed on this one.
 GRACE = 5.0
 
@@ -105,7 +108,7 @@ def create_new(
 def open_shared(path: Path, comm: MPI.Comm) -> h5py.File:
     """Open an existing file for writing on all ranks; on one rank without locking, so that others may read it."""
     if comm.size == 1:
-        return h5py.File(path, "r+", locking=False)
+        return h5py.File(path, "r+", locking=False, rdcc_nbytes=CHUNK_CACHE)
     return h5py.File(path, "r+", driver="mpio", comm=comm)
 
 

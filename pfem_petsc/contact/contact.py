@@ -2,50 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import ClassVar
-
 import numpy as np
+from mpi4py import MPI
 
 from ..errors import InputError, SimulationFailure
 from ..parallel.agreement import agreed
 from ..registry import lookup
-from .friction import add_friction
+from .explicit import ExplicitContact
+from .forces import WallForces
 from .frames import NodalFrames, build_frames
 from .log import ContactLog
 from .motion import WallMotion
-from .projection import project
 from .search import near_planes
 
-__all__ = ["Contact", "WallForces"]
+__all__ = ["Contact"]
 
-_CURVED_ROUNDS = 100  # projections of an explicit step until tangent planes and positions agree
 _ZERO = np.zeros(1)
-
-
-@dataclass
-class WallForces:
-    """Per wall, sums over this rank's nodes, and these nodes.
-
-    Attributes
-    ----------
-    force : (walls, 3) on the truss [N]
-    contacts : (walls,) nodes in contact
-    moment : (walls, 3) of the force about the origin [N m]
-    nodes : (m,) owned nodes near walls
-    touching : (m, walls) bool, what they touch
-    places : (m, 3) where they are [m]
-    sums : names of those that are sums
-    """
-
-    sums: ClassVar[tuple[str, ...]] = ("force", "contacts", "moment")
-
-    force: np.ndarray
-    contacts: np.ndarray
-    moment: np.ndarray
-    nodes: np.ndarray
-    touching: np.ndarray
-    places: np.ndarray
 
 
 class Contact:
@@ -93,8 +65,10 @@ class Contact:
         self._offsets = np.zeros(len(walls))
         for k in np.flatnonzero(self.flat):
             self.normals[k], self._offsets[k] = self.walls[k].normal, self.walls[k].offset
-        extent = np.ptp(mesh.points, axis=0).max() if len(mesh.points) else 0.0
-        self.length = max(mesh.comm.allgather(float(extent)))
+        self._explicit = ExplicitContact(self)
+        ends = np.stack([-mesh.points.min(axis=0, initial=np.inf), mesh.points.max(axis=0, initial=-np.inf)])
+        mesh.comm.Allreduce(MPI.IN_PLACE, ends, op=MPI.MAX)
+        self.length = float(ends.sum(axis=0).max())
 
     def none(self) -> WallForces:
         """No contact."""
@@ -167,9 +141,10 @@ class Contact:
             count = comm.allreduce(count)
             if count:
                 raise InputError(
-                    f"{self.source}: wall {self.names[k]!r}: node {node} starts {-depth:.6g} m beyond the wall "
-                    f"({count} node{'s' if count > 1 else ''} in all); move the wall or the mesh, turn the normal to the "
-                    "allowed side, name the nodes that it concerns with 'node_set', or let 'adjust = true' move the nodes"
+                    f"{self.source}: wall {self.names[k]!r}: node {node} starts {-depth:.6g} "
+                    f"m beyond the wall ({count} node{'s' if count > 1 else ''} in all); move the wall or the mesh, "
+                    "turn the normal to the allowed side, name the nodes that it concerns with 'node_set', or let "
+                    "'adjust = true' move the nodes"
                 )
 
     def concerned(self, nodes: np.ndarray, x: np.ndarray, shifts: np.ndarray) -> np.ndarray:
@@ -211,129 +186,16 @@ class Contact:
         (nodes, correction (m, 3) [m], force (m, 3) [N] by the walls, WallForces)
         """
         if self.motion.free is not None:
-            self._push_walls(x, stiffness, time, tolerance)
-        return self._project(x, stiffness, time, tolerance)
-
-    def _push_walls(self, x: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float) -> None:
-        """Find where walls with mass end in an explicit step. Collective."""
-        free = self.motion.free
-        failure: SimulationFailure | None = None
-
-        def forces() -> tuple[np.ndarray, np.ndarray]:
-            nonlocal failure
-            try:
-                nodes, _, _, walls = self._project(x.copy(), stiffness, time, tolerance, booked=False)
-            except SimulationFailure as met:  # told once all ranks have left the iteration
-                failure = failure or met
-                return np.zeros((len(free.at), 3)), np.zeros((len(free.at), 3, 3))
-            normals, _ = self.planes(walls.touching, walls.places, self.motion.shifts(time))
-            active = np.where(walls.touching[:, :, None] & ~self.fixed[nodes][:, None, :], normals, 0.0)
-            inverse = np.linalg.pinv(active, rcond=1e-8) if len(nodes) else np.zeros((0, 3, len(self.walls)))
-            weight = stiffness[nodes][:, None] * (inverse * inverse).sum(axis=1)  # k (N N^T)^-1 on its diagonal
-            slope = np.einsum("mw,mwi,mwj->wij", np.where(walls.touching, weight, 0.0), normals, normals)
-            return walls.force[free.at], slope[free.at]
-
-        free.solve(forces, 1e-15 * self.length)
-        if failure is not None:
-            raise failure
-
-    def _project(
-        self, x: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float, booked: bool = True
-    ) -> tuple:
-        shifts = self.motion.shifts(time)
-        near = self.near(x, shifts)
-        if self.restitution.any():
-            near |= self._returning()
-        nodes = np.flatnonzero(near)
-        if len(nodes) == 0:
-            return nodes, np.empty((0, 3)), np.empty((0, 3)), self.none()
-        free = x[nodes]
-        concerned = self.concerned(nodes, free, shifts)
-        at = free
-        rebound = self._rebound(nodes)
-        for _ in range(_CURVED_ROUNDS):
-            normals, offsets = self.planes(concerned, at, shifts)
-            offsets += rebound
-            moved, multipliers = free.copy(), np.zeros(offsets.shape)
-            stuck = project(moved, self.fixed[nodes], normals, offsets, tolerance, multipliers)
-            if stuck >= 0:
-                raise SimulationFailure(self._no_room(nodes[stuck], offsets[stuck], time))
-            if self.flat.all() or np.abs(moved - at).max() <= tolerance:
-                break
-            at = moved
-        else:
-            node = self.mesh.node_ids[nodes[np.argmax(np.abs(moved - at).max(axis=1))]]
-            raise SimulationFailure(
-                f"the place of node {node} on curved walls at time {time:.6g} s was not found in {_CURVED_ROUNDS} rounds; "
-                "take a smaller time step"
-            )
-        strength = multipliers * stiffness[nodes][:, None]
-        force = strength[:, :, None] * normals
-        if self.rough:
-            moved, force = self._rub(nodes, free, shifts, (normals, offsets), stiffness[nodes], moved, strength, time)
-        if booked and self.restitution.any():
-            self._remember_approach(nodes, free, shifts, normals, strength)
-        walls = self.sums(nodes, force, moved, np.einsum("mwi,mwi->mw", force, normals) > 0.0)
-        x[nodes] = moved
-        return nodes, moved - free, force.sum(axis=1), walls
-
-    def _returning(self) -> np.ndarray:
-        """(owned,) bool: nodes that hit a wall with restitution in the last step."""
-        rebound = self.state.memory.get("rebound")
-        return (rebound > 0.0).any(axis=1) if rebound is not None else np.zeros(len(self.members), dtype=bool)
-
-    def _rebound(self, nodes: np.ndarray) -> np.ndarray:
-        """Distances (m, walls) [m] from walls that nodes get to in this step, having hit them in the last."""
-        rebound = self.state.memory.get("rebound") if self.restitution.any() else None
-        return rebound[nodes] if rebound is not None else np.zeros((len(nodes), len(self.walls)))
-
-    def _remember_approach(self, nodes, free, shifts, normals, strength) -> None:
-        """Who hits a wall with restitution in this step, and how far it gets from it in the next [m]."""
-        state = self.state
-        rebound = state.memory.setdefault("rebound", np.zeros((len(self.members), len(self.walls))))
-        way = shifts - self.motion.shifts(state.time)
-        if self.motion.free is not None:  # how they would meet, not how the wall gives way
-            way[self.motion.free.at] = self.motion.free.unpushed() - self.motion.free.state.x
-        approach = -np.einsum("mwi,mwi->mw", normals, (free - state.position[nodes])[:, None, :] - way)
-        fresh = (strength > 0.0) & ~self.log.touching[nodes]
-        rebound[:] = 0.0
-        rebound[nodes] = np.where(fresh, self.restitution * np.maximum(approach, 0.0), 0.0)
-
-    def _rub(self, nodes, free, shifts, planes, stiffness, moved, strength, time) -> tuple[np.ndarray, np.ndarray]:
-        """Positions and forces (m, w, 3) with friction, from those without; curved walls by tangent planes at the result."""
-        state = self.state
-        way = shifts - self.motion.shifts(state.time)
-        before, fixed = state.position[nodes], self.fixed[nodes]
-        normals, offsets = planes
-        concerned = offsets > -np.inf
-        tolerance = 1e-13 * self.length
-        for _ in range(_CURVED_ROUNDS):
-            at, pressing, drag = moved.copy(), strength.copy(), np.zeros(normals.shape)
-            unsettled = add_friction(
-                at, before, way, fixed, normals, offsets, self.friction, self.static_friction, stiffness, pressing, drag
-            )
-            if unsettled >= 0:
-                raise SimulationFailure(
-                    f"the friction of node {self.mesh.node_ids[nodes[unsettled]]} at time {time:.6g} s on several walls was "
-                    "not settled; take a smaller time step"
-                )
-            if self.flat.all():
-                break
-            normals_there, offsets = self.planes(concerned, at, shifts)
-            if np.abs(normals_there - normals).max() <= 1e-14:
-                break
-            normals = normals_there
-            moved, multipliers = free.copy(), np.zeros(offsets.shape)
-            project(moved, fixed, normals, offsets, tolerance, multipliers)
-            strength = multipliers * stiffness[:, None]
-        return at, pressing[:, :, None] * normals + drag
+            self._explicit.push_walls(x, stiffness, time, tolerance)
+        return self._explicit.project(x, stiffness, time, tolerance)
 
     def sums(self, nodes: np.ndarray, force: np.ndarray, x: np.ndarray, touching: np.ndarray) -> WallForces:
         """Sums of forces (m, w, 3) on nodes at (m, 3)."""
         moment = np.cross(x[:, None, :], force).sum(axis=0)
         return WallForces(force.sum(axis=0), touching.sum(axis=0), moment, nodes, touching, x)
 
-    def _no_room(self, node: int, offsets: np.ndarray, time: float) -> str:
+    def no_room(self, node: int, offsets: np.ndarray, time: float) -> str:
+        """What to tell about a node (owned index) whose planes contradict each other."""
         touched = [name for name, offset in zip(self.names, offsets, strict=True) if offset > -np.inf]
         return (
             f"no position of node {self.mesh.node_ids[node]} at time {time:.6g} s satisfies all walls "
@@ -345,8 +207,8 @@ class Contact:
     ) -> NodalFrames:
         """Coordinates and bounds of candidate nodes from their planes at positions (owned, 3). Collective.
 
-        ``concerned`` (m, walls) says which walls can stop a candidate; ``rank`` (m, walls) in which order they are taken
-        where there are more than three; default: nearest first.
+        ``concerned`` (m, walls) says which walls can stop a candidate; ``rank`` (m, walls) in which order they are
+        taken where there are more than three; default: nearest first.
         """
         at = x[candidates]
         normals, offsets = self.planes(concerned, at, self.motion.shifts(time))
@@ -357,7 +219,7 @@ class Contact:
         with agreed(self.mesh.comm):
             if frames.contradiction >= 0:
                 node = frames.contradiction
-                raise SimulationFailure(self._no_room(candidates[node], offsets[node], time))
+                raise SimulationFailure(self.no_room(candidates[node], offsets[node], time))
         return frames
 
     def strengths(self, frames: NodalFrames, residual: np.ndarray, active: np.ndarray) -> np.ndarray:

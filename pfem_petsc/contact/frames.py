@@ -2,8 +2,8 @@
 
 At a node, y = B x with the normals of up to three independent planes as rows of B makes each plane a bound on one
 coordinate; opposite planes bound the same coordinate from both sides. Rows along the axes stay in their axis's slot,
-so that walls along the axes need no change of coordinates at all. Planes are taken in the order of a rank, nearest first;
-a plane that finds no row, or would take the volume of the rows (the product of the sines of their angles) below
+so that walls along the axes need no change of coordinates at all. Planes are taken in the order of a rank, nearest
+first; a plane that finds no row, or would take the volume of the rows (the product of the sines of their angles) below
 :data:`MIN_VOLUME`, waits: whether it is kept is verified after the solve.
 """
 

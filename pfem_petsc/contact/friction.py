@@ -1,9 +1,9 @@
 """Coulomb friction of nodes on walls in explicit steps.
 
-Each wall k presses a node with lambda_k >= 0 along its normal and drags it by tau_k in its plane. With the slip s_k of the
-step, which is the node's motion relative to the wall in the wall's plane: the node sticks (s_k = 0) where
-|tau_k| <= mu_static lambda_k does it, else it slips and tau_k = -mu lambda_k s_k/|s_k|. On one wall this is solved exactly;
-several walls at a node are swept until nothing changes.
+Each wall k presses a node with lambda_k >= 0 along its normal and drags it by tau_k in its plane. With the slip s_k of
+the step, which is the node's motion relative to the wall in the wall's plane: the node sticks (s_k = 0) where
+|tau_k| <= mu_static lambda_k does it, else it slips and tau_k = -mu lambda_k s_k/|s_k|. On one wall this is solved
+exactly; several walls at a node are swept until nothing changes.
 """
 
 from __future__ import annotations

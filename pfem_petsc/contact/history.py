@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from .contact import Contact, WallForces
+from .contact import Contact
+from .forces import WallForces
 
 __all__ = ["contact_columns", "contact_sums", "contact_values"]
 

@@ -3,8 +3,8 @@
 With lumped mass, minimise |x - x_free|^2 subject to n_k . x >= d_k for the planes that the node's walls offer; the mass
 is the same in all directions, so it drops out. The solution is the one active set of at most three independent planes
 whose multipliers are not negative and whose point breaks no other plane: 0 <= lambda complementary to N x - d >= 0.
-Clamping one plane after the other is wrong where planes are oblique. Only planes that are broken on the way take part in
-the search: the optimum for them that breaks no other plane is the optimum for all.
+Clamping one plane after the other is wrong where planes are oblique. Only planes that are broken on the way take part
+in the search: the optimum for them that breaks no other plane is the optimum for all.
 """
 
 from __future__ import annotations
@@ -49,9 +49,9 @@ def _solve(gram, rhs, n, factor, out):
 
 @kernel
 def _best_set(free, gap, among, count, tolerance, gram, rhs, factor, solution, chosen, multipliers, move):
-    """The optimum for ``among[:count]`` planes: number of active planes, in ``chosen`` with ``multipliers``; 0: none fits.
+    """The optimum for ``among[:count]`` planes: number of active planes, 0 where no set fits.
 
-    ``move`` (3,) takes the way to the optimum.
+    ``chosen`` and ``multipliers`` (3,) take the active planes, ``move`` (3,) the way to the optimum.
     """
     best = math.inf
     found = 0

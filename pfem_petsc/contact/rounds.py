@@ -13,7 +13,7 @@ from mpi4py import MPI
 from ..integrators.base import Balance, State
 from ..solvers.newton import zero_tolerance
 from ..stepping.stepper import NotConverged
-from .contact import WallForces
+from .forces import WallForces
 from .frames import NodalFrames
 from .projection import project
 
@@ -81,7 +81,7 @@ class ContactRounds:
         return u
 
     def approach(self, problem, u: np.ndarray) -> np.ndarray:
-        """A guess (owned, 3) with a better active set: projected steepest descent, each node by its own stiffness. Collective.
+        """A guess (owned, 3) with a better active set, by projected steepest descent. Collective.
 
         In oblique coordinates Newton's active sets can go round in a circle; projections onto the true planes cannot.
         """
@@ -182,7 +182,7 @@ class ContactRounds:
         return bool(broken.any()), beyond[broken.any(axis=1)]
 
     def _off_surface(self, x: np.ndarray, tolerance: float) -> bool:
-        """Whether a node pressed against a curved wall is off its surface, or was held by the plane of another point."""
+        """Whether a node pressed on a curved wall is off its surface, or was held by the plane of another point."""
         at = self._frames.nodes
         for k in np.flatnonzero(~self.contact.flat):
             pressed = self.strengths[:, k] > 0.0

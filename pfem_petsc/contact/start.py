@@ -45,7 +45,7 @@ def adjust_start(case, nodes: dict[str, np.ndarray], mesh) -> int:
             bar = int(np.argmin(length))
             ends = mesh.node_ids[[a[bar], b[bar]]]
             raise InputError(
-                f"{case.source}: wall.adjust: bar {mesh.bar_ids[bar]} between nodes {ends[0]} and {ends[1]} has no length "
-                "left once its nodes are on the wall; move the wall or the mesh"
+                f"{case.source}: wall.adjust: bar {mesh.bar_ids[bar]} between nodes {ends[0]} and {ends[1]} has no "
+                "length left once its nodes are on the wall; move the wall or the mesh"
             )
     return mesh.comm.allreduce(len(moved))

@@ -11,7 +11,7 @@ from ..errors import SimulationFailure
 __all__ = ["BlowUp"]
 
 _CREATED = 1e3  # energy created by the integration, over all that was ever put in: far beyond any error of a sound run
-_ROWS = 10  # rows in succession; after a start from rest, or when a wall first strikes, there is nothing to compare with
+_ROWS = 10  # in succession: after a start from rest, or when a wall first strikes, nothing is there to compare with
 
 
 class BlowUp:

@@ -1,9 +1,10 @@
 """The energy ledger: every term by its own formula, so that their balance is a check and not a definition.
 
-For a scheme whose balance holds at the ends of steps (``at_ends``), works follow the trapezoidal rule: with dx = x1 - x0,
-external work = (e0 + e1) dx/2, contact work (r0 + r1) dx/2, damping dissipation (C v0 + C v1) dx/2, and the numerical
+For a scheme whose balance holds at the ends of steps (``at_ends``), works follow the trapezoidal rule: with
+dx = x1 - x0, external work = (e0 + e1) dx/2, contact work (r0 + r1) dx/2, damping dissipation (C v0 + C v1) dx/2, and the numerical
 dissipation is what inertia and internal force work beyond the change of their energies:
-(M a0 + M a1) dx/2 - dT + (f0 + f1) dx/2 - dU - dD + dH, with the work dH of changing temperatures. For the others the forces of the one balance work over the whole step.
+(M a0 + M a1) dx/2 - dT + (f0 + f1) dx/2 - dU - dD + dH, with the work dH of changing temperatures. For the others the
+forces of the one balance work over the whole step.
 The sum of all changes is then the work of the residual, zero up to the solver's tolerance.
 """
 
@@ -102,7 +103,8 @@ class Ledger:
         jump = self.stepper.treatment.jump
         a, v = after.a.copy(), after.v.copy()
         a[jump.nodes], v[jump.nodes] = jump.a, jump.v
-        return replace(after, a=a, v=v, contact=self.stepper.state.contact, kinetic=after.kinetic - jump.energy), jump.energy
+        kinetic = after.kinetic - jump.energy
+        return replace(after, a=a, v=v, contact=self.stepper.state.contact, kinetic=kinetic), jump.energy
 
     @property
     def kinetic(self) -> float:
@@ -113,6 +115,9 @@ class Ledger:
         state, inertia = self.stepper.state, self.model.inertia
         owned = self.model.mesh.n_owned
         a, v, momentum = state.a, state.v, state.v
+        contact = state.contact
+        if "contact_change" in state.memory:  # what a treatment of impact made of the accelerations
+            contact = contact + state.memory["contact_change"]
         if inertia.products:
             momentum = inertia.mass_times(state.v, np.empty_like(state.v))
             a = inertia.mass_times(state.a, np.empty_like(state.a))
@@ -125,7 +130,7 @@ class Ledger:
             internal=state.f[:owned].copy(),
             external=state.external,
             support=state.support,
-            contact=state.contact + state.memory["contact_change"] if "contact_change" in state.memory else state.contact,
+            contact=contact,
             kinetic=kinetic,
             energy=self.stepper.energy,
         )

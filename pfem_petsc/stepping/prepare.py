@@ -129,8 +129,8 @@ def make_stepper(model, plan: Plan) -> Stepper:
     name = model.case.contact.treatment
     if name == "scheme" and model.contact.any and (growth := held_growth(plan.scheme)) > 1.0 + 1e-9:
         model.warnings.append(
-            f"walls: with contact.treatment = \"scheme\" {model.case.time.integrator} with these parameters amplifies the "
-            f"motion of a node that a wall holds (by {growth:.3f} a step): contact chatters and gains energy; take "
+            f'walls: with contact.treatment = "scheme" {model.case.time.integrator} with these parameters amplifies '
+            f"the motion of a node that a wall holds (by {growth:.3f} a step): contact chatters and gains energy; take "
             'contact.treatment = "stick"'
         )
     if name == "scheme" or not model.contact.any:

@@ -146,7 +146,8 @@ class StepProblem:
         if not inertia.consistent:
             matrix.add_lumped(self.nodal, values)
             if inertia.redistribution is not None:
-                matrix.add_blocks(inertia.redistribution.touched, balance.alpha * inertia.redistribution.tensors, values)
+                moved = inertia.redistribution
+                matrix.add_blocks(moved.touched, balance.alpha * moved.tensors, values)
         coefficients = inertia.coefficients(balance.alpha, balance.eta)
         if balance.weight or inertia.consistent:
             bars, arguments = self.model.bars, (balance.weight, coefficients, matrix.pattern, values)

@@ -17,8 +17,8 @@ _ITERATIONS = 200
 class RedistributedStepper(Stepper):
     """Nodes with mass step by the balance at t_n; those without are in equilibrium along the normal at x_{n+1} as well.
 
-    Each step costs a few evaluations of the bars more than one without: the equilibrium of the contact nodes is found by
-    Newton's method with their own stiffness.
+    Each step costs a few evaluations of the bars more than one without: the equilibrium of the contact nodes is found
+    by Newton's method with their own stiffness.
     """
 
     def __init__(self, model, scheme, h: float) -> None:
@@ -94,8 +94,8 @@ class RedistributedStepper(Stepper):
         else:
             if not largest <= 1e-9 * model.length and self.fault is None:
                 self.fault = SimulationFailure(
-                    f"step {self.state.step}: contact nodes without mass found no equilibrium (last move {largest:.3g} m); "
-                    "take a smaller time.step or another contact.treatment"
+                    f"step {self.state.step}: contact nodes without mass found no equilibrium (last move {largest:.3g} "
+                    "m); take a smaller time.step or another contact.treatment"
                 )
         u[nodes] = x[nodes] - balance.predictor[nodes]
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..contact.contact import WallForces
+from ..contact.forces import WallForces
 from ..errors import SimulationFailure
 from ..integrators.base import Balance, Scheme, State
 from ..mechanics.bars import StrainEnergy

@@ -21,9 +21,9 @@ def search(x, fixed, normals, offsets):
                 continue
             multipliers = np.linalg.solve(a @ a.T, -gap[list(active)]) if n else np.zeros(0)
             move = multipliers @ a
-            if (multipliers >= 0.0).all() and all(gap[k] + free[k] @ move >= -1e-12 for k in usable):
-                if best is None or move @ move < best[1] @ best[1]:
-                    best = (active, move, multipliers)
+            fits = (multipliers >= 0.0).all() and all(gap[k] + free[k] @ move >= -1e-12 for k in usable)
+            if fits and (best is None or move @ move < best[1] @ best[1]):
+                best = (active, move, multipliers)
     return best
 
 

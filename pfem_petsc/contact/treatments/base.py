@@ -50,7 +50,7 @@ class Treatment(ABC):
         """Called after each part of a step, before it is booked: changes v, a and memory of the state."""
 
     def held(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Nodes that walls hold (m,), projections (m, 3, 3) onto their normals, and the walls' velocities (m, 3) [m/s]."""
+        """Nodes that walls hold (m,), projections (m, 3, 3) on their normals, velocities (m, 3) of the walls [m/s]."""
         stepper = self.stepper
         contact, walls = stepper.model.contact, stepper.solution.walls
         touched = walls.touching.any(axis=1)

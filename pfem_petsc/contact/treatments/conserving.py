@@ -1,9 +1,9 @@
 """The velocity update of Laursen and Love (2002): contact does no work, step by step.
 
-The normal velocity of a held node takes back the work W that contact did on it: m (v+^2 - v^2)/2 = -W, away from the wall.
-Its acceleration is the one without contact, so that the next step knows nothing of this contact force. Where W is
-positive and more than the node's energy, what is left is taken back in the steps to come. For schemes whose balance holds
-at x_{n+1}.
+The normal velocity of a held node takes back the work W that contact did on it: m (v+^2 - v^2)/2 = -W, away from the
+wall. Its acceleration is the one without contact, so that the next step knows nothing of this contact force. Where W is
+positive and more than the node's energy, what is left is taken back in the steps to come. For schemes whose balance
+holds at x_{n+1}.
 """
 
 from __future__ import annotations
@@ -19,12 +19,14 @@ class Treatment(Base):
     """Velocity of held nodes such that contact does no work."""
 
     def before(self) -> None:
+        """Keep where nodes start, and the forces there."""
         state = self.stepper.state
         self._start = state.position.copy()
         change = state.memory.get("contact_change")
         self._force = state.contact if change is None else state.contact + change
 
     def after(self) -> None:
+        """See :class:`~pfem_petsc.contact.treatments.base.Treatment`."""
         self.clear()
         stepper, state, inertia = self.stepper, self.stepper.state, self.stepper.model.inertia
         debt = state.memory.setdefault("contact_debt", np.zeros_like(state.v))

@@ -2,8 +2,9 @@
 
 The mass m of a contact node moves, for motions along its wall's normal n, to the neighbours that its bars lead to away
 from the wall: the mass of a node becomes a matrix, m I - m n n^T at the contact node and m_j I + w m n n^T at its
-neighbours, with the total kept. A contact node then follows its neighbours by equilibrium along n: its force is continuous
-in time, no spike grows as 1/h, and impact loses no energy. Needs plane walls with a node set, each node in one wall only.
+neighbours, with the total kept. A contact node then follows its neighbours by equilibrium along n: its force is
+continuous in time, no spike grows as 1/h, and impact loses no energy. Needs plane walls
+with a node set, each node in one wall only.
 """
 
 from __future__ import annotations
@@ -75,8 +76,8 @@ def redistribute(model) -> Redistribution:
         lone = nodes[info[nodes, 4] <= 1e-6]
         if len(lone):
             raise InputError(
-                f"{key}: node {mesh.node_ids[lone[0]]} has no bar that leads away from its wall, so its mass has nowhere "
-                "to go; leave it out of the wall's node_set"
+                f"{key}: node {mesh.node_ids[lone[0]]} has no bar that leads away from its wall, so its mass has "
+                "nowhere to go; leave it out of the wall's node_set"
             )
     tensors = np.zeros((owned, 3, 3))
     normals = info[:, :3]
@@ -94,6 +95,7 @@ class Treatment(Base):
     """No mass on contact nodes along the walls' normals."""
 
     def before(self) -> None:
+        """Keep where nodes start."""
         self._start = self.stepper.state.position.copy()
 
     def after(self) -> None:

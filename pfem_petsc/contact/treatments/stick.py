@@ -1,7 +1,7 @@
 """Held nodes move with the wall: their normal velocity is the wall's, and they are not accelerated.
 
-On closure a node loses the kinetic energy of its approach, m v_n^2/2, an O(element length) part of the whole; on release
-it starts from rest. Energy never grows by contact with a wall at rest.
+On closure a node loses the kinetic energy of its approach, m v_n^2/2, an O(element length) part of the whole; on
+release it starts from rest. Energy never grows by contact with a wall at rest.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ class Treatment(Base):
     """Velocity and acceleration of held nodes as those of the wall."""
 
     def after(self) -> None:
+        """See :class:`~pfem_petsc.contact.treatments.base.Treatment`."""
         self.clear()
         state = self.stepper.state
         nodes, normal, speed = self.held()

@@ -1,0 +1,145 @@
+"""Contact of explicit steps: each node's own small problem, curved walls, walls with mass, friction and restitution."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..errors import SimulationFailure
+from .friction import add_friction
+from .projection import project
+
+__all__ = ["ExplicitContact"]
+
+_CURVED_ROUNDS = 100  # projections of a step until tangent planes and positions agree
+
+
+class ExplicitContact:
+    """Projects free positions onto what the walls of a :class:`~pfem_petsc.contact.contact.Contact` allow."""
+
+    def __init__(self, contact) -> None:
+        self.contact = contact
+
+    def push_walls(self, x: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float) -> None:
+        """Find where walls with mass end in an explicit step. Collective."""
+        free = self.contact.motion.free
+        failure: SimulationFailure | None = None
+
+        def forces() -> tuple[np.ndarray, np.ndarray]:
+            nonlocal failure
+            try:
+                nodes, _, _, walls = self.project(x.copy(), stiffness, time, tolerance, booked=False)
+            except SimulationFailure as met:  # told once all ranks have left the iteration
+                failure = failure or met
+                return np.zeros((len(free.at), 3)), np.zeros((len(free.at), 3, 3))
+            normals, _ = self.contact.planes(walls.touching, walls.places, self.contact.motion.shifts(time))
+            active = np.where(walls.touching[:, :, None] & ~self.contact.fixed[nodes][:, None, :], normals, 0.0)
+            inverse = np.linalg.pinv(active, rcond=1e-8) if len(nodes) else np.zeros((0, 3, len(self.contact.walls)))
+            weight = stiffness[nodes][:, None] * (inverse * inverse).sum(axis=1)  # k (N N^T)^-1 on its diagonal
+            slope = np.einsum("mw,mwi,mwj->wij", np.where(walls.touching, weight, 0.0), normals, normals)
+            return walls.force[free.at], slope[free.at]
+
+        free.solve(forces, 1e-15 * self.contact.length)
+        if failure is not None:
+            raise failure
+
+    def project(
+        self, x: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float, booked: bool = True
+    ) -> tuple:
+        """See :meth:`Contact.explicit`; ``booked``: this is the step, not a trial of it."""
+        shifts = self.contact.motion.shifts(time)
+        near = self.contact.near(x, shifts)
+        if self.contact.restitution.any():
+            near |= self._returning()
+        nodes = np.flatnonzero(near)
+        if len(nodes) == 0:
+            return nodes, np.empty((0, 3)), np.empty((0, 3)), self.contact.none()
+        free = x[nodes]
+        concerned = self.contact.concerned(nodes, free, shifts)
+        at = free
+        rebound = self._rebound(nodes)
+        for _ in range(_CURVED_ROUNDS):
+            normals, offsets = self.contact.planes(concerned, at, shifts)
+            offsets += rebound
+            moved, multipliers = free.copy(), np.zeros(offsets.shape)
+            stuck = project(moved, self.contact.fixed[nodes], normals, offsets, tolerance, multipliers)
+            if stuck >= 0:
+                raise SimulationFailure(self.contact.no_room(nodes[stuck], offsets[stuck], time))
+            if self.contact.flat.all() or np.abs(moved - at).max() <= tolerance:
+                break
+            at = moved
+        else:
+            node = self.contact.mesh.node_ids[nodes[np.argmax(np.abs(moved - at).max(axis=1))]]
+            raise SimulationFailure(
+                f"the place of node {node} on curved walls at time {time:.6g} s was not found in {_CURVED_ROUNDS} "
+                "rounds; take a smaller time step"
+            )
+        strength = multipliers * stiffness[nodes][:, None]
+        force = strength[:, :, None] * normals
+        if self.contact.rough:
+            moved, force = self._rub(nodes, free, shifts, (normals, offsets), stiffness[nodes], moved, strength, time)
+        if booked and self.contact.restitution.any():
+            self._remember_approach(nodes, free, shifts, normals, strength)
+        walls = self.contact.sums(nodes, force, moved, np.einsum("mwi,mwi->mw", force, normals) > 0.0)
+        x[nodes] = moved
+        return nodes, moved - free, force.sum(axis=1), walls
+
+    def _returning(self) -> np.ndarray:
+        """(owned,) bool: nodes that hit a wall with restitution in the last step."""
+        rebound = self.contact.state.memory.get("rebound")
+        return (rebound > 0.0).any(axis=1) if rebound is not None else np.zeros(len(self.contact.members), dtype=bool)
+
+    def _rebound(self, nodes: np.ndarray) -> np.ndarray:
+        """Distances (m, walls) [m] from walls that nodes get to in this step, having hit them in the last."""
+        rebound = self.contact.state.memory.get("rebound") if self.contact.restitution.any() else None
+        return rebound[nodes] if rebound is not None else np.zeros((len(nodes), len(self.contact.walls)))
+
+    def _remember_approach(self, nodes, free, shifts, normals, strength) -> None:
+        """Who hits a wall with restitution in this step, and how far it gets from it in the next [m]."""
+        state = self.contact.state
+        rebound = state.memory.setdefault("rebound", np.zeros((len(self.contact.members), len(self.contact.walls))))
+        way = shifts - self.contact.motion.shifts(state.time)
+        if self.contact.motion.free is not None:  # how they would meet, not how the wall gives way
+            way[self.contact.motion.free.at] = self.contact.motion.free.unpushed() - self.contact.motion.free.state.x
+        approach = -np.einsum("mwi,mwi->mw", normals, (free - state.position[nodes])[:, None, :] - way)
+        fresh = (strength > 0.0) & ~self.contact.log.touching[nodes]
+        rebound[:] = 0.0
+        rebound[nodes] = np.where(fresh, self.contact.restitution * np.maximum(approach, 0.0), 0.0)
+
+    def _rub(self, nodes, free, shifts, planes, stiffness, moved, strength, time) -> tuple[np.ndarray, np.ndarray]:
+        """Positions and forces (m, w, 3) with friction, from those without; curved walls by planes at the result."""
+        contact, state = self.contact, self.contact.state
+        way = shifts - self.contact.motion.shifts(state.time)
+        before, fixed = state.position[nodes], self.contact.fixed[nodes]
+        normals, offsets = planes
+        concerned = offsets > -np.inf
+        tolerance = 1e-13 * self.contact.length
+        for _ in range(_CURVED_ROUNDS):
+            at, pressing, drag = moved.copy(), strength.copy(), np.zeros(normals.shape)
+            unsettled = add_friction(
+                at,
+                before,
+                way,
+                fixed,
+                normals,
+                offsets,
+                self.contact.friction,
+                self.contact.static_friction,
+                stiffness,
+                pressing,
+                drag,
+            )
+            if unsettled >= 0:
+                raise SimulationFailure(
+                    f"the friction of node {contact.mesh.node_ids[nodes[unsettled]]} at time {time:.6g} s on "
+                    "several walls was not settled; take a smaller time step"
+                )
+            if self.contact.flat.all():
+                break
+            normals_there, offsets = self.contact.planes(concerned, at, shifts)
+            if np.abs(normals_there - normals).max() <= 1e-14:
+                break
+            normals = normals_there
+            moved, multipliers = free.copy(), np.zeros(offsets.shape)
+            project(moved, fixed, normals, offsets, tolerance, multipliers)
+            strength = multipliers * stiffness[:, None]
+        return at, pressing[:, :, None] * normals + drag

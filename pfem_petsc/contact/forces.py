@@ -1,0 +1,35 @@
+"""Forces of walls on the nodes of a rank, and their sums."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+
+__all__ = ["WallForces"]
+
+
+@dataclass
+class WallForces:
+    """Per wall, sums over this rank's nodes, and these nodes.
+
+    Attributes
+    ----------
+    force : (walls, 3) on the truss [N]
+    contacts : (walls,) nodes in contact
+    moment : (walls, 3) of the force about the origin [N m]
+    nodes : (m,) owned nodes near walls
+    touching : (m, walls) bool, what they touch
+    places : (m, 3) where they are [m]
+    sums : names of those that are sums
+    """
+
+    sums: ClassVar[tuple[str, ...]] = ("force", "contacts", "moment")
+
+    force: np.ndarray
+    contacts: np.ndarray
+    moment: np.ndarray
+    nodes: np.ndarray
+    touching: np.ndarray
+    places: np.ndarray

@@ -71,13 +71,14 @@ def step_time(parts: Parts, bars: float, ranks: np.ndarray) -> dict[str, np.ndar
 def parts_from(found: dict, latency: float | None, bandwidth: float | None) -> Parts:
     """Parts from what ``bench`` wrote of an explicit run on all cores; a network's figures replace those measured."""
     run = max((r for r in found["runs"] if r["job"] == "explicit"), key=lambda r: r["bars"])
-    overhead = next(r["median"] for r in found["overhead"] if r["job"] == "tiny")
+    # the best steps: on a shared machine the others hold waiting as well
+    overhead = next(r["best"] for r in found["overhead"] if r["job"] == "tiny")
     messages = found["messages"] or {"latency": 1e-6, "bandwidth": 1e10, "reduction": 0.0}
     # on several ranks a tiny step has an exchange and a sum in it, which are counted apart
     waiting = messages["reduction"] + messages["latency"] * run["neighbours"] if found["ranks"] > 1 else 0.0
     overhead = max(overhead - waiting, 0.5 * overhead)
     return Parts(
-        bar=max(run["median"] - overhead - waiting, 0.0) * found["ranks"] / run["evaluated"],
+        bar=max(run["best"] - overhead - waiting, 0.0) * found["ranks"] / run["evaluated"],
         overhead=overhead,
         latency=latency if latency is not None else messages["latency"],
         bandwidth=bandwidth if bandwidth is not None else messages["bandwidth"],

@@ -10,11 +10,11 @@ from ..errors import InputError
 
 __all__ = ["LinearChoice", "choose_linear", "configure"]
 
-_DIRECT_BELOW = 6000  # unknowns; below, a factorisation costs no more than a few dozen Krylov iterations in any state
-# Steps over the explicit limit up to which each is fastest, 101,376 bars on one core: a product costs 0.5 ms without a
-# matrix and 3.4 ms with one; Jacobi takes 13, 102, 377 iterations at 1, 10, 100 x, incomplete Cholesky 5, 31, 166,
-# multigrid 8, 13, 14 after a set-up of 0.8 s.
-_MATRIX_FREE_UP_TO = 200.0
+_DIRECT_BELOW = 500  # unknowns; a lattice of 3,993 takes 0.22 s to factorise, and 1 to 4 ms with conjugate gradients
+# Steps over the explicit limit up to which each is chosen. scripts/linear_solvers.py, 101,706 bars on one core, seconds a
+# Newmark step at 1, 10, 100, 1000 x: matrix-free Jacobi 0.015, 0.046, 0.13, 0.15; point-block Jacobi 0.091, 0.16, 0.30,
+# 0.36; incomplete Cholesky 0.082, 0.15, 0.34, 0.42; multigrid 0.55, 0.60, 0.58, 0.60 (docs/linear_solvers.md).
+_MATRIX_FREE_UP_TO = 3000.0
 _JACOBI_UP_TO = 5.0
 _CHOLESKY_UP_TO = 50.0
 

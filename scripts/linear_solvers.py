@@ -4,8 +4,8 @@
     python scripts/linear_solvers.py --cells 10 22 48         # 10^6 bars as well
     mpirun -n 2 python scripts/linear_solvers.py --cells 22
 
-Newmark steps (beta = 1/4, gamma = 1/2) of an elastic cubic lattice that flies, vibrating, at 1, 10, 100 and 1000 times the
-critical step of central differences. Writes Markdown and JSON; times are CPU seconds of the slowest rank, per step.
+Newmark steps (beta = 1/4, gamma = 1/2) of an elastic cubic lattice that flies, vibrating, at 1, 10, 100 and 1000 times
+the critical step of central differences. Writes Markdown and JSON; times are CPU seconds of the slowest rank, per step.
 """
 
 from __future__ import annotations
@@ -62,14 +62,13 @@ def measure(cells: int, ratio: float, overrides: tuple[str, ...], steps: int) ->
     folder = comm.bcast(tempfile.mkdtemp() if comm.rank == 0 else None)
     critical = 0.01 / np.sqrt(110e9 / 4500.0) * 1.93  # of this lattice; the exact ratio is printed by the program
     simulation = Simulation(case(cells, ratio * critical, steps + 1, overrides), comm, output=folder, quiet=True)
-    made, newton, linear, began = 0, 0, 0, 0.0
-    for done in simulation:
+    newton, linear, began = 0, 0, 0.0
+    for made, done in enumerate(simulation):
         if made == 0:
             began = time.process_time()
         else:
             newton += done.newton
             linear += done.linear
-        made += 1
     seconds = comm.allreduce(time.process_time() - began, op=MPI.MAX) / steps
     return {
         "seconds": seconds,

@@ -133,7 +133,7 @@ class Simulation:
         if self.restart is not None:
             # before anything in the folder changes: it may be refused
             checkpoint = self._checkpoints.take_back(self.restart)
-        prepare_folder(self.comm, self.folder, self.restart)
+        aside = prepare_folder(self.comm, self.folder, self.restart)
         self._progress = Progress(
             self.comm,
             self.case.title,
@@ -151,6 +151,8 @@ class Simulation:
             self._progress.message(self.plan.scheme.notice)
         for note in self._notes:
             self._progress.message(note)
+        if aside is not None:
+            self._progress.message(f"{self.folder}: held results, which are in {aside} now")
         if self.restart is None:
             self.stepper.start()
             self._meet()
@@ -264,7 +266,8 @@ class Simulation:
             self._snapshot()
         if checkpoint or self._meetings.checkpoint_due:
             self._checkpoint()
-        drift = self.row["energy_imbalance"] / max(abs(self.recorder.start_energy), 1e-300)
+        scale = self.recorder.energy_scale
+        drift = self.row["energy_imbalance"] / scale if scale > 0.0 else None
         self._progress.update(
             step, self.state.time, stepper.h, solution.newton, solution.linear, self.row["active_contacts"], drift
         )

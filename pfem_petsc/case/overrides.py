@@ -1,4 +1,4 @@
-"""Values set over those of the case file: ``time.step=1e-5``, ``wall.0.point=[1.0, 0.0, 0.0]``."""
+"""Values set over those of the case file: ``time.step=1e-5``, ``wall.0.point=[1.0, 0.0, 0.0]``, ``time.beta=``."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ def apply_overrides(data: dict[str, Any], overrides: Iterable[str]) -> list[tupl
     Parameters
     ----------
     data : the case as nested tables
-    overrides : texts ``path=value``; the value is TOML, or else taken as a text as it stands
+    overrides : texts ``path=value``; the value is TOML, or else taken as a text as it stands; without a value, the key
+        is taken out where it is there
 
     Returns
     -------
@@ -40,6 +41,9 @@ def apply_overrides(data: dict[str, Any], overrides: Iterable[str]) -> list[tupl
         parts = _split(key.strip())
         if not equals or parts is None:
             raise InputError(f"--set {text}: expected KEY=VALUE, like time.step=1e-5 or wall.0.point=[1.0, 0.0, 0.0]")
+        if not value.strip():
+            _take_out(data, parts)
+            continue
         paths.append(_put(data, parts, _value(value.strip()), f"--set {text}"))
     return paths
 
@@ -69,6 +73,18 @@ def _split(key: str) -> list[str] | None:
         elif position < len(key) and key[position] != "[":
             return None
     return parts if parts and all(parts) else None
+
+
+def _take_out(data: dict[str, Any], parts: list[str]) -> None:
+    here: Any = data
+    for k, part in enumerate(parts):
+        key = int(part) if isinstance(here, list) and part.isdigit() else part
+        if not (key in here if isinstance(here, dict) else isinstance(here, list) and key in range(len(here))):
+            return
+        if k == len(parts) - 1:
+            del here[key]
+        else:
+            here = here[key]
 
 
 def _put(data: dict[str, Any], parts: list[str], value: Any, where: str) -> tuple[str | int, ...]:

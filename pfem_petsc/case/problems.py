@@ -107,7 +107,10 @@ class Problems:
         field = model.model_fields.get(str(item["loc"][0])) if item["loc"] else None
         about = f" ({field.description.strip().rstrip('.')})" if field is not None and field.description else ""
         if kind == "extra_forbidden":
-            self.add(where, _unknown_key(str(item["loc"][-1]), list(model.model_fields), known, taker))
+            text = _unknown_key(str(item["loc"][-1]), list(model.model_fields), known, taker)
+            if taker and where not in self.overridden and any(p[:-1] == where[:-1] for p in self.overridden):
+                text += f"; --set {key_text(where)}= takes it out"
+            self.add(where, text)
         elif kind == "missing" and len(item["loc"]) == 1:
             self.add(where, f"this key is missing{about}")
         elif kind in ("missing", "too_long", "too_short") and isinstance(value, list | tuple):

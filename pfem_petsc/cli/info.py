@@ -18,7 +18,7 @@ example:
 
 STORED = ("kinetic_energy", "elastic_energy")
 LOST = ("plastic_dissipation", "damping_dissipation", "numerical_dissipation")
-SUPPLIED = ("external_work", "contact_work")
+SUPPLIED = ("external_work", "contact_work", "thermal_work")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -62,7 +62,7 @@ def describe(result: Result) -> list[str]:
 
 
 def _energies(history, names: list[str]) -> list[str]:  # noqa: ANN001 - any mapping of names to (rows,) arrays
-    """Energies [J] at start and end, and what their balance leaves over."""
+    """Energies [J] at start and end, and what their balance leaves over, also of the largest that any had meanwhile."""
     from ..output.units import engineering
 
     present = [name for name in (*STORED, *LOST, *SUPPLIED) if name in names]
@@ -77,7 +77,7 @@ def _energies(history, names: list[str]) -> list[str]:  # noqa: ANN001 - any map
         lines.append(f"  {name:{width}}  {engineering(start, 'J'):>12}  {engineering(end, 'J'):>12}")
     error = sum(change.get(name, 0.0) for name in (*STORED, *LOST))
     error -= sum(change.get(name, 0.0) for name in SUPPLIED)
-    scale = max(max(abs(float(history[name][k])) for name in present) for k in (0, -1))
+    scale = max(float(abs(history[name]).max()) for name in present)
     relative = f" ({error / scale:.1e} of the largest)" if scale > 0.0 else ""
     lines.append(f"  {'balance error':{width}}  {engineering(error, 'J'):>26}{relative}")
     return lines

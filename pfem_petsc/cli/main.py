@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import difflib
 import importlib
 import io
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 from types import ModuleType
 
+from ..case.builtin import built_in_cases
 from ..errors import InputError
 from .launcher import collectively, launched_rank, on_first_rank, refuse
 from .parser import PROGRAM, Parser, add_debug
@@ -61,6 +64,9 @@ def _parse(words: list[str]) -> tuple[argparse.Namespace, ModuleType]:
     if not words:
         raise InputError(f"CASE or a verb is missing: {', '.join(VERBS)}; see {PROGRAM} --help")
     if words[0] not in (*VERBS, "-h", "--help", "--version"):
+        near = difflib.get_close_matches(words[0], VERBS, n=1, cutoff=0.7)
+        if near and not Path(words[0]).exists() and words[0] not in built_in_cases():
+            raise InputError(f"{words[0]}: there is no such verb or case; did you mean '{near[0]}'?")
         words = ["run", *words]
     # Help comes from one rank.
     with contextlib.redirect_stdout(io.StringIO()) if launched_rank() else contextlib.nullcontext():

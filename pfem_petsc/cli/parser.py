@@ -38,7 +38,7 @@ def add_case(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         action="extend",
         default=[],
-        help="set values over those of the case: time.step=1e-5 wall.0.point=[1,0,0]",
+        help="set values over those of the case: time.step=1e-5 wall.0.point=[1,0,0]; KEY= takes a key out",
     )
 
 

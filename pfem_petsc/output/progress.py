@@ -123,7 +123,7 @@ class Progress:
         step, time, dt : number of the step, its time and its length [s]
         newton, linear : Newton and linear-solver iterations of this step
         contacts : nodes in contact now
-        energy_drift : balance error of the energies relative to their scale, None where not known
+        energy_drift : balance error of the energies relative to the largest of them, None where there is none
         """
         if not self._root:
             return
@@ -216,7 +216,7 @@ class Progress:
         steps = max(1, step - self._marked[1])
         newton, linear = self._newton - self._marked[3], self._linear - self._marked[4]
         parts = [f"Newton {newton / steps:.1f}/step"] if newton else []
-        parts += [f"CG {linear / steps:.1f}/step"] if linear else []
+        parts += [f"linear {linear / steps:.1f}/step"] if linear else []
         parts += [f"contacts {contacts:,}"]
         return parts + ([f"energy drift {drift:+.1e}"] if drift is not None else [])
 

@@ -19,7 +19,7 @@ __all__ = ["plot"]
 
 STORED = ("kinetic_energy", "elastic_energy")
 LOST = ("plastic_dissipation", "damping_dissipation", "numerical_dissipation")
-SUPPLIED = ("external_work", "contact_work")
+SUPPLIED = ("external_work", "contact_work", "thermal_work")
 WINDOW = 0.02  # width of the mean that smooths wall forces, as a part of the run
 
 History = Mapping[str, np.ndarray]
@@ -253,8 +253,9 @@ def _solver(history: History, title: str, file: Path) -> Path | None:
         "active_contacts": "nodes in\ncontact",
     }
     names = [name for name in labels if name in history]
-    # an explicit scheme iterates nowhere: its panels would be empty
-    names = [name for name in names if name == "active_contacts" or np.any(history[name])]
+    # an explicit scheme iterates nowhere, and a truss without walls touches nothing: these panels would be empty
+    walls = any(name.startswith("wall/") for name in history)
+    names = [name for name in names if (walls and name == "active_contacts") or np.any(history[name])]
     if not names:
         return None
     chart = Chart(_read(history, "time"), title, len(names), heights=[0.7] * len(names))

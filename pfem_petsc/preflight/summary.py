@@ -19,11 +19,14 @@ def summarise(case, model, plan) -> dict[str, str]:
     parameters = ", ".join(f"{k} = {v:g}" for k, v in case.time.scheme.model_dump().items())
     # kibibytes on Linux
     peak = comm.allreduce(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024.0)
+    ranks = f"{comm.size}"
+    if comm.size > 1:
+        ranks += f", owning {min(c[0] for c in counts):,} to {max(c[0] for c in counts):,} nodes ({mesh.partitioner})"
+        ranks += f", at most {max(c[1] for c in counts):,} ghosts"
     return {
         "nodes": f"{mesh.n_nodes:,}",
         "bars": f"{mesh.n_bars:,}",
-        "ranks": f"{comm.size}, owning {min(c[0] for c in counts):,} to {max(c[0] for c in counts):,} nodes "
-        f"({mesh.partitioner}), at most {max(c[1] for c in counts):,} ghosts",
+        "ranks": ranks,
         "extent": " x ".join(engineering(float(d), "m") for d in model.high - model.low),
         "mass": engineering(model.total_mass, "kg") + f" ({case.time.mass})",
         "wave speed": engineering(model.wave_speed, "m/s"),

@@ -91,15 +91,19 @@ def _continues(folder: Path, path: Path) -> bool:
     return (folder / RESULT).is_file() and path.resolve().parent == folder.resolve()
 
 
-def prepare_folder(comm: MPI.Comm, folder: Path, restart: Restart | None) -> None:
+def prepare_folder(comm: MPI.Comm, folder: Path, restart: Restart | None) -> Path | None:
     """Make the output folder; what it holds is moved aside to a numbered name, unless a restart continues it.
+
+    Returns
+    -------
+    The new name of what was moved aside, or None
 
     Raises
     ------
     InputError
         On all ranks, where the folder cannot be written.
     """
-    on_root(comm, _prepare, folder, restart)
+    return on_root(comm, _prepare, folder, restart)
 
 
 def _refuse_gap(path: Path, restart: Restart) -> None:
@@ -115,7 +119,8 @@ def _refuse_gap(path: Path, restart: Restart) -> None:
         )
 
 
-def _prepare(folder: Path, restart: Restart | None) -> None:
+def _prepare(folder: Path, restart: Restart | None) -> Path | None:
+    aside = None
     try:
         if restart is not None and restart.continues:
             _refuse_gap(folder / RESULT, restart)
@@ -124,9 +129,10 @@ def _prepare(folder: Path, restart: Restart | None) -> None:
                 os.replace(folder / NAME, folder / ASIDE)
         elif any((folder / name).exists() for name in (RESULT, NAME, PREVIOUS)):
             number = 1
-            while (aside := folder.with_name(f"{folder.name}.{number}")).exists():
+            while (free := folder.with_name(f"{folder.name}.{number}")).exists():
                 number += 1
-            folder.rename(aside)
+            folder.rename(free)
+            aside = free
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(
@@ -134,3 +140,4 @@ def _prepare(folder: Path, restart: Restart | None) -> None:
         ) from error
     if not os.access(folder, os.W_OK | os.X_OK):
         raise InputError(f"{folder}: cannot write the results there: permission denied; choose another with -o")
+    return aside

@@ -22,6 +22,7 @@ class Recorder:
     ----------
     columns : name to shape of a row's value
     types : name to dtype where it is not float64
+    energy_scale : the largest that any energy was in the rows so far [J]
     alarmed : whether any rank raised an alarm with the last row
     probe_nodes : probe name to the mesh numbers of its nodes, ascending: the order of rows in a probe's columns
     """
@@ -31,6 +32,7 @@ class Recorder:
         self.ledger = ledger
         self.model = stepper.model
         self.start_energy: float | None = None
+        self.energy_scale = 0.0
         self.alarmed = False
         self.iterations = np.zeros(2, dtype=np.int64)
         case, mesh, comm = self.model.case, self.model.mesh, self.model.comm
@@ -96,6 +98,7 @@ class Recorder:
         held = kinetic + elastic + heat + hardening + damping + numerical - external - contact - thermal
         if self.start_energy is None:
             self.start_energy = float(held)
+        self.energy_scale = max(self.energy_scale, float(np.abs(sums[:9]).max()))
         row: dict[str, Any] = {
             "time": state.time,
             "step": state.step,

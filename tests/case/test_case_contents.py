@@ -184,7 +184,9 @@ def test_any_case_reads_back_equal(data):
         ("time.integrator=newmark", {"time": {"integrator": "newmark"}}),
         ('title="a = b"', {"title": "a = b"}),
         ("title=a = b", {"title": "a = b"}),
-        ("title=", {"title": ""}),
+        ('title=""', {"title": ""}),
+        ("title=", {}),
+        ("wall.0.point=", {}),
         ("title=1\nx = 2", {"title": "1\nx = 2"}),
         ("wall.0.point=[1, 2.0, 3]", {"wall": [{"point": [1, 2.0, 3]}]}),
         ("wall[0].name=a", {"wall": [{"name": "a"}]}),
@@ -203,6 +205,12 @@ def test_override_changes_only_its_key():
     data = {"wall": [{"point": [1.0, 0.0, 0.0], "name": "a"}, {"name": "b"}]}
     apply_overrides(data, ["wall.0.point.1=5.0", "wall.1.name=c", "wall.2.name=d"])
     assert data == {"wall": [{"point": [1.0, 5.0, 0.0], "name": "a"}, {"name": "c"}, {"name": "d"}]}
+
+
+def test_override_without_a_value_takes_the_key_out():
+    data = {"time": {"beta": 0.25, "step": 0.1}, "wall": [{"name": "a", "mass": 1.0}, {}], "gravity": {}}
+    apply_overrides(data, ["time.beta=", "wall.0.mass= ", "wall.1=", "gravity=", "time.step.unit=", "wall.7.name="])
+    assert data == {"time": {"step": 0.1}, "wall": [{"name": "a"}]}
 
 
 def test_given_tables_stay_as_they_are(case_text):

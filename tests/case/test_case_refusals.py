@@ -239,3 +239,14 @@ def test_mesh_file_takes_no_generator_keys(case_text):
     text = case_text.replace('generator = "rod"', 'file = "a.msh"')
     with pytest.raises(InputError, match=r"mesh\.length: .*a mesh from a file takes no other keys"):
         Case.from_toml(text)
+
+
+def test_parameter_of_another_scheme_is_refused_with_the_way_out():
+    data = Case.load("rod_impact", ["time.integrator=newmark", "time.beta=0.25"]).to_dict()
+    with pytest.raises(InputError, match=r"time.beta: unknown key; houbolt .*; --set time.beta= takes it out"):
+        Case.from_dict(data, overrides=["time.integrator=houbolt"])
+    taken_out = ["time.integrator=houbolt", "time.beta=", "time.gamma="]
+    assert Case.from_dict(data, overrides=taken_out).time.integrator == "houbolt"
+    data["time"]["integrator"] = "houbolt"
+    with pytest.raises(InputError, match=r"time.beta: unknown key; houbolt takes no parameters(\n|$)"):
+        Case.from_dict(data)

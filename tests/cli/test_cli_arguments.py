@@ -42,6 +42,7 @@ def test_help_and_version(capsys):
         (["list", "--", "-log_view"], "list takes no PETSc options: -log_view"),
         (["info"], "required: RESULT"),
         (["rod_impct"], "rod_impct: there is no such case file or built-in case; did you mean 'rod_impact'?"),
+        (["rendr", "results/rod_impact"], "rendr: there is no such verb or case; did you mean 'render'?"),
         (["check", "rod_impact", "--set", "time.end=0"], "time.end = 0"),
         (["rod_impact", "--set", "time.end=0", "mesh.elements=x"], "time.end = 0"),
         (["rod_impact", "--set", "time.end=0", "--set", "mesh.elements=x"], 'mesh.elements = "x"'),

@@ -32,18 +32,19 @@ def test_summary():
 
 
 def test_energies_and_their_balance():
-    """Stored plus lost minus supplied, from start to end: (3 + 1 + 4) - (10) - (-1.5) = -0.5 J, of at most 10 J."""
+    """Stored plus lost minus supplied, end minus start: (3 + 1 + 4) - (10) - (-1.5) - (0.5) = -1 J, of at most 20 J."""
     history = {
-        "time": [0.0, 1.0],
-        "kinetic_energy": [10.0, 3.0],
-        "elastic_energy": [0.0, 1.0],
-        "plastic_dissipation": [0.0, 4.0],
-        "external_work": [0.0, -1.5],
+        "time": [0.0, 0.5, 1.0],
+        "kinetic_energy": [10.0, 20.0, 3.0],
+        "elastic_energy": [0.0, 1.0, 1.0],
+        "plastic_dissipation": [0.0, 2.0, 4.0],
+        "external_work": [0.0, 1.0, -1.5],
+        "thermal_work": [0.0, 0.5, 0.5],
     }
     lines = describe(result(history))
     rows = {line.split()[0]: line.split() for line in lines}
     assert rows["kinetic_energy"][1:] == ["10.00", "J", "3.000", "J"]
-    assert rows["balance"][1:] == ["error", "-500.0", "mJ", "(-5.0e-02", "of", "the", "largest)"]
+    assert rows["balance"][1:] == ["error", "-1.000", "J", "(-5.0e-02", "of", "the", "largest)"]
 
 
 def test_result_without_history():

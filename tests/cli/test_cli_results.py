@@ -1,5 +1,7 @@
 """From a case to results, and from results to what is said and drawn about them, by the command line."""
 
+import re
+
 import pytest
 
 from pfem_petsc.cli.main import main
@@ -49,6 +51,19 @@ def test_results_go_to_a_folder_named_after_the_case(tmp_path, monkeypatch):
     assert (tmp_path / "results" / "rod_impact" / "result.vtkhdf").is_file()
     assert main(words) == 0
     assert len(list((tmp_path / "results").iterdir())) == 2
+
+
+def test_a_run_says_where_earlier_results_went_and_how_energy_drifts(tmp_path, capsys):
+    """From rest, too, where the energy at the start is none to compare with."""
+    folder = tmp_path / "swing"
+    words = ["pendulum", "-o", str(folder), "--set", "time.end=0.2"]
+    assert main(words) == 0
+    assert "held results" not in capsys.readouterr().out
+    assert main(words) == 0
+    shown = capsys.readouterr().out
+    assert f"{folder}: held results, which are in {folder}.1 now" in shown
+    assert "\n  ranks          1\n" in shown
+    assert abs(float(re.search(r"energy drift (\S+)", shown)[1])) < 1e-9
 
 
 def test_quiet_run_prints_nothing(tmp_path, capsys):

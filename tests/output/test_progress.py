@@ -60,7 +60,7 @@ def test_line_says_where_the_run_is():
     first = lines[0]
     assert first.split()[1] == "16/100" and " 16 %" in first
     assert "t = 16.00 ms" in first and "dt = 1.00 ms" in first
-    assert "Newton 2.0/step" in first and "CG 30.0/step" in first
+    assert "Newton 2.0/step" in first and "linear 30.0/step" in first
     assert "contacts 3" in first and "energy drift -1.5e-06" in first
     assert "8 steps/s" in first and "ETA 10.5 s" in first
     assert "100 %" in lines[-1] and "ETA 0.00 s" in lines[-1]

@@ -37,6 +37,14 @@ def test_what_a_result_lacks_is_left_out(tmp_path, result):
     assert names == ["energies.png", "momentum.png", "solver.png"]
 
 
+def test_contact_has_no_panel_without_walls(tmp_path, result):
+    result.history = {name: values for name, values in result.history.items() if "/" not in name}
+    with_contact = Image.open(plot(result, tmp_path)[-1]).height
+    result.history["active_contacts"] = 0 * result.history["active_contacts"]
+    without = plot(result, tmp_path)[-1]
+    assert without.name == "solver.png" and Image.open(without).height < with_contact
+
+
 def test_named_curves(tmp_path, result):
     written = plot(result, tmp_path, curves=["kinetic_energy", "momentum", "probe/tip/velocity", "wall/wall/contacts"])
     assert [path.name for path in written] == ["curves.png"] and len(saturated(written[0])) > 500
@@ -74,8 +82,9 @@ def test_balance_error_counts_supply_against_storage_and_loss():
         "plastic_dissipation": np.array([0.0, 2.0]),
         "external_work": np.array([0.0, 1.5]),
         "contact_work": np.array([0.0, -0.75]),
+        "thermal_work": np.array([0.0, 4.0]),
     }
-    assert balance_error(history) == pytest.approx([0.0, 6 + 3 + 2 - 1.5 + 0.75 - 10])
+    assert balance_error(history) == pytest.approx([0.0, 6 + 3 + 2 - 1.5 + 0.75 - 4 - 10])
 
 
 def test_thinned_curve_keeps_spikes_and_ends():

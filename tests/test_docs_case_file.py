@@ -1,0 +1,42 @@
+"""docs/case_file.md names every key of a case file, and its example can be read."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from pfem_petsc.case import settings, tables
+from pfem_petsc.case.schema import Case
+from pfem_petsc.registry import choices, lookup
+
+DOCS = Path(__file__).parents[1] / "docs"
+TEXT = (DOCS / "case_file.md").read_text()
+MODELS = [
+    *(tables.MeshKeys, tables.NodeSet, tables.Material, tables.Section, tables.Initial, tables.Support, tables.Load),
+    *(tables.Gravity, tables.Temperature, settings.TimeKeys, settings.OutputKeys, settings.Probe, settings.Solver),
+    *(lookup("pfem_petsc.mesh.generators", name, "").Parameters for name in choices("pfem_petsc.mesh.generators")),
+]
+
+
+def named(text: str) -> set[str]:
+    quoted = re.findall(r"`([^`]+)`", re.sub(r"^```.*?^```$", "", text, flags=re.MULTILINE | re.DOTALL))
+    return {word for span in quoted for word in re.findall(r"\w+", span)}
+
+
+@pytest.mark.parametrize("model", MODELS, ids=lambda model: f"{model.__module__}.{model.__name__}")
+def test_every_key_is_named(model):
+    assert set(model.model_fields) <= named(TEXT)
+
+
+def test_every_key_of_walls_is_named():
+    text = named((DOCS / "contact.md").read_text())
+    for kind in choices("pfem_petsc.contact.walls"):
+        assert set(lookup("pfem_petsc.contact.walls", kind, "").Parameters.model_fields) <= text, kind
+
+
+def test_example_is_read(tmp_path):
+    case = Case.from_toml(re.search(r"^```toml\n(.*?)^```$", TEXT, flags=re.MULTILINE | re.DOTALL)[1], tmp_path)
+    assert [load.force for load in case.load] == [(0.0, 0.0, -5e4)]
+    assert case.temperature[0].bars == case.section["chord"].bars == "chords"

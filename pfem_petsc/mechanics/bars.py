@@ -19,12 +19,14 @@ __all__ = ["BarBlock", "Bars", "StrainEnergy"]
 
 
 class StrainEnergy(NamedTuple):
-    """Sums over the bars counted on this rank [J], and the first bar that collapsed (local index, -1: none)."""
+    """Sums over the bars counted on this rank [J], the first bar that collapsed (local index, -1: none), and
+    whether any is so short that it may have turned over."""
 
     elastic: float
     plastic_heat: float
     hardening: float
     failed: int
+    shortened: bool = False
 
 
 @dataclass(frozen=True)
@@ -39,7 +41,6 @@ class BarBlock:
     density: float
     damping: float
     thermal_expansion: float
-    measure: int
     parameters: tuple[float, ...]
     history: np.ndarray
     kernels: SimpleNamespace
@@ -111,33 +112,33 @@ class Bars:
                     density=material.density,
                     damping=material.damping,
                     thermal_expansion=material.thermal_expansion,
-                    measure=MEASURES[material.strain],
                     parameters=law.pack(material),
                     history=np.zeros((count if law.REMEMBERS else 0, 2)),
-                    kernels=make_kernels(law.response, law.REMEMBERS),
-                    conserving=make_conserving_kernels(law.response, law.REMEMBERS),
+                    kernels=make_kernels(law.response, law.REMEMBERS, MEASURES[material.strain]),
+                    conserving=make_conserving_kernels(law.response, law.REMEMBERS, MEASURES[material.strain]),
                 )
             )
 
     def _arguments(self, x: np.ndarray, block: BarBlock) -> tuple:
-        return (x, self.ends, self.rest, self.thermal, block.parameters, block.area, block.measure, block.history)
+        return (x, self.ends, self.rest, self.thermal, block.parameters, block.area, block.history)
 
     def forces(self, x: np.ndarray, f: np.ndarray, commit: bool) -> StrainEnergy:
         """Internal forces ``f`` (local nodes, 3) [N] at positions ``x``; valid for owned nodes. Keeps the plastic state
         reached only where ``commit``."""
         f[:] = 0.0
         elastic_energy = heat = hardening = 0.0
-        failed = -1
+        failed, shortened = -1, False
         for block in self.blocks:
-            u, q, w, at = block.kernels.forces(
+            u, q, w, at, short = block.kernels.forces(
                 *self._arguments(x, block), block.start, block.counted, block.stop, commit, f
             )
             elastic_energy += u
             heat += q
             hardening += w
+            shortened |= short
             if failed < 0:
                 failed = at
-        return StrainEnergy(elastic_energy, heat, hardening, failed)
+        return StrainEnergy(elastic_energy, heat, hardening, failed, shortened)
 
     def first_inverted(self, x: np.ndarray, before: np.ndarray) -> int:
         """First local bar that went through zero length from positions ``before`` to ``x``, or -1.

@@ -2,8 +2,8 @@
 
 Between d0 and d1 (end differences of a bar at the start and end of a step) with d = (d0 + d1)/2, the force on the ends
 is -+ A l0 S R d, with the mean stress S = (s0 + s1)/2 and R = (e1 - e0)/((l1^2 - l0^2)/2). Its work over the step is
-exactly A l0 S (e1 - e0), which is the change of energy of a linear elastic bar; it is along d, so that both momenta are kept.
-For engineering strain R = 2/(L (l0 + l1)), for Green's 1/L^2, for the logarithmic ln(l1/l0)/((l1^2 - l0^2)/2).
+exactly A l0 S (e1 - e0), which is the change of energy of a linear elastic bar; it is along d, so that both momenta
+are kept. For engineering strain R = 2/(L (l0 + l1)), for Green's 1/L^2, for the logarithmic ln(l1/l0)/((l1^2 - l0^2)/2).
 """
 
 from __future__ import annotations
@@ -17,19 +17,24 @@ from numba.extending import register_jitable
 
 from .compiled import kernel
 from .kernels import COLLAPSED_STRETCH
-from .strain import strain_of
+from .strain import engineering, green, logarithmic
 
 __all__ = ["make_conserving_kernels"]
 
 
 @register_jitable
-def _ratio(measure: int, s0: float, s1: float) -> tuple[float, float]:
-    """L^2 R and L^2 dR/ds1 for the stretches s0 = l0/L, s1 = l1/L."""
-    if measure == 0:
-        total = s0 + s1
-        return 2.0 / total, -2.0 / (total * total)
-    if measure == 1:
-        return 1.0, 0.0
+def _engineering_ratio(s0: float, s1: float) -> tuple[float, float]:
+    total = s0 + s1
+    return 2.0 / total, -2.0 / (total * total)
+
+
+@register_jitable
+def _green_ratio(s0: float, s1: float) -> tuple[float, float]:
+    return 1.0, 0.0
+
+
+@register_jitable
+def _logarithmic_ratio(s0: float, s1: float) -> tuple[float, float]:
     q = s1 / s0 - 1.0
     if abs(q) < 1e-4:
         # ln(1+q)/(q (1 + q/2)) = 1 - q + 5/6 q^2 - 2/3 q^3 + ...
@@ -42,31 +47,37 @@ def _ratio(measure: int, s0: float, s1: float) -> tuple[float, float]:
     return value / (s0 * s0), slope / (s0 * s0 * s0)
 
 
+# L^2 R and L^2 dR/ds1 for the stretches s0 = l0/L, s1 = l1/L
+_RATIOS = {engineering: _engineering_ratio, green: _green_ratio, logarithmic: _logarithmic_ratio}
+
+
 @cache
-def make_conserving_kernels(response: Callable, remembers: bool) -> SimpleNamespace:
+def make_conserving_kernels(response: Callable, remembers: bool, measure: Callable) -> SimpleNamespace:
     """Kernels ``forces`` and ``tangents`` of a material law; arguments as in :mod:`~pfem_petsc.mechanics.kernels`, with
     positions and thermal strains at the start (``x0``, ``cold``) and end (``x``, ``thermal``) of the step."""
 
+    ratio = _RATIOS[measure]
+
     @register_jitable
-    def pair(ox, oy, oz, dx, dy, dz, rest, shift0, shift, p, area, measure, plastic, accumulated):
+    def pair(ox, oy, oz, dx, dy, dz, rest, shift0, shift, p, area, plastic, accumulated):
         """Coefficient c = A l0 S R [N/m], dc/dl1 [N/m2] and 1/l1; c is NaN for a collapsed bar."""
         length = math.sqrt(dx * dx + dy * dy + dz * dz)
         s0 = math.sqrt(ox * ox + oy * oy + oz * oz) / rest
         s1 = length / rest
         if not (s1 > COLLAPSED_STRETCH):
             return math.nan, 0.0, 0.0
-        e0, _, _ = strain_of(measure, s0)
-        e1, slope, _ = strain_of(measure, s1)
+        e0, _, _ = measure(s0)
+        e1, slope, _ = measure(s1)
         stress0, _, _, _, _, _, _ = response(e0 - shift0, p, plastic, accumulated)
         stress1, modulus, _, _, _, _, _ = response(e1 - shift, p, plastic, accumulated)
         mean = 0.5 * (stress0 + stress1)
-        r, dr = _ratio(measure, s0, s1)
+        r, dr = ratio(s0, s1)
         c = area * mean * r / rest
         dc = area * (0.5 * modulus * slope * r + mean * dr) / (rest * rest)
         return c, dc, 1.0 / length
 
     @kernel
-    def forces(x0, cold, x, bars, rest, thermal, p, area, measure, history, start, stop, f):
+    def forces(x0, cold, x, bars, rest, thermal, p, area, history, start, stop, f):
         """Add the step's internal forces to ``f``."""
         warm = len(thermal) > 0
         for k in range(start, stop):
@@ -82,7 +93,7 @@ def make_conserving_kernels(response: Callable, remembers: bool) -> SimpleNamesp
             dx = x[b, 0] - x[a, 0]
             dy = x[b, 1] - x[a, 1]
             dz = x[b, 2] - x[a, 2]
-            c, _, _ = pair(ox, oy, oz, dx, dy, dz, rest[k], shift0, shift, p, area, measure, plastic, accumulated)
+            c, _, _ = pair(ox, oy, oz, dx, dy, dz, rest[k], shift0, shift, p, area, plastic, accumulated)
             dx, dy, dz = 0.5 * (ox + dx), 0.5 * (oy + dy), 0.5 * (oz + dz)
             f[a, 0] -= c * dx
             f[a, 1] -= c * dy
@@ -92,9 +103,7 @@ def make_conserving_kernels(response: Callable, remembers: bool) -> SimpleNamesp
             f[b, 2] += c * dz
 
     @kernel
-    def tangents(
-        x0, cold, x, bars, rest, thermal, p, area, measure, history, start, stop, inertia, weight, ptr, slots, values
-    ):
+    def tangents(x0, cold, x, bars, rest, thermal, p, area, history, start, stop, inertia, weight, ptr, slots, values):
         """Add ``weight`` df/dx1 = c/2 I + dc/dl1 d n1^T (not symmetric) and the consistent inertia."""
         warm = len(thermal) > 0
         for k in range(start, stop):
@@ -110,9 +119,7 @@ def make_conserving_kernels(response: Callable, remembers: bool) -> SimpleNamesp
             dx = x[b, 0] - x[a, 0]
             dy = x[b, 1] - x[a, 1]
             dz = x[b, 2] - x[a, 2]
-            c, dc, inverse = pair(
-                ox, oy, oz, dx, dy, dz, rest[k], shift0, shift, p, area, measure, plastic, accumulated
-            )
+            c, dc, inverse = pair(ox, oy, oz, dx, dy, dz, rest[k], shift0, shift, p, area, plastic, accumulated)
             d = (0.5 * (ox + dx), 0.5 * (oy + dy), 0.5 * (oz + dz))
             n = (dx * inverse, dy * inverse, dz * inverse)
             mass = inertia * rest[k]

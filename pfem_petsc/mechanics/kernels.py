@@ -15,31 +15,32 @@ from types import SimpleNamespace
 from numba.extending import register_jitable
 
 from .compiled import kernel
-from .strain import strain_of
 
-__all__ = ["COLLAPSED_STRETCH", "make_kernels"]
+__all__ = ["COLLAPSED_STRETCH", "SHORTENED_STRETCH", "make_kernels"]
 
 COLLAPSED_STRETCH = 1e-3  # a bar below this fraction of its rest length has been crushed: no truss model holds there
+SHORTENED_STRETCH = math.sqrt(0.8)  # only a bar shorter than this is looked at for having jumped through zero length
 
 
 @cache
-def make_kernels(response: Callable, remembers: bool) -> SimpleNamespace:
-    """Kernels of a material law: ``forces``, ``tangents``, ``product``, ``linearise``, ``fields``.
+def make_kernels(response: Callable, remembers: bool, measure: Callable) -> SimpleNamespace:
+    """Kernels of a material law and strain measure: ``forces``, ``tangents``, ``product``, ``linearise``, ``fields``.
 
     Common arguments: ``x`` (local nodes, 3) [m]; ``bars`` (b, 2) local ends; ``rest`` (b,) rest lengths [m];
-    ``thermal`` (b,) thermal strains, or (0,) for none; ``p`` the law's parameters; ``area`` [m2]; ``measure`` of
-    :mod:`~pfem_petsc.mechanics.strain`; ``history`` of the bars of this block, whose row is ``k - start``: plastic and
-    accumulated plastic strain, (0, 2) for a law that does not remember. No array goes into an inner function: counting
-    its references costs more than the bar.
+    ``thermal`` (b,) thermal strains, or (0,) for none; ``p`` the law's parameters; ``area`` [m2]; ``history`` of the
+    bars of this block, whose row is ``k - start``: plastic and accumulated plastic strain, (0, 2) for a law that does not
+    remember. No array goes into an inner function: counting its references costs more than the bar.
     """
 
     @kernel
-    def forces(x, bars, rest, thermal, p, area, measure, history, start, counted, stop, commit, f):
-        """Add internal forces to ``f``; sums over counted bars: elastic, heat, hardening [J]; first failed or -1."""
+    def forces(x, bars, rest, thermal, p, area, history, start, counted, stop, commit, f):
+        """Add internal forces to ``f``; sums over counted bars: elastic, heat, hardening [J]; first failed or -1;
+        whether any bar is so short that it may have turned over."""
         elastic = 0.0
         heat = 0.0
         hardening = 0.0
         failed = -1
+        shortened = False
         warm = len(thermal) > 0
         for k in range(start, stop):
             a = bars[k, 0]
@@ -56,7 +57,9 @@ def make_kernels(response: Callable, remembers: bool) -> SimpleNamespace:
                     f[a, 0] = math.nan
                     f[b, 0] = math.nan
                 continue
-            strain, slope, _ = strain_of(measure, stretch)
+            if stretch < SHORTENED_STRETCH:
+                shortened = True
+            strain, slope, _ = measure(stretch)
             if warm:
                 strain -= thermal[k]
             plastic = history[k - start, 0] if remembers else 0.0
@@ -68,8 +71,9 @@ def make_kernels(response: Callable, remembers: bool) -> SimpleNamespace:
             if k < counted:
                 volume = area * rest[k]
                 elastic += volume * u
-                heat += volume * q
-                hardening += volume * w
+                if remembers:
+                    heat += volume * q
+                    hardening += volume * w
             c = area * stress * slope / length
             f[a, 0] -= c * dx
             f[a, 1] -= c * dy
@@ -77,19 +81,19 @@ def make_kernels(response: Callable, remembers: bool) -> SimpleNamespace:
             f[b, 0] += c * dx
             f[b, 1] += c * dy
             f[b, 2] += c * dz
-        return elastic, heat, hardening, failed
+        return elastic, heat, hardening, failed, shortened
 
     @register_jitable
-    def stiffness(dx, dy, dz, rest, shift, p, area, measure, plastic, accumulated):
+    def stiffness(dx, dy, dz, rest, shift, p, area, plastic, accumulated):
         """dN/dl [N/m], N/l [N/m] and 1/l of one bar."""
         length = math.sqrt(dx * dx + dy * dy + dz * dz)
-        strain, slope, curvature = strain_of(measure, length / rest)
+        strain, slope, curvature = measure(length / rest)
         stress, modulus, _, _, _, _, _ = response(strain - shift, p, plastic, accumulated)
         axial = area * (modulus * slope * slope + stress * curvature) / rest
         return axial, area * stress * slope / length, 1.0 / length
 
     @kernel
-    def tangents(x, bars, rest, thermal, p, area, measure, history, start, stop, inertia, weight, ptr, slots, values):
+    def tangents(x, bars, rest, thermal, p, area, history, start, stop, inertia, weight, ptr, slots, values):
         """Add ``weight`` K_t, and ``inertia`` l0 (2 on the diagonal, 1 beside it), to the block rows of owned nodes.
 
         ``slots`` (b, 4): index among all blocks of (a, a), (a, b), (b, b), (b, a), -1 where the row is not owned;
@@ -105,7 +109,7 @@ def make_kernels(response: Callable, remembers: bool) -> SimpleNamespace:
             nz = x[b, 2] - x[a, 2]
             plastic = history[k - start, 0] if remembers else 0.0
             accumulated = history[k - start, 1] if remembers else 0.0
-            axial, geometric, inverse = stiffness(nx, ny, nz, rest[k], shift, p, area, measure, plastic, accumulated)
+            axial, geometric, inverse = stiffness(nx, ny, nz, rest[k], shift, p, area, plastic, accumulated)
             nx *= inverse
             ny *= inverse
             nz *= inverse
@@ -136,7 +140,7 @@ def make_kernels(response: Callable, remembers: bool) -> SimpleNamespace:
                 values[at + 2] += c * nz * nz + d
 
     @kernel
-    def product(x, bars, rest, thermal, p, area, measure, history, start, stop, u, out):
+    def product(x, bars, rest, thermal, p, area, history, start, stop, u, out):
         """Add K_t u to ``out``; both (local nodes, 3), ``u`` with ghosts."""
         warm = len(thermal) > 0
         for k in range(start, stop):
@@ -148,7 +152,7 @@ def make_kernels(response: Callable, remembers: bool) -> SimpleNamespace:
             nz = x[b, 2] - x[a, 2]
             plastic = history[k - start, 0] if remembers else 0.0
             accumulated = history[k - start, 1] if remembers else 0.0
-            axial, geometric, inverse = stiffness(nx, ny, nz, rest[k], shift, p, area, measure, plastic, accumulated)
+            axial, geometric, inverse = stiffness(nx, ny, nz, rest[k], shift, p, area, plastic, accumulated)
             nx *= inverse
             ny *= inverse
             nz *= inverse
@@ -167,7 +171,7 @@ def make_kernels(response: Callable, remembers: bool) -> SimpleNamespace:
             out[b, 2] += fz
 
     @kernel
-    def linearise(x, bars, rest, thermal, p, area, measure, history, start, stop, weight, stored):
+    def linearise(x, bars, rest, thermal, p, area, history, start, stop, weight, stored):
         """What a product with ``weight`` K_t needs of each bar: n, dN/dl - N/l and N/l, to ``stored`` (b, 5)."""
         warm = len(thermal) > 0
         for k in range(start, stop):
@@ -179,7 +183,7 @@ def make_kernels(response: Callable, remembers: bool) -> SimpleNamespace:
             dz = x[b, 2] - x[a, 2]
             plastic = history[k - start, 0] if remembers else 0.0
             accumulated = history[k - start, 1] if remembers else 0.0
-            axial, geometric, inverse = stiffness(dx, dy, dz, rest[k], shift, p, area, measure, plastic, accumulated)
+            axial, geometric, inverse = stiffness(dx, dy, dz, rest[k], shift, p, area, plastic, accumulated)
             stored[k, 0] = dx * inverse
             stored[k, 1] = dy * inverse
             stored[k, 2] = dz * inverse
@@ -187,7 +191,7 @@ def make_kernels(response: Callable, remembers: bool) -> SimpleNamespace:
             stored[k, 4] = weight * geometric
 
     @kernel
-    def fields(x, bars, rest, thermal, p, area, measure, history, start, stop, strain_out, stress_out, force_out):
+    def fields(x, bars, rest, thermal, p, area, history, start, stop, strain_out, stress_out, force_out):
         """Total strain, stress [Pa] and axial force [N] of each bar."""
         warm = len(thermal) > 0
         for k in range(start, stop):
@@ -196,7 +200,7 @@ def make_kernels(response: Callable, remembers: bool) -> SimpleNamespace:
             dx = x[b, 0] - x[a, 0]
             dy = x[b, 1] - x[a, 1]
             dz = x[b, 2] - x[a, 2]
-            strain, slope, _ = strain_of(measure, math.sqrt(dx * dx + dy * dy + dz * dz) / rest[k])
+            strain, slope, _ = measure(math.sqrt(dx * dx + dy * dy + dz * dz) / rest[k])
             shift = thermal[k] if warm else 0.0
             plastic = history[k - start, 0] if remembers else 0.0
             accumulated = history[k - start, 1] if remembers else 0.0

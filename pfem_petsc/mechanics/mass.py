@@ -1,7 +1,7 @@
 """Mass and damping: lumped to the nodes, or consistent with the linear shape functions of the bar.
 
-Consistent mass of a bar: rho A l0 / 6 [[2, 1], [1, 2]] for each direction; its row sums are the lumped mass rho A l0 / 2.
-Damping is c_m per reference volume, distributed the same way.
+Consistent mass of a bar: rho A l0 / 6 [[2, 1], [1, 2]] for each direction; its row sums are the lumped mass
+rho A l0 / 2. Damping is c_m per reference volume, distributed the same way.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
 """Strain measures of a bar as functions of its stretch: strain, and its first two derivatives by length.
 
 The work-conjugate stress acts on the reference volume A l0, so the axial force is N = A l0 s de/dl and
-dN/dl = A l0 (E_t (de/dl)^2 + s d2e/dl2).
+dN/dl = A l0 (E_t (de/dl)^2 + s d2e/dl2). Each measure gives strain, l0 de/dl and l0^2 d2e/dl2 at a stretch l/l0; all
+are dimensionless. The loops over bars are compiled for one measure each.
 """
 
 from __future__ import annotations
@@ -10,16 +11,25 @@ import math
 
 from numba.extending import register_jitable
 
-__all__ = ["MEASURES", "strain_of"]
-
-MEASURES = {"engineering": 0, "green": 1, "logarithmic": 2}
+__all__ = ["MEASURES", "engineering", "green", "logarithmic"]
 
 
 @register_jitable
-def strain_of(measure: int, stretch: float) -> tuple[float, float, float]:
-    """Strain, l0 de/dl and l0^2 d2e/dl2 at a stretch l/l0 (all dimensionless)."""
-    if measure == 0:
-        return stretch - 1.0, 1.0, 0.0
-    if measure == 1:
-        return 0.5 * (stretch * stretch - 1.0), stretch, 1.0
+def engineering(stretch: float) -> tuple[float, float, float]:
+    """Engineering strain l/l0 - 1."""
+    return stretch - 1.0, 1.0, 0.0
+
+
+@register_jitable
+def green(stretch: float) -> tuple[float, float, float]:
+    """Green's strain ((l/l0)^2 - 1)/2."""
+    return 0.5 * (stretch * stretch - 1.0), stretch, 1.0
+
+
+@register_jitable
+def logarithmic(stretch: float) -> tuple[float, float, float]:
+    """Logarithmic strain ln(l/l0)."""
     return math.log(stretch), 1.0 / stretch, -1.0 / (stretch * stretch)
+
+
+MEASURES = {"engineering": engineering, "green": green, "logarithmic": logarithmic}

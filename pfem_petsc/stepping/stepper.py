@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..contact.forces import WallForces
+from ..contact.resting import start_at_rest
 from ..errors import SimulationFailure
 from ..integrators.base import Balance, Scheme, State
 from ..mechanics.bars import StrainEnergy
@@ -104,9 +105,13 @@ class Stepper(ABC):
         if model.inertia.damped:
             load -= model.inertia.damping_times(state.v, np.zeros_like(load))
         state.a = self.accelerate(load)
+        if model.contact.any and model.inertia.redistribution is None:
+            walls = start_at_rest(model, state, self.accelerate, load)
+            if walls is not None:
+                self.solution.walls, self.solution.contacts = walls, int(walls.touching.any(axis=1).sum())
         if supports.any:
             state.support = np.zeros_like(state.v)
-            state.support[supports.fixed] = -load[supports.fixed]
+            state.support[supports.fixed] = -(load + state.contact)[supports.fixed]
         self.scheme.start(state, self.h)
         if model.contact.motion.free is not None:
             model.contact.motion.free.start(self.h)
@@ -172,7 +177,7 @@ class Stepper(ABC):
         failed = self.energy.failed
         if self._before is None:
             self._before = np.empty_like(state.x)
-        elif failed < 0:
+        elif failed < 0 and self.energy.shortened:
             failed = self.model.bars.first_inverted(state.x, self._before)
         if failed >= 0 and self.fault is None:
             self.fault = SimulationFailure(self._collapse(failed))

@@ -115,7 +115,7 @@ class Scheme(ABC):
         """Set memory up from the complete state at the start (x, v, a); nothing by default."""
 
     def restart(self, state: State, nodes: np.ndarray, h: float) -> None:
-        """Make what is remembered of some owned nodes agree with their v and a, which contact changed. Nothing by default."""
+        """Make what is remembered of some owned nodes agree with v and a, which contact changed; nothing by default."""
 
     def step_changed(self, state: State) -> None:
         """Forget what holds for the old step only; the state (x, v, a) is complete. Nothing by default."""

@@ -3,7 +3,8 @@
 Between d0 and d1 (end differences of a bar at the start and end of a step) with d = (d0 + d1)/2, the force on the ends
 is -+ A l0 S R d, with the mean stress S = (s0 + s1)/2 and R = (e1 - e0)/((l1^2 - l0^2)/2). Its work over the step is
 exactly A l0 S (e1 - e0), which is the change of energy of a linear elastic bar; it is along d, so that both momenta
-are kept. For engineering strain R = 2/(L (l0 + l1)), for Green's 1/L^2, for the logarithmic ln(l1/l0)/((l1^2 - l0^2)/2).
+are kept. For engineering strain R = 2/(L (l0 + l1)), for Green's 1/L^2, for the logarithmic
+ln(l1/l0)/((l1^2 - l0^2)/2).
 """
 
 from __future__ import annotations

@@ -28,8 +28,8 @@ def make_kernels(response: Callable, remembers: bool, measure: Callable) -> Simp
 
     Common arguments: ``x`` (local nodes, 3) [m]; ``bars`` (b, 2) local ends; ``rest`` (b,) rest lengths [m];
     ``thermal`` (b,) thermal strains, or (0,) for none; ``p`` the law's parameters; ``area`` [m2]; ``history`` of the
-    bars of this block, whose row is ``k - start``: plastic and accumulated plastic strain, (0, 2) for a law that does not
-    remember. No array goes into an inner function: counting its references costs more than the bar.
+    bars of this block, whose row is ``k - start``: plastic and accumulated plastic strain, (0, 2) for a law that does
+    not remember. No array goes into an inner function: counting its references costs more than the bar.
     """
 
     @kernel

@@ -11,9 +11,9 @@ from ..errors import InputError
 __all__ = ["LinearChoice", "choose_linear", "configure"]
 
 _DIRECT_BELOW = 500  # unknowns; a lattice of 3,993 takes 0.22 s to factorise, and 1 to 4 ms with conjugate gradients
-# Steps over the explicit limit up to which each is chosen. scripts/linear_solvers.py, 101,706 bars on one core, seconds a
-# Newmark step at 1, 10, 100, 1000 x: matrix-free Jacobi 0.015, 0.046, 0.13, 0.15; point-block Jacobi 0.091, 0.16, 0.30,
-# 0.36; incomplete Cholesky 0.082, 0.15, 0.34, 0.42; multigrid 0.55, 0.60, 0.58, 0.60 (docs/linear_solvers.md).
+# Steps over the explicit limit up to which each is chosen. scripts/linear_solvers.py, 101,706 bars on one core, seconds
+# a Newmark step at 1, 10, 100, 1000 x: matrix-free Jacobi 0.015, 0.046, 0.13, 0.15; point-block Jacobi 0.091, 0.16,
+# 0.30, 0.36; incomplete Cholesky 0.082, 0.15, 0.34, 0.42; multigrid 0.55, 0.60, 0.58, 0.60 (docs/linear_solvers.md).
 _MATRIX_FREE_UP_TO = 3000.0
 _JACOBI_UP_TO = 5.0
 _CHOLESKY_UP_TO = 50.0

@@ -203,7 +203,7 @@ class ImplicitStepper(Stepper):
             worst = (float(size[at]), int(model.mesh.node_ids[at]))
         residual, node = max(model.comm.allgather(worst))
         return (
-            f"step {self.state.step + 1}, t = {problem.balance.time:.6g} s: no convergence after {report.newton} Newton "
-            f"iterations: {report.why}; residual {report.norm:.3g} N, asked {tolerance:.3g} N; worst at node {node} "
+            f"step {self.state.step + 1}, t = {problem.balance.time:.6g} s: no convergence after {report.newton} "
+            f"Newton iterations: {report.why}; residual {report.norm:.3g} N, asked {tolerance:.3g} N; worst at node {node} "
             f'({residual:.3g} N). Take a smaller time.step, or solver.linear = "mumps"'
         )

@@ -1,8 +1,8 @@
 """The energy ledger: every term by its own formula, so that their balance is a check and not a definition.
 
 For a scheme whose balance holds at the ends of steps (``at_ends``), works follow the trapezoidal rule: with
-dx = x1 - x0, external work = (e0 + e1) dx/2, contact work (r0 + r1) dx/2, damping dissipation (C v0 + C v1) dx/2, and the numerical
-dissipation is what inertia and internal force work beyond the change of their energies:
+dx = x1 - x0, external work = (e0 + e1) dx/2, contact work (r0 + r1) dx/2, damping dissipation (C v0 + C v1) dx/2, and
+the numerical dissipation is what inertia and internal force work beyond the change of their energies:
 (M a0 + M a1) dx/2 - dT + (f0 + f1) dx/2 - dU - dD + dH, with the work dH of changing temperatures. For the others the
 forces of the one balance work over the whole step.
 The sum of all changes is then the work of the residual, zero up to the solver's tolerance.

@@ -41,6 +41,10 @@ def check_names(case: Mapping[str, Any], data: Mapping[str, Any], problems: Prob
     for i, entry in enumerate(on):
         _node_set(("initial", "on", i), entry, node_sets, problems)
     _distinct(("wall",), case["wall"], "wall", problems)
+    for i, pair in enumerate(case["contact_pair"]):
+        for key in ("first", "second"):
+            problems.refer(("contact_pair", i, key), getattr(pair, key), node_sets, "node set")
+    _distinct(("contact_pair",), case["contact_pair"], "contact pair", problems)
 
     output = case["output"]
     if output is not None:

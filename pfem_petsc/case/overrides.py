@@ -11,7 +11,15 @@ from ..errors import InputError
 
 __all__ = ["apply_overrides"]
 
-LISTS = {("load",), ("support",), ("temperature",), ("wall",), ("initial", "on"), ("output", "probe")}
+LISTS = {
+    ("load",),
+    ("support",),
+    ("temperature",),
+    ("wall",),
+    ("contact_pair",),
+    ("initial", "on"),
+    ("output", "probe"),
+}
 """Keys under which a missing value is made as a list of tables."""
 
 _PART = re.compile(r"""(?:"((?:[^"\\]|\\.)*)"|([^.\[\]"]+))|\[(\d+)\]""")

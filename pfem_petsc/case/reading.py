@@ -25,7 +25,7 @@ M = TypeVar("M", bound=StrictModel)
 
 KEYS = [
     *("title", "mesh", "node_set", "material", "section", "initial", "support"),
-    *("load", "gravity", "temperature", "wall", "contact", "time", "output", "solver"),
+    *("load", "gravity", "temperature", "wall", "contact_pair", "contact", "time", "output", "solver"),
 ]
 """Keys of a case file at its top."""
 
@@ -77,6 +77,7 @@ def read_tables(data: Mapping[str, Any], folder: Path, problems: Problems) -> di
         "gravity": problems.read(t.Gravity, data["gravity"], ("gravity",)) if "gravity" in data else None,
         "temperature": _listed(t.Temperature, data.get("temperature"), ("temperature",), problems),
         "wall": _walls(data.get("wall"), problems),
+        "contact_pair": _pairs(data.get("contact_pair"), problems),
         "contact": problems.read(s.ContactSettings, data.get("contact", {}), ("contact",)),
         "time": _time(data, problems),
         "output": _output(data.get("output", {}), problems),
@@ -190,6 +191,12 @@ def _walls(data: Any, problems: Problems) -> list[StrictModel]:
             named = {"name": f"wall{i + 1}", **row}
             walls.append(problems.read(model, named, path, taker=f"a wall of type {row['type']}"))
     return [wall for wall in walls if wall is not None]
+
+
+def _pairs(data: Any, problems: Problems) -> list[t.ContactPair]:
+    rows = _rows(data, ("contact_pair",), problems)
+    named = [{"name": f"pair{i + 1}", **row} if isinstance(row, Mapping) else row for i, row in enumerate(rows)]
+    return _listed(t.ContactPair, named, ("contact_pair",), problems)
 
 
 def _time(data: Mapping[str, Any], problems: Problems) -> s.Time | None:

@@ -32,7 +32,7 @@ class Case:
     folder : what the case's relative file names start from
     mesh : :class:`~pfem_petsc.case.tables.Mesh`: generator with parameters, or file
     node_set, material, section : tables by name, in the file's order
-    initial, support, load, temperature, wall : lists of tables
+    initial, support, load, temperature, wall, contact_pair : lists of tables
     gravity : :class:`~pfem_petsc.case.tables.Gravity` or None
     contact, time, output, solver : tables of :mod:`~pfem_petsc.case.settings`
 
@@ -127,6 +127,7 @@ class Case:
             "gravity": _table(self.gravity),
             "temperature": [_table(entry) for entry in self.temperature],
             "wall": [_table(entry) for entry in self.wall],
+            "contact_pair": [_table(entry) for entry in self.contact_pair],
             "contact": _table(self.contact),
             "time": {**time, **_table(self.time.scheme)},
             "output": _table(self.output),

@@ -9,7 +9,17 @@ from pydantic import Field, InstanceOf, field_validator
 
 from .base import Name, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, StrictModel, listed
 
-__all__ = ["CELL_FIELDS", "ContactSettings", "POINT_FIELDS", "Output", "OutputKeys", "Probe", "Solver", "Time", "TimeKeys"]
+__all__ = [
+    "CELL_FIELDS",
+    "POINT_FIELDS",
+    "ContactSettings",
+    "Output",
+    "OutputKeys",
+    "Probe",
+    "Solver",
+    "Time",
+    "TimeKeys",
+]
 
 POINT_FIELDS = ("displacement", "velocity", "acceleration", "contact_force")
 CELL_FIELDS = ("strain", "stress", "axial_force", "plastic_strain", "temperature")

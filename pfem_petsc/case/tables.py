@@ -20,6 +20,7 @@ from .base import (
 )
 
 __all__ = [
+    "ContactPair",
     "Gravity",
     "Initial",
     "Load",
@@ -207,6 +208,28 @@ class Support(StrictModel):
             if moves and axis not in self.fix:
                 raise ValueError(f'{axis} is given a motion, but fix = "{self.fix}" leaves it free')
         return self
+
+
+class ContactPair(StrictModel):
+    """Nodes of two bodies that cannot pass each other along a direction, in pairs."""
+
+    name: Name
+    """names the pairs in results and messages; unique"""
+    first: str
+    """name of a node set"""
+    second: str
+    """name of a node set of as many nodes; each is paired with the first one nearest to it, seen along the direction"""
+    direction: Vector3
+    """points from the first nodes to the second"""
+    gap: Finite = 0.0
+    """smallest distance of second from first along the direction [m]"""
+
+    @field_validator("direction")
+    @classmethod
+    def _has_length(cls, value: Vector3) -> Vector3:
+        if not any(value):
+            raise ValueError("has zero length; give the direction from first to second")
+        return value
 
 
 class Load(StrictModel):

@@ -60,6 +60,10 @@ class ExplicitStepper(Stepper):
             except SimulationFailure as failure:
                 if self.fault is None:
                     self.fault = SimulationFailure(f"step {state.step}: {failure}")
+        if model.pairs is not None:
+            if state.contact is self.zero:
+                state.contact = np.zeros_like(u)
+            contacts += model.pairs.explicit(balance.predictor, u, stiffness, state.contact)
         if supports.any:
             state.support = np.zeros_like(u)
             state.support[at] = stiffness[supports.nodes] * u[at] - load - state.contact[at]

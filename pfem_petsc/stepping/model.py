@@ -6,6 +6,7 @@ import numpy as np
 from mpi4py import MPI
 
 from ..contact.contact import Contact
+from ..contact.pairs import ContactPairs
 from ..contact.start import adjust_start
 from ..errors import InputError
 from ..mechanics.bars import Bars, section_of_bars
@@ -67,6 +68,9 @@ class Model:
             self.supports = Supports(case, self.nodes, mesh)
             self.temperatures = Temperatures(case, mesh, self.bars)
         self.contact = Contact(case, self.nodes, mesh, self.supports.fixed)
+        self.pairs = None
+        if case.contact_pair:
+            self.pairs = ContactPairs(case, self.nodes, mesh, self.supports.fixed, self.contact.members)
 
         points = mesh.points[: mesh.n_owned]
         low, high = points.min(axis=0, initial=np.inf), points.max(axis=0, initial=-np.inf)

@@ -48,6 +48,9 @@ class Recorder:
         )
         self.columns |= {name: shape for name, shape, _ in contact_columns(self.model.contact)}
         self.types |= {name: kind for name, _, kind in contact_columns(self.model.contact) if kind is not float}
+        self._pairs = self.model.pairs
+        if self._pairs is not None:
+            self.columns |= {f"pair/{name}/force": (3,) for name in self._pairs.names}
         self.probe_nodes: dict[str, np.ndarray] = {}
         self._probes: list[tuple[str, np.ndarray, np.ndarray]] = []
         for probe in case.output.probe:
@@ -125,6 +128,8 @@ class Recorder:
         self.iterations[:] = 0
         values, at = contact_values(self.model.contact, sums, 23, state.time)
         row |= values
+        if self._pairs is not None:
+            row |= {f"pair/{name}/force": force for name, force in self._pairs.totals().items()}
         for name, nodes in self.probe_nodes.items():
             size = 12 * len(nodes)
             values = sums[at : at + size].reshape(4, len(nodes), 3)

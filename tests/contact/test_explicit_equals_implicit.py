@@ -8,8 +8,6 @@ from pfem_petsc.integrators.base import Balance
 from pfem_petsc.solvers.linear import LinearChoice
 from pfem_petsc.stepping.implicit import ImplicitStepper
 
-pytestmark = pytest.mark.parallel
-
 
 def wedge(angle, seed):
     half = 0.5 * angle
@@ -89,3 +87,9 @@ def test_steps_are_the_same(name, supported, comm, shared_tmp_path):
     assert max(contacts) >= 1 and sum(c > 0 for c in contacts) >= 2
     assert max(w[0] for w in worst) < 1e-12 * 0.2
     assert max(w[1] for w in worst) < 1e-9
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("name", ["corner", "twelve", "inside a sphere"])
+def test_steps_are_the_same_on_ranks(name, comm, shared_tmp_path):
+    test_steps_are_the_same(name, True, comm, shared_tmp_path)

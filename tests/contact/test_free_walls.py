@@ -7,8 +7,6 @@ from lattices import lattice_case, planes, simulation
 from pfem_petsc import Case, Simulation
 from pfem_petsc.errors import InputError
 
-pytestmark = pytest.mark.parallel
-
 SCHEMES = [("central_differences", {}), ("chung_lee", {}), ("newmark", {}), ("houbolt", {})]
 SPEED = np.array([1.0, -0.5, -4.0])
 
@@ -117,3 +115,9 @@ def test_restart_keeps_the_walls(comm, shared_tmp_path):
     for column, value in rows["one"].items():
         np.testing.assert_array_equal(rows["two"][column], value, err_msg=column)
     assert rows["one"]["wall/free/releases"] > 0 and rows["one"]["wall/rough/impulse"][2] > 0.0
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("kind, integrator", [("corner", "central_differences"), ("sphere", "newmark")])
+def test_momentum_is_shared_between_ranks(kind, integrator, comm, shared_tmp_path):
+    test_momentum_is_shared(kind, integrator, {}, comm, shared_tmp_path)

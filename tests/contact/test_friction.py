@@ -6,8 +6,6 @@ from lattices import lattice_case, simulation
 
 from pfem_petsc.errors import InputError
 
-pytestmark = pytest.mark.parallel
-
 ANGLE, G = 0.4, 9.81
 SLOPE = np.array([np.cos(ANGLE), 0.0, -np.sin(ANGLE)])  # downhill
 NORMAL = np.array([np.sin(ANGLE), 0.0, np.cos(ANGLE)])
@@ -146,3 +144,8 @@ def test_bouncing(restitution, comm, shared_tmp_path):
         hit += flight
     if restitution == 0.0:
         assert z[time > fall + 0.01].max() < 1e-6
+
+
+@pytest.mark.parallel
+def test_sliding_on_ranks(comm, shared_tmp_path):
+    test_sliding_block("central_differences", 0.3, comm, shared_tmp_path)

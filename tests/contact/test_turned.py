@@ -5,8 +5,6 @@ import pytest
 from lattices import lattice_case, planes, rotation, simulation
 from turning import with_mesh_file
 
-pytestmark = pytest.mark.parallel
-
 # schemes whose recursion of a held node is stable under walls that bound positions alone
 SCHEMES = {
     "central_differences": {},
@@ -84,3 +82,9 @@ def test_frame_does_not_matter(problem, integrator, comm, shared_tmp_path):
     if comm.rank == 0:
         size = np.ptp(positions[0], axis=0).max()
         assert np.abs(positions[0] - positions[1]).max() < 1e-9 * size
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("integrator", ["central_differences", "newmark"])
+def test_frame_does_not_matter_on_ranks(integrator, comm, shared_tmp_path):
+    test_frame_does_not_matter(plastic, integrator, comm, shared_tmp_path)

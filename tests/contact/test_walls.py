@@ -8,8 +8,6 @@ from pfem_petsc import Case
 from pfem_petsc.contact.walls import cylinder, rectangle, sphere
 from pfem_petsc.errors import InputError, SimulationFailure
 
-pytestmark = pytest.mark.parallel
-
 EXPLICIT = ("central_differences", {})
 IMPLICIT = ("newmark", {})
 
@@ -199,3 +197,14 @@ def test_reports_of_a_bounce(comm, shared_tmp_path):
     assert sum(row["active_set_changes"] for row in rows) == 2 * last["wall/wall3/releases"]
     touching = rows[int(np.argmax(force[:, 2]))]
     assert touching["wall/wall3/moment"][1] == pytest.approx(-0.1 * touching["wall/wall3/force"][2], rel=1e-6)
+
+
+@pytest.mark.parallel
+def test_on_ranks(comm, shared_tmp_path):
+    """What needs the ranks to agree: starts, curved walls, walls without room, sums of the reports."""
+    test_adjust_moves_nodes_onto_the_wall(comm, shared_tmp_path / "adjust")
+    test_starting_beyond_a_wall_is_refused(comm, shared_tmp_path / "beyond")
+    test_ball_stays_on_the_surface("newmark", {}, comm, shared_tmp_path / "ball")
+    for integrator in ("central_differences", "newmark"):
+        test_walls_that_leave_no_room(integrator, {}, comm, shared_tmp_path / integrator)
+    test_reports_of_a_bounce(comm, shared_tmp_path / "bounce")

@@ -1,0 +1,146 @@
+"""Contact between bodies: pairs of nodes that cannot pass each other along a direction.
+
+A pair bounds the relative coordinate: n . (x_second - x_first) >= gap. In an explicit step with lumped mass a pair
+whose free positions x break it is a problem of two nodes of stiffness k_1 and k_2 with the exact solution
+
+    lambda = (gap - n . (x_2 - x_1)) / (1/k_1 + 1/k_2),   x_1 -= lambda n / k_1,   x_2 += lambda n / k_2,
+
+where components that supports prescribe do not give way. Each node is in one pair at most, and no wall stops it, so
+pairs are independent of each other. The ends of a pair may be on two ranks: all ranks know all pairs.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from mpi4py import MPI
+
+from ..errors import InputError
+
+__all__ = ["ContactPairs"]
+
+
+class ContactPairs:
+    """All pairs of a case. Construction is collective.
+
+    Attributes
+    ----------
+    names : of the tables; ``table`` (p,) says to which of them a pair belongs
+    first, second : (p,) mesh numbers of the nodes
+    force : (p,) force of each pair in the last step, positive where it presses [N]; the same on all ranks
+    """
+
+    def __init__(self, case, nodes: dict[str, np.ndarray], mesh, fixed: np.ndarray, members: np.ndarray) -> None:
+        self.mesh = mesh
+        self.names = [pair.name for pair in case.contact_pair]
+        self.normals = np.empty((0, 3))
+        self.gaps = np.empty(0)
+        self.table = np.empty(0, dtype=np.int64)
+        self.first = self.second = np.empty(0, dtype=np.int64)
+        for index, pair in enumerate(case.contact_pair):
+            normal = np.array(pair.direction) / np.linalg.norm(pair.direction)
+            first, second = _match(pair, nodes, mesh, normal, f"{case.source}: contact_pair {pair.name!r}")
+            self.first = np.append(self.first, first)
+            self.second = np.append(self.second, second)
+            self.normals = np.vstack([self.normals, np.tile(normal, (len(first), 1))])
+            self.gaps = np.append(self.gaps, np.full(len(first), pair.gap))
+            self.table = np.append(self.table, np.full(len(first), index))
+        ids = mesh.node_ids[: mesh.n_owned]
+        order = np.argsort(ids)
+        ends = np.stack([self.first, self.second])
+        everyone = ends.ravel()
+        numbers, counts = np.unique(everyone, return_counts=True)
+        if (counts > 1).any():
+            twice = numbers[counts > 1][0]
+            raise InputError(f"{case.source}: contact_pair: node {twice} is in several pairs; a node can be in one")
+        place = np.searchsorted(ids[order], ends)
+        place = np.minimum(place, max(len(ids) - 1, 0))
+        self._mine = (ids[order][place] == ends) if len(ids) else np.zeros(ends.shape, dtype=bool)
+        self._local = order[place] if len(ids) else np.zeros(ends.shape, dtype=np.int64)
+        self._free = np.zeros((*ends.shape, 3))
+        self._free[self._mine] = np.where(fixed[self._local[self._mine]], 0.0, 1.0)
+        stopped = np.zeros(ends.shape, dtype=np.int64)
+        stopped[self._mine] = members[self._local[self._mine]].any(axis=1)
+        mesh.comm.Allreduce(MPI.IN_PLACE, stopped)
+        if stopped.any():
+            raise InputError(
+                f"{case.source}: contact_pair: node {ends[stopped > 0][0]} is in a pair, and a wall stops it as well; "
+                "give the wall a node_set without it"
+            )
+        mesh.comm.Allreduce(MPI.IN_PLACE, self._free)
+        self.force = np.zeros(len(self.table))
+
+    def check_start(self, x: np.ndarray, length: float, source: str) -> None:
+        """Refuse pairs that start beyond each other by more than rounding of the model's size [m]. Collective."""
+        distance = self._distance(self._gather(x)) - self.gaps
+        if len(distance) and distance.min() < -1e-12 * length:
+            pair = int(np.argmin(distance))
+            raise InputError(
+                f"{source}: contact_pair {self.names[self.table[pair]]!r}: nodes {self.first[pair]} and "
+                f"{self.second[pair]} start {-distance[pair]:.6g} m beyond each other; turn the direction, which "
+                "points from the first to the second, or move the mesh"
+            )
+
+    def explicit(self, predictor: np.ndarray, u: np.ndarray, stiffness: np.ndarray, contact: np.ndarray) -> int:
+        """Part the pairs that free positions, predictor + u, break. Collective.
+
+        Parameters
+        ----------
+        predictor, u : (owned, 3) [m]; u is changed
+        stiffness : (owned,) force for a displacement of a node [N/m]
+        contact : (owned, 3) forces on the nodes, added to [N]
+
+        Returns
+        -------
+        int
+            Nodes of this rank that pairs hold.
+        """
+        data = np.zeros((*self._mine.shape, 4))
+        mine = self._local[self._mine]
+        data[self._mine, :3] = predictor[mine] + u[mine]
+        data[self._mine, 3] = 1.0 / stiffness[self._local[self._mine]]
+        self.mesh.comm.Allreduce(MPI.IN_PLACE, data)
+        gives = data[:, :, 3] * np.einsum("epi,pi->ep", self._free, self.normals**2)
+        short = self.gaps - self._distance(data[:, :, :3])
+        soft = gives.sum(axis=0)
+        self.force = np.where((short > 0.0) & (soft > 0.0), short / np.maximum(soft, 1e-300), 0.0)
+        pressed = self.force > 0.0
+        for end, sign in ((0, -1.0), (1, 1.0)):
+            here = self._mine[end] & pressed
+            at = self._local[end, here]
+            push = sign * self.force[here, None] * self.normals[here]
+            u[at] += push * self._free[end, here] / stiffness[at, None]
+            contact[at] += push
+        return int((self._mine & pressed).sum())
+
+    def totals(self) -> dict[str, np.ndarray]:
+        """Name of each table to its pairs' force on the second nodes (3,) [N], in the last step."""
+        forces = self.force[:, None] * self.normals
+        return {name: forces[self.table == k].sum(axis=0) for k, name in enumerate(self.names)}
+
+    def _gather(self, x: np.ndarray) -> np.ndarray:
+        data = np.zeros((*self._mine.shape, 3))
+        data[self._mine] = x[self._local[self._mine]]
+        self.mesh.comm.Allreduce(MPI.IN_PLACE, data)
+        return data
+
+    def _distance(self, ends: np.ndarray) -> np.ndarray:
+        return np.einsum("pi,pi->p", self.normals, ends[1] - ends[0])
+
+
+def _match(pair, nodes, mesh, normal: np.ndarray, key: str) -> tuple[np.ndarray, np.ndarray]:
+    """Mesh numbers of a table's pairs: each second node with the first one nearest to it across the direction."""
+    found = []
+    for name in (pair.first, pair.second):
+        local = nodes[name]
+        parts = mesh.comm.allgather((mesh.node_ids[local], mesh.points[local]))
+        ids = np.concatenate([part[0] for part in parts])
+        order = np.argsort(ids)
+        points = np.concatenate([part[1] for part in parts])[order]
+        found.append((ids[order], points - np.outer(points @ normal, normal)))
+    (first, here), (second, there) = found
+    if len(first) != len(second):
+        raise InputError(f"{key}: first has {len(first)} nodes and second {len(second)}: they cannot be paired")
+    nearest = np.array([int(np.argmin(((here - point) ** 2).sum(axis=1))) for point in there], dtype=np.int64)
+    if len(np.unique(nearest)) < len(nearest):
+        raise InputError(f"{key}: two nodes of second are nearest to the same node of first, seen along the direction")
+    return first[nearest], second

@@ -1,0 +1,79 @@
+"""A truss that lies on a wall stays there: at rest from the first row on, with its weight as the wall's force."""
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from pfem_petsc import Case, Simulation
+from pfem_petsc.output.result import open_result
+
+pytestmark = pytest.mark.parallel
+
+SCHEMES = (
+    "central_differences",
+    "chung_lee",
+    "hulbert_chung",
+    "newmark",
+    "houbolt",
+    "wilson",
+    "generalized_alpha",
+    "energy_momentum",
+)
+GRAVITY = 9.81
+CASE = """
+[mesh]
+generator = "rod"
+length = 1.0
+elements = 4
+[material.it]
+young_modulus = 1e9
+density = 1000.0
+[section.it]
+area = 1e-4
+material = "it"
+[gravity]
+acceleration = [0.0, 0.0, -{gravity}]
+[initial]
+velocity = {velocity}
+[[wall]]
+name = "floor"
+type = "plane"
+point = [0.3, 0.0, 0.0]
+normal = [0.0, 0.0, 2.5]
+[time]
+integrator = "{scheme}"
+mass = "{mass}"
+step = 5e-5
+end = 2e-3
+"""
+
+
+def lie(scheme, mass, folder, velocity="[0.0, 0.0, 0.0]"):
+    """History and last positions of a rod that starts on a floor."""
+    case = Case.from_toml(CASE.format(scheme=scheme, mass=mass, gravity=GRAVITY, velocity=velocity))
+    Simulation(case, MPI.COMM_WORLD, output=folder, quiet=True).run()
+    read = None
+    if MPI.COMM_WORLD.rank == 0:
+        with open_result(folder) as result:
+            read = {name: np.array(result.history[name]) for name in result.history}, result.positions(-1)
+    return MPI.COMM_WORLD.bcast(read)
+
+
+@pytest.mark.parametrize("mass", ["lumped", "consistent"])
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_weight_from_the_start(scheme, mass, shared_tmp_path):
+    history, end = lie(scheme, mass, shared_tmp_path)
+    weight = 1000.0 * 1e-4 * GRAVITY
+    np.testing.assert_allclose(history["wall/floor/force"][:, 2], weight, rtol=1e-9)
+    assert (history["active_contacts"] == 5).all()
+    assert history["kinetic_energy"].max() <= 1e-24 * weight  # J: the jolt of a step without the floor is 1e-7 of it
+    assert np.abs(end[:, 2]).max() <= 1e-18
+
+
+@pytest.mark.parametrize("scheme", ["central_differences", "energy_momentum"])
+def test_a_truss_that_leaves_falls_freely(scheme, shared_tmp_path):
+    """Touching a wall is no rest: z = v t - g t^2/2 from the first step on."""
+    history, end = lie(scheme, "lumped", shared_tmp_path, "[0.0, 0.0, 0.5]")
+    time = history["time"][-1]
+    np.testing.assert_allclose(end[:, 2], 0.5 * time - 0.5 * GRAVITY * time**2, rtol=1e-12)
+    assert not history["wall/floor/force"].any()

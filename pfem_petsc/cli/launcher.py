@@ -80,7 +80,10 @@ def collectively(function: Callable[[MPI.Comm], int], debug: bool) -> int:
     Where all ranks fail, the lowest prints its message. Where only some do, the others may wait for them for ever:
     each of the failed prints its message and ends the job.
     """
-    from mpi4py import MPI
+    try:
+        from mpi4py import MPI
+    except ImportError as error:
+        return _print(error, debug)
 
     comm = MPI.COMM_WORLD
     # Of its own, so that it matches whatever else the ranks are waiting in.
@@ -127,7 +130,8 @@ def _message(error: BaseException) -> tuple[int, str]:
     if isinstance(error, MemoryError):
         return SimulationFailure.exit_status, f"error: out of memory: {error}; use more machines or a smaller mesh"
     if isinstance(error, ModuleNotFoundError) and not str(error.name).startswith(__package__.partition(".")[0]):
-        return InputError.exit_status, f"error: {error}; scripts/setup.sh installs all that is needed"
+        way = "scripts/setup.sh makes an environment that has it: source .venv/bin/activate"
+        return InputError.exit_status, f"error: {error}; {way}"
     detail = " ".join(str(error).split()) or "no message"
 
     return (

@@ -95,3 +95,10 @@ def test_light_import(statement):
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines()[-1].split() == ["loaded"]
+
+
+def test_without_its_environment_the_way_in_is_told():
+    code = "import sys; sys.modules['mpi4py'] = None; import pfem_petsc.cli.main as m; sys.exit(m.main(['rod_impact']))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 2 and "Traceback" not in done.stderr
+    assert "source .venv/bin/activate" in done.stderr

@@ -51,8 +51,7 @@ class NewtonSolver:
     """Solves for the position increment of a step; made once for a run.
 
     Options: prefix ``pfem_`` for free steps, ``pfem_contact_`` for steps with bounds, and
-    ``pfem_contact_full_`` where these
-    are tried again without a line search.
+    ``pfem_contact_full_`` where these are tried again without a line search.
     """
 
     def __init__(

@@ -204,6 +204,6 @@ class ImplicitStepper(Stepper):
         residual, node = max(model.comm.allgather(worst))
         return (
             f"step {self.state.step + 1}, t = {problem.balance.time:.6g} s: no convergence after {report.newton} "
-            f"Newton iterations: {report.why}; residual {report.norm:.3g} N, asked {tolerance:.3g} N; worst at node {node} "
-            f'({residual:.3g} N). Take a smaller time.step, or solver.linear = "mumps"'
+            f"Newton iterations: {report.why}; residual {report.norm:.3g} N, asked {tolerance:.3g} N; worst at "
+            f'node {node} ({residual:.3g} N). Take a smaller time.step, or solver.linear = "mumps"'
         )

@@ -1,0 +1,25 @@
+"""Every kind of wall can be drawn: its surface lies on the wall."""
+
+import numpy as np
+import pytest
+
+from pfem_petsc.contact.walls import cylinder, rectangle, sphere
+from pfem_petsc.post.walls import wall_surfaces
+
+WALLS = [
+    sphere.Parameters(name="w", type="sphere", point=(0.1, 0.2, 0.3), radius=0.5),
+    cylinder.Parameters(name="w", type="cylinder", point=(0.1, 0.2, 0.3), axis=(1.0, 1.0, 0.2), radius=0.5),
+    rectangle.Parameters(
+        name="w", type="rectangle", point=(0, 0, 1.0), normal=(0, 0.5, 1.0), along=(1.0, 0, 0), size=(2.0, 1.0)
+    ),
+]
+
+
+@pytest.mark.parametrize("parameters", WALLS, ids=lambda p: p.type)
+def test_surface_is_on_the_wall(parameters):
+    (surface,) = wall_surfaces([parameters], np.array([[-1.0, -1, -1], [1.0, 1, 1]]))
+    module = {"sphere": sphere, "cylinder": cylinder, "rectangle": rectangle}[parameters.type]
+    face = surface.points[surface.depth == 0.0]
+    normals, offsets = module.Wall(parameters).planes(face)
+    np.testing.assert_allclose(np.einsum("ij,ij->i", normals, face), offsets, atol=1e-12)
+    assert surface.faces.max() < len(surface.points) and len(face) >= 4

@@ -1,0 +1,81 @@
+"""Nodes that rest on walls at the start: their acceleration and the forces that hold them.
+
+A node that touches a wall and does not move along its normal is not accelerated into it: with the walls' forces r,
+
+    M a = f + r,   0 <= n . a  complementary to  the strength of r.
+
+An acceleration without r starts a truss at rest on a floor with a jolt of h g, which dies out slowly with some schemes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from .projection import project
+
+__all__ = ["start_at_rest"]
+
+_ROUNDS = 60  # each at least halves the error
+_SLACK = 1e-12  # of lengths and wave speeds: strains that rounding makes
+
+
+def start_at_rest(model, state, accelerate: Callable[[np.ndarray], np.ndarray], load: np.ndarray):
+    """Put the acceleration and the contact forces of resting nodes into the state; the forces per wall. Collective.
+
+    The forces are found by projections with the lumped mass: at once where the mass is lumped. A consistent mass is
+    between a third of the lumped one and all of it, so that with half the lumped mass every round halves the error.
+
+    Parameters
+    ----------
+    model, state : with ``state.a`` as it is without walls
+    accelerate : acceleration (owned, 3) with M a = load. Collective
+    load : (owned, 3) without walls [N]
+
+    Returns
+    -------
+    WallForces or None
+        None where no node of any rank rests on a wall, or only one that lets it go.
+    """
+    contact, comm, mass = model.contact, model.comm, model.inertia.mass
+    x, v = state.position, state.v
+    shifts, rates = contact.motion.shifts(state.time), contact.motion.rates(state.time)
+    slack = _SLACK * model.length
+    nodes = np.flatnonzero(contact.near(x, shifts, np.array([slack])))
+    concerned = contact.members[nodes]
+    normals, offsets = contact.planes(concerned, x[nodes], shifts)
+    gaps = np.einsum("mwi,mi->mw", normals, x[nodes]) - offsets
+    away = np.einsum("mwi,mwi->mw", normals, v[nodes][:, None, :] - rates)
+    resting = concerned & (np.abs(gaps) <= slack) & (np.abs(away) <= _SLACK * model.wave_speed)
+    resting[:, [wall.partial for wall in contact.walls]] = False  # beside it, its plane goes on
+    if contact.motion.free is not None:
+        resting[:, contact.motion.free.at] = False  # these give way
+    kept = resting.any(axis=1)
+    nodes, normals, resting = nodes[kept], normals[kept], resting[kept]
+    planes = np.where(resting, 0.0, -np.inf)
+    inverse = 1.0 / mass[nodes][:, None]
+    fixed = model.supports.fixed[nodes]
+    share = 0.5 if model.inertia.consistent else 1.0
+
+    hold = np.zeros((len(nodes), 3))  # free components of the walls' forces
+    strengths = np.zeros(resting.shape)
+    for _ in range(_ROUNDS if model.inertia.consistent else 1):
+        free = state.a[nodes] - hold * inverse / share
+        moved = free.copy()
+        project(moved, fixed, normals, planes, 0.0, strengths)
+        before, hold = hold, share * mass[nodes][:, None] * (moved - free)
+        sizes = np.array([np.abs(hold - before).max(initial=0.0), np.abs(hold).max(initial=0.0)])
+        change, largest = np.max(comm.allgather(sizes), axis=0)
+        if change <= 1e-13 * largest:
+            break
+        total = load.copy()
+        total[nodes] += hold
+        state.a = accelerate(total)
+    if largest == 0.0:
+        return None
+    strengths *= share * mass[nodes][:, None]
+    force = strengths[:, :, None] * normals
+    state.contact = np.zeros_like(load)
+    state.contact[nodes] = force.sum(axis=1)
+    return contact.sums(nodes, force, x[nodes], strengths > 0.0)

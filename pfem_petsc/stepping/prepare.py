@@ -23,6 +23,8 @@ from .stepper import Stepper
 
 __all__ = ["Plan", "make_plan", "make_stepper"]
 
+_MOST_STEPS = 2.0**53  # beyond, the time of a step is not a number of its own
+
 CONSERVING = ("newmark", "houbolt", "energy_momentum")
 """Schemes whose contact force of a step acts in that step alone once its acceleration is taken away."""
 
@@ -73,6 +75,11 @@ def make_plan(model, recorded: Mapping[str, Any] | None = None) -> Plan:
         frequency = highest_frequency(model, model.mesh.points)
     else:
         frequency = Frequency(*recorded["frequency"])
+    if not np.isfinite(frequency.upper):
+        raise InputError(
+            f"{case.source}: material: the stiffness of the bars over their mass cannot be computed with: correct "
+            "young_modulus, density and area (SI units)"
+        )
     # mass-proportional damping: xi = c_m / (2 rho omega) is largest where c_m / rho is
     ratio = max(m.damping / m.density for m in case.material.values()) / (2.0 * max(frequency.lower, 1e-300))
     limit = scheme.limit(min(ratio, 1e3))
@@ -84,13 +91,13 @@ def make_plan(model, recorded: Mapping[str, Any] | None = None) -> Plan:
     certain = limit / frequency.lower if frequency.lower > 0.0 else np.inf
     if recorded is not None:
         step = float(recorded["step"])
-        steps = _steps_to(time.end, step)
+        steps = _steps_to(time.end, step, case.source)
     elif time.step == "auto":
         if not np.isfinite(critical):
             raise InputError(
                 f'{case.source}: time.step = "auto": {time.integrator} has no critical step here; give time.step [s]'
             )
-        steps = max(int(np.ceil(time.end / (time.safety * critical))), 1)
+        steps = _steps_to(time.end, time.safety * critical, case.source)
         step = time.end / steps
     else:
         step = float(time.step)
@@ -99,7 +106,7 @@ def make_plan(model, recorded: Mapping[str, Any] | None = None) -> Plan:
                 f"{case.source}: time.step = {step:g} s is above the limit of {time.integrator}, which is unstable "
                 f'beyond {critical:.6g} s for this model; take a smaller step or time.step = "auto"'
             )
-        steps = _steps_to(time.end, step)
+        steps = _steps_to(time.end, step, case.source)
     linear = None
     if not scheme.explicit or model.inertia.consistent:
         over = step * frequency.upper / 2.0
@@ -113,7 +120,12 @@ def make_plan(model, recorded: Mapping[str, Any] | None = None) -> Plan:
     return Plan(scheme, step, steps, critical, frequency, linear)
 
 
-def _steps_to(end: float, step: float) -> int:
+def _steps_to(end: float, step: float, source: str) -> int:
+    if not end / step < _MOST_STEPS:
+        raise InputError(
+            f"{source}: time.end = {end:g} s in steps of {step:g} s is more steps than can be counted; take a larger "
+            "time.step or a smaller time.end"
+        )
     return max(int(np.ceil(end / step * (1.0 - 1e-12) - 1e-9)), 1)
 
 

@@ -8,9 +8,14 @@ import numpy as np
 
 __all__ = ["Frequency", "highest_frequency"]
 
+_LARGEST = 1e150  # squares of frequencies [rad2/s2] whose own squares are still numbers
+
 
 class Frequency(NamedTuple):
-    """Bounds on the highest angular frequency [rad/s]: ``lower`` is certain, ``upper`` holds to Lanczos' residual."""
+    """Bounds on the highest angular frequency [rad/s]: ``lower`` is certain, ``upper`` holds to Lanczos' residual.
+
+    Infinite where stiffness over mass cannot be computed with.
+    """
 
     lower: float
     upper: float
@@ -69,6 +74,8 @@ def highest_frequency(model, x: np.ndarray, steps: int = 60, accuracy: float = 1
         beta = norm(w)
         diagonal.append(alpha)
         matrix = np.diag(diagonal) + np.diag(beside, 1) + np.diag(beside, -1)
+        if not np.isfinite(matrix).all() or np.abs(matrix).max() > _LARGEST:
+            return Frequency(np.inf, np.inf)
         values, vectors = np.linalg.eigh(matrix)
         ritz, residual = values[-1], beta * abs(vectors[-1, -1])
         low, high = max(ritz, 0.0), max(ritz + residual, 0.0)

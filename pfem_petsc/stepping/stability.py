@@ -21,6 +21,7 @@ class Frequency(NamedTuple):
     upper: float
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def highest_frequency(model, x: np.ndarray, steps: int = 60, accuracy: float = 1e-4) -> Frequency:
     """Highest natural frequency at positions ``x`` by Lanczos' method on M^-1/2 K_t M^-1/2 (lumped mass). Collective.
 

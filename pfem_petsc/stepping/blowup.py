@@ -12,6 +12,7 @@ __all__ = ["BlowUp"]
 
 _CREATED = 1e3  # energy created by the integration, over all that was ever put in: far beyond any error of a sound run
 _ROWS = 10  # in succession: after a start from rest, or when a wall first strikes, nothing is there to compare with
+_ROUNDING = 1e-12  # strains that are rounding: their energy is the least that counts as put in
 
 
 class BlowUp:
@@ -21,7 +22,7 @@ class BlowUp:
         self.model = model
         self._rows = 0
         self._strange = 0
-        self._most = 0.0
+        self._most = model.total_mass * (_ROUNDING * model.wave_speed) ** 2  # [J]
 
     def check(self, row: dict[str, Any], state) -> None:
         """Look at a row.

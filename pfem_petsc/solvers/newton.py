@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 from petsc4py import PETSc
 
+from ..errors import InputError
 from .linear import LinearChoice, configure
 from .matrix import HessianMatrix
 from .matrix_free import MatrixFreeHessian
@@ -111,6 +113,21 @@ class NewtonSolver:
             report = self._with_full_steps(start, report)
         u[:] = self._u.array.reshape(u.shape)
         return report
+
+    def prepare(self, contact: bool) -> None:
+        """Make the solvers of free steps, and of those with bounds, before any is needed. Collective.
+
+        Raises
+        ------
+        InputError
+            On all ranks, where PETSc refuses an option.
+        """
+        try:
+            for bounded in (False, True) if contact else (False,):
+                self._solver(bounded)
+        except PETSc.Error as error:
+            words = re.split(r"\[\d+\]", str(error))[-1].strip()
+            raise InputError(f"options after --: PETSc refuses one of those of the solvers: {words}") from error
 
     def destroy(self) -> None:
         """Free the PETSc objects."""

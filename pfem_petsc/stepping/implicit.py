@@ -37,6 +37,7 @@ class ImplicitStepper(Stepper):
             self.hessian = HessianMatrix(model.mesh, model.supports.fixed, model.supports.any, scheme.symmetric)
             self.hessian.rigid = choice.preconditioner == "gamg"
         self.newton = NewtonSolver(model.mesh, self.hessian, choice, model.case.solver.max_newton, model.length)
+        self.newton.prepare(model.contact.any)
         self.level = 0  # the next step is made in 2**level parts
         self.message: Callable[[str], None] = lambda text: None
         self.held = np.zeros(model.mesh.n_owned, dtype=bool)  # nodes held by walls in the last step

@@ -30,6 +30,8 @@ def run_collectively(on_ranks, tmp_path, ranks, body, timeout=60.0, debug=False)
         (["rod_impact", "--set", "time.end=0"], "rod_impact.toml: time.end = 0"),
         (["list", "extra"], "unrecognized arguments: extra"),
         (["info", "no_such_folder"], "no_such_folder"),
+        (["rod_impact", "--set", "time.integrator=newmark", "--", "-pfem_ksp_type", "nonsense"], "options after --"),
+        (["rod_impact", "--set", "time.integrator=newmark", "--", "-pfem_contact_pc_type", "nonsense"], "nonsense"),
     ],
 )
 def test_refusal_is_printed_once(on_ranks, tmp_path, ranks, words, text):

@@ -53,7 +53,11 @@ class RunState:
 
     def arrays(self) -> dict[str, tuple[NaturalOrder, np.ndarray]]:
         """Name to (order, rows owned by this rank) of all arrays; the same names on all ranks."""
-        nodes = {name: (self.node_order, array) for name, array in self._node_arrays().items()}
+        own = self._node_arrays()
+        # what a scheme or a treatment keeps may be on the ranks alone where something happened
+        names = sorted(set().union(*self.comm.allgather(set(own))))
+        nothing = np.zeros((self.model.mesh.n_owned, 3))
+        nodes = {name: (self.node_order, own.get(name, nothing)) for name in names}
         bars = {name: (self.bar_order, array[self.counted]) for name, array in self._bar_arrays().items()}
         return {**nodes, **bars}
 
@@ -67,6 +71,7 @@ class RunState:
             "contact_log": self.model.contact.log.share(),
             "contacts": int(stepper.solution.contacts),
         }
+        memories = self.comm.allgather(sorted(stepper.state.memory))
         return {
             "step": stepper.state.step,
             "time": stepper.state.time,
@@ -76,7 +81,8 @@ class RunState:
             "free_walls": free.kept() if (free := self.model.contact.motion.free) is not None else None,
             "contact_times": self.model.contact.log.times(self.comm),
             "row": {name: float(row[name]) for name in ("energy_imbalance", "active_contacts")},
-            "node_arrays": sorted(self._node_arrays()),
+            "node_arrays": sorted(set().union(*self.comm.allgather(set(self._node_arrays())))),
+            "memories": memories,
             "bar_arrays": sorted(self._bar_arrays()),
             "ranks": self.comm.allgather(mine),
         }
@@ -103,6 +109,9 @@ class RunState:
             else:
                 # not in place: a force that does not act may be an array that others share
                 setattr(state, name, values.copy())
+        if len(scalars["memories"]) == self.comm.size:
+            mine = scalars["memories"][self.comm.rank]
+            state.memory = {name: array for name, array in state.memory.items() if name in mine}
         self.model.mesh.update_ghosts(state.x)
         self._put_back_bars(checkpoint)
         state.step, state.time = int(scalars["step"]), float(scalars["time"])

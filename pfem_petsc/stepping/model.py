@@ -84,7 +84,8 @@ class Model:
             axial = block.area * block.parameters[0]
             _node_stiffness(mesh.bars, self.bars.rest, block.start, block.stop, axial, stiffness)
         self.nodal_stiffness = stiffness[: mesh.n_owned].copy()
-        squares = comm.allreduce(float((self.nodal_stiffness**2).sum()))
+        with np.errstate(over="ignore"):  # what is too stiff to be computed with is refused by the plan
+            squares = comm.allreduce(float((self.nodal_stiffness**2).sum()))
         self.rounding = 4.0 * np.finfo(float).eps * self.reach * np.sqrt(squares)
         self.total_mass = comm.allreduce(float(self.inertia.mass.sum()))
         speeds = [np.sqrt(m.young_modulus / m.density) for m in case.material.values()]

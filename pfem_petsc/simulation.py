@@ -157,7 +157,7 @@ class Simulation:
             self.stepper.start()
             self._meet()
         self.ledger = Ledger(self.stepper)
-        self.stepper.booking = self.ledger.update
+        self.stepper.booking = self._book
         if hasattr(self.stepper, "message"):
             self.stepper.message = self._progress.warning
         self.recorder = Recorder(self.stepper, self.ledger)
@@ -250,7 +250,6 @@ class Simulation:
         stepper, output = self.stepper, self.case.output
         stepper.step()
         solution = stepper.solution
-        self.recorder.count(solution.newton, solution.linear)
         step = self.state.step
         last = step == self.plan.steps
         row = None
@@ -272,6 +271,11 @@ class Simulation:
             step, self.state.time, stepper.h, solution.newton, solution.linear, self.row["active_contacts"], drift
         )
         return Step(step, self.state.time, solution.newton, solution.linear, row)
+
+    def _book(self) -> None:
+        """Energies and iterations of a step, or of each part of a halved one."""
+        self.ledger.update()
+        self.recorder.count(self.stepper.solution.newton, self.stepper.solution.linear)
 
     def _record(self) -> dict[str, Any]:
         """A history row, unless a rank has a fault, which is raised on all."""

@@ -178,8 +178,9 @@ class NewtonSolver:
         if full_steps:
             PETSc.Options(prefix)["snes_linesearch_type"] = "basic"
         snes.setType("vinewtonrsls" if contact else "newtonls")
-        snes.setFunction(self._residual, self._g)
-        snes.setJacobian(self._hessian, self.hessian.mat, self.hessian.mat)
+        # looked up at each call: the methods may be covered by log events after this
+        snes.setFunction(lambda *arguments: self._residual(*arguments), self._g)
+        snes.setJacobian(lambda *arguments: self._hessian(*arguments), self.hessian.mat, self.hessian.mat)
         snes.setTolerances(rtol=0.0, atol=0.0, stol=0.0, max_it=self.max_newton)
         snes.setConvergenceTest(self._converged)
         if contact:

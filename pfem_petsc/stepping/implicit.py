@@ -62,6 +62,9 @@ class ImplicitStepper(Stepper):
             except NotConverged as failure:
                 if size == 1:
                     raise NotConverged(f"{failure} (the step was halved {_HALVINGS} times)") from failure
+                if self.model.temperatures.varying:
+                    # the failed solve has heated the bars to its own end
+                    self.model.temperatures.apply(self.state.time)
                 size //= 2
                 self.level += 1
                 self.message(f"{failure}; halving the step to {self.h * size / ticks:.4g} s")

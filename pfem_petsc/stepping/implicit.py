@@ -161,12 +161,24 @@ class ImplicitStepper(Stepper):
             if contacts.settled(w, u, g, report.norm):
                 break
             guess = u
+        if frames is None and not model.supports.any:
+            self._keep_momentum(problem, u, g)
         state.contact, walls, self.held = contacts.forces(u)
         state.support = np.zeros_like(u)
         fixed = model.supports.fixed
         state.support[fixed] = g[fixed] - state.contact[fixed]
         internal = problem.f if balance.weight else state.f
         return Solution(u, internal, walls, newton, linear, int(self.held.sum()))
+
+    def _keep_momentum(self, problem: StepProblem, u: np.ndarray, g: np.ndarray) -> None:
+        """Take the net force that the solver has left from a free truss, by a translation, which strains no bar.
+
+        An iterative solution leaves a residual within the tolerance, whose sum would be a drift of linear momentum.
+        """
+        net = self.model.comm.allreduce(np.append(g.sum(axis=0), problem.nodal.sum()))
+        shift = net[:3] / net[3]
+        u -= shift
+        g -= problem.nodal[:, None] * shift
 
     def _tolerance(self, balance: Balance) -> float:
         """Of the residual's 2-norm [N]: relative to the forces at work (momentum per step, loads, internal forces)."""

@@ -13,7 +13,6 @@ from .errors import EarlyStop, PfemError, SimulationFailure
 from .output.progress import Progress
 from .output.units import engineering
 from .output.vtkhdf import ResultWriter
-from .parallel.natural import NaturalOrder
 from .parallel.petsc_log import lay_over, staged
 from .preflight.forecast import forecast
 from .preflight.inspection import inspect, warnings_before
@@ -329,6 +328,5 @@ class Simulation:
 
     def gather(self, values: np.ndarray) -> np.ndarray | None:
         """An owned array (owned, ...) as a whole in mesh numbering on rank 0, None elsewhere. Collective."""
-        order = NaturalOrder(self.comm, self.mesh.node_ids[: self.mesh.n_owned], self.mesh.n_nodes)
-        parts = self.comm.gather(order.to_slab(values))
+        parts = self.comm.gather(self.mesh.node_order.to_slab(values))
         return np.concatenate(parts) if parts is not None else None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 from petsc4py import PETSc
 
@@ -138,7 +140,11 @@ class HessianMatrix:
             self._fixed = np.zeros((mesh.n_local, 3))
             self._fixed[: mesh.n_owned] = fixed
             mesh.update_ghosts(self._fixed)
-            self._local_columns = local_columns(mesh, self.pattern.columns)
+
+    @cached_property
+    def local_columns(self) -> np.ndarray:
+        """Local node index (int32) of each block's column; worked out where supports or oblique walls first need it."""
+        return local_columns(self.mesh, self.pattern.columns)
 
     def fill(self, add) -> PETSc.Mat:
         """Assemble: ``add(values)`` adds the Hessian of the owned rows to the zeroed values."""
@@ -185,7 +191,7 @@ class HessianMatrix:
         if self.any_fixed:
             p = self.pattern
             _constrain_rows(p.ptr, p.diagonal, self._fixed, scale, values)
-            _constrain_columns(p.ptr, self._local_columns, p.diagonal, self._fixed, values)
+            _constrain_columns(p.ptr, self.local_columns, p.diagonal, self._fixed, values)
 
     def destroy(self) -> None:
         """Free the PETSc matrix."""

@@ -7,20 +7,20 @@ import numpy as np
 from ..contact.frames import NodalFrames
 from ..integrators.base import Balance, State
 from ..mechanics.compiled import kernel
-from ..solvers.matrix import HessianMatrix, local_columns
+from ..solvers.matrix import HessianMatrix
 
 __all__ = ["StepProblem"]
 
 
 @kernel
-def _turn_blocks(ptr, local_columns, frame_of_row, frame_of_column, inverse, values):
+def _turn_blocks(ptr, local_columns, frame_of, inverse, values):
     """H <- B^-T H B^-1 on the rows and columns of nodes with a frame (index -1: none)."""
     block = np.zeros((3, 3))
     for row in range(len(ptr) - 1):
         width = 3 * (ptr[row + 1] - ptr[row])
-        r = frame_of_row[row]
+        r = frame_of[row]
         for k in range(ptr[row], ptr[row + 1]):
-            c = frame_of_column[local_columns[k]]
+            c = frame_of[local_columns[k]]
             if r < 0 and c < 0:
                 continue
             at = 6 * ptr[row] + 3 * k
@@ -156,8 +156,7 @@ class StepProblem:
             else:
                 bars.tangents(self.x, *arguments)
         if self.oblique:
-            columns = local_columns(self.model.mesh, matrix.pattern.columns)
-            _turn_blocks(matrix.pattern.ptr, columns, self._frame_of, self._frame_of, self._inverse, values)
+            _turn_blocks(matrix.pattern.ptr, matrix.local_columns, self._frame_of, self._inverse, values)
         matrix.constrain(self.scale, values)
 
     def place(self, u: np.ndarray) -> None:

@@ -14,6 +14,7 @@ from .frames import NodalFrames, build_frames
 from .log import ContactLog
 from .motion import WallMotion
 from .search import near_planes
+from .tied import Ties
 
 __all__ = ["Contact"]
 
@@ -31,6 +32,7 @@ class Contact:
     normals : (walls, 3) of flat walls, zero for the others
     log : ContactLog
     restitution, friction, static_friction : (walls,); rough : whether any wall has friction
+    ties : Ties
     state : of the nodes, for walls that must know where nodes come from; set by the stepper
     """
 
@@ -59,6 +61,7 @@ class Contact:
         self.static_friction = np.array(static, dtype=np.float64)
         self.restitution = np.array([wall.restitution for wall in walls], dtype=np.float64)
         self.rough = bool(self.static_friction.any())
+        self.ties = Ties(self, walls)
         self.flat = np.array([wall.flat for wall in self.walls], dtype=bool)
         self.partial = any(wall.partial for wall in self.walls)
         self.normals = np.zeros((len(walls), 3))
@@ -242,8 +245,3 @@ class Contact:
             strengths[touching, k] = np.abs(left[every[touching], safe[touching]])
             left[every[touching], safe[touching]] = 0.0  # walls that share a bound: the first takes the force
         return strengths
-
-    def forces(self, frames: NodalFrames, strengths: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, WallForces]:
-        """Forces (m, 3) on the frames' nodes at (m, 3) from normal forces (m, walls), and their sums per wall."""
-        force = strengths[:, :, None] * frames.normals
-        return force.sum(axis=1), self.sums(frames.nodes, force, x, strengths > 0.0)

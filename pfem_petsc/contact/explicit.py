@@ -32,10 +32,17 @@ class ExplicitContact:
                 failure = failure or met
                 return np.zeros((len(free.at), 3)), np.zeros((len(free.at), 3, 3))
             normals, _ = self.contact.planes(walls.touching, walls.places, self.contact.motion.shifts(time))
-            active = np.where(walls.touching[:, :, None] & ~self.contact.fixed[nodes][:, None, :], normals, 0.0)
+            touching = walls.touching
+            if self.contact.ties.any:
+                touching = touching & ~self.contact.ties.held[nodes][:, None]
+            active = np.where(touching[:, :, None] & ~self.contact.fixed[nodes][:, None, :], normals, 0.0)
             inverse = np.linalg.pinv(active, rcond=1e-8) if len(nodes) else np.zeros((0, 3, len(self.contact.walls)))
             weight = stiffness[nodes][:, None] * (inverse * inverse).sum(axis=1)  # k (N N^T)^-1 on its diagonal
-            slope = np.einsum("mw,mwi,mwj->wij", np.where(walls.touching, weight, 0.0), normals, normals)
+            slope = np.einsum("mw,mwi,mwj->wij", np.where(touching, weight, 0.0), normals, normals)
+            if self.contact.ties.any:
+                tied, at = self.contact.ties.nodes()
+                gives = stiffness[tied, None] * ~self.contact.fixed[tied]
+                np.add.at(slope, at, gives[:, :, None] * np.eye(3))
             return walls.force[free.at], slope[free.at]
 
         free.solve(forces, 1e-15 * self.contact.length)
@@ -46,13 +53,34 @@ class ExplicitContact:
         self, x: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float, booked: bool = True
     ) -> tuple:
         """See :meth:`Contact.explicit`; ``booked``: this is the step, not a trial of it."""
+        contact, ties = self.contact, self.contact.ties
+        nodes, moved, force, touching = self._press(x, stiffness, time, tolerance, booked)
+        if ties.any:
+            tied, walls, places, pull = ties.hold(x, stiffness, time)
+            every = np.zeros((len(tied), len(contact.walls), 3))
+            every[np.arange(len(tied)), walls] = pull
+            own = np.zeros(every.shape[:2], dtype=bool)
+            own[np.arange(len(tied)), walls] = True
+            nodes, moved = np.append(nodes, tied), np.vstack([moved, places])
+            force, touching = np.vstack([force, every]), np.vstack([touching, own])
+        if len(nodes) == 0:
+            return nodes, moved, np.empty((0, 3)), contact.none()
+        correction = moved - x[nodes]
+        x[nodes] = moved
+        return nodes, correction, force.sum(axis=1), contact.sums(nodes, force, moved, touching)
+
+    def _press(self, x: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float, booked: bool) -> tuple:
+        """Nodes (m,) near walls that do not hold them for good, places (m, 3), forces (m, w, 3), touching (m, w)."""
         shifts = self.contact.motion.shifts(time)
         near = self.contact.near(x, shifts)
         if self.contact.restitution.any():
             near |= self._returning()
+        if self.contact.ties.any:
+            near &= ~self.contact.ties.held
         nodes = np.flatnonzero(near)
         if len(nodes) == 0:
-            return nodes, np.empty((0, 3)), np.empty((0, 3)), self.contact.none()
+            walls = len(self.contact.walls)
+            return nodes, np.empty((0, 3)), np.empty((0, walls, 3)), np.empty((0, walls), dtype=bool)
         free = x[nodes]
         concerned = self.contact.concerned(nodes, free, shifts)
         at = free
@@ -79,9 +107,7 @@ class ExplicitContact:
             moved, force = self._rub(nodes, free, shifts, (normals, offsets), stiffness[nodes], moved, strength, time)
         if booked and self.contact.restitution.any():
             self._remember_approach(nodes, free, shifts, normals, strength)
-        walls = self.contact.sums(nodes, force, moved, np.einsum("mwi,mwi->mw", force, normals) > 0.0)
-        x[nodes] = moved
-        return nodes, moved - free, force.sum(axis=1), walls
+        return nodes, moved, force, np.einsum("mwi,mwi->mw", force, normals) > 0.0
 
     def _returning(self) -> np.ndarray:
         """(owned,) bool: nodes that hit a wall with restitution in the last step."""

@@ -50,6 +50,11 @@ class NodalFrames:
         self.oblique = False
         self.contradiction = -1
 
+    def pin(self, at: np.ndarray, values: np.ndarray, which: np.ndarray) -> None:
+        """Hold the coordinates ``which`` (k, 3) of the frames ``at`` (k,) at values (k, 3) [m]."""
+        self.lower[at] = np.where(which, values, self.lower[at])
+        self.upper[at] = np.where(which, values, self.upper[at])
+
 
 def build_frames(
     nodes: np.ndarray,

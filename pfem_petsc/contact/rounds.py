@@ -11,6 +11,7 @@ import numpy as np
 from mpi4py import MPI
 
 from ..integrators.base import Balance, State
+from ..parallel.agreement import agreed
 from ..solvers.newton import zero_tolerance
 from ..stepping.stepper import NotConverged
 from .forces import WallForces
@@ -43,7 +44,7 @@ class ContactRounds:
         self.round = 0
         self._frames: NodalFrames | None = None
         self._rank: np.ndarray | None = None
-        self._seen: set[bytes] = set()
+        self._tied: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None  # in the frames, walls, places
         self.candidates = self._expected() if self.contact.any else None
 
     def _expected(self) -> np.ndarray | None:
@@ -53,6 +54,8 @@ class ContactRounds:
         reach = 0.5 * np.linalg.norm(move, axis=1) + 1e-9 * self.model.length
         self._shifts = contact.motion.shifts(time)
         near = self.held | contact.near(state.position + move, self._shifts, reach)
+        if contact.ties.any:
+            near |= contact.ties.held
         if self.model.comm.allreduce(int(near.any()), op=MPI.MAX) == 0:
             return None
         nodes = np.flatnonzero(near)
@@ -63,8 +66,23 @@ class ContactRounds:
         """Frames of the candidates from the planes at positions (owned, 3). Collective."""
         self._frames = None
         if self.candidates is not None:
-            self._frames = self.contact.frames(self.candidates, x, self.balance.time, self._concerned, self._rank)
+            concerned = self._concerned
+            if self.contact.ties.any:
+                concerned = concerned & ~self.contact.ties.held[self.candidates][:, None]
+            self._frames = self.contact.frames(self.candidates, x, self.balance.time, concerned, self._rank)
+            if self.contact.ties.any:
+                self._tie()
         return self._frames
+
+    def _tie(self) -> None:
+        """Hold tied nodes at their places. Collective."""
+        contact = self.contact
+        nodes, walls, places = contact.ties.targets(self.balance.time)
+        with agreed(self.model.comm):
+            contact.ties.check(nodes, walls, places, self.balance.time)
+        at = np.searchsorted(self.candidates, nodes)
+        self._frames.pin(at, places, ~contact.fixed[nodes])
+        self._tied = at, walls, places
 
     def feasible(self, u: np.ndarray) -> np.ndarray:
         """The increment (owned, 3) nearest to a guess, node by node, that keeps the frames' planes."""
@@ -78,6 +96,10 @@ class ContactRounds:
         project(moved, self.contact.fixed[at], frames.normals, frames.offsets, tolerance, multipliers)
         u = u.copy()
         u[at] += moved - x
+        if self._tied is not None:
+            tied, _, places = self._tied
+            nodes = at[tied]
+            u[nodes] = np.where(self.contact.fixed[nodes], u[nodes], places - self.balance.predictor[nodes])
         return u
 
     def approach(self, problem, u: np.ndarray) -> np.ndarray:
@@ -134,6 +156,7 @@ class ContactRounds:
         self.strengths = None
         if self._frames is not None:
             self.strengths = self._strengths(w, g, noise)
+            self._pull = np.where(contact.fixed[self.candidates], 0.0, g[self.candidates])
         tolerance = 1e-12 * self.model.length
         beyond = np.flatnonzero(contact.near(x, self._shifts, np.array([-tolerance])))
         unsettled, joined = self._unexpected(beyond, x, tolerance)
@@ -177,6 +200,8 @@ class ContactRounds:
             known[known] = self.candidates[place[known]] == beyond[known]
             # what a bound keeps is kept to rounding of the coordinates; supports decide over walls
             broken[known] &= self._frames.rows[place[known]] < 0
+            if contact.ties.any:
+                broken &= ~contact.ties.held[beyond][:, None]
         thin = (np.where(contact.fixed[beyond][:, None, :], 0.0, normals) ** 2).sum(axis=2) <= 1e-12
         broken &= ~thin
         return bool(broken.any()), beyond[broken.any(axis=1)]
@@ -221,7 +246,13 @@ class ContactRounds:
         walls = self.contact.none()
         if self._frames is not None:
             at = self._frames.nodes
-            force, walls = self.contact.forces(self._frames, self.strengths, (self.balance.predictor + u)[at])
-            total[at] = force
-            held[at] = (self.strengths > 0.0).any(axis=1)
+            force = self.strengths[:, :, None] * self._frames.normals
+            touching = self.strengths > 0.0
+            if self._tied is not None:
+                tied, owners, _ = self._tied
+                force[tied, owners] = self._pull[tied]
+                touching[tied, owners] = True
+            walls = self.contact.sums(at, force, (self.balance.predictor + u)[at], touching)
+            total[at] = force.sum(axis=1)
+            held[at] = touching.any(axis=1)
         return total, walls, held

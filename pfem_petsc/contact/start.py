@@ -24,7 +24,9 @@ def adjust_start(case, nodes: dict[str, np.ndarray], mesh) -> int:
     InputError
         On all ranks: walls that leave a node no room, or a bar that loses its length.
     """
-    walls = [wall for wall in case.wall if wall.adjust]
+    # where nodes come from, and what they do there, is no matter yet
+    plain = {"friction": 0.0, "static_friction": None, "restitution": 0.0, "tied": False}
+    walls = [wall.model_copy(update=plain) for wall in case.wall if wall.adjust]
     if not walls:
         return 0
     owned = mesh.n_owned

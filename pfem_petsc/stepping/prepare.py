@@ -185,6 +185,8 @@ def _check_walls(model, plan: Plan) -> None:
             raise InputError(f"{key}: friction needs an explicit integrator with lumped mass")
         if model.contact.restitution[k] and not (plan.linear is None and plan.scheme.leads):
             raise InputError(f"{key}: restitution needs central_differences with lumped mass")
+        if model.contact.ties.tying[k] and model.case.contact.treatment not in ("scheme", "stick"):
+            raise InputError(f'{key}: tied needs contact.treatment = "scheme" or "stick"')
         explicit_only = model.contact.static_friction[k] or model.contact.restitution[k]
         if explicit_only and model.case.contact.treatment != "scheme":
             raise InputError(f'{key}: friction and restitution need contact.treatment = "scheme"')

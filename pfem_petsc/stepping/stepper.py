@@ -155,7 +155,10 @@ class Stepper(ABC):
         state.external = self._load(self.balance)
         self.solution = self.solve(self.balance)
         if self.model.contact.any:
-            self.model.contact.log.book(self.solution.walls, self.part)
+            walls = self.solution.walls
+            self.model.contact.log.book(walls, self.part)
+            if self.model.contact.ties.any:
+                self.model.contact.ties.take(walls.nodes, walls.touching, walls.places, self.balance.time)
         self.scheme.finish(state, self.balance, self.solution.u, self.part)
         if free is not None:
             free.finish(self.part)

@@ -126,7 +126,7 @@ def test_galilean_equivalence(kind, integrator, comm, shared_tmp_path):
 
 def test_adjust_moves_nodes_onto_the_wall(comm, shared_tmp_path):
     """Nodes that start beyond the wall start on it, and their bars without stress."""
-    walls = planes([[0.0, 0.1, 1.0]], [0.004], adjust=True)
+    walls = planes([[0.0, 0.1, 1.0]], [0.004], adjust=True, friction=0.1, restitution=0.2)
     rows, _, run = run_of(lattice_case(walls, end=0.002), comm, shared_tmp_path)
     points = run.mesh.points[: run.mesh.n_owned]
     normal = run.model.contact.walls[0].normal

@@ -50,7 +50,10 @@ class Treatment(ABC):
         """Called after each part of a step, before it is booked: changes v, a and memory of the state."""
 
     def held(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Nodes that walls hold (m,), projections (m, 3, 3) on their normals, velocities (m, 3) of the walls [m/s]."""
+        """Nodes that walls hold (m,), projections (m, 3, 3) on their normals, velocities (m, 3) of the walls [m/s].
+
+        Of nodes that walls hold for good the projection is on all directions.
+        """
         stepper = self.stepper
         contact, walls = stepper.model.contact, stepper.solution.walls
         touched = walls.touching.any(axis=1)
@@ -60,8 +63,14 @@ class Treatment(ABC):
         normals = np.where(touching[:, :, None], normals, 0.0)
         # the normals' pseudo-inverse serves any number of walls at a node, parallel ones too
         inverse = np.linalg.pinv(normals, rcond=1e-8) if len(nodes) else np.zeros((0, 3, normals.shape[1]))
-        speeds = np.einsum("mwi,wi->mw", normals, contact.motion.rates(stepper.state.time))
-        return nodes, inverse @ normals, np.einsum("miw,mw->mi", inverse, speeds)
+        rates = contact.motion.rates(stepper.state.time)
+        speeds = np.einsum("miw,mw->mi", inverse, np.einsum("mwi,wi->mw", normals, rates))
+        normal = inverse @ normals
+        if contact.ties.any:
+            tied = contact.ties.held[nodes]
+            normal[tied] = np.eye(3)
+            speeds[tied] = rates[contact.ties.walls(nodes[tied])]
+        return nodes, normal, speeds
 
     def set(self, nodes: np.ndarray, v: np.ndarray, a: np.ndarray) -> None:
         """Give nodes new velocities and accelerations (m, 3), and keep what they were for the ledger."""

@@ -35,6 +35,9 @@ class WallKeys(WallParameters):
     restitution: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
     """part of the normal velocity with which a node leaves that hits the wall"""
 
+    tied: bool = False
+    """true: a node that touches the wall is held where it is on it from then on, in all directions"""
+
     @field_validator("motion")
     @classmethod
     def _times_increase(cls, rows: tuple | None) -> tuple | None:
@@ -53,6 +56,8 @@ class WallKeys(WallParameters):
             raise ValueError("expected at most one of the keys mass, motion")
         if self.static_friction is not None and self.static_friction < self.friction:
             raise ValueError(f"static_friction must be no less than friction = {self.friction!r}")
+        if self.tied and (self.friction or self.static_friction or self.restitution):
+            raise ValueError("a wall that is tied takes no friction and no restitution: nodes neither slip nor leave")
         return self
 
 

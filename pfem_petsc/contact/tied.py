@@ -1,0 +1,110 @@
+"""Nodes that walls with ``tied = true`` hold for good.
+
+In the step in which a node meets such a wall it is stopped as by any wall, along the normal; from then on its position
+relative to the wall is the one of that moment, in all three directions and whatever the sign of the force. Components
+that supports prescribe stay the supports'. What is tied is part of the state: ``tied_to`` (owned,) is the wall's index
+plus one, 0 where there is none, and ``tied_at`` (owned, 3) the place relative to the wall [m].
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..errors import SimulationFailure
+
+__all__ = ["Ties"]
+
+_SLACK = 1e-9  # of the model's length: how far beyond another wall a tied node may be carried
+
+
+class Ties:
+    """The tied nodes of this rank.
+
+    Attributes
+    ----------
+    any : whether the case has walls that tie
+    tying : (walls,) bool
+    """
+
+    def __init__(self, contact, walls) -> None:
+        self.contact = contact
+        self.tying = np.array([wall.tied for wall in walls], dtype=bool)
+        self.any = bool(self.tying.any())
+
+    @property
+    def held(self) -> np.ndarray:
+        """(owned,) bool: nodes that are tied."""
+        return self._memory()[0] > 0
+
+    def walls(self, nodes: np.ndarray) -> np.ndarray:
+        """Walls (m,) that tied nodes (m,) are tied to."""
+        return self._memory()[0][nodes] - 1
+
+    def nodes(self) -> tuple[np.ndarray, np.ndarray]:
+        """Tied nodes (m,), ascending, and their walls (m,)."""
+        tied_to, _ = self._memory()
+        nodes = np.flatnonzero(tied_to)
+        return nodes, tied_to[nodes] - 1
+
+    def targets(self, time: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Tied nodes (m,), their walls (m,), and where these hold them at a time [s] (m, 3) [m]."""
+        nodes, walls = self.nodes()
+        return nodes, walls, self._memory()[1][nodes] + self.contact.motion.shifts(time)[walls]
+
+    def hold(self, x: np.ndarray, stiffness: np.ndarray, time: float) -> tuple[np.ndarray, ...]:
+        """Tied nodes (m,) of an explicit step, with their walls (m,), places and forces (m, 3) [m], [N].
+
+        Parameters
+        ----------
+        x : (owned, 3) free positions at ``time`` [m]
+        stiffness : (owned,) force for a displacement of the node [N/m]
+
+        Raises
+        ------
+        SimulationFailure
+            On this rank: a node was carried through another wall.
+        """
+        nodes, walls, places = self.targets(time)
+        places = np.where(self.contact.fixed[nodes], x[nodes], places)
+        self.check(nodes, walls, places, time)
+        return nodes, walls, places, stiffness[nodes, None] * (places - x[nodes])
+
+    def check(self, nodes: np.ndarray, walls: np.ndarray, places: np.ndarray, time: float) -> None:
+        """Refuse to carry nodes at (m, 3) through walls other than their own (m,).
+
+        Raises
+        ------
+        SimulationFailure
+            On this rank.
+        """
+        contact = self.contact
+        if len(nodes) == 0 or len(contact.walls) == 1:
+            return
+        shifts = contact.motion.shifts(time)
+        concerned = contact.concerned(nodes, places, shifts)
+        concerned[np.arange(len(nodes)), walls] = False
+        normals, offsets = contact.planes(concerned, places, shifts)
+        gaps = np.einsum("mwi,mi->mw", normals, places) - offsets
+        gaps[(np.where(contact.fixed[nodes][:, None, :], 0.0, normals) ** 2).sum(axis=2) <= 1e-12] = np.inf
+        node, other = np.unravel_index(np.argmin(gaps), gaps.shape)
+        if gaps[node, other] < -_SLACK * contact.length:
+            raise SimulationFailure(
+                f"node {contact.mesh.node_ids[nodes[node]]}, tied to wall {contact.names[walls[node]]!r}, is carried "
+                f"{-gaps[node, other]:.3g} m beyond wall {contact.names[other]!r} at time {time:.6g} s; keep the walls "
+                "apart, or name the nodes that they concern with 'node_set'"
+            )
+
+    def take(self, nodes: np.ndarray, touching: np.ndarray, places: np.ndarray, time: float) -> None:
+        """Tie nodes (m,) at (m, 3) that touch (m, walls) walls that tie; of several the first."""
+        tied_to, tied_at = self._memory()
+        fresh = touching & self.tying & (tied_to[nodes] == 0)[:, None]
+        met = fresh.any(axis=1)
+        walls = fresh[met].argmax(axis=1)
+        tied_to[nodes[met]] = walls + 1
+        tied_at[nodes[met]] = places[met] - self.contact.motion.shifts(time)[walls]
+
+    def _memory(self) -> tuple[np.ndarray, np.ndarray]:
+        memory, owned = self.contact.state.memory, self.contact.mesh.n_owned
+        if "tied_to" not in memory:
+            memory["tied_to"], memory["tied_at"] = np.zeros(owned, dtype=np.int64), np.zeros((owned, 3))
+        return memory["tied_to"], memory["tied_at"]

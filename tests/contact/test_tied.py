@@ -1,0 +1,231 @@
+"""Tied walls: nodes that touch them stay, whatever pulls at them."""
+
+import numpy as np
+import pytest
+from lattices import lattice_case, planes, simulation
+from mpi4py import MPI
+from turning import with_mesh_file
+
+from pfem_petsc import Case, Simulation
+from pfem_petsc.errors import InputError, SimulationFailure
+
+SCHEMES = [("central_differences", {}), ("chung_lee", {}), ("newmark", {}), ("houbolt", {})]
+SCHEMES += [("generalized_alpha", {}), ("wilson", {"theta": 1.8}), ("energy_momentum", {})]
+STICK = ("generalized_alpha", "energy_momentum")
+
+
+def rod(integrator, parameters, *, gap=0.0213, speed=1e-3, end=9.0, step=0.01, elements=40, **wall):
+    """A rod of length, wave speed and mass one, thrown along x at a wall that ties its tip."""
+    return {
+        "mesh": {"generator": "rod", "length": 1.0, "elements": elements},
+        "material": {"m": {"young_modulus": 1.0, "density": 1.0}},
+        "section": {"s": {"area": 1.0, "material": "m"}},
+        "node_set": {"tip": {"nearest": [1.0, 0.0, 0.0]}},
+        "initial": {"velocity": [speed, 0.0, 0.0]},
+        "wall": planes([[-1.0, 0.0, 0.0]], [-1.0 - gap * speed], node_set="tip", tied=True, name="glue", **wall),
+        "time": {"integrator": integrator, "step": step, "end": end, **parameters},
+        "contact": {"treatment": "stick" if integrator in STICK else "scheme"},
+        "output": {"fields_every": 0},
+        "solver": {"rtol": 1e-12},
+    }
+
+
+def columns(run):
+    rows = [step.row for step in run]
+    return {name: np.array([row[name] for row in rows]) for name in rows[0]}
+
+
+@pytest.mark.parametrize("integrator, parameters", SCHEMES)
+def test_rod_stays_and_oscillates(integrator, parameters, comm, shared_tmp_path):
+    """After the touch the rod is one with a fixed end: the force is a square wave of period 4 L/c, its first half
+    presses with rho c A v and its second pulls as much, and momentum is the initial one plus the impulse."""
+    speed = 1e-3
+    found = columns(simulation(rod(integrator, parameters, speed=speed), comm, shared_tmp_path))
+    since = found["time"] - 0.0213
+    force = -found["wall/glue/force"][:, 0] / speed
+    for start, sign in ((0.0, 1.0), (2.0, -1.0), (4.0, 1.0), (6.0, -1.0)):
+        inside = (since > start + 0.4) & (since < start + 1.6)
+        tolerance = 0.03 if integrator != "newmark" else 0.35  # Hu's pair damps waves
+        assert np.mean(force[inside]) == pytest.approx(sign, abs=tolerance), start
+    momentum, impulse = found["momentum"][:, 0], found["wall/glue/impulse"][:, 0]
+    if integrator == "central_differences":
+        # the force of a row acts from half a step before to half a step after it
+        force = found["wall/glue/force"][:, 0]
+        np.testing.assert_allclose(momentum - 0.5 * 0.01 * force, speed + impulse - 0.01 * force, atol=1e-13)
+    elif integrator in ("newmark", "houbolt"):
+        assert np.abs(momentum - speed - impulse)[since > 0].max() < 0.1 * speed
+    contacts = found["wall/glue/contacts"]
+    assert (contacts[since > 0.02] == 1).all() and found["wall/glue/releases"][-1] == 0
+    assert np.abs(found["energy_imbalance"]).max() < 1e-9 * found["kinetic_energy"][0]
+    if integrator in ("central_differences", "chung_lee"):
+        # v(t) of the mass centre: the triangle wave v (1 - t c/L), period 4
+        triangle = speed * (np.abs((since % 4.0) - 2.0) - 1.0)
+        late = since > 0.1
+        assert np.abs(momentum - triangle)[late].max() < 0.05 * speed
+
+
+@pytest.mark.parametrize("integrator", ["central_differences", "newmark"])
+def test_tip_keeps_its_place(integrator, comm, shared_tmp_path):
+    """From the touch on the tip is where it was then, to rounding, on a wall at rest and on one that moves about."""
+    for name, keys in (("rest", {}), ("moved", {"motion": [[0.0, 0, 0, 0], [0.5, 0, 0.02, 0.01], [2.0, -0.01, 0, 0]]})):
+        case = rod(integrator, {}, end=1.5, speed=0.05, step=0.02, elements=10, **keys)
+        case["initial"]["velocity"] = [0.05, 0.01, 0.0]
+        run = simulation(case, comm, shared_tmp_path, name)
+        place = None
+        for _ in run:
+            nodes, _, places = run.model.contact.ties.targets(run.state.time)
+            if len(nodes) == 0:
+                continue
+            away = run.state.position[nodes] - run.model.contact.motion.shifts(run.state.time)[0]
+            if place is None and run.state.time > 0.3:
+                place = away
+            if place is not None:
+                np.testing.assert_allclose(away, place, atol=1e-14)
+        assert comm.allreduce(int(place is not None)) == 1
+
+
+@pytest.mark.parametrize("integrator", ["central_differences", "newmark"])
+def test_touching_at_the_start(integrator, comm, shared_tmp_path):
+    """At gap zero the first push ties, and one that moves away is free."""
+    for sign, contacts in ((1.0, 1), (-1.0, 0)):
+        case = rod(integrator, {}, gap=0.0, end=0.1, elements=5)
+        case["initial"]["velocity"] = [sign * 1e-3, 0, 0]
+        found = columns(simulation(case, comm, shared_tmp_path, f"{contacts}"))
+        assert (found["wall/glue/contacts"][1:] == contacts).all()
+    case["initial"]["velocity"] = [0.0, 0.0, 0.0]
+    found = columns(simulation(case, comm, shared_tmp_path, "rest"))
+    assert (found["wall/glue/contacts"] == 0).all()
+
+
+def drop(integrator, **keys):
+    """A spinning lattice that a tied, oblique plane catches by a corner, under gravity that pulls it off again."""
+    walls = planes([[0.2, 0.1, 1.0]], [-0.004], tied=True, name="glue", **keys)
+    return lattice_case(
+        walls,
+        velocity=[0.5, 0.1, -1.5],
+        spin=[3.0, 2.0, -5.0],
+        integrator=integrator,
+        end=0.05,
+        gravity=[20.0, 0.0, 30.0],
+        solver={"rtol": 1e-13},
+    )
+
+
+@pytest.mark.parametrize("integrator", ["central_differences", "chung_lee", "newmark", "houbolt"])
+def test_turned(integrator, comm, shared_tmp_path):
+    """The problem turned about is the same one."""
+    turn = np.linalg.qr(np.random.default_rng(5).normal(size=(3, 3)))[0]
+    turn *= np.linalg.det(turn)
+    found = {}
+    for name, by in (("as it is", None), ("turned", turn)):
+        case = with_mesh_file(drop(integrator), shared_tmp_path / f"{name}.vtu", by)
+        run = simulation(case, comm, shared_tmp_path, name)
+        rows = [step.row for step in run]
+        found[name] = run.gather(run.state.position), rows[-1], max(-r["wall/glue/force"] @ _normal(by) for r in rows)
+    assert found["turned"][1]["wall/glue/contacts"] >= 2
+    assert found["turned"][2] > 0.0  # it pulls at times
+    if comm.rank == 0:
+        assert np.abs(found["turned"][0] - found["as it is"][0] @ turn.T).max() < 1e-9 * 0.2
+    impulse = found["as it is"][1]["wall/glue/impulse"]
+    np.testing.assert_allclose(
+        found["turned"][1]["wall/glue/impulse"], turn @ impulse, atol=1e-8 * np.abs(impulse).max()
+    )
+
+
+def _normal(turn):
+    normal = np.array([0.2, 0.1, 1.0]) / np.linalg.norm([0.2, 0.1, 1.0])
+    return normal if turn is None else turn @ normal
+
+
+def test_implicit_steps_tend_to_the_explicit_ones(comm, shared_tmp_path):
+    """On a curved wall: the difference of Houbolt's method and central differences falls with the step."""
+    wall = {"type": "sphere", "name": "ball", "point": [0.1, 0.05, -0.304], "radius": 0.3, "tied": True}
+    apart = []
+    for step in (4e-4, 1e-4):
+        x = {}
+        for integrator in ("central_differences", "houbolt"):
+            case = lattice_case([wall], velocity=[0.2, 0, -1.0], integrator=integrator, end=0.04, step=step)
+            run = simulation(case, comm, shared_tmp_path, f"{integrator} {step}")
+            for _ in run:
+                pass
+            x[integrator] = run.gather(run.state.position)
+            centre = np.array(wall["point"])
+            tied = run.model.contact.ties.held
+            np.testing.assert_allclose(np.linalg.norm(run.state.position[tied] - centre, axis=1), 0.3, atol=2e-13)
+            assert comm.allreduce(int(tied.sum())) >= 1
+        if comm.rank == 0:
+            apart.append(np.abs(x["houbolt"] - x["central_differences"]).max())
+    if comm.rank == 0:
+        assert apart[1] < 0.4 * apart[0] and apart[1] < 2e-3
+
+
+@pytest.mark.parametrize("integrator", ["central_differences", "newmark", "houbolt"])
+def test_wall_with_mass(integrator, comm, shared_tmp_path):
+    """Momentum of truss and wall together stays, and they end up with one velocity on average."""
+    case = drop(integrator, mass=0.05)
+    del case["gravity"]
+    case["time"]["end"] = 0.03
+    run = simulation(case, comm, shared_tmp_path)
+    rows = [step.row for step in run]
+    total = np.array([row["momentum"] + 0.05 * row["wall/glue/velocity"] for row in rows])
+    np.testing.assert_allclose(total, total[:1].repeat(len(rows), axis=0), atol=1e-12 * np.abs(total).max())
+    assert rows[-1]["wall/glue/contacts"] >= 1 and rows[-1]["wall/glue/releases"] == 0
+
+
+@pytest.mark.parametrize("integrator", ["central_differences", "newmark"])
+def test_carried_through_another_wall(integrator, comm, shared_tmp_path):
+    case = rod(integrator, {}, end=1.0, elements=5, velocity=[0.0, 0.0, -1.0])
+    case["wall"] += planes([[0.0, 0.0, 1.0]], [-0.1], name="floor")
+    with pytest.raises(SimulationFailure, match=r"node 5, tied to wall 'glue', is carried .* beyond wall 'floor'"):
+        simulation(case, comm, shared_tmp_path).run()
+
+
+def test_refused(comm, shared_tmp_path):
+    with pytest.raises(InputError, match="takes no friction and no restitution"):
+        Case.from_dict(rod("newmark", {}, friction=0.1))
+    case = rod("newmark", {})
+    case["contact"]["treatment"] = "conserving"
+    with pytest.raises(InputError, match='tied needs contact.treatment = "scheme" or "stick"'):
+        simulation(case, comm, shared_tmp_path)
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("integrator", ["central_differences", "newmark"])
+def test_restart_is_bitwise(integrator, comm, shared_tmp_path):
+    """A run in two parts is the run in one; on another number of ranks the ties come back to the last bit."""
+    rows = {}
+    for name, end in (("one", 0.03), ("two", 0.02), ("two", 0.03)):
+        case = drop(integrator)
+        case["time"]["end"], case["output"]["checkpoint_every"] = end, 50
+        run = Simulation(
+            Case.from_dict(case, name="it"), comm, output=shared_tmp_path / name, quiet=True, restart=name == "two"
+        )
+        rows[name, end] = [step.row for step in run][-1]
+    for column, value in rows["one", 0.03].items():
+        np.testing.assert_array_equal(rows["two", 0.03][column], value, err_msg=column)
+    assert rows["two", 0.02]["wall/glue/contacts"] >= 1
+    memory = {name: run.gather(run.state.memory[name]) for name in ("tied_to", "tied_at")}
+    if comm.rank == 0:
+        alone = Simulation(
+            Case.from_dict(case, name="it"), MPI.COMM_SELF, output=shared_tmp_path / "two", quiet=True, restart=True
+        )
+        alone.start()
+        for name, values in memory.items():
+            assert alone.gather(alone.state.memory[name]).tobytes() == values.tobytes()
+    comm.Barrier()
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("integrator", ["central_differences", "newmark"])
+def test_any_number_of_ranks(integrator, comm, shared_tmp_path):
+    case = Case.from_dict(drop(integrator), name="it")
+    everyone = Simulation(case, comm, output=shared_tmp_path / "all", quiet=True)
+    last = [step.row for step in everyone][-1]
+    x = everyone.gather(everyone.state.position)
+    if comm.rank == 0:
+        alone = Simulation(case, MPI.COMM_SELF, output=shared_tmp_path / "one", quiet=True)
+        row = [step.row for step in alone][-1]
+        assert np.abs(alone.gather(alone.state.position) - x).max() < 1e-10 * 0.2
+        np.testing.assert_allclose(last["wall/glue/impulse"], row["wall/glue/impulse"], rtol=1e-8)
+        assert last["wall/glue/contacts"] == row["wall/glue/contacts"] >= 2
+    comm.Barrier()

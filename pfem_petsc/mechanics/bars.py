@@ -14,6 +14,7 @@ from .conserving import make_conserving_kernels
 from .kernels import make_kernels
 from .materials import elastic, elastoplastic
 from .strain import MEASURES
+from .sweep import Sweep, make_sweep
 
 __all__ = ["BarBlock", "Bars", "StrainEnergy"]
 
@@ -43,6 +44,7 @@ class BarBlock:
     thermal_expansion: float
     parameters: tuple[float, ...]
     history: np.ndarray
+    sweep: Sweep
     kernels: SimpleNamespace
     conserving: SimpleNamespace
 
@@ -82,6 +84,7 @@ class Bars:
     Attributes
     ----------
     ends : (b, 2) int32, local node indices of each bar
+    far : (b,) uint32, that end of each bar whose index is larger
     rest : (b,) float64, rest lengths [m]
     thermal : (b,) thermal strains, or (0,) where no temperature acts
     thermal_at_start : thermal strains at the start of the step, where they vary
@@ -95,6 +98,9 @@ class Bars:
         _rest_lengths(mesh.points, mesh.bars, self.rest)
         self.thermal = np.empty(0)
         self.thermal_at_start = self.thermal
+        self.far = np.maximum(
+            mesh.bars[:, 0], mesh.bars[:, 1], out=np.empty(len(mesh.bars), dtype=np.uint32), casting="unsafe"
+        )
         names = list(case.section)
         self.blocks: list[BarBlock] = []
         for block in mesh.blocks:
@@ -113,7 +119,8 @@ class Bars:
                     damping=material.damping,
                     thermal_expansion=material.thermal_expansion,
                     parameters=law.pack(material),
-                    history=np.zeros((count if law.REMEMBERS else 0, 2)),
+                    history=np.zeros((2, count if law.REMEMBERS else 0)),
+                    sweep=make_sweep(mesh.bars, block.start, block.counted, block.stop),
                     kernels=make_kernels(law.response, law.REMEMBERS, MEASURES[material.strain]),
                     conserving=make_conserving_kernels(law.response, law.REMEMBERS, MEASURES[material.strain]),
                 )
@@ -130,7 +137,16 @@ class Bars:
         failed, shortened = -1, False
         for block in self.blocks:
             u, q, w, at, short = block.kernels.forces(
-                *self._arguments(x, block), block.start, block.counted, block.stop, commit, f
+                x,
+                *block.sweep,
+                self.far,
+                self.rest,
+                self.thermal,
+                block.parameters,
+                block.area,
+                block.history,
+                commit,
+                f,
             )
             elastic_energy += u
             heat += q
@@ -190,14 +206,14 @@ class Bars:
                 out["stress"],
                 out["axial_force"],
             )
-            if len(block.history):
-                out["plastic_strain"][block.start : block.stop] = block.history[:, 0]
+            if block.history.size:
+                out["plastic_strain"][block.start : block.stop] = block.history[0]
         return out
 
     @property
     def plastic(self) -> bool:
         """Whether any bar of this rank can yield."""
-        return any(len(block.history) for block in self.blocks)
+        return any(block.history.size for block in self.blocks)
 
 
 def section_of_bars(case, slab) -> np.ndarray:

@@ -86,8 +86,8 @@ def make_conserving_kernels(response: Callable, remembers: bool, measure: Callab
             b = bars[k, 1]
             shift0 = cold[k] if warm else 0.0
             shift = thermal[k] if warm else 0.0
-            plastic = history[k - start, 0] if remembers else 0.0
-            accumulated = history[k - start, 1] if remembers else 0.0
+            plastic = history[0, k - start] if remembers else 0.0
+            accumulated = history[1, k - start] if remembers else 0.0
             ox = x0[b, 0] - x0[a, 0]
             oy = x0[b, 1] - x0[a, 1]
             oz = x0[b, 2] - x0[a, 2]
@@ -112,8 +112,8 @@ def make_conserving_kernels(response: Callable, remembers: bool, measure: Callab
             b = bars[k, 1]
             shift0 = cold[k] if warm else 0.0
             shift = thermal[k] if warm else 0.0
-            plastic = history[k - start, 0] if remembers else 0.0
-            accumulated = history[k - start, 1] if remembers else 0.0
+            plastic = history[0, k - start] if remembers else 0.0
+            accumulated = history[1, k - start] if remembers else 0.0
             ox = x0[b, 0] - x0[a, 0]
             oy = x0[b, 1] - x0[a, 1]
             oz = x0[b, 2] - x0[a, 2]

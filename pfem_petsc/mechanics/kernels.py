@@ -12,9 +12,11 @@ from collections.abc import Callable
 from functools import cache
 from types import SimpleNamespace
 
+import numpy as np
 from numba.extending import register_jitable
 
 from .compiled import kernel
+from .sweep import CHUNK
 
 __all__ = ["COLLAPSED_STRETCH", "SHORTENED_STRETCH", "make_kernels"]
 
@@ -27,60 +29,109 @@ def make_kernels(response: Callable, remembers: bool, measure: Callable) -> Simp
     """Kernels of a material law and strain measure: ``forces``, ``tangents``, ``product``, ``linearise``, ``fields``.
 
     Common arguments: ``x`` (local nodes, 3) [m]; ``bars`` (b, 2) local ends; ``rest`` (b,) rest lengths [m];
-    ``thermal`` (b,) thermal strains, or (0,) for none; ``p`` the law's parameters; ``area`` [m2]; ``history`` of the
-    bars of this block, whose row is ``k - start``: plastic and accumulated plastic strain, (0, 2) for a law that does
-    not remember. No array goes into an inner function: counting its references costs more than the bar.
+    ``thermal`` (b,) thermal strains, or (0,) for none; ``p`` the law's parameters; ``area`` [m2]; ``history`` (2, n) of
+    the bars of this block: plastic and accumulated plastic strain of bar ``k`` in column ``k - start``; (2, 0) where
+    the law does not remember. No array goes into an inner function: counting its references costs more than the bar.
     """
 
     @kernel
-    def forces(x, bars, rest, thermal, p, area, history, start, counted, stop, commit, f):
+    def forces(x, heads, starts, chunks, counted, far, rest, thermal, p, area, history, commit, f):
         """Add internal forces to ``f``; sums over counted bars: elastic, heat, hardening [J]; first failed or -1;
-        whether any bar is so short that it may have turned over."""
+        whether any bar is so short that it may have turned over.
+
+        ``heads``, ``starts``, ``chunks``, ``counted``: a :class:`~pfem_petsc.mechanics.sweep.Sweep`; ``far`` (b,) the
+        other end of each bar. Sums are kept for each place of a chunk: vector instructions need not reorder any then.
+        """
         elastic = 0.0
         heat = 0.0
         hardening = 0.0
         failed = -1
         shortened = False
         warm = len(thermal) > 0
-        for k in range(start, stop):
-            a = bars[k, 0]
-            b = bars[k, 1]
-            dx = x[b, 0] - x[a, 0]
-            dy = x[b, 1] - x[a, 1]
-            dz = x[b, 2] - x[a, 2]
-            length = math.sqrt(dx * dx + dy * dy + dz * dz)
-            stretch = length / rest[k]
-            if not (stretch > COLLAPSED_STRETCH):  # NaN fails this test too
-                if failed < 0:
-                    failed = k
-                if not commit:  # a trial position: the solver's norms must see that it is out of bounds
-                    f[a, 0] = math.nan
-                    f[b, 0] = math.nan
-                continue
-            if stretch < SHORTENED_STRETCH:
-                shortened = True
-            strain, slope, _ = measure(stretch)
-            if warm:
-                strain -= thermal[k]
-            plastic = history[k - start, 0] if remembers else 0.0
-            accumulated = history[k - start, 1] if remembers else 0.0
-            stress, _, plastic, new, u, q, w = response(strain, p, plastic, accumulated)
-            if remembers and commit and new != accumulated:
-                history[k - start, 0] = plastic
-                history[k - start, 1] = new
-            if k < counted:
-                volume = area * rest[k]
-                elastic += volume * u
+        origin = starts[0]
+        work = np.zeros((9, CHUNK))  # end differences, force over length, three energies, new history
+        for chunk in range(len(chunks) - 1):
+            if chunk == counted:  # what follows is counted elsewhere
+                elastic, heat, hardening = work[4].sum(), work[5].sum(), work[6].sum()
+            first = starts[chunks[chunk]]
+            stop = starts[chunks[chunk + 1]]
+            n = stop - first
+            for run in range(chunks[chunk], chunks[chunk + 1]):
+                a = heads[run]
+                ax = x[a, 0]
+                ay = x[a, 1]
+                az = x[a, 2]
+                for k in range(starts[run], starts[run + 1]):
+                    b = far[k]
+                    i = k - first
+                    dx = x[b, 0] - ax
+                    dy = x[b, 1] - ay
+                    dz = x[b, 2] - az
+                    work[0, i] = dx
+                    work[1, i] = dy
+                    work[2, i] = dz
+                    work[3, i] = dx * dx + dy * dy + dz * dz
+            rests = rest[first:stop]
+            shifts = thermal[first:stop]
+            old_plastic = history[0][first - origin : stop - origin]
+            old_accumulated = history[1][first - origin : stop - origin]
+            short = 0
+            for i in range(n):
+                length = math.sqrt(work[3, i])
+                stretch = length / rests[i]
+                short += 0 if stretch >= SHORTENED_STRETCH else 1  # NaN counts
+                strain, slope, _ = measure(stretch)
+                if warm:
+                    strain -= shifts[i]
+                plastic = old_plastic[i] if remembers else 0.0
+                accumulated = old_accumulated[i] if remembers else 0.0
+                stress, _, plastic, accumulated, u, q, w = response(strain, p, plastic, accumulated)
+                volume = area * rests[i]
+                work[4, i] += volume * u
                 if remembers:
-                    heat += volume * q
-                    hardening += volume * w
-            c = area * stress * slope / length
-            f[a, 0] -= c * dx
-            f[a, 1] -= c * dy
-            f[a, 2] -= c * dz
-            f[b, 0] += c * dx
-            f[b, 1] += c * dy
-            f[b, 2] += c * dz
+                    work[5, i] += volume * q
+                    work[6, i] += volume * w
+                    work[7, i] = plastic
+                    work[8, i] = accumulated
+                work[3, i] = area * stress * slope / length
+            if remembers and commit:
+                for i in range(n):
+                    old_plastic[i] = work[7, i]
+                    old_accumulated[i] = work[8, i]
+            if short > 0:
+                for i in range(n):
+                    length = math.sqrt(work[0, i] ** 2 + work[1, i] ** 2 + work[2, i] ** 2)
+                    stretch = length / rests[i]
+                    if stretch < SHORTENED_STRETCH:
+                        shortened = True
+                    if not (stretch > COLLAPSED_STRETCH):  # NaN fails this test too
+                        if failed < 0:
+                            failed = np.int64(first + i)  # a signed one, as -1 is
+                        # of a trial position the solver's norms must see that it is out of bounds
+                        work[3, i] = 0.0 if commit else math.nan
+            for run in range(chunks[chunk], chunks[chunk + 1]):
+                fx = 0.0
+                fy = 0.0
+                fz = 0.0
+                for k in range(starts[run], starts[run + 1]):
+                    b = far[k]
+                    i = k - first
+                    c = work[3, i]
+                    gx = c * work[0, i]
+                    gy = c * work[1, i]
+                    gz = c * work[2, i]
+                    fx += gx
+                    fy += gy
+                    fz += gz
+                    f[b, 0] += gx
+                    f[b, 1] += gy
+                    f[b, 2] += gz
+                a = heads[run]
+                f[a, 0] -= fx
+                f[a, 1] -= fy
+                f[a, 2] -= fz
+        if counted == len(chunks) - 1:
+            elastic, heat, hardening = work[4].sum(), work[5].sum(), work[6].sum()
         return elastic, heat, hardening, failed, shortened
 
     @register_jitable
@@ -107,8 +158,8 @@ def make_kernels(response: Callable, remembers: bool, measure: Callable) -> Simp
             nx = x[b, 0] - x[a, 0]
             ny = x[b, 1] - x[a, 1]
             nz = x[b, 2] - x[a, 2]
-            plastic = history[k - start, 0] if remembers else 0.0
-            accumulated = history[k - start, 1] if remembers else 0.0
+            plastic = history[0, k - start] if remembers else 0.0
+            accumulated = history[1, k - start] if remembers else 0.0
             axial, geometric, inverse = stiffness(nx, ny, nz, rest[k], shift, p, area, plastic, accumulated)
             nx *= inverse
             ny *= inverse
@@ -150,8 +201,8 @@ def make_kernels(response: Callable, remembers: bool, measure: Callable) -> Simp
             nx = x[b, 0] - x[a, 0]
             ny = x[b, 1] - x[a, 1]
             nz = x[b, 2] - x[a, 2]
-            plastic = history[k - start, 0] if remembers else 0.0
-            accumulated = history[k - start, 1] if remembers else 0.0
+            plastic = history[0, k - start] if remembers else 0.0
+            accumulated = history[1, k - start] if remembers else 0.0
             axial, geometric, inverse = stiffness(nx, ny, nz, rest[k], shift, p, area, plastic, accumulated)
             nx *= inverse
             ny *= inverse
@@ -181,8 +232,8 @@ def make_kernels(response: Callable, remembers: bool, measure: Callable) -> Simp
             dx = x[b, 0] - x[a, 0]
             dy = x[b, 1] - x[a, 1]
             dz = x[b, 2] - x[a, 2]
-            plastic = history[k - start, 0] if remembers else 0.0
-            accumulated = history[k - start, 1] if remembers else 0.0
+            plastic = history[0, k - start] if remembers else 0.0
+            accumulated = history[1, k - start] if remembers else 0.0
             axial, geometric, inverse = stiffness(dx, dy, dz, rest[k], shift, p, area, plastic, accumulated)
             stored[k, 0] = dx * inverse
             stored[k, 1] = dy * inverse
@@ -202,8 +253,8 @@ def make_kernels(response: Callable, remembers: bool, measure: Callable) -> Simp
             dz = x[b, 2] - x[a, 2]
             strain, slope, _ = measure(math.sqrt(dx * dx + dy * dy + dz * dz) / rest[k])
             shift = thermal[k] if warm else 0.0
-            plastic = history[k - start, 0] if remembers else 0.0
-            accumulated = history[k - start, 1] if remembers else 0.0
+            plastic = history[0, k - start] if remembers else 0.0
+            accumulated = history[1, k - start] if remembers else 0.0
             stress, _, _, _, _, _, _ = response(strain - shift, p, plastic, accumulated)
             strain_out[k] = strain
             stress_out[k] = stress

@@ -44,7 +44,7 @@ class RunState:
         self.comm = comm
         self.counted = mesh.counted
         self.node_order = mesh.node_order
-        self._columns = comm.allreduce(2 * any(len(b.history) for b in self.model.bars.blocks), op=MPI.MAX)
+        self._columns = comm.allreduce(2 * any(b.history.size for b in self.model.bars.blocks), op=MPI.MAX)
 
     @property
     def bar_order(self) -> NaturalOrder:
@@ -162,8 +162,8 @@ class RunState:
         if self._columns:
             history = np.zeros((len(bars.ends), self._columns))
             for block in bars.blocks:
-                if len(block.history):
-                    history[block.start : block.stop] = block.history
+                if block.history.size:
+                    history[block.start : block.stop] = block.history.T
             found["history"] = history
         if self.model.temperatures.any:
             found |= {"thermal_strain": bars.thermal, "temperature": self.model.temperatures.values}
@@ -178,8 +178,8 @@ class RunState:
             values = asking.reply(checkpoint.arrays[name][asked])
             if name == "history":
                 for block in bars.blocks:
-                    if len(block.history):
-                        block.history[:] = values[block.start : block.stop]
+                    if block.history.size:
+                        block.history[:] = values[block.start : block.stop].T
             else:
                 target = bars.thermal if name == "thermal_strain" else self.model.temperatures.values
                 target[:] = values

@@ -117,9 +117,9 @@ class Simulation:
     def inspect(self) -> tuple[dict[str, str], list[str]]:
         """Label and text of a closer look at the truss and a forecast of the run; and what looks wrong. Collective."""
         recorder = Recorder(self.stepper, None)
-        entries = inspect(self.case, self.model)
+        entries, warnings = inspect(self.case, self.model)
         entries |= forecast(self.case, self.model, self.plan, self.fields, recorder.columns, recorder.types)
-        return entries, self.model.warnings + warnings_before(self.case, self.model, self.plan)
+        return entries, self.model.warnings + warnings_before(self.case, self.model, self.plan) + warnings
 
     @staged
     def start(self) -> None:

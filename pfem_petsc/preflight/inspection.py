@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from .forecast import memory_warning
+from .overlaps import nodes_on_bars, overlapping_bars
 from .parts import count_parts
 from .rigidity import global_rigidity, model_directions, unbraced_nodes
 from .sanity import odd_numbers
@@ -20,6 +21,13 @@ def warnings_before(case, model, plan) -> list[str]:
             f"the truss is in {count} parts that no bar connects; the smallest has {nodes} nodes, node {first} among "
             "them"
         )
+    # what is generated is sound by construction
+    pairs, shown = overlapping_bars(model.mesh) if case.mesh.generator is None else (0, [])
+    if pairs:
+        texts.append(
+            f"{pairs} pair{'s' if pairs > 1 else ''} of bars lie{'' if pairs > 1 else 's'} along each other, from a "
+            f"common node on: {_list(pairs, shown)}; where a node is meant to divide the longer one, take that bar out"
+        )
     loose, first = unbraced_nodes(model)
     if loose:
         texts.append(
@@ -29,9 +37,9 @@ def warnings_before(case, model, plan) -> list[str]:
     return texts
 
 
-def inspect(case, model) -> dict[str, str]:
-    """Label and text of what ``check`` tells besides. Collective."""
-    entries = {}
+def inspect(case, model) -> tuple[dict[str, str], list[str]]:
+    """Label and text of what ``check`` tells besides, and what looks wrong. Collective."""
+    entries, warnings = {}, []
     count, _, _ = count_parts(model.mesh)
     entries["parts"] = "all bars are connected" if count == 1 else f"{count} that no bar connects"
     dimensions = len(model_directions(model))
@@ -44,4 +52,25 @@ def inspect(case, model) -> dict[str, str]:
         )
     for name, text in wall_gaps(model)[0].items():
         entries[f"wall {name}"] = text
-    return entries
+    if case.mesh.generator is None:
+        warnings += _nodes_on_bars(model.mesh, entries)
+    return entries, warnings
+
+
+def _nodes_on_bars(mesh, entries: dict[str, str]) -> list[str]:
+    found = nodes_on_bars(mesh)
+    if found is None:
+        entries["nodes on bars"] = "not looked for: too many nodes, or bars of too different lengths"
+        return []
+    if found.coinciding:
+        pairs = _list(found.coinciding // 2, found.shown_coinciding)
+        entries["same place"] = f"{found.coinciding:,} nodes, {pairs}: merge them unless they are of different bodies"
+    if not found.between:
+        return []
+    what = "nodes lie on bars that do not use them" if found.between > 1 else "node lies on a bar that does not use it"
+    shown = _list(found.between, found.shown_between)
+    return [f"{found.between} {what}: {shown}; where they are meant to be connected, divide the bar there"]
+
+
+def _list(count: int, shown: list[str]) -> str:
+    return ", ".join(shown) + (", ..." if count > len(shown) else "")

@@ -50,6 +50,41 @@ def test_strong_but_bearable_impact_runs_on(comm, shared_tmp_path):
         assert min(result.field("strain", i).min() for i in range(len(result.times))) < -0.5
 
 
+@pytest.mark.parametrize("scheme", ["energy_momentum", "central_differences"])
+def test_truss_crushed_between_walls(scheme, comm, shared_tmp_path):
+    """Two walls close in on a tetrahedron until there is no room between them, or a bar has collapsed before."""
+    import h5py
+
+    if comm.rank == 0:
+        with h5py.File(shared_tmp_path / "mesh.h5", "w") as file:
+            file["points"] = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.3, 0.3, 0.8]]
+            file["bars"] = [(0, 1), (0, 2), (0, 3), (1, 2), (2, 3), (3, 1)]
+    comm.Barrier()
+    walls = [("floor", -0.01, 1.0), ("roof", 0.81, -1.0)]
+    data = {
+        "mesh": {"file": "mesh.h5"},
+        "material": {"m": {"young_modulus": 1e9, "density": 1000.0}},
+        "section": {"s": {"area": 1e-2, "material": "m"}},
+        "wall": [
+            {
+                "name": name,
+                "type": "plane",
+                "point": [0.0, 0.0, z],
+                "normal": [0.0, 0.0, n],
+                "velocity": [0.0, 0.0, 4 * n],
+            }
+            for name, z, n in walls
+        ],
+        "time": {"integrator": scheme, "step": 2e-4 if scheme == "central_differences" else 1e-2, "end": 1.0},
+    }
+    case = Case.from_dict(data, source="crush.toml", folder=shared_tmp_path)
+    simulation = Simulation(case, comm, output=shared_tmp_path / "it", quiet=True)
+    with pytest.raises(SimulationFailure, match="the walls leave it no room|collapsed|zero length") as failure:
+        simulation.run()
+    assert 0.01 < simulation.state.time < 0.105
+    assert comm.allgather(str(failure.value)) == [str(failure.value)] * comm.size
+
+
 def test_no_convergence(comm, shared_tmp_path):
     """One Newton iteration for a nonlinear step and a tolerance below rounding."""
     keys = ["time.integrator=newmark", "solver.max_newton=1", "solver.rtol=1e-16", "time.step=0.2"]

@@ -6,10 +6,13 @@ whose free positions x break it is a problem of two nodes of stiffness k_1 and k
     lambda = (gap - n . (x_2 - x_1)) / (1/k_1 + 1/k_2),   x_1 -= lambda n / k_1,   x_2 += lambda n / k_2,
 
 where components that supports prescribe do not give way. Each node is in one pair at most, and no wall stops it, so
-pairs are independent of each other. The ends of a pair may be on two ranks: all ranks know all pairs.
+pairs are independent of each other. The ends of a pair may be on two ranks: all ranks know all pairs. For implicit
+steps see :mod:`pfem_petsc.contact.pair_coordinates`.
 """
 
 from __future__ import annotations
+
+from collections.abc import Iterator
 
 import numpy as np
 from mpi4py import MPI
@@ -26,6 +29,9 @@ class ContactPairs:
     ----------
     names : of the tables; ``table`` (p,) says to which of them a pair belongs
     first, second : (p,) mesh numbers of the nodes
+    normals, gaps : (p, 3), (p,) unit directions, and bounds on n . (x_second - x_first) [m]
+    mine, local : (2, p) which ends this rank owns, and their owned local indices
+    free : (2, p, 3) 1.0 where a component of an end may move, 0.0 where a support prescribes it
     force : (p,) force of each pair in the last step, positive where it presses [N]; the same on all ranks
     """
 
@@ -54,24 +60,24 @@ class ContactPairs:
             raise InputError(f"{case.source}: contact_pair: node {twice} is in several pairs; a node can be in one")
         place = np.searchsorted(ids[order], ends)
         place = np.minimum(place, max(len(ids) - 1, 0))
-        self._mine = (ids[order][place] == ends) if len(ids) else np.zeros(ends.shape, dtype=bool)
-        self._local = order[place] if len(ids) else np.zeros(ends.shape, dtype=np.int64)
-        self._free = np.zeros((*ends.shape, 3))
-        self._free[self._mine] = np.where(fixed[self._local[self._mine]], 0.0, 1.0)
+        self.mine = (ids[order][place] == ends) if len(ids) else np.zeros(ends.shape, dtype=bool)
+        self.local = order[place] if len(ids) else np.zeros(ends.shape, dtype=np.int64)
+        self.free = np.zeros((*ends.shape, 3))
+        self.free[self.mine] = np.where(fixed[self.local[self.mine]], 0.0, 1.0)
         stopped = np.zeros(ends.shape, dtype=np.int64)
-        stopped[self._mine] = members[self._local[self._mine]].any(axis=1)
+        stopped[self.mine] = members[self.local[self.mine]].any(axis=1)
         mesh.comm.Allreduce(MPI.IN_PLACE, stopped)
         if stopped.any():
             raise InputError(
                 f"{case.source}: contact_pair: node {ends[stopped > 0][0]} is in a pair, and a wall stops it as well; "
                 "give the wall a node_set without it"
             )
-        mesh.comm.Allreduce(MPI.IN_PLACE, self._free)
-        self.force = np.zeros(len(self.table))
+        mesh.comm.Allreduce(MPI.IN_PLACE, self.free)
+        self.release()
 
     def check_start(self, x: np.ndarray, length: float, source: str) -> None:
         """Refuse pairs that start beyond each other by more than rounding of the model's size [m]. Collective."""
-        distance = self._distance(self._gather(x)) - self.gaps
+        distance = self.distances(self.gather(x)) - self.gaps
         if len(distance) and distance.min() < -1e-12 * length:
             pair = int(np.argmin(distance))
             raise InputError(
@@ -94,36 +100,64 @@ class ContactPairs:
         int
             Nodes of this rank that pairs hold.
         """
-        data = np.zeros((*self._mine.shape, 4))
-        mine = self._local[self._mine]
-        data[self._mine, :3] = predictor[mine] + u[mine]
-        data[self._mine, 3] = 1.0 / stiffness[self._local[self._mine]]
-        self.mesh.comm.Allreduce(MPI.IN_PLACE, data)
-        gives = data[:, :, 3] * np.einsum("epi,pi->ep", self._free, self.normals**2)
-        short = self.gaps - self._distance(data[:, :, :3])
+        self.force = self.part(predictor, u, stiffness)
+        self.push(contact)
+        return self.held
+
+    @property
+    def held(self) -> int:
+        """Nodes of this rank that pairs hold."""
+        return int((self.mine & (self.force > 0.0)).sum())
+
+    def release(self) -> None:
+        """No pair presses."""
+        self.force = np.zeros(len(self.table))
+
+    def part(self, predictor: np.ndarray, u: np.ndarray, stiffness: np.ndarray) -> np.ndarray:
+        """Change u (owned, 3) [m] so that predictor + u keeps all pairs; the pairs' forces (p,) [N]. Collective."""
+        data = np.zeros((*self.mine.shape, 4))
+        mine = self.local[self.mine]
+        data[self.mine, :3] = predictor[mine] + u[mine]
+        data[self.mine, 3] = 1.0 / stiffness[mine]
+        self.sum(data)
+        gives = data[:, :, 3] * np.einsum("epi,pi->ep", self.free, self.normals**2)
+        short = self.gaps - self.distances(data[:, :, :3])
         soft = gives.sum(axis=0)
-        self.force = np.where((short > 0.0) & (soft > 0.0), short / np.maximum(soft, 1e-300), 0.0)
-        pressed = self.force > 0.0
-        for end, sign in ((0, -1.0), (1, 1.0)):
-            here = self._mine[end] & pressed
-            at = self._local[end, here]
-            push = sign * self.force[here, None] * self.normals[here]
-            u[at] += push * self._free[end, here] / stiffness[at, None]
+        force = np.where((short > 0.0) & (soft > 0.0), short / np.maximum(soft, 1e-300), 0.0)
+        for end, here, at, push in self._pushes(force):
+            u[at] += push * self.free[end, here] / stiffness[at, None]
+        return force
+
+    def push(self, contact: np.ndarray) -> None:
+        """Add the pairs' forces to those on the nodes (owned, 3) [N]."""
+        for _, _, at, push in self._pushes(self.force):
             contact[at] += push
-        return int((self._mine & pressed).sum())
+
+    def _pushes(self, force: np.ndarray) -> Iterator[tuple[int, np.ndarray, np.ndarray, np.ndarray]]:
+        """Of both ends: end, (p,) pairs that press on it here, nodes (k,), forces (k, 3) [N]."""
+        for end, sign in ((0, -1.0), (1, 1.0)):
+            here = self.mine[end] & (force > 0.0)
+            yield end, here, self.local[end, here], sign * force[here, None] * self.normals[here]
 
     def totals(self) -> dict[str, np.ndarray]:
         """Name of each table to its pairs' force on the second nodes (3,) [N], in the last step."""
         forces = self.force[:, None] * self.normals
         return {name: forces[self.table == k].sum(axis=0) for k, name in enumerate(self.names)}
 
-    def _gather(self, x: np.ndarray) -> np.ndarray:
-        data = np.zeros((*self._mine.shape, 3))
-        data[self._mine] = x[self._local[self._mine]]
-        self.mesh.comm.Allreduce(MPI.IN_PLACE, data)
+    def gather(self, values: np.ndarray) -> np.ndarray:
+        """Values (2, p, ...) of both ends from those of owned nodes (owned, ...), on all ranks. Collective."""
+        data = np.zeros((*self.mine.shape, *values.shape[1:]))
+        data[self.mine] = values[self.local[self.mine]]
+        return self.sum(data)
+
+    def sum(self, data: np.ndarray) -> np.ndarray:
+        """The sum over ranks, in place: what one rank has set, all know. Collective."""
+        if self.mesh.comm.size > 1:
+            self.mesh.comm.Allreduce(MPI.IN_PLACE, data)
         return data
 
-    def _distance(self, ends: np.ndarray) -> np.ndarray:
+    def distances(self, ends: np.ndarray) -> np.ndarray:
+        """n . (x_2 - x_1) (p,) [m] of positions (2, p, 3)."""
         return np.einsum("pi,pi->p", self.normals, ends[1] - ends[0])
 
 

@@ -1,8 +1,9 @@
 """The contact side of an implicit step: who may touch what, bounds, and re-solves until nothing unexpected is left.
 
 A step is solved with bounds for the nodes that may reach a wall. Afterwards all walls are verified: nodes that were not
-expected at a wall, walls that found no place among three coordinates, and curved walls whose tangent plane was that of
-another point. Where something is left, the step is solved again, from where it is, with what was learnt.
+expected at a wall, walls that found no place among three coordinates, curved walls whose tangent plane was that of
+another point, and pairs of nodes that met. Where something is left, the step is solved again, from where it is, with
+what was learnt.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from ..solvers.newton import zero_tolerance
 from ..stepping.stepper import NotConverged
 from .forces import WallForces
 from .frames import NodalFrames
+from .pair_coordinates import PairCoordinates
 from .projection import project
 
 __all__ = ["ContactRounds"]
@@ -33,9 +35,16 @@ class ContactRounds:
     state : at the start of the step
     balance : of the step
     held : (owned,) bool, nodes held by walls in the last step
+    pairs : of the case
+
+    Attributes
+    ----------
+    pairs : None as long as they are too far apart to meet
     """
 
-    def __init__(self, model, state: State, balance: Balance, held: np.ndarray) -> None:
+    def __init__(
+        self, model, state: State, balance: Balance, held: np.ndarray, pairs: PairCoordinates | None = None
+    ) -> None:
         self.contact = model.contact
         self.model = model
         self.state = state
@@ -46,6 +55,11 @@ class ContactRounds:
         self._rank: np.ndarray | None = None
         self._tied: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None  # in the frames, walls, places
         self.candidates = self._expected() if self.contact.any else None
+        self._all_pairs, self.pairs = pairs, None
+        if pairs is not None:
+            move = (balance.time - state.time) * state.v
+            if pairs.reached(state.position, move, state.contact, 1e-9 * model.length):
+                self.pairs = pairs
 
     def _expected(self) -> np.ndarray | None:
         """Owned nodes that may touch a wall in this step; None where no rank has any (free flight). Collective."""
@@ -84,8 +98,15 @@ class ContactRounds:
         self._frames.pin(at, places, ~contact.fixed[nodes])
         self._tied = at, walls, places
 
-    def feasible(self, u: np.ndarray) -> np.ndarray:
-        """The increment (owned, 3) nearest to a guess, node by node, that keeps the frames' planes."""
+    def feasible(self, u: np.ndarray, stiffness: np.ndarray | None = None) -> np.ndarray:
+        """The increment (owned, 3) nearest to a guess that keeps the frames' planes and the pairs. Collective.
+
+        ``stiffness`` (owned,): how hard nodes of pairs are to move [N/m]; default: as their masses.
+        """
+        if self.pairs is not None:
+            u = u.copy()
+            weight = self.model.inertia.mass if stiffness is None else stiffness
+            self.pairs.pairs.part(self.balance.predictor, u, weight)
         frames = self._frames
         if frames is None or len(frames.nodes) == 0:
             return u
@@ -110,38 +131,49 @@ class ContactRounds:
         model = self.model
         stiffness = problem.nodal + 2.0 * self.balance.weight * model.nodal_stiffness
         g = np.empty_like(u)
-        u = self.feasible(u)
+        u = self.feasible(u, stiffness)
         for _ in range(_DESCENTS):
             problem.imbalance(u, g)
             g[model.supports.fixed] = 0.0
-            u = self.feasible(u - g / stiffness[:, None])
+            u = self.feasible(u - g / stiffness[:, None], stiffness)
         return u
 
-    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Bounds on w (owned, 3): those of the frames less B predictor."""
+    def bounds(self, guess: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+        """Bounds on w (owned, 3): those of the frames less B predictor, and of pairs; None in free flight. Collective.
+
+        ``guess`` (owned, 3): of u, whose prescribed components hold.
+        """
+        self._bounds = None
         frames = self._frames
+        if frames is None and self.pairs is None:
+            return None
         shape = (self.model.mesh.n_owned, 3)
         lower, upper = np.full(shape, -np.inf), np.full(shape, np.inf)
-        at = frames.nodes
-        base = np.einsum("nij,nj->ni", frames.basis, self.balance.predictor[at])
-        lower[at] = frames.lower - base
-        upper[at] = frames.upper - base
+        if frames is not None:
+            at = frames.nodes
+            base = np.einsum("nij,nj->ni", frames.basis, self.balance.predictor[at])
+            lower[at] = frames.lower - base
+            upper[at] = frames.upper - base
+        if self.pairs is not None:
+            self.pairs.bound(self.balance.predictor, guess, lower)
         self._bounds = lower, upper
-        return lower, upper
+        return self._bounds
 
     def clipped(self, w: np.ndarray) -> np.ndarray:
         """A guess (owned, 3) within the bounds, to the last digit."""
-        return w if self._frames is None else np.clip(w, *self._bounds)
+        return w if self._bounds is None else np.clip(w, *self._bounds)
 
     def snap(self, w: np.ndarray) -> None:
         """Put unknowns that the solver counts as on a bound exactly there."""
+        if self._bounds is None:
+            return
         within = 2.0 * zero_tolerance(self.model.length)
         for bound in self._bounds:
             near = np.abs(w - bound) <= within
             w[near] = bound[near]
 
     def settled(self, w: np.ndarray, u: np.ndarray, g: np.ndarray, noise: float) -> bool:
-        """Whether the solution keeps all walls; if not, the next round knows better. Collective.
+        """Whether the solution keeps all walls and pairs; if not, the next round knows better. Collective.
 
         Parameters
         ----------
@@ -150,20 +182,25 @@ class ContactRounds:
         noise : what a free node has left of it [N]
         """
         contact = self.contact
-        if not contact.any:
-            return True
         x = self.balance.predictor + u
+        tolerance = 1e-12 * self.model.length
+        settled = True
+        if self.pairs is not None:
+            self.pairs.press(w, g, self._bounds[0], noise)
+        elif self._all_pairs is not None and self._all_pairs.broken(x, tolerance):
+            self.pairs, settled = self._all_pairs, False
+        if not contact.any:
+            return settled
         self.strengths = None
         if self._frames is not None:
             self.strengths = self._strengths(w, g, noise)
             self._pull = np.where(contact.fixed[self.candidates], 0.0, g[self.candidates])
-        tolerance = 1e-12 * self.model.length
         beyond = np.flatnonzero(contact.near(x, self._shifts, np.array([-tolerance])))
         unsettled, joined = self._unexpected(beyond, x, tolerance)
         if not contact.flat.all() and self._frames is not None:
             unsettled = unsettled or self._off_surface(x, tolerance)
         if self.model.comm.allreduce(int(unsettled), op=MPI.MAX) == 0:
-            return True
+            return settled
         self.round += 1
         if self.round >= _ROUNDS:
             names = self.model.comm.allgather(self.model.mesh.node_ids[beyond[:3]].tolist())
@@ -240,8 +277,12 @@ class ContactRounds:
         self.candidates, self._concerned, self._rank = nodes, concerned, rank
 
     def forces(self, u: np.ndarray) -> tuple[np.ndarray, WallForces, np.ndarray]:
-        """Contact forces (owned, 3) [N], sums per wall, and which owned nodes are held, at the solution."""
+        """Contact forces (owned, 3) [N], sums per wall, and which owned nodes walls hold, at the solution."""
         total = np.zeros_like(u)
+        if self.pairs is not None:
+            self.pairs.pairs.push(total)
+        elif self._all_pairs is not None:
+            self._all_pairs.pairs.release()
         held = np.zeros(len(u), dtype=bool)
         walls = self.contact.none()
         if self._frames is not None:

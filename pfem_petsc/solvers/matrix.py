@@ -113,6 +113,7 @@ class HessianMatrix:
     Attributes
     ----------
     mat : PETSc matrix
+    bounded : the matrix that steps with bounds take: ``mat``, or where pairs have coordinates T^T mat T
     rigid : whether the matrix carries the rigid motions, for multigrid
     """
 
@@ -134,6 +135,9 @@ class HessianMatrix:
             self._pointers, self._columns = pointers, columns
             self.mat.setPreallocationCSR((pointers, columns))
         self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
+        self.bounded = self.mat
+        self._pairs: PETSc.Mat | None = None
+        self._symmetric = symmetric
         self.any_fixed = any_fixed
         self.rigid = False
         if any_fixed:
@@ -157,9 +161,18 @@ class HessianMatrix:
             self.mat.assemble()
         return self.mat
 
+    def couple(self, pairs) -> None:
+        """Give steps with bounds the :class:`~pfem_petsc.contact.pair_coordinates.PairCoordinates`. Collective."""
+        self._pairs = pairs.matrix()
+        self.fill(lambda values: None)
+        self.bounded = self.mat.ptap(self._pairs)
+        self.bounded.setOption(PETSc.Mat.Option.SYMMETRIC, self._symmetric)
+
     def update(self, problem, w: np.ndarray) -> None:
         """Assemble the Hessian of a problem at ``w``. Collective."""
         self.fill(lambda values: problem.hessian(w, self, values))
+        if problem.pairs is not None:
+            self.mat.ptap(self._pairs, self.bounded)
         if self.rigid:
             self._attach_rigid_motions(problem.x)
 
@@ -194,7 +207,10 @@ class HessianMatrix:
             _constrain_columns(p.ptr, self.local_columns, p.diagonal, self._fixed, values)
 
     def destroy(self) -> None:
-        """Free the PETSc matrix."""
+        """Free the PETSc matrices."""
+        if self._pairs is not None:
+            self.bounded.destroy()
+            self._pairs.destroy()
         self.mat.destroy()
 
 

@@ -89,6 +89,7 @@ class MatrixFreeHessian:
     Attributes
     ----------
     mat : PETSc matrix of type python
+    bounded : the matrix that steps with bounds take: the same
     """
 
     def __init__(self, model) -> None:
@@ -99,6 +100,7 @@ class MatrixFreeHessian:
         self.mat = PETSc.Mat().createPython(((local, total), (local, total)), self, comm=mesh.comm)
         self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         self.mat.setUp()
+        self.bounded = self.mat
         self._stored = np.zeros((len(mesh.bars), 5))
         self._u = np.zeros((mesh.n_local, 3))
         self._out = np.zeros((mesh.n_local, 3))
@@ -130,6 +132,8 @@ class MatrixFreeHessian:
         if problem.oblique:
             at = problem.frames.nodes
             u[at] = np.einsum("nij,nj->ni", problem.frames.inverse, u[at])
+        if problem.pairs is not None:
+            problem.pairs.increment(u)
         self.mesh.update_ghosts(u)
         inertia, bars = self.model.inertia, self.model.bars
         if inertia.consistent:
@@ -143,6 +147,8 @@ class MatrixFreeHessian:
         _product(self.mesh.bars, self._stored, u, out)
         if problem.oblique:
             out[at] = np.einsum("nji,nj->ni", problem.frames.inverse, out[at])
+        if problem.pairs is not None:
+            problem.pairs.gradient(out)
         if fixed is not None:
             out[:owned][fixed] = held
 
@@ -159,13 +165,23 @@ class MatrixFreeHessian:
         nodal = problem.nodal * (2.0 / 3.0 if self.model.inertia.consistent else 1.0)
         diagonal = blocks[:owned][:, [0, 3, 5]] + nodal[:, None]
         if problem.oblique:
-            at = problem.frames.nodes
-            full = blocks[at][:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3) + nodal[at, None, None] * np.eye(3)
             inverse = problem.frames.inverse
-            diagonal[at] = np.einsum("nji,njk,nki->ni", inverse, full, inverse)
+            full = self._blocks(blocks, nodal, problem.frames.nodes)
+            diagonal[problem.frames.nodes] = np.einsum("nji,njk,nki->ni", inverse, full, inverse)
+        if problem.pairs is not None:
+            problem.pairs.diagonal(self._blocks(blocks, nodal, problem.pairs.carriers), diagonal)
         if self.model.supports.any:
             diagonal[self._fixed] = problem.scale
         return diagonal
+
+    @staticmethod
+    def _blocks(stiffness: np.ndarray, nodal: np.ndarray, nodes: np.ndarray) -> np.ndarray:
+        """Diagonal blocks (k, 3, 3) of H at nodes (k,)."""
+        full = stiffness[nodes][:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+        return full + nodal[nodes, None, None] * np.eye(3)
+
+    def couple(self, pairs) -> None:
+        """Nothing to prepare: pairs are applied with the bars."""
 
     def createSubMatrix(self, mat, rows, columns, out=None):  # noqa: ANN001, ANN201, N802 - PETSc's name
         """The restriction of H to some unknowns; called by PETSc."""

@@ -180,7 +180,8 @@ class NewtonSolver:
         snes.setType("vinewtonrsls" if contact else "newtonls")
         # looked up at each call: the methods may be covered by log events after this
         snes.setFunction(lambda *arguments: self._residual(*arguments), self._g)
-        snes.setJacobian(lambda *arguments: self._hessian(*arguments), self.hessian.mat, self.hessian.mat)
+        matrix = self.hessian.bounded if contact else self.hessian.mat
+        snes.setJacobian(lambda *arguments: self._hessian(*arguments), matrix, matrix)
         snes.setTolerances(rtol=0.0, atol=0.0, stol=0.0, max_it=self.max_newton)
         snes.setConvergenceTest(self._converged)
         if contact:

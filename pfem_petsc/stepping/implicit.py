@@ -9,6 +9,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from ..contact.pair_coordinates import PairCoordinates
 from ..contact.rounds import ContactRounds
 from ..integrators.base import Balance
 from ..solvers.linear import LinearChoice
@@ -36,8 +37,11 @@ class ImplicitStepper(Stepper):
         else:
             self.hessian = HessianMatrix(model.mesh, model.supports.fixed, model.supports.any, scheme.symmetric)
             self.hessian.rigid = choice.preconditioner == "gamg"
+        self.pairs = None if model.pairs is None else PairCoordinates(model.pairs)
+        if self.pairs is not None:
+            self.hessian.couple(self.pairs)
         self.newton = NewtonSolver(model.mesh, self.hessian, choice, model.case.solver.max_newton, model.length)
-        self.newton.prepare(model.contact.any)
+        self.newton.prepare(model.contact.any or self.pairs is not None)
         self.level = 0  # the next step is made in 2**level parts
         self.message: Callable[[str], None] = lambda text: None
         self.held = np.zeros(model.mesh.n_owned, dtype=bool)  # nodes held by walls in the last step
@@ -138,23 +142,22 @@ class ImplicitStepper(Stepper):
         if model.temperatures.varying:
             model.temperatures.apply(balance.time)
         tolerance = self._tolerance(balance)
-        contacts = ContactRounds(model, self.state, balance, self.held)
+        contacts = ContactRounds(model, self.state, balance, self.held, self.pairs)
         newton = linear = 0
         while True:
             frames = contacts.frames(balance.predictor + guess)
-            problem = StepProblem(model, state, balance, state.external, frames)
-            bounds = contacts.bounds() if frames is not None else None
+            problem = StepProblem(model, state, balance, state.external, frames, contacts.pairs)
+            bounds = contacts.bounds(guess)
             w = contacts.clipped(problem.coordinates(contacts.feasible(guess)))
             report = self.newton.solve(problem, w, tolerance, model.rounding, bounds)
-            if not report.converged and problem.oblique:
+            if not report.converged and (problem.oblique or problem.pairs is not None):
                 w = contacts.clipped(problem.coordinates(contacts.approach(problem, guess)))
                 report = report.then(self.newton.solve(problem, w, tolerance, model.rounding, bounds))
             newton += report.newton
             linear += report.linear
             if not report.converged:
                 raise NotConverged(self._failure(problem, w, bounds, report, tolerance))
-            if frames is not None:
-                contacts.snap(w)
+            contacts.snap(w)
             u = problem.increment(w).copy()
             g = np.empty_like(u)
             problem.imbalance(u, g)
@@ -164,11 +167,12 @@ class ImplicitStepper(Stepper):
         if frames is None and not model.supports.any:
             self._keep_momentum(problem, u, g)
         state.contact, walls, self.held = contacts.forces(u)
+        held = int(self.held.sum()) + (0 if model.pairs is None else model.pairs.held)
         state.support = np.zeros_like(u)
         fixed = model.supports.fixed
         state.support[fixed] = g[fixed] - state.contact[fixed]
         internal = problem.f if balance.weight else state.f
-        return Solution(u, internal, walls, newton, linear, int(self.held.sum()))
+        return Solution(u, internal, walls, newton, linear, held)
 
     def _keep_momentum(self, problem: StepProblem, u: np.ndarray, g: np.ndarray) -> None:
         """Take the net force that the solver has left from a free truss, by a translation, which strains no bar.

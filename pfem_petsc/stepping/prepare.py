@@ -168,8 +168,6 @@ def make_stepper(model, plan: Plan) -> Stepper:
 def _check_walls(model, plan: Plan) -> None:
     """Refuse what a wall asks for and the scheme cannot do."""
     if model.pairs is not None:
-        if plan.linear is not None:
-            raise InputError(f"{model.case.source}: contact_pair needs an explicit integrator with lumped mass")
         if model.case.contact.treatment != "scheme":
             raise InputError(f'{model.case.source}: contact_pair needs contact.treatment = "scheme"')
         points = model.mesh.points[: model.mesh.n_owned]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..contact.frames import NodalFrames
+from ..contact.pair_coordinates import PairCoordinates
 from ..integrators.base import Balance, State
 from ..mechanics.compiled import kernel
 from ..solvers.matrix import HessianMatrix
@@ -45,6 +46,8 @@ def _turn_blocks(ptr, local_columns, frame_of, inverse, values):
 class StepProblem:
     """g(w) of one step, where w is the increment u from the predictor, in nodal coordinates w = B u at walls.
 
+    With ``pairs``, nodes of contact pairs have their coordinates as well.
+
     Components that supports prescribe have a zero residual and a unit row: the guess carries their value.
     """
 
@@ -55,7 +58,9 @@ class StepProblem:
         balance: Balance,
         external: np.ndarray,
         frames: NodalFrames | None,
+        pairs: PairCoordinates | None = None,
     ) -> None:
+        self.pairs = pairs
         self.model = model
         self.state = state
         self.balance = balance
@@ -93,19 +98,23 @@ class StepProblem:
         self._inverse = np.ascontiguousarray(inverse[turned, 1:]).reshape(-1, 3, 3)
 
     def increment(self, w: np.ndarray) -> np.ndarray:
-        """u (owned, 3) for w."""
+        """u (owned, 3) for w. Collective."""
         self.u[:] = w
         if self.oblique:
             at = self.frames.nodes
             self.u[at] = np.einsum("nij,nj->ni", self.frames.inverse, w[at])
+        if self.pairs is not None:
+            self.pairs.increment(self.u)
         return self.u
 
     def coordinates(self, u: np.ndarray) -> np.ndarray:
-        """w (owned, 3) for u."""
+        """w (owned, 3) for u. Collective."""
         w = u.copy()
         if self.oblique:
             at = self.frames.nodes
             w[at] = np.einsum("nij,nj->ni", self.frames.basis, u[at])
+        if self.pairs is not None:
+            self.pairs.coordinates(w)
         return w
 
     def imbalance(self, u: np.ndarray, g: np.ndarray) -> None:
@@ -136,11 +145,13 @@ class StepProblem:
         if self.oblique:
             at = self.frames.nodes
             g[at] = np.einsum("nji,nj->ni", self.frames.inverse, g[at])
+        if self.pairs is not None:
+            self.pairs.gradient(g)
         if self.model.supports.any:
             g[self.model.supports.fixed] = 0.0
 
     def hessian(self, w: np.ndarray, matrix: HessianMatrix, values: np.ndarray) -> None:
-        """Add dg/dw to the values of an assembled matrix. Collective."""
+        """Add dg/dw to the values of an assembled matrix, in which pairs have no coordinates yet. Collective."""
         inertia, balance = self.model.inertia, self.balance
         self.place(self.increment(w))
         if not inertia.consistent:

@@ -2,14 +2,21 @@
 
 import numpy as np
 import pytest
-from lattices import simulation
+from bodies import two_lattices
+from lattices import rotation, simulation
+from turning import with_mesh_file
 
 from pfem_petsc.errors import InputError
+from pfem_petsc.solvers.linear import LinearChoice
+from pfem_petsc.stepping.implicit import ImplicitStepper
 
-SCHEMES = ["central_differences", "chung_lee", "hulbert_chung"]
+EXPLICIT = [{"integrator": name} for name in ("central_differences", "chung_lee", "hulbert_chung")]
+IMPLICIT = [{"integrator": name} for name in ("newmark", "generalized_alpha", "energy_momentum", "houbolt")]
+IMPLICIT += [{"integrator": "wilson", "theta": 1.5}, {"integrator": "central_differences", "mass": "consistent"}]
+DIRECTION = [2.0, 0.0, 0.0]
 
 
-def two_rods(integrator, **pair):
+def two_rods(integrator="central_differences", linear="auto", **pair):
     """Equal rods that fly at each other; wave speed 1, gap 0.1."""
     return {
         "mesh": {"generator": "two_rods", "length": 1.0, "elements": 10, "gap": 0.1},
@@ -21,14 +28,15 @@ def two_rods(integrator, **pair):
         "material": {"m": {"young_modulus": 1.0, "density": 1.0}},
         "section": {"s": {"area": 1.0, "material": "m"}},
         "initial": {"velocity": [0.1, 0, 0], "on": [{"node_set": "second", "velocity": [-0.1, 0, 0]}]},
-        "contact_pair": [{"name": "faces", "first": "left", "second": "right", "direction": [2.0, 0, 0], **pair}],
+        "contact_pair": [{"name": "faces", "first": "left", "second": "right", "direction": DIRECTION, **pair}],
         "time": {"integrator": integrator, "step": 0.02, "end": 4.0},
         "output": {"fields_every": 0},
+        "solver": {"rtol": 1e-13, "linear": linear},
     }
 
 
-def half(integrator):
-    case = two_rods(integrator)
+def half():
+    case = two_rods()
     case["mesh"] = {"generator": "rod", "length": 1.0, "elements": 10}
     case["node_set"] = {"left": {"group": "end"}}
     case["initial"] = {"velocity": [0.1, 0, 0]}
@@ -39,12 +47,19 @@ def half(integrator):
     return case
 
 
-@pytest.mark.parallel
-@pytest.mark.parametrize("integrator", SCHEMES)
-def test_two_rods_are_the_symmetric_model(integrator, comm, shared_tmp_path):
-    both = simulation(two_rods(integrator), comm, shared_tmp_path, "both")
+def label(time):
+    return "-".join(str(value) for value in time.values())
+
+
+@pytest.mark.parametrize("time", [*EXPLICIT, *IMPLICIT], ids=label)
+def test_two_rods_are_the_symmetric_model(time, comm, shared_tmp_path, linear="auto"):
+    """Direct solver, as the models are small."""
+    cases = two_rods(linear=linear), half()
+    for case in cases:
+        case["time"] |= time
+    both = simulation(cases[0], comm, shared_tmp_path, "both")
     rows = [step.row for step in both]
-    one = simulation(half(integrator), comm, shared_tmp_path, "one")
+    one = simulation(cases[1], comm, shared_tmp_path, "one")
     others = [step.row for step in one]
     force = np.array([row["pair/faces/force"] for row in rows])
     wall = np.array([row["wall/symmetry/force"] for row in others])
@@ -57,7 +72,95 @@ def test_two_rods_are_the_symmetric_model(integrator, comm, shared_tmp_path):
     for row in rows:  # momentum of both together, and the ledger
         assert abs(row["momentum"][0]) < 1e-13
         assert abs(row["energy_imbalance"]) < 1e-12
+    for name in ("contact_work", "kinetic_energy", "elastic_energy", "numerical_dissipation"):
+        np.testing.assert_allclose([row[name] for row in rows], [2.0 * row[name] for row in others], atol=1e-9)
     assert max(row["active_contacts"] for row in rows) == 2
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("integrator", ["chung_lee", "newmark", "energy_momentum"])
+def test_two_rods_on_ranks(integrator, comm, shared_tmp_path):
+    test_two_rods_are_the_symmetric_model({"integrator": integrator}, comm, shared_tmp_path)
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("integrator", ["generalized_alpha"])
+def test_matrix_free_rods_are_the_symmetric_model(integrator, comm, shared_tmp_path):
+    test_two_rods_are_the_symmetric_model({"integrator": integrator}, comm, shared_tmp_path, linear="cg")
+
+
+@pytest.mark.parametrize("time", IMPLICIT[:-1], ids=label)
+def test_rods_in_any_direction(time, comm, shared_tmp_path):
+    straight = two_rods()
+    straight["time"] |= time | {"end": 3.0}  # in compression a chain of bars amplifies rounding across it
+    turn = rotation(4)
+    sets = {name: straight["node_set"][name] for name in ("left", "right")}
+    straight["node_set"] |= {"left": {"nearest": [1.0, 0, 0]}, "right": {"nearest": [1.1, 0, 0]}}
+    oblique = with_mesh_file(straight, shared_tmp_path / "turned.vtu", turn)
+    straight["node_set"] |= sets
+    oblique["contact_pair"][0]["direction"] = (turn @ DIRECTION).tolist()
+    runs = [simulation(case, comm, shared_tmp_path, f"r{k}") for k, case in enumerate((straight, oblique))]
+    forces = [np.array([step.row["pair/faces/force"] for step in run]) for run in runs]
+    np.testing.assert_allclose(forces[1] @ turn, forces[0], atol=1e-9)
+    x, y = (run.gather(run.state.position) for run in runs)
+    if comm.rank == 0:
+        np.testing.assert_allclose(y @ turn, x, atol=1e-9)
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("solver", [{}, {"operator": "matrix_free"}, {"linear": "gamg"}], ids=str)
+def test_lattices_turned(solver, comm, shared_tmp_path):
+    """Thirteen pairs, oblique to the faces they are on; what solves the steps and in which frame does not matter."""
+    turn, found = rotation(5), []
+    for k, (frame, keys) in enumerate([(np.eye(3), {}), (turn, solver)]):
+        options = {"turn": frame, "step": 1e-3, "end": 0.04, "solver": {"rtol": 1e-12, **keys}}
+        run = simulation(
+            two_lattices(shared_tmp_path / f"{k}.vtu", "newmark", **options), comm, shared_tmp_path, f"r{k}"
+        )
+        rows = [step.row for step in run]
+        momentum = np.array([row["momentum"] for row in rows])
+        np.testing.assert_allclose(momentum, np.tile(momentum[0], (len(rows), 1)), atol=1e-14)
+        assert max(abs(row["energy_imbalance"]) for row in rows) < 1e-11
+        assert max(row["active_contacts"] for row in rows) > 20
+        found.append((np.array([row["pair/faces/force"] for row in rows]) @ frame, run.gather(run.state.position)))
+    np.testing.assert_allclose(found[1][0], found[0][0], atol=1e-9 * np.abs(found[0][0]).max())
+    if comm.rank == 0:
+        np.testing.assert_allclose(found[1][1] @ turn, found[0][1], atol=1e-10)
+
+
+@pytest.mark.parametrize("supported", [False, True], ids=["free", "supported"])
+def test_explicit_steps_solve_the_variational_inequality(supported, comm, shared_tmp_path):
+    supports = [{"node_set": "held", "fix": "y"}, {"node_set": "hinged", "fix": "xz"}] if supported else []
+    options = {"solver": {"rtol": 1e-13}, "supports": supports}
+    run = simulation(two_lattices(shared_tmp_path / "m.vtu", "central_differences", **options), comm, shared_tmp_path)
+    explicit, pairs = run.stepper, run.model.pairs
+    implicit = ImplicitStepper(run.model, explicit.scheme, explicit.h, LinearChoice("preonly", "lu", "test"))
+    implicit.state = explicit.state
+    solve, worst, pressed = explicit.solve, [], []
+
+    def both(balance):
+        kept = explicit.state.contact
+        other = implicit.solve(balance)
+        forces, supported = pairs.force, explicit.state.support
+        explicit.state.contact = kept
+        solution = solve(balance)
+        scale = np.abs(pairs.force).max()
+        worst.append(np.abs(solution.u - other.u).max(initial=0.0))
+        if scale:
+            assert np.abs(forces - pairs.force).max() < 1e-9 * scale
+            np.testing.assert_allclose(explicit.state.support, supported, atol=1e-9 * scale)
+        pressed.append(int((pairs.force > 0.0).sum()))
+        return solution
+
+    explicit.solve = both
+    assert run.run() == 0
+    implicit.destroy()
+    assert max(pressed) > 8 and max(worst) < 1e-14
+
+
+@pytest.mark.parallel
+def test_explicit_steps_on_ranks(comm, shared_tmp_path):
+    test_explicit_steps_solve_the_variational_inequality(True, comm, shared_tmp_path)
 
 
 def test_unequal_bodies_keep_momentum(comm, shared_tmp_path):
@@ -85,10 +188,8 @@ def test_refusals(change, message, comm, shared_tmp_path):
         simulation(two_rods("central_differences", **change), comm, shared_tmp_path)
 
 
-def test_needs_explicit_steps_and_no_wall(comm, shared_tmp_path):
-    with pytest.raises(InputError, match="needs an explicit integrator"):
-        simulation(two_rods("newmark"), comm, shared_tmp_path)
-    case = two_rods("central_differences")
+def test_no_wall_on_nodes_of_pairs(comm, shared_tmp_path):
+    case = two_rods("newmark")
     case["wall"] = [{"type": "plane", "point": [-1.0, 0, 0], "normal": [1.0, 0, 0]}]
     with pytest.raises(InputError, match="a wall stops it as well"):
         simulation(case, comm, shared_tmp_path)

@@ -10,6 +10,13 @@ from pfem_petsc.errors import EarlyStop
 
 SHORT = ("time.end=1.6", "output.fields_every=7")
 LATTICE = ("mesh.cells=[3,3,3]", "time.end=1.2e-4", "time.step=1e-6")
+TWO_RODS = (
+    "mesh={generator='two_rods', length=1.0, elements=10, gap=0.05}",
+    "node_set={tip={group='first_end'}, other={group='second_start'}, target={box=[[1.04, -1, -1], [3, 1, 1]]}}",
+    "initial={velocity=[0.5, 0.0, 0.0], on=[{node_set='target', velocity=[0.0, 0.0, 0.0]}]}",
+    "wall=[]",
+    "contact_pair=[{name='faces', first='tip', second='other', direction=[1.0, 0.0, 0.0]}]",
+)
 CASES = {
     "central differences": ("rod_impact", SHORT),
     "consistent mass": ("rod_impact", (*SHORT, "time.mass=consistent")),
@@ -24,6 +31,8 @@ CASES = {
     "stick": ("rod_impact", (*SHORT, "time.integrator=newmark", "contact.treatment=stick")),
     "conserving": ("rod_impact", (*SHORT, "time.integrator=newmark", "contact.treatment=conserving")),
     "mass redistribution": ("rod_impact", (*SHORT, "contact.treatment=mass_redistribution")),
+    "pairs": ("rod_impact", (*SHORT, *TWO_RODS)),
+    "pairs, implicit": ("rod_impact", (*SHORT, *TWO_RODS, "time.integrator=generalized_alpha")),
     "sparse history": ("rod_impact", (*SHORT, "output.history_every=9")),
     "plastic, explicit": ("bar_collision_plastic", ("time.end=8e-5",)),
     "plastic, implicit": ("bar_collision_plastic", ("time.end=8e-5", "time.integrator=newmark")),

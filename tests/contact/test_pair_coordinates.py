@@ -1,0 +1,126 @@
+"""The coordinates that make bounds of contact pairs: their matrix, gradient and inverse, and both operators in them."""
+
+import numpy as np
+import pytest
+from bodies import two_lattices
+
+from pfem_petsc import Case
+from pfem_petsc.contact.pair_coordinates import PairCoordinates
+from pfem_petsc.solvers.matrix import HessianMatrix
+from pfem_petsc.solvers.matrix_free import MatrixFreeHessian
+from pfem_petsc.stepping.model import Model
+from pfem_petsc.stepping.prepare import make_plan, make_stepper
+from pfem_petsc.stepping.problem import StepProblem
+
+pytestmark = pytest.mark.parallel
+
+SUPPORTS = [{"node_set": "held", "fix": "y"}, {"node_set": "hinged", "fix": "xz"}]
+
+
+@pytest.fixture(params=[(), SUPPORTS], ids=["free", "supported"])
+def model(request, comm, shared_tmp_path):
+    case = two_lattices(shared_tmp_path / "mesh.vtu", "newmark", supports=request.param)
+    return Model(Case.from_dict(case), comm)
+
+
+def dense(mat, comm):
+    """A PETSc matrix on every rank."""
+    rows, columns = mat.getSize()[0], mat.getSize()[1]
+    start, stop = mat.getOwnershipRange()
+    whole = np.zeros((rows, columns))
+    x, y = mat.createVecs()
+    for k in range(columns):
+        x.set(0.0)
+        if x.getOwnershipRange()[0] <= k < x.getOwnershipRange()[1]:
+            x[k] = 1.0
+        x.assemble()
+        mat.mult(x, y)
+        whole[start:stop, k] = y.array
+    x.destroy()
+    y.destroy()
+    return comm.allreduce(whole)
+
+
+def whole(function, model, comm):
+    """The matrix of a linear map of nodal arrays (owned, 3), by columns."""
+    n = 3 * model.mesh.n_nodes
+    mine = slice(3 * model.mesh.first_node, 3 * (model.mesh.first_node + model.mesh.n_owned))
+    out = np.zeros((n, n))
+    for k in range(n):
+        unit = np.zeros(n)
+        unit[k] = 1.0
+        values = unit[mine].reshape(-1, 3).copy()
+        function(values)
+        out[mine, k] = values.ravel()
+    return comm.allreduce(out)
+
+
+def test_matrix_gradient_and_inverse(model, comm):
+    pairs = PairCoordinates(model.pairs)
+    mat = pairs.matrix()
+    matrix = dense(mat, comm)
+    mat.destroy()
+    np.testing.assert_allclose(whole(pairs.increment, model, comm), matrix, atol=1e-15)
+    np.testing.assert_allclose(whole(pairs.gradient, model, comm), matrix.T, atol=1e-15)
+    np.testing.assert_allclose(whole(pairs.coordinates, model, comm), np.linalg.inv(matrix), atol=1e-13)
+    assert (np.abs(matrix - np.eye(len(matrix))) > 1e-3).any(axis=1).sum() == 39  # 13 carriers
+    fixed = np.zeros(len(matrix), dtype=bool)
+    fixed[3 * model.mesh.first_node :][: 3 * model.mesh.n_owned] = model.supports.fixed.ravel()
+    fixed = comm.allreduce(fixed.astype(int)) > 0
+    np.testing.assert_array_equal(matrix[fixed], np.eye(len(matrix))[fixed])
+    np.testing.assert_array_equal(matrix[:, fixed], np.eye(len(matrix))[:, fixed])
+
+
+def test_bounds_are_the_distances(model, comm):
+    """An unknown on its bound is a pair that is closed, whatever the supports do; its force is the gradient's."""
+    pairs = PairCoordinates(model.pairs)
+    rng = np.random.default_rng(1)
+    u = rng.normal(size=(model.mesh.n_nodes, 3))[model.mesh.node_ids[: model.mesh.n_owned]]
+    x = model.mesh.points[: model.mesh.n_owned]
+    lower = np.full(u.shape, -np.inf)
+    pairs.bound(x, u, lower)
+    assert comm.allreduce(int(np.isfinite(lower).sum())) == 13
+    w = u.copy()
+    pairs.coordinates(w)
+    on = np.where(np.isfinite(lower), lower, w)
+    closed = on.copy()
+    pairs.increment(closed)
+    np.testing.assert_allclose(model.pairs.distances(model.pairs.gather(x + closed)), model.pairs.gaps, atol=1e-13)
+    np.testing.assert_array_equal(closed[model.supports.fixed], u[model.supports.fixed])
+    model.pairs.force = 1.0 + np.arange(13.0)
+    g = np.zeros_like(u)
+    model.pairs.push(g)
+    model.pairs.release()
+    pairs.press(on, g, lower, 1e-9)
+    np.testing.assert_allclose(model.pairs.force, 1.0 + np.arange(13.0), rtol=1e-13)
+
+
+def test_both_operators_are_the_congruent_matrix(model, comm):
+    stepper = make_stepper(model, make_plan(model))
+    stepper.start()
+    state = stepper.state
+    balance = stepper.scheme.balance(state, stepper.h)
+    pairs = stepper.pairs
+    rng = np.random.default_rng(2)
+    u = 1e-3 * rng.normal(size=(model.mesh.n_nodes, 3))[model.mesh.node_ids[: model.mesh.n_owned]]
+    plain = StepProblem(model, state, balance, state.external, None)
+    coupled = StepProblem(model, state, balance, state.external, None, pairs)
+    w = coupled.coordinates(u)
+    np.testing.assert_allclose(coupled.increment(w), u, atol=1e-17)
+    assembled, free = HessianMatrix(model.mesh, model.supports.fixed, model.supports.any), MatrixFreeHessian(model)
+    assembled.update(plain, u)
+    hessian = dense(assembled.mat, comm)
+    mat = pairs.matrix()
+    matrix = dense(mat, comm)
+    mat.destroy()
+    expected = matrix.T @ hessian @ matrix
+    assembled.couple(pairs)
+    for operator in (assembled, free):
+        operator.update(coupled, w)
+        np.testing.assert_allclose(dense(operator.bounded, comm), expected, atol=1e-12 * np.abs(expected).max())
+    diagonal = np.zeros(len(expected))
+    diagonal[3 * model.mesh.first_node :][: 3 * model.mesh.n_owned] = free.diagonal().ravel()
+    np.testing.assert_allclose(comm.allreduce(diagonal), np.diag(expected), rtol=1e-12)
+    assembled.destroy()
+    free.destroy()
+    stepper.destroy()

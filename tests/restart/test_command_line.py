@@ -183,30 +183,72 @@ def test_checkpoints_by_the_clock(tmp_path):
     assert (folder / "checkpoint-previous.h5").is_file()
 
 
+STOPPED = KINDS["explicit contact, plastic"]
+STOPPED_WORDS = [STOPPED.case, "--quiet", "--set", *STOPPED.overrides, "time.end=2e-4", "-o"]
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory):
+    """Number of ranks to the result of the case that is stopped by signals."""
+    folder = tmp_path_factory.mktemp("undisturbed")
+    for ranks in (1, 2):
+        line = command(ranks, *STOPPED_WORDS, folder / str(ranks))
+        done = subprocess.run(line, env=environment(), capture_output=True, text=True, timeout=120)
+        assert done.returncode == 0, done.stderr
+    return folder
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("ranks", "number"), [(1, signal.SIGTERM), (1, signal.SIGINT), (1, signal.SIGUSR1), (2, signal.SIGTERM)]
+    ("ranks", "number", "whom"),
+    [
+        (1, signal.SIGTERM, "last rank"),
+        (1, signal.SIGINT, "last rank"),
+        (1, signal.SIGUSR1, "last rank"),
+        (2, signal.SIGTERM, "last rank"),
+        (2, signal.SIGTERM, "all ranks"),
+        (2, signal.SIGUSR1, "launcher"),
+    ],
 )
-def test_signal_stops_with_a_checkpoint_and_the_restart_is_bitwise(tmp_path, ranks, number):
-    kind = KINDS["explicit contact, plastic"]
-    words = [kind.case, "--quiet", "--set", *kind.overrides, "time.end=2e-4", "-o"]
+def test_signal_stops_with_a_checkpoint_and_the_restart_is_bitwise(tmp_path, undisturbed, ranks, number, whom):
+    """To the ranks, as a batch system sends it, or to the launcher, which passes this one on."""
     folder = tmp_path / "stopped"
-    line = command(ranks, *words, folder)
-    process = subprocess.Popen(line, env=environment(), stderr=subprocess.PIPE, text=True)
-    while not (folder / "log.txt").exists() and process.poll() is None:
-        time.sleep(0.01)
-    os.kill(processes_of(process, ranks)[-1], number)
-    said = process.communicate(timeout=60)[1]
-    assert process.returncode == 4, said
+    line = command(ranks, *STOPPED_WORDS, folder)
+    status, said = signalled(line, ranks, folder, number, whom)
+    assert status == 4, said
     assert f"stopped: {signal.Signals(number).name} received" in said
     assert said.count("stopped: ") == 1
     done = subprocess.run([*line, "--restart"], env=environment(), capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
-    done = subprocess.run(
-        command(ranks, *words, tmp_path / "whole"), env=environment(), capture_output=True, text=True, timeout=120
-    )
+    assert differences(folder / "result.vtkhdf", undisturbed / str(ranks) / "result.vtkhdf") == {}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_launcher_that_ends_its_ranks_leaves_them_time_for_a_checkpoint(tmp_path, number):
+    """It sends them SIGTERM, and has a status of its own."""
+    folder = tmp_path / "stopped"
+    line = [*command(2, *STOPPED_WORDS, folder), "--set=output.fields_every=1000"]
+    status, said = signalled([*line, "--set=time.end=1.0"], 2, folder, number, "launcher")
+    assert status not in (0, 2, 3), said
+    assert said.count("stopped: SIGTERM received") == 1
+    reached = int(re.search(r"step (\d+) is finished", said).group(1))
+    line.append(f"--set=time.end={(reached + 50) * 5e-7}")
+    done = subprocess.run([*line, "--restart"], env=environment(), capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
-    assert differences(folder / "result.vtkhdf", tmp_path / "whole" / "result.vtkhdf") == {}
+    np.testing.assert_array_equal(steps(folder)[0], range(reached + 51))
+
+
+def signalled(line, ranks, folder, number, whom):
+    """Run until the first step, send a signal: exit status and stderr."""
+    process = subprocess.Popen(line, env=environment(), stderr=subprocess.PIPE, text=True)
+    while not (folder / "log.txt").exists() and process.poll() is None:
+        time.sleep(0.01)
+    pids = processes_of(process, ranks)
+    for pid in {"last rank": pids[-1:], "all ranks": pids, "launcher": [process.pid]}[whom]:
+        os.kill(pid, number)
+    said = process.communicate(timeout=60)[1]
+    return process.returncode, said
 
 
 def test_second_interrupt_ends_at_once(tmp_path):

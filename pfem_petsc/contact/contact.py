@@ -197,11 +197,11 @@ class Contact:
         moment = np.cross(x[:, None, :], force).sum(axis=0)
         return WallForces(force.sum(axis=0), touching.sum(axis=0), moment, nodes, touching, x)
 
-    def no_room(self, node: int, offsets: np.ndarray, time: float) -> str:
+    def no_room(self, node: int, offsets: np.ndarray) -> str:
         """What to tell about a node (owned index) whose planes contradict each other."""
         touched = [name for name, offset in zip(self.names, offsets, strict=True) if offset > -np.inf]
         return (
-            f"no position of node {self.mesh.node_ids[node]} at time {time:.6g} s satisfies all walls "
+            f"no position of node {self.mesh.node_ids[node]} satisfies all walls "
             f"({', '.join(touched)}) and its supports; the walls leave it no room"
         )
 
@@ -222,7 +222,7 @@ class Contact:
         with agreed(self.mesh.comm):
             if frames.contradiction >= 0:
                 node = frames.contradiction
-                raise SimulationFailure(self.no_room(candidates[node], offsets[node], time))
+                raise SimulationFailure(self.no_room(candidates[node], offsets[node]))
         return frames
 
     def strengths(self, frames: NodalFrames, residual: np.ndarray, active: np.ndarray) -> np.ndarray:

@@ -91,14 +91,14 @@ class ExplicitContact:
             moved, multipliers = free.copy(), np.zeros(offsets.shape)
             stuck = project(moved, self.contact.fixed[nodes], normals, offsets, tolerance, multipliers)
             if stuck >= 0:
-                raise SimulationFailure(self.contact.no_room(nodes[stuck], offsets[stuck], time))
+                raise SimulationFailure(self.contact.no_room(nodes[stuck], offsets[stuck]))
             if self.contact.flat.all() or np.abs(moved - at).max() <= tolerance:
                 break
             at = moved
         else:
             node = self.contact.mesh.node_ids[nodes[np.argmax(np.abs(moved - at).max(axis=1))]]
             raise SimulationFailure(
-                f"the place of node {node} on curved walls at time {time:.6g} s was not found in {_CURVED_ROUNDS} "
+                f"the place of node {node} on curved walls was not found in {_CURVED_ROUNDS} "
                 "rounds; take a smaller time step"
             )
         strength = multipliers * stiffness[nodes][:, None]
@@ -156,7 +156,7 @@ class ExplicitContact:
             )
             if unsettled >= 0:
                 raise SimulationFailure(
-                    f"the friction of node {contact.mesh.node_ids[nodes[unsettled]]} at time {time:.6g} s on "
+                    f"the friction of node {contact.mesh.node_ids[nodes[unsettled]]} on "
                     "several walls was not settled; take a smaller time step"
                 )
             if self.contact.flat.all():

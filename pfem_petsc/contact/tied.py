@@ -90,7 +90,7 @@ class Ties:
         if gaps[node, other] < -_SLACK * contact.length:
             raise SimulationFailure(
                 f"node {contact.mesh.node_ids[nodes[node]]}, tied to wall {contact.names[walls[node]]!r}, is carried "
-                f"{-gaps[node, other]:.3g} m beyond wall {contact.names[other]!r} at time {time:.6g} s; keep the walls "
+                f"{-gaps[node, other]:.3g} m beyond wall {contact.names[other]!r}; keep the walls "
                 "apart, or name the nodes that they concern with 'node_set'"
             )
 

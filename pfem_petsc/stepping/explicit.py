@@ -59,7 +59,7 @@ class ExplicitStepper(Stepper):
                 contacts = len(nodes)
             except SimulationFailure as failure:
                 if self.fault is None:
-                    self.fault = SimulationFailure(f"step {state.step}: {failure}")
+                    self.fault = SimulationFailure(f"{self.when(balance)}: {failure}")
         if model.pairs is not None:
             if state.contact is self.zero:
                 state.contact = np.zeros_like(u)

@@ -11,6 +11,7 @@ from petsc4py import PETSc
 
 from ..contact.pair_coordinates import PairCoordinates
 from ..contact.rounds import ContactRounds
+from ..errors import SimulationFailure
 from ..integrators.base import Balance
 from ..solvers.linear import LinearChoice
 from ..solvers.matrix import HessianMatrix
@@ -145,7 +146,10 @@ class ImplicitStepper(Stepper):
         contacts = ContactRounds(model, self.state, balance, self.held, self.pairs)
         newton = linear = 0
         while True:
-            frames = contacts.frames(balance.predictor + guess)
+            try:
+                frames = contacts.frames(balance.predictor + guess)
+            except SimulationFailure as failure:
+                raise SimulationFailure(f"{self.when(balance)}: {failure}") from failure
             problem = StepProblem(model, state, balance, state.external, frames, contacts.pairs)
             bounds = contacts.bounds(guess)
             w = contacts.clipped(problem.coordinates(contacts.feasible(guess)))
@@ -223,7 +227,7 @@ class ImplicitStepper(Stepper):
             worst = (float(size[at]), int(model.mesh.node_ids[at]))
         residual, node = max(model.comm.allgather(worst))
         return (
-            f"step {self.state.step + 1}, t = {problem.balance.time:.6g} s: no convergence after {report.newton} "
+            f"{self.when(problem.balance)}: no convergence after {report.newton} "
             f"Newton iterations: {report.why}; residual {report.norm:.3g} N, asked {tolerance:.3g} N; worst at "
             f'node {node} ({residual:.3g} N). Take a smaller time.step, or solver.linear = "mumps"'
         )

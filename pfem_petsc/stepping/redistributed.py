@@ -94,7 +94,7 @@ class RedistributedStepper(Stepper):
         else:
             if not largest <= 1e-9 * model.length and self.fault is None:
                 self.fault = SimulationFailure(
-                    f"step {self.state.step}: contact nodes without mass found no equilibrium (last move {largest:.3g} "
+                    f"{self.when(balance)}: contact nodes without mass found no equilibrium (last move {largest:.3g} "
                     "m); take a smaller time.step or another contact.treatment"
                 )
         u[nodes] = x[nodes] - balance.predictor[nodes]

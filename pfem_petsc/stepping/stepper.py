@@ -172,6 +172,13 @@ class Stepper(ABC):
             total += weight * self.model.external.at(time, part)
         return total
 
+    def when(self, balance: Balance) -> str:
+        """The step that a balance is for, and the time that it holds at, for messages."""
+        step = self.state.step + 1
+        if self.scheme.leads and self.state.time > 0.0:
+            step += 1  # the position solved for is that of the step after
+        return f"step {step}, t = {balance.time:.6g} s"
+
     def evaluate(self, commit: bool) -> None:
         """Internal force and energies at the state's positions; a collapsed bar becomes a fault."""
         state, mesh = self.state, self.model.mesh

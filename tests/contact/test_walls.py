@@ -157,11 +157,13 @@ def test_starting_exactly_on_walls(integrator, parameters, comm, shared_tmp_path
 
 @pytest.mark.parametrize("integrator, parameters", [EXPLICIT, IMPLICIT])
 def test_walls_that_leave_no_room(integrator, parameters, comm, shared_tmp_path):
-    """Two walls that close in on the truss until they overlap: a failure that names a node, on all ranks."""
-    walls = planes([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]], [-0.001, -0.101])
-    walls[0]["velocity"], walls[1]["velocity"] = [0.0, 0.0, 60.0], [0.0, 0.0, -60.0]
-    case = lattice_case(walls, integrator=integrator, step=2e-4, end=0.01)
-    with pytest.raises(SimulationFailure, match="no room|collapsed"):
+    """Walls that close in on a node until they overlap: a failure that names it, the step and the time, on all ranks."""
+    walls = planes([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]], [-0.001, -0.0041], node_set="corner")
+    walls[0]["velocity"], walls[1]["velocity"] = [0.0, 0.0, 2.0], [0.0, 0.0, -2.0]  # they meet at 1.275 ms
+    case = lattice_case(walls, node_set={"corner": {"nearest": [0.0, 0.0, 0.0]}}, step=2e-4, end=0.01)
+    case["time"] |= {"integrator": integrator, **parameters}
+    told = "step 7, t = 0.0014 s: no position of node 0 satisfies all walls"
+    with pytest.raises(SimulationFailure, match=told):
         simulation(case, comm, shared_tmp_path).run()
 
 

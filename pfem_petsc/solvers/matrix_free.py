@@ -144,6 +144,9 @@ class MatrixFreeHessian:
         else:
             np.multiply(problem.nodal[:, None], u[:owned], out=out[:owned])
             out[owned:] = 0.0
+            if inertia.redistribution is not None:
+                moved = inertia.redistribution
+                out[moved.touched] += problem.balance.alpha * np.einsum("kij,kj->ki", moved.tensors, u[moved.touched])
         _product(self.mesh.bars, self._stored, u, out)
         if problem.oblique:
             out[at] = np.einsum("nji,nj->ni", problem.frames.inverse, out[at])
@@ -161,6 +164,10 @@ class MatrixFreeHessian:
         problem, owned = self._problem, self.mesh.n_owned
         blocks = np.zeros((self.mesh.n_local, 6))
         _diagonal(self.mesh.bars, self._stored, blocks)
+        if self.model.inertia.redistribution is not None:
+            moved = self.model.inertia.redistribution
+            upper = moved.tensors.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
+            blocks[moved.touched] += problem.balance.alpha * upper
         # consistent mass has two thirds of the lumped one on its diagonal
         nodal = problem.nodal * (2.0 / 3.0 if self.model.inertia.consistent else 1.0)
         diagonal = blocks[:owned][:, [0, 3, 5]] + nodal[:, None]

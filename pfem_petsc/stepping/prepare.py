@@ -156,8 +156,6 @@ def make_stepper(model, plan: Plan) -> Stepper:
     if name == "mass_redistribution":
         if plan.scheme.explicit and not plan.scheme.leads:
             raise InputError(f"{key}: of the explicit schemes only central_differences can have nodes without mass")
-        if plan.linear is not None and plan.linear.matrix_free:
-            raise InputError(f'{key}: needs solver.operator = "assembled"')
         model.inertia.redistribution = redistribute(model)
         explicit = RedistributedStepper
     stepper = _stepper(model, plan, explicit)

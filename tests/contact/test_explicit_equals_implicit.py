@@ -86,7 +86,7 @@ def test_steps_are_the_same(name, supported, comm, shared_tmp_path):
     implicit.destroy()
     assert max(contacts) >= 1 and sum(c > 0 for c in contacts) >= 2
     assert max(w[0] for w in worst) < 1e-12 * 0.2
-    assert max(w[1] for w in worst) < 1e-8  # curved walls are followed to 1e-13 of the length, alpha m times stiffer
+    assert max(w[1] for w in worst) < 1e-8  # curved walls are followed to 1e-13 of the length
 
 
 @pytest.mark.parallel

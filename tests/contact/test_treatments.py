@@ -136,6 +136,33 @@ def test_mass_redistribution_of_a_lattice(integrator, comm, shared_tmp_path):
     assert max(row["active_contacts"] for row in rows) >= 3
 
 
+@pytest.mark.parallel
+def test_mass_redistribution_without_a_matrix(comm, shared_tmp_path):
+    """What is chosen beyond 500 unknowns gives what a direct solution does."""
+    found = []
+    for solver in ({}, {"linear": "mumps"}):
+        case = lattice_case(
+            planes([[0.0, 0.2, 1.0]], [-0.001], node_set="foot"),
+            velocity=[0.2, 0.1, -1.0],
+            integrator="newmark",
+            step=4e-4,
+            end=0.008,
+            cells=[4, 3, 3],
+            node_set={"foot": {"box": [[-1, -1, -1e-6], [1, 1, 1e-6]]}},
+            solver={"rtol": 1e-12, **solver},
+            contact={"treatment": "mass_redistribution"},
+        )
+        case["time"] |= TRAPEZOID
+        run = simulation(case, comm, shared_tmp_path, "it")
+        assert run.plan.linear.matrix_free == (solver == {})
+        rows = [step.row for step in run]
+        assert max(row["active_contacts"] for row in rows) >= 5
+        found.append((np.array([row["wall/wall1/force"] for row in rows]), run.gather(run.state.position)))
+    np.testing.assert_allclose(found[0][0], found[1][0], atol=1e-8 * np.abs(found[0][0]).max())
+    if comm.rank == 0:
+        np.testing.assert_allclose(found[0][1], found[1][1], atol=1e-10)
+
+
 @pytest.mark.parametrize(
     "tables, message",
     [

@@ -157,7 +157,7 @@ def test_starting_exactly_on_walls(integrator, parameters, comm, shared_tmp_path
 
 @pytest.mark.parametrize("integrator, parameters", [EXPLICIT, IMPLICIT])
 def test_walls_that_leave_no_room(integrator, parameters, comm, shared_tmp_path):
-    """Walls that close in on a node until they overlap: a failure that names it, the step and the time, on all ranks."""
+    """Walls that close in on a node until they overlap: a failure that names it, step and time, on all ranks."""
     walls = planes([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]], [-0.001, -0.0041], node_set="corner")
     walls[0]["velocity"], walls[1]["velocity"] = [0.0, 0.0, 2.0], [0.0, 0.0, -2.0]  # they meet at 1.275 ms
     case = lattice_case(walls, node_set={"corner": {"nearest": [0.0, 0.0, 0.0]}}, step=2e-4, end=0.01)

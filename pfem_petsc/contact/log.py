@@ -9,6 +9,8 @@ from mpi4py import MPI
 
 __all__ = ["ContactLog"]
 
+_PENDING = 4096  # steps whose contacts are kept before the ranks put them together
+
 
 class ContactLog:
     """Sums over the steps of a run.
@@ -29,13 +31,17 @@ class ContactLog:
         self.changes = 0
         self.time = np.zeros(n_walls)
         self._before = np.empty(0, dtype=np.int64)
-        self._steps: list[float] = []
-        self._flags: list[np.ndarray] = []
+        self._pending = 0
+        self._steps = np.empty(_PENDING)
+        self._flags = np.empty((_PENDING, n_walls), dtype=np.uint8)
 
-    def book(self, walls, step: float) -> None:
-        """Book the forces of a step of so many seconds."""
-        self._steps.append(step)
-        self._flags.append(walls.contacts > 0)
+    def book(self, walls, step: float, comm: MPI.Comm) -> None:
+        """Book the forces of a step of so many seconds. Collective where many have come together."""
+        if self._pending >= _PENDING:
+            self.meet(comm)
+        self._steps[self._pending] = step
+        self._flags[self._pending] = walls.contacts > 0
+        self._pending += 1
         if len(walls.nodes) == 0 and len(self._before) == 0:
             return
         self.impulse += step * walls.force
@@ -50,11 +56,11 @@ class ContactLog:
 
     def meet(self, comm: MPI.Comm) -> None:
         """Bring the contact times up to date on all ranks. Collective."""
-        if self._steps and len(self.time):
-            flags = np.array(self._flags, dtype=np.uint8)
+        n, self._pending = self._pending, 0
+        if n and len(self.time):
+            flags = self._flags[:n]
             comm.Allreduce(MPI.IN_PLACE, flags, op=MPI.MAX)
-            self.time += np.array(self._steps) @ flags
-        self._steps, self._flags = [], []
+            self.time += self._steps[:n] @ flags
 
     def share(self) -> dict[str, Any]:
         """This rank's sums, for a checkpoint."""
@@ -69,9 +75,9 @@ class ContactLog:
 
         They are added by :meth:`meet` only: other partial sums would end in other last digits.
         """
-        flags = np.array(self._flags, dtype=np.uint8).reshape(len(self._steps), len(self.time))
+        flags = self._flags[: self._pending].copy()
         comm.Allreduce(MPI.IN_PLACE, flags, op=MPI.MAX)
-        return {"sum": self.time.tolist(), "steps": list(self._steps), "flags": flags.tolist()}
+        return {"sum": self.time.tolist(), "steps": self._steps[: self._pending].tolist(), "flags": flags.tolist()}
 
     def put_back(self, share: dict[str, Any], times: dict[str, Any], touching: np.ndarray) -> None:
         """Take this rank's sums, the contact times and who touches what from a checkpoint."""
@@ -79,7 +85,8 @@ class ContactLog:
         self.releases[:] = np.array(share["wall_releases"], dtype=np.int64)
         self.changes = int(share["contact_changes"])
         self.time[:] = times["sum"]
-        self._steps = list(times["steps"])
-        self._flags = [np.array(flags, dtype=np.uint8) for flags in times["flags"]]
+        self._pending = n = len(times["steps"])
+        self._steps[:n] = times["steps"]
+        self._flags[:n] = np.array(times["flags"], dtype=np.uint8).reshape(n, len(self.time))
         self.touching = touching
         self._before = np.flatnonzero(touching.any(axis=1))

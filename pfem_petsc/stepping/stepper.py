@@ -156,7 +156,7 @@ class Stepper(ABC):
         self.solution = self.solve(self.balance)
         if self.model.contact.any:
             walls = self.solution.walls
-            self.model.contact.log.book(walls, self.part)
+            self.model.contact.log.book(walls, self.part, self.model.comm)
             if self.model.contact.ties.any:
                 self.model.contact.ties.take(walls.nodes, walls.touching, walls.places, self.balance.time)
         self.scheme.finish(state, self.balance, self.solution.u, self.part)

@@ -1,0 +1,65 @@
+"""Contact times between rows of the history that are far apart: bounded memory, the same sums."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+from pfem_petsc.contact import log as logs
+from pfem_petsc.contact.log import ContactLog
+
+pytestmark = pytest.mark.parallel
+
+
+def walls(contacts):
+    """Forces of a step in which this rank has so many nodes on each wall."""
+    n = len(contacts)
+    nodes, touching = np.empty(0, np.int64), np.zeros((0, n), bool)
+    return SimpleNamespace(contacts=np.array(contacts), nodes=nodes, touching=touching, force=np.zeros((n, 3)))
+
+
+def booked(log, comm, steps, start=0):
+    """Two walls: one that a rank touches at a time in turn with none, one that only the last rank touches."""
+    for i in range(start, steps):
+        turn = i % (comm.size + 1)
+        log.book(walls([3 * (turn == comm.rank), (i % 5 == 0) * (comm.rank == comm.size - 1)]), 1.0 + 0.25 * i, comm)
+    return log
+
+
+def expected(comm, steps):
+    i = np.arange(steps)
+    lengths = 1.0 + 0.25 * i
+    return lengths[i % (comm.size + 1) < comm.size].sum(), lengths[i % 5 == 0].sum()
+
+
+@pytest.mark.parametrize("steps", [0, 3, 40, 41, 167])
+def test_time_on_walls_of_many_steps_without_a_row(comm, monkeypatch, steps):
+    monkeypatch.setattr(logs, "_PENDING", 40)
+    log = booked(ContactLog(7, 2), comm, steps)
+    assert len(log._steps) == len(log._flags) == 40
+    log.meet(comm)
+    # multiples of a quarter: exact in any order
+    np.testing.assert_array_equal(log.time, expected(comm, steps))
+
+
+def test_pending_steps_come_back_from_a_checkpoint(comm, monkeypatch):
+    """Also on other numbers of ranks: all have what any has."""
+    monkeypatch.setattr(logs, "_PENDING", 40)
+    whole, stopped, again = (ContactLog(7, 2) for _ in range(3))
+    booked(whole, comm, 167).meet(comm)
+    booked(stopped, comm, 99)
+    share, times = stopped.share(), stopped.times(comm)
+    again.put_back(share, times, np.zeros((7, 2), bool))
+    assert len(times["steps"]) == 19
+    booked(again, comm, 167, start=99).meet(comm)
+    assert again.time.tobytes() == whole.time.tobytes()
+
+
+def test_no_walls(comm):
+    log = ContactLog(3, 0)
+    for _ in range(10):
+        log.book(walls([]), 1.0, MPI.COMM_SELF)
+    log.put_back(log.share(), log.times(comm), np.zeros((3, 0), bool))
+    log.meet(comm)
+    assert len(log.time) == 0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +16,7 @@ from ..output.units import prefix_for
 from .camera import VIEWS, Camera, aim
 from .fields import ColourField, ColourScale
 from .headless import require_rendering
-from .walls import Surface, wall_surfaces
+from .walls import Surface, wall_shifts, wall_surfaces
 
 __all__ = ["render"]
 
@@ -151,7 +151,7 @@ def _emptied(folder: Path) -> Path:
 
 @dataclass
 class _Film:
-    """What all frames share: where the structure goes, its walls, and its colours."""
+    """What all frames share: where the structure and its walls go, and its colours."""
 
     result: Any
     colour: ColourField
@@ -170,11 +170,33 @@ class _Film:
             low, high = np.fmin(low, points.min(axis=0)), np.fmax(high, points.max(axis=0))
         self.bounds = np.array([low, high])
         walls = list(self.result.case.wall)
-        self.surfaces: list[Surface] = wall_surfaces(walls, self.bounds, self.note)
+        self.surfaces = self._moved(walls)
         self.normals = [np.asarray(wall.normal, dtype=float) for wall in walls if hasattr(wall, "normal")]
         self.normals = [normal / np.linalg.norm(normal) for normal in self.normals]
         times = np.asarray(self.result.times, dtype=float)
         self.time_factor, self.time_unit = prefix_for(float(np.abs(times).max()), "s")
+
+    def _moved(self, walls: Sequence[Any]) -> dict[int, list[Surface]]:
+        """Frame to the surfaces of the walls where they are then; a wall at rest has the same one in all."""
+        shifts = dict(zip(self.frames, wall_shifts(self.result, self.result.times[list(self.frames)]), strict=True))
+        still = {surface.name: surface for surface in wall_surfaces(walls, self.bounds, self.note)}
+        surfaces: dict[int, list[Surface]] = {frame: [] for frame in self.frames}
+        for k, wall in enumerate(walls):
+            if wall.name not in still:
+                continue
+            for frame in self.frames:
+                surface, shift = still[wall.name], self.scale * shifts[frame][k]
+                if shift.any():
+                    point = tuple((np.asarray(wall.point) + shift).tolist())
+                    (surface,) = wall_surfaces([wall.model_copy(update={"point": point})], self.bounds)
+                surfaces[frame].append(surface)
+        return surfaces
+
+    @property
+    def places(self) -> Iterator[np.ndarray]:
+        """Points (n, 3) [m] of all different wall surfaces."""
+        for surface in {id(s): s for surfaces in self.surfaces.values() for s in surfaces}.values():
+            yield surface.points
 
     def positions(self, frame: int) -> np.ndarray:
         points = np.asarray(self.result.positions(frame), dtype=float)
@@ -187,11 +209,11 @@ class _Film:
         corners = np.array(np.meshgrid(*self.bounds.T)).reshape(3, -1).T
         near = [corners]
         size = float(np.linalg.norm(self.bounds[1] - self.bounds[0])) or 1.0
-        for surface in self.surfaces:
+        for points in self.places:
             # a wall far away would make the structure a dot: it is drawn, but not aimed at
-            gap = np.maximum(surface.points.min(axis=0) - self.bounds[1], self.bounds[0] - surface.points.max(axis=0))
+            gap = np.maximum(points.min(axis=0) - self.bounds[1], self.bounds[0] - points.max(axis=0))
             if gap.max() < 0.6 * size:
-                near.append(surface.points)
+                near.append(points)
         return aim(np.concatenate(near), self.bounds, self.normals, self.view, aspect, self._upward())
 
     def _upward(self) -> tuple[float, float, float]:
@@ -206,11 +228,11 @@ class _Film:
     def scene(self, camera: Camera, size: tuple[int, int], style: dict[str, Any]) -> Any:
         from .scene import Scene
 
-        return Scene(self.start, self.bars, camera, self.bounds, self.surfaces, size, **style)
+        return Scene(self.start, self.bars, camera, self.bounds, self.surfaces[self.frames[0]], size, **style)
 
     def draw(self, scene: Any, frame: int) -> np.ndarray:
         colours = self.colours.colours(self.colour.values(frame))
-        return scene.draw(self.positions(frame), colours, self.colour.on_nodes)
+        return scene.draw(self.positions(frame), colours, self.colour.on_nodes, self.surfaces[frame])
 
 
 def _draw_frames(film: _Film, folder: Path, size: tuple[int, int], title: str, style: dict[str, Any]) -> list[Path]:
@@ -236,9 +258,7 @@ def _draw_poster(film: _Film, file: Path, title: str, style: dict[str, Any]) -> 
     tiles = instants(film.result, film.frames, POSTER_TILES)
     look = film.camera(1.0)
     corners = np.array(np.meshgrid(*film.bounds.T)).reshape(3, -1).T
-    shape = [
-        np.ptp(np.concatenate([corners, *(s.points for s in film.surfaces)]) @ way) for way in (look.right, look.up)
-    ]
+    shape = [np.ptp(np.concatenate([corners, *film.places]) @ way) for way in (look.right, look.up)]
     size = (1600, 900)
     _, _, width, height = Page.region_of(size)
     columns, rows = grid(len(tiles), shape[0] / max(shape[1], 1e-3 * shape[0]), (width, height))

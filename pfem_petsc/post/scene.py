@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -26,7 +27,7 @@ class Scene:
     bars : (b, 2) int, ends of the bars
     camera : the view of all frames
     bounds : (2, 3) [m], bounds of the motion, for depth
-    surfaces : walls
+    surfaces : walls of the first frame
     size : width and height in pixels
     bar_width : in pixels; None: from the length of the bars in the picture
     nodes : draw nodes as balls; None: for small models
@@ -67,8 +68,7 @@ class Scene:
         plotter.background_color = "white"
         if not self._tubes:
             plotter.enable_anti_aliasing("msaa", multi_samples=4)
-        for surface in surfaces:
-            self._add_wall(surface)
+        self._walls = [self._add_wall(surface) for surface in surfaces]
         # reference points far from the origin lose digits in the single precision of the graphics
         self._origin = camera.centre.copy()
         lines = np.column_stack([np.full(len(bars), 2), bars]).ravel()
@@ -91,7 +91,9 @@ class Scene:
             ball.SetPosition(*self._origin)
         camera.apply(plotter.camera)
 
-    def draw(self, points: np.ndarray, colours: np.ndarray, on_nodes: bool) -> np.ndarray:
+    def draw(
+        self, points: np.ndarray, colours: np.ndarray, on_nodes: bool, surfaces: Sequence[Surface] | None = None
+    ) -> np.ndarray:
         """Draw a frame.
 
         Parameters
@@ -99,11 +101,16 @@ class Scene:
         points : (n, 3) float64 [m]
         colours : (n, 3) uint8 of nodes or (b, 3) of bars
         on_nodes : whether the colours are those of nodes
+        surfaces : the walls where they are now; None: where they were
 
         Returns
         -------
         (height, width, 3) uint8
         """
+        if surfaces is not None:
+            for surface, meshes in zip(surfaces, self._walls, strict=True):
+                for mesh in meshes:
+                    mesh.points = self._behind(surface.points)
         moved = (points - self._origin).astype(np.float32)
         self._lines.points = moved
         if self._balls is not None:
@@ -156,13 +163,17 @@ class Scene:
         depth = np.clip((self._near - places @ self._camera.towards) / self._deep, 0.0, 1.0)
         return (colours + (255.0 - colours) * (0.5 * depth)[:, None]).astype(np.uint8)
 
-    def _add_wall(self, surface: Surface) -> None:
+    def _behind(self, points: np.ndarray) -> np.ndarray:
+        """Points of a wall as drawn: without perspective behind all bars, so that it never dims one that touches it."""
+        if self._camera.parallel:
+            points = points - 3.0 * self._camera.half_height * self._camera.towards
+        return points
+
+    def _add_wall(self, surface: Surface) -> list[Any]:
+        """Draw a wall; its meshes, whose points move with it."""
         import pyvista
 
-        points = surface.points
-        if self._camera.parallel:
-            # without perspective a wall may stand behind all bars, so that it never dims one that touches it
-            points = points - 3.0 * self._camera.half_height * self._camera.towards
+        points = self._behind(surface.points)
         first = points[surface.faces[0]]
         normal = np.cross(first[1] - first[0], first[2] - first[1])
         facing = float(normal @ self._camera.towards) / (np.linalg.norm(normal) or 1.0)
@@ -175,12 +186,15 @@ class Scene:
         rgba[:, 3] = strength * (1.0 - np.clip(surface.depth, 0.0, 1.0))
         body.point_data["colour"] = rgba
         self._plotter.add_mesh(body, scalars="colour", rgb=True, lighting=False, reset_camera=False)
+        meshes = [body]
         if len(surface.edge):
             lines = np.column_stack([np.full(len(surface.edge), 2), surface.edge]).ravel()
+            meshes.append(pyvista.PolyData(points, lines=lines))
             self._plotter.add_mesh(
-                pyvista.PolyData(points, lines=lines),
+                meshes[-1],
                 color=EDGE_COLOUR,
                 line_width=2.0 * self._factor,
                 lighting=False,
                 reset_camera=False,
             )
+        return meshes

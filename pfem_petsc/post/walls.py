@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from ..contact.motion import WallMotion
 from ..errors import InputError
 from ..registry import lookup
 
-__all__ = ["Surface", "plane", "revolved", "slab", "wall_surfaces"]
+__all__ = ["Surface", "plane", "revolved", "slab", "wall_shifts", "wall_surfaces"]
 
 
 @dataclass(frozen=True)
@@ -120,3 +121,20 @@ def wall_surfaces(walls: Iterable[Any], bounds: np.ndarray, note: Callable[[str]
             shape = Surface(wall.name, points, faces, depth=np.zeros(len(points)), edge=edge)
         drawn.append(shape)
     return drawn
+
+
+def wall_shifts(result: Any, times: Sequence[float]) -> np.ndarray:
+    """Displacements (times, walls, 3) [m] of a result's walls from where the case puts them.
+
+    Walls with mass are where the history has them, linear between its rows; the others where the case moves them.
+    """
+    walls = list(result.case.wall)
+    motion = WallMotion(walls)
+    shifts = np.array([motion.shifts(time) for time in times]).reshape(len(times), len(walls), 3)
+    for k, wall in enumerate(walls):
+        if wall.mass is not None:
+            when = np.asarray(result.history["time"], dtype=float)
+            places = np.asarray(result.history[f"wall/{wall.name}/position"], dtype=float)
+            for axis in range(3):
+                shifts[:, k, axis] = np.interp(times, when, places[:, axis] - places[0, axis])
+    return shifts

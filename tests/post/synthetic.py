@@ -9,7 +9,10 @@ import numpy as np
 
 from pfem_petsc.mesh.distribution import DistributedMesh
 
-WALL = SimpleNamespace(type="plane", name="wall", node_set=None, point=(1.2, 0.0, 0.0), normal=(-1.0, 0.0, 0.0))
+AT_REST = {"velocity": None, "motion": None, "mass": None}
+WALL = SimpleNamespace(
+    type="plane", name="wall", node_set=None, point=(1.2, 0.0, 0.0), normal=(-1.0, 0.0, 0.0), **AT_REST
+)
 
 
 def ring(bays: int = 14) -> tuple[np.ndarray, np.ndarray]:

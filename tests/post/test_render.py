@@ -11,8 +11,9 @@ import imageio_ffmpeg
 import numpy as np
 import pytest
 from PIL import Image
-from synthetic import WALL, SyntheticResult, lattice, ring, rod, write_result
+from synthetic import AT_REST, WALL, SyntheticResult, lattice, ring, rod, write_result
 
+from pfem_petsc.contact.walls.plane import Parameters
 from pfem_petsc.errors import InputError
 from pfem_petsc.post import headless
 from pfem_petsc.post.page import Page
@@ -91,10 +92,31 @@ def test_wall_is_seen_where_it_is(tmp_path):
     assert row[darkest - 3] == 255 and row[darkest] < 150 < row[darkest + 8] < 255
 
 
+@pytest.mark.parametrize(
+    "moves",
+    [
+        {"velocity": (8.0, 0.0, 0.0)},
+        {"motion": ((0.0, 0.0, 0.0, 0.0), (0.05, 0.4, 0.0, 0.0))},
+        {"mass": 2.0, "velocity": (-1.0, 0.0, 0.0)},
+    ],
+    ids=lambda moves: next(iter(moves)),
+)
+def test_wall_is_drawn_where_it_is_then(moves, tmp_path):
+    """To the right by 0.4 m: by velocity, by a table, or as the history has it."""
+    wall = Parameters(type="plane", name="wall", point=WALL.point, normal=WALL.normal, **moves)
+    result = SyntheticResult(tmp_path / "x", *ring(), walls=[wall])
+    places = np.array(wall.point) + np.outer(result.history["time"], [8.0, 0.0, 0.0])
+    result.history["wall/wall/position"] = places
+    first, last = (drawing(file) for file in draw(tmp_path, result, frames=[0, 12]))
+    faces = [int(np.argmin(picture[picture.shape[0] // 22, :, 0])) for picture in (first, last)]
+    start = inked(first)[1].min()  # of the ring at x = -1; the wall is at 1.2
+    assert faces[1] - faces[0] == pytest.approx(0.4 / 2.2 * (faces[0] - start), abs=2.0)
+
+
 def test_unknown_wall_is_left_out_with_a_note(tmp_path):
     notes = []
     result = SyntheticResult(tmp_path / "x", *ring())
-    result.case.wall = [SimpleNamespace(type="pyramid", name="tomb")]
+    result.case.wall = [SimpleNamespace(type="pyramid", name="tomb", **AT_REST)]
     draw(tmp_path, result, frames=[0], note=notes.append)
     assert notes == ["wall 'tomb' is left out of the picture: type 'pyramid' has no drawing"]
 

@@ -93,6 +93,7 @@ class Simulation:
         self.stepper = make_stepper(self.model, self.plan)
         self.fields = Fields(self.model)
         self.row: dict[str, Any] | None = None
+        self._last_snapshot = -1  # its step
         self._started = False
         self._asked = 0  # code of a request to stop, zero for none
         self._writer: ResultWriter | None = None
@@ -166,6 +167,7 @@ class Simulation:
         if self.restart is not None:
             continues = self.restart.continues
             self.row = self._checkpoints.state.put_back_sums(checkpoint, self.ledger, self.recorder)
+            self._last_snapshot = self.restart.last[0]
             changes = f"; changed: {'; '.join(self.restart.changed)}" if self.restart.changed else ""
             self._progress.message(
                 f"restart from {self.restart.path}: step {self.state.step}, t = {engineering(self.state.time, 's')}"
@@ -183,6 +185,7 @@ class Simulation:
             attributes=self._attributes(),
             precision=self.case.output.precision,
             append_after_step=self.state.step if continues else None,
+            last=self.restart.last if continues else None,
         )
         if not continues:
             self._record()
@@ -212,8 +215,8 @@ class Simulation:
             while self.state.step < self.plan.steps:
                 yield self._advance()
                 self._stop_early(self._asked)
-            if self._checkpoints.wanted:
-                self._checkpoint()
+            # where a run that was killed after its last checkpoint had not got to it
+            self._complete()
             self._finish("done")
         except (GeneratorExit, EarlyStop):
             self._finish("stopped")
@@ -252,11 +255,11 @@ class Simulation:
         step = self.state.step
         last = step == self.plan.steps
         row = None
-        snapshot = last or bool(output.fields_every and step % output.fields_every == 0)
+        snapshot = bool(output.fields_every and step % output.fields_every == 0)
         checkpoint = self._checkpoints.due(step)
-        if step % output.history_every == 0 or last:
+        if step % output.history_every == 0:
             row = self._record()
-        elif snapshot or checkpoint:
+        elif snapshot or checkpoint or last:
             self._asked = self._meet()
         if self._meetings.due(step):
             self._asked = self._meet()
@@ -264,6 +267,8 @@ class Simulation:
             self._snapshot()
         if checkpoint or self._meetings.checkpoint_due:
             self._checkpoint()
+        if last:
+            row = self._complete()
         scale = self.recorder.energy_scale
         drift = self.row["energy_imbalance"] / scale if scale > 0.0 else None
         self._progress.update(
@@ -286,6 +291,20 @@ class Simulation:
         self._writer.append_history(row if self.comm.rank == 0 else None)
         return row
 
+    def _complete(self) -> dict[str, Any]:
+        """Bring checkpoint and results to the end of the run, and give its last row.
+
+        The checkpoint comes before a row and a snapshot off their schedule: a run that is given a later end goes on as
+        if they had not been.
+        """
+        if self._checkpoints.wanted:
+            self._checkpoint()
+        if self.row["step"] != self.state.step:
+            self._record()
+        if self._last_snapshot != self.state.step:
+            self._snapshot()
+        return self.row
+
     def _meet(self) -> int:
         """All ranks agree on faults, which are raised on all, and on a request to stop: its code, or zero."""
         return self._meetings.meet(self.state.step, self.stepper.fault)
@@ -293,7 +312,7 @@ class Simulation:
     def _checkpoint(self) -> None:
         """Results first: what the checkpoint goes on from must be in them."""
         self._writer.flush_history()
-        self._checkpoints.write(self.ledger, self.recorder, self.row)
+        self._checkpoints.write(self.ledger, self.recorder, self.row, self._last_snapshot)
         self._meetings.checkpoint_written()
 
     def _stop_early(self, code: int) -> None:
@@ -313,6 +332,7 @@ class Simulation:
         self._writer.write_snapshot(
             state.time, state.step, state.position, fields.at_nodes(state), fields.at_bars(state)
         )
+        self._last_snapshot = state.step
 
     def _finish(self, outcome: str) -> None:
         writer, self._writer = self._writer, None

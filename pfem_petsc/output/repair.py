@@ -18,8 +18,14 @@ from .provenance import read_attributes, write_case
 __all__ = ["reopen", "repair"]
 
 
-def repair(path: Path | str, after_step: int | None = None) -> tuple[int, int]:
-    """Cut off what a killed run left incomplete, and everything later than step ``after_step``. One process.
+def repair(path: Path | str, last: tuple[int, int] | None = None) -> tuple[int, int]:
+    """Cut off what a killed run left incomplete, and everything after the ``last`` steps. One process.
+
+    Parameters
+    ----------
+    path : Path or str
+    last : (int, int), optional
+        Steps of the last snapshot and of the last history row that are kept.
 
     Returns
     -------
@@ -37,9 +43,9 @@ def repair(path: Path | str, after_step: int | None = None) -> tuple[int, int]:
     with readable(path), h5py.File(path, "r+", locking=False) as file:
         n_snapshots, n_rows = complete_snapshots(file), complete_rows(file)
         vtk, steps, history = file["VTKHDF"], file["VTKHDF/Steps"], file["history"]
-        if after_step is not None:
-            n_snapshots = int(np.searchsorted(file["snapshots/step"][:n_snapshots], after_step, side="right"))
-            n_rows = int(np.searchsorted(history["step"][:n_rows], after_step, side="right"))
+        if last is not None:
+            n_snapshots = int(np.searchsorted(file["snapshots/step"][:n_snapshots], last[0], side="right"))
+            n_rows = int(np.searchsorted(history["step"][:n_rows], last[1], side="right"))
         # VTK's reader crashes on more times than steps: the times go first.
         if len(steps["Values"]) > n_snapshots:
             grow(steps["Values"], n_snapshots)
@@ -70,6 +76,7 @@ def repair(path: Path | str, after_step: int | None = None) -> tuple[int, int]:
 def reopen(
     path: Path,
     after_step: int,
+    last: tuple[int, int],
     sizes: tuple[int, int],
     fields: Mapping[str, list[str]],
     columns: Mapping[str, tuple[int, ...]],
@@ -82,7 +89,9 @@ def reopen(
     ----------
     path : Path
     after_step : int
-        What is later is dropped.
+        The step that the run goes on from.
+    last : (int, int)
+        Steps of the last snapshot and of the last history row that are kept.
     sizes : (int, int)
         Nodes and bars of the case.
     fields : mapping of "PointData" and "CellData" to sorted names
@@ -95,7 +104,7 @@ def reopen(
     InputError
         When the file is missing, damaged, or of another mesh, other fields or columns.
     """
-    n_snapshots, _ = repair(path, after_step)
+    n_snapshots, _ = repair(path, last)
     with h5py.File(path, "r+", locking=False) as file:
         vtk = file["VTKHDF"]
         has = (int(vtk["NumberOfPoints"][0]), int(vtk["NumberOfCells"][0]))

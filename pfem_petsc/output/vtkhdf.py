@@ -67,6 +67,8 @@ class ResultWriter:
         Of the fields. Points stay float64: strain from positions in single precision is noise.
     append_after_step : int, optional
         Continue an existing file: what is later than this step is dropped.
+    last : (int, int), optional
+        Steps of the last snapshot and of the last history row that are kept then, where not all up to that step are.
 
     Raises
     ------
@@ -89,6 +91,7 @@ class ResultWriter:
         attributes: Mapping[str, Any],
         precision: str = "float64",
         append_after_step: int | None = None,
+        last: tuple[int, int] | None = None,
     ) -> None:
         require_parallel_hdf5(comm)
         self.path, self.comm = Path(path), comm
@@ -109,7 +112,10 @@ class ResultWriter:
         if append_after_step is None:
             create_new(self.path, comm, create_result, *sizes, columns, column_types, case_text, described)
         else:
-            on_root(comm, reopen, self.path, append_after_step, sizes, self._fields, columns, case_text, described)
+            last = last or (append_after_step, append_after_step)
+            on_root(
+                comm, reopen, self.path, append_after_step, last, sizes, self._fields, columns, case_text, described
+            )
         with writing(comm, self.path):
             self._file = open_shared(self.path, comm)
         vtk, steps = self._file["VTKHDF"], self._file["VTKHDF/Steps"]

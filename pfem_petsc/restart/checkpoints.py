@@ -43,15 +43,15 @@ class Checkpoints:
         every = self.case.output.checkpoint_every
         return bool(every) and step % every == 0
 
-    def write(self, ledger, recorder, row: dict[str, Any]) -> None:
-        """Write one, which becomes the newest. Collective.
+    def write(self, ledger, recorder, row: dict[str, Any], snapshot: int) -> None:
+        """Write one, with the last history row and the step of the last snapshot. It becomes the newest. Collective.
 
         Raises
         ------
         SimulationFailure
             On all ranks; those before stay.
         """
-        scalars = self.state.scalars(ledger, recorder, row)
+        scalars = self.state.scalars(ledger, recorder, row, snapshot)
         if scalars["step"] == self.last_step:
             return
         attributes = {

@@ -44,6 +44,11 @@ class Restart:
         """The step after which it was written."""
         return int(self.scalars["step"])
 
+    @property
+    def last(self) -> tuple[int, int]:
+        """Steps of the last snapshot and of the last history row before it."""
+        return int(self.scalars["snapshot"]), int(self.scalars["row"]["step"])
+
 
 def find_restart(case, comm: MPI.Comm, folder: Path, asked: bool | Path | None) -> Restart | str | None:
     """What ``--restart`` means for an output folder. Collective.
@@ -79,7 +84,9 @@ def _finished(case, path: Path, end: float) -> bool:
         return False
     try:
         with results.open_result(path) as result:
-            reached = float(result.history["time"][-1]) if len(result.history["time"]) else -1.0
+            reached = min(
+                (float(times[-1]) for times in (result.history["time"], result.times) if len(times)), default=-1.0
+            )
             changed_keys(path, result.case.to_dict(), case.to_dict(), case.source)
     except InputError:
         # of another case, or not readable: it is moved aside
@@ -108,11 +115,10 @@ def prepare_folder(comm: MPI.Comm, folder: Path, restart: Restart | None) -> Pat
 
 def _refuse_gap(path: Path, restart: Restart) -> None:
     """Results that end before the checkpoint cannot be continued from it."""
-    every = int(restart.attributes["case"]["output"]["history_every"])
     with results.open_result(path) as result:
         steps = result.history["step"]
         last = int(steps[-1]) if len(steps) else -1
-    if last < restart.step // every * every:
+    if last < restart.last[1]:
         raise InputError(
             f"{path}: the history ends at step {last}, before {restart.path}, written after step {restart.step}: they "
             "belong to different runs; restart into another folder (-o), where new results begin at the checkpoint"

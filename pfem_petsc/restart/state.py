@@ -22,7 +22,7 @@ from ..parallel.natural import NaturalOrder
 
 __all__ = ["STATE_VERSION", "RunState"]
 
-STATE_VERSION = 1
+STATE_VERSION = 2
 """Changed with the meaning of what is saved."""
 
 _MEMORY = "memory."
@@ -61,8 +61,8 @@ class RunState:
         bars = {name: (self.bar_order, array[self.counted]) for name, array in self._bar_arrays().items()}
         return {**nodes, **bars}
 
-    def scalars(self, ledger, recorder, row: dict[str, Any]) -> dict[str, Any]:
-        """The numbers. Collective."""
+    def scalars(self, ledger, recorder, row: dict[str, Any], snapshot: int) -> dict[str, Any]:
+        """The numbers; the last history row, and the step of the last snapshot. Collective."""
         stepper, energy, walls = self.stepper, self.stepper.energy, self.stepper.solution.walls
         mine = {
             "work": ledger.work.tolist(),
@@ -80,7 +80,8 @@ class RunState:
             "start_energy": recorder.start_energy,
             "free_walls": free.kept() if (free := self.model.contact.motion.free) is not None else None,
             "contact_times": self.model.contact.log.times(self.comm),
-            "row": {name: float(row[name]) for name in ("energy_imbalance", "active_contacts")},
+            "row": {name: float(row[name]) for name in ("energy_imbalance", "active_contacts", "step")},
+            "snapshot": snapshot,
             "node_arrays": sorted(set().union(*self.comm.allgather(set(self._node_arrays())))),
             "memories": memories,
             "bar_arrays": sorted(self._bar_arrays()),

@@ -89,6 +89,68 @@ def test_restart_on_as_many_ranks_is_bitwise(comm, shared_tmp_path, name):
     assert everywhere(comm, differences, *(folder / "result.vtkhdf" for folder in folders)) == {}
 
 
+EXTENDED = {
+    "central differences": ("rod_impact", ("time.step=0.01",), 0.01),
+    "newmark": ("rod_impact", ("time.step=0.01", "time.integrator=newmark"), 0.01),
+    "houbolt": ("pendulum", ("time.step=1e-3", "time.integrator=houbolt"), 1e-3),
+    "plastic lattice": ("lattice_drop", ("mesh.cells=[3,3,3]", "time.step=1e-6"), 1e-6),
+}
+SPARSE = ("output.history_every=4", "output.fields_every=6", "output.checkpoint_every=25")
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize(
+    ("name", "end"), [("central differences", 33), ("newmark", 42), ("houbolt", 36), ("plastic lattice", 33)]
+)
+def test_finished_run_with_a_later_end_is_the_run_that_had_it_from_the_start(comm, shared_tmp_path, name, end):
+    """The former end is off the schedule of rows, of snapshots, or both: what was written for it goes."""
+    case, overrides, step = EXTENDED[name]
+    folders = shared_tmp_path / "whole", shared_tmp_path / "longer"
+    overrides = (*overrides, *SPARSE)
+    simulate(case, (*overrides, f"time.end={70 * step}"), folders[0], comm)
+    assert simulate(case, (*overrides, f"time.end={end * step}"), folders[1], comm) == end
+    assert everywhere(comm, _last_steps, folders[1]) == (end, end)
+    assert simulate(case, (*overrides, f"time.end={70 * step}"), folders[1], comm, restart=True) == 70
+    assert everywhere(comm, differences, *(folder / "result.vtkhdf" for folder in folders)) == {}
+
+
+def _last_steps(folder):
+    with open_result(folder) as result:
+        return int(result.history["step"][-1]), int(result.steps[-1])
+
+
+class Killed(Exception):
+    """In place of a signal that nobody can catch."""
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("lost", ["row", "snapshot"])
+def test_killed_between_the_last_checkpoint_and_the_end_of_the_results(comm, shared_tmp_path, monkeypatch, lost):
+    case, overrides, step = EXTENDED["newmark"]
+    folders = shared_tmp_path / "whole", shared_tmp_path / "killed"
+    overrides = (*overrides, *SPARSE, f"time.end={33 * step}")
+    simulate(case, overrides, folders[0], comm)
+
+    def killed(self):
+        if self.state.step != 33:
+            return done(self)
+        if lost == "snapshot":
+            self._writer.flush_history()
+        raise Killed
+
+    with monkeypatch.context() as patch:
+        done = Simulation._record if lost == "row" else Simulation._snapshot
+        patch.setattr(Simulation, "_record" if lost == "row" else "_snapshot", killed)
+        simulation = Simulation(Case.load(case, overrides), comm, output=folders[1], quiet=True)
+        with pytest.raises(Killed):
+            simulation.run()
+        simulation._finish("failed")
+    assert everywhere(comm, _last_steps, folders[1]) == (32 if lost == "row" else 33, 30)
+    assert simulate(case, overrides, folders[1], comm, restart=True) == 33
+    assert everywhere(comm, differences, *(folder / "result.vtkhdf" for folder in folders)) == {}
+    assert everywhere(comm, _last_steps, folders[1]) == (33, 33)
+
+
 @pytest.mark.parallel
 @pytest.mark.parametrize("name", ["central differences", "houbolt", "plastic lattice", "newmark"])
 def test_restart_on_another_number_of_ranks(comm, shared_tmp_path, name):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import types
 import typing
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, TypeVar
 
 from pydantic import ValidationError
@@ -78,7 +78,16 @@ class Problems:
             lines.append(f"{self.source}: ... and {len(self.lines) - MOST} more")
         raise InputError("\n".join(lines))
 
-    def read(self, model: type[M], data: Any, path: Path, *, known: Sequence[str] = (), taker: str = "") -> M | None:
+    def read(
+        self,
+        model: type[M],
+        data: Any,
+        path: Path,
+        *,
+        known: Sequence[str] = (),
+        taker: str = "",
+        siblings: Callable[[], Mapping[str, Sequence[str]]] = dict,
+    ) -> M | None:
         """Validate a table; None, with the problems noted, where it is refused.
 
         Parameters
@@ -88,6 +97,7 @@ class Problems:
         path : where it is
         known : keys of the same table that are not the model's own (for hints)
         taker : name of the scheme, generator or wall that takes these keys, named where one is unknown
+        siblings : gives the other choices by name with the keys that they take, to tell whose a key is
         """
         if not isinstance(data, Mapping):
             self.add(path, "expected a table", data)
@@ -98,16 +108,26 @@ class Problems:
             self.add(path, str(error))
         except ValidationError as error:
             for item in error.errors(include_url=False):
-                self._describe(model, item, path, known, taker)
+                self._describe(model, item, path, known, taker, siblings)
         return None
 
-    def _describe(self, model: type[StrictModel], item: Any, path: Path, known: Sequence[str], taker: str) -> None:
+    def _describe(
+        self,
+        model: type[StrictModel],
+        item: Any,
+        path: Path,
+        known: Sequence[str],
+        taker: str,
+        siblings: Callable[[], Mapping[str, Sequence[str]]],
+    ) -> None:
         where: Path = (*path, *item["loc"])
         kind, value, context = item["type"], item["input"], item.get("ctx", {})
         field = model.model_fields.get(str(item["loc"][0])) if item["loc"] else None
         about = f" ({field.description.strip().rstrip('.')})" if field is not None and field.description else ""
         if kind == "extra_forbidden":
-            text = _unknown_key(str(item["loc"][-1]), list(model.model_fields), known, taker)
+            key = str(item["loc"][-1])
+            owners = [name for name, keys in siblings().items() if key in keys] if len(item["loc"]) == 1 else []
+            text = _unknown_key(key, list(model.model_fields), known, taker, owners)
             if taker and where not in self.overridden and any(p[:-1] == where[:-1] for p in self.overridden):
                 text += f"; --set {key_text(where)}= takes it out"
             self.add(where, text)
@@ -127,12 +147,14 @@ def _short(value: Any, most: int = 60) -> str:
     return text if len(text) <= most else f"{text[: most - 4]} ..."
 
 
-def _unknown_key(key: str, own: list[str], shared: Sequence[str], taker: str) -> str:
+def _unknown_key(key: str, own: list[str], shared: Sequence[str], taker: str, owners: Sequence[str]) -> str:
     if not taker:
         return f"unknown key{nearest(key, own)}"
-    takes = f"{taker} takes {', '.join(own) if own else 'no parameters'}"
+    keys = ", ".join(own) if own else "no parameters"
+    if owners:
+        return f"a key of {', '.join(owners)}, not of {taker}, which takes {keys}"
     hint = nearest(key, [*own, *shared])
-    return f"unknown key; {takes}" + (hint if hint.startswith(", did") else "")
+    return f"unknown key; {taker} takes {keys}" + (hint if hint.startswith(", did") else "")
 
 
 def _plain(annotation: Any) -> Any:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from ..errors import InputError
-from ..registry import lookup, nearest
+from ..registry import choices, lookup, nearest
 from . import settings as s
 from . import tables as t
 from .base import StrictModel
@@ -137,6 +137,12 @@ def _parameters_model(package: str, name: Any, path: KeyPath, problems: Problems
     return None
 
 
+def _siblings(package: str) -> dict[str, list[str]]:
+    """All choices in a package, with the keys that they take."""
+    models = {name: getattr(lookup(package, name, ""), "Parameters", None) for name in choices(package)}
+    return {name: list(model.model_fields) for name, model in models.items() if model is not None}
+
+
 def _mesh(data: Mapping[str, Any], folder: Path, problems: Problems) -> t.Mesh | None:
     table = _required(data, "mesh", problems)
     if table is None:
@@ -153,7 +159,9 @@ def _mesh(data: Mapping[str, Any], folder: Path, problems: Problems) -> t.Mesh |
     if model is None:
         return None
     taker = f"generator {keys.generator}"
-    parameters = problems.read(model, others, ("mesh",), known=["generator", "file"], taker=taker)
+    parameters = problems.read(
+        model, others, ("mesh",), known=["generator", "file"], taker=taker, siblings=lambda: _siblings(GENERATORS)
+    )
     return None if parameters is None else t.Mesh(generator=keys.generator, parameters=parameters)
 
 
@@ -189,7 +197,8 @@ def _walls(data: Any, problems: Problems) -> list[StrictModel]:
         model = _parameters_model(WALLS, row["type"], (*path, "type"), problems)
         if model is not None:
             named = {"name": f"wall{i + 1}", **row}
-            walls.append(problems.read(model, named, path, taker=f"a wall of type {row['type']}"))
+            taker = f"a wall of type {row['type']}"
+            walls.append(problems.read(model, named, path, taker=taker, siblings=lambda: _siblings(WALLS)))
     return [wall for wall in walls if wall is not None]
 
 
@@ -211,7 +220,8 @@ def _time(data: Mapping[str, Any], problems: Problems) -> s.Time | None:
     model = _parameters_model(INTEGRATORS, name, ("time", "integrator"), problems)
     if model is None:
         return None
-    scheme = problems.read(model, others, ("time",), known=list(s.TimeKeys.model_fields), taker=name)
+    known = list(s.TimeKeys.model_fields)
+    scheme = problems.read(model, others, ("time",), known=known, taker=name, siblings=lambda: _siblings(INTEGRATORS))
     automatic = keys is not None and keys.step == "auto"
     if automatic and not lookup(INTEGRATORS, name, "time.integrator").Scheme.explicit:
         message = f"only explicit schemes can choose their step, and {name} is implicit: give it in seconds"

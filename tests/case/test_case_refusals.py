@@ -43,7 +43,16 @@ REFUSED = {
     ),
     "generator and file": (["mesh.file=a.msh"], ["mesh", "exactly one of the keys generator, file"]),
     "unknown integrator": (["time.integrator=newmrk"], ["time.integrator", '"newmrk"', "did you mean 'newmark'?"]),
-    "other scheme's key": (["time.beta=0.5"], ["time.beta", "central_differences takes no parameters"]),
+    "other scheme's key": (
+        ["time.beta=0.5"],
+        ["time.beta", "a key of chung_lee, newmark, not of central_differences, which takes no parameters"],
+    ),
+    "other scheme's key where one is like it": (
+        ["time.integrator=wilson", "time.beta=0.5"],
+        ["time.beta", "a key of chung_lee, newmark, not of wilson, which takes theta"],
+    ),
+    "other wall's key": (["wall.0.radius=1.0"], ["wall[0].radius", "a key of cylinder, sphere, not of a wall of type"]),
+    "other generator's key": (["mesh.cells=[1,1,1]"], ["mesh.cells", "a key of lattice, not of generator rod"]),
     "misspelt scheme key": (
         ["time.integrator=newmark", "time.betta=0.5"],
         ["time.betta", "newmark takes beta, gamma", "did you mean 'beta'?"],
@@ -243,7 +252,9 @@ def test_mesh_file_takes_no_generator_keys(case_text):
 
 def test_parameter_of_another_scheme_is_refused_with_the_way_out():
     data = Case.load("rod_impact", ["time.integrator=newmark", "time.beta=0.25"]).to_dict()
-    with pytest.raises(InputError, match=r"time.beta: unknown key; houbolt .*; --set time.beta= takes it out"):
+    with pytest.raises(
+        InputError, match=r"time.beta: a key of chung_lee, newmark, not of houbolt, .*; --set time.beta= takes it out"
+    ):
         Case.from_dict(data, overrides=["time.integrator=houbolt"])
     taken_out = ["time.integrator=houbolt", "time.beta=", "time.gamma="]
     assert Case.from_dict(data, overrides=taken_out).time.integrator == "houbolt"

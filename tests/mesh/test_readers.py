@@ -52,6 +52,13 @@ def test_gmsh_with_windows_line_ends_and_other_sections(comm, shared_tmp_path):
     check_sample(whole(read(written(comm, shared_tmp_path, "truss.msh", content), comm), comm))
 
 
+@pytest.mark.parametrize("kind", ["2.2 ascii", "4.1 ascii"])
+def test_gmsh_with_a_byte_order_mark(comm, shared_tmp_path, kind):
+    """As editors of Windows save it."""
+    content = GMSH[kind].decode().encode("utf-8-sig")
+    check_sample(whole(read(written(comm, shared_tmp_path, "truss.msh", content), comm), comm))
+
+
 @pytest.mark.parametrize("version", ["gmsh22", "gmsh"])
 @pytest.mark.parametrize("binary", [False, True])
 def test_gmsh_written_by_meshio(comm, shared_tmp_path, version, binary):
@@ -125,10 +132,16 @@ def test_the_other_meshes_in_the_repository_are_braced_trusses(comm, name, nodes
 
 @pytest.mark.parametrize(
     ("name", "text"),
-    [("missing.msh", "cannot open .*missing.msh: No such file"), ("ring.stl", "no reader for 'ring.stl'; known.*.msh")],
+    [
+        ("rnig.msh", "mesh.file: there is no file .*rnig.msh, did you mean 'ring.msh'"),
+        ("ring.vtu", "there is no file .*ring.vtu, did you mean 'ring.msh'"),
+        ("house.vtu", "there is no file .*house.vtu; that folder has ring.msh"),
+        ("sub/ring.msh", "there is no file .*sub/ring.msh: there is no folder .*sub"),
+        ("ring.stl", "no reader for 'ring.stl'; known.*.msh"),
+    ],
 )
 def test_files_that_are_not_there_or_not_known(comm, shared_tmp_path, name, text):
-    if name != "missing.msh":
-        written(comm, shared_tmp_path, name, b"solid")
+    for there in ("ring.msh", "ring.stl"):
+        written(comm, shared_tmp_path, there, b"solid")
     with pytest.raises(InputError, match=text):
         read_slab(shared_tmp_path / name, comm)

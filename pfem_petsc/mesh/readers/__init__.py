@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 import importlib
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -41,5 +42,23 @@ def _check_file(path: Path) -> None:
     try:
         with open(path, "rb"):
             pass
+    except FileNotFoundError:
+        raise InputError(f"mesh.file: there is no file {path}{_near(path)}") from None
     except OSError as error:
         raise InputError(f"mesh.file: cannot open {path}: {error.strerror}") from None
+
+
+def _near(path: Path) -> str:
+    """A hint at the mesh file that may be meant."""
+    folder = path.parent
+    try:
+        there = sorted(entry.name for entry in folder.iterdir() if entry.suffix.lower() in SUFFIXES)
+    except FileNotFoundError:
+        return f": there is no folder {folder}"
+    except OSError:
+        return ""
+    # the right name with another suffix comes first
+    match = [name for name in there if Path(name).stem == path.stem] or difflib.get_close_matches(path.name, there, n=1)
+    if match:
+        return f", did you mean {match[0]!r}?"
+    return f"; that folder has {', '.join(there[:5])}" + (", ..." if len(there) > 5 else "") if there else ""

@@ -6,6 +6,7 @@ groups; surfaces and volumes are left out, which a warning says. Nodes are numbe
 
 from __future__ import annotations
 
+import codecs
 from pathlib import Path
 
 import numpy as np
@@ -42,7 +43,8 @@ def read(path: Path, comm: MPI.Comm) -> MeshSlab:
 
 
 def _read(path: Path) -> WholeMesh:
-    content = path.read_bytes()
+    # editors of Windows put a mark in front
+    content = path.read_bytes().removeprefix(codecs.BOM_UTF8)
     if not content.lstrip().startswith(b"$MeshFormat"):
         raise InputError(f"{path}: does not start with $MeshFormat: not a Gmsh mesh of version 2.2 or 4.1")
     parts = sections(path, content)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import numpy as np
 from mpi4py import MPI
 
@@ -73,10 +75,11 @@ class Contact:
         mesh.comm.Allreduce(MPI.IN_PLACE, ends, op=MPI.MAX)
         self.length = float(ends.sum(axis=0).max())
 
-    def none(self) -> WallForces:
-        """No contact."""
+    @cached_property
+    def nothing(self) -> WallForces:
+        """No contact; not to be written to."""
         n = len(self.walls)
-        return WallForces(
+        nothing = WallForces(
             np.zeros((n, 3)),
             np.zeros(n, dtype=np.int64),
             np.zeros((n, 3)),
@@ -84,6 +87,9 @@ class Contact:
             np.empty((0, n), dtype=bool),
             np.empty((0, 3)),
         )
+        for name in nothing.sums:
+            getattr(nothing, name).flags.writeable = False
+        return nothing
 
     def positions(self, time: float) -> np.ndarray:
         """Where the walls' centres are (walls, 3) [m]."""
@@ -107,6 +113,12 @@ class Contact:
         """Distances (m,) [m] of positions (m, 3) from wall k."""
         normals, offsets = self.walls[k].planes(x - shifts[k])
         return np.einsum("ij,ij->i", normals, x - shifts[k]) - offsets
+
+    def plane_offsets(self, time: float) -> np.ndarray:
+        """Offsets (w,) [m] of the planes n . x = d of flat walls at a time [s]."""
+        if not self.moving.any():
+            return self._offsets
+        return self._offsets + np.einsum("ij,ij->i", self.normals, self.motion.shifts(time))
 
     def near(self, x: np.ndarray, shifts: np.ndarray, reach: np.ndarray = _ZERO) -> np.ndarray:
         """(owned,) bool: nodes at positions (owned, 3) within reach of a wall; (owned,) or (1,) [m], 0: beyond it."""
@@ -175,22 +187,22 @@ class Contact:
         offsets[~concerned] = -np.inf
         return normals, offsets
 
-    def explicit(self, x: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float) -> tuple:
-        """Project free positions (owned, 3), in place, onto what the walls allow.
+    def explicit(
+        self, predictor: np.ndarray, u: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float
+    ) -> tuple[np.ndarray, np.ndarray, WallForces]:
+        """Correct increments ``u`` (owned, 3), in place, so that the walls allow the positions predictor + u.
 
         Parameters
         ----------
-        x : (owned, 3) free positions at ``time`` [m]
+        predictor, u : (owned, 3) positions at ``time`` if there were no walls are their sum [m]
         stiffness : (owned,) alpha m + eta c: force for a displacement of the node [N/m]
         tolerance : [m]
 
         Returns
         -------
-        (nodes, correction (m, 3) [m], force (m, 3) [N] by the walls, WallForces)
+        (nodes (m,), force (m, 3) [N] by the walls, WallForces)
         """
-        if self.motion.free is not None:
-            self._explicit.push_walls(x, stiffness, time, tolerance)
-        return self._explicit.project(x, stiffness, time, tolerance)
+        return self._explicit.press(predictor, u, stiffness, time, tolerance)
 
     def sums(self, nodes: np.ndarray, force: np.ndarray, x: np.ndarray, touching: np.ndarray) -> WallForces:
         """Sums of forces (m, w, 3) on nodes at (m, 3)."""

@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from ..errors import SimulationFailure
+from .flat import press_planes
+from .forces import WallForces
 from .friction import add_friction
 from .projection import project
 
@@ -18,6 +20,43 @@ class ExplicitContact:
 
     def __init__(self, contact) -> None:
         self.contact = contact
+        plain = contact.flat.all() and not (contact.rough or contact.partial or contact.ties.any)
+        self._plain = bool(plain and not contact.restitution.any())  # one compiled pass does all
+        self._room = np.empty(len(contact.members) if plain else 0, dtype=np.int64)
+
+    def press(
+        self, predictor: np.ndarray, u: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float
+    ) -> tuple[np.ndarray, np.ndarray, WallForces]:
+        """See :meth:`~pfem_petsc.contact.contact.Contact.explicit`."""
+        contact = self.contact
+        if contact.motion.free is not None:
+            self.push_walls(predictor + u, stiffness, time, tolerance)
+        if self._plain:
+            return self._press_planes(predictor, u, stiffness, time, tolerance)
+        nodes, correction, force, walls = self.project(predictor + u, stiffness, time, tolerance)
+        u[nodes] += correction
+        return nodes, force, walls
+
+    def _press_planes(self, predictor, u, stiffness, time: float, tolerance: float) -> tuple:
+        contact = self.contact
+        offsets = contact.plane_offsets(time)
+        nodes, stuck, offsets, force, touching, places, *sums = press_planes(
+            predictor,
+            u,
+            contact.fixed,
+            contact.normals,
+            offsets,
+            contact.everyone,
+            contact.members,
+            tolerance,
+            stiffness,
+            self._room,
+        )
+        if stuck >= 0:
+            raise SimulationFailure(contact.no_room(nodes[stuck], offsets[stuck], time))
+        if len(nodes) == 0:
+            return nodes, force, contact.nothing
+        return nodes, force, WallForces(*sums, nodes, touching, places)
 
     def push_walls(self, x: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float) -> None:
         """Find where walls with mass end in an explicit step. Collective."""
@@ -52,7 +91,10 @@ class ExplicitContact:
     def project(
         self, x: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float, booked: bool = True
     ) -> tuple:
-        """See :meth:`Contact.explicit`; ``booked``: this is the step, not a trial of it."""
+        """Move free positions (owned, 3), in place, onto what the walls allow; ``booked``: not a trial of the step.
+
+        Gives the nodes (m,), their corrections (m, 3) [m], the forces (m, 3) [N] on them, and the walls' sums.
+        """
         contact, ties = self.contact, self.contact.ties
         nodes, moved, force, touching = self._press(x, stiffness, time, tolerance, booked)
         if ties.any:
@@ -64,7 +106,7 @@ class ExplicitContact:
             nodes, moved = np.append(nodes, tied), np.vstack([moved, places])
             force, touching = np.vstack([force, every]), np.vstack([touching, own])
         if len(nodes) == 0:
-            return nodes, moved, np.empty((0, 3)), contact.none()
+            return nodes, moved, np.empty((0, 3)), contact.nothing
         correction = moved - x[nodes]
         x[nodes] = moved
         return nodes, correction, force.sum(axis=1), contact.sums(nodes, force, moved, touching)

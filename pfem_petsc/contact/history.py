@@ -2,60 +2,66 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from .contact import Contact
 from .forces import WallForces
 
-__all__ = ["contact_columns", "contact_sums", "contact_values"]
+__all__ = ["ContactColumns", "contact_columns"]
+
+_SUMMED = (("force", (3,), float), ("moment", (3,), float), ("impulse", (3,), float), ("contacts", (), np.int64))
+_SUMMED += (("contact_time", (), float), ("releases", (), np.int64))
 
 
 def contact_columns(contact: Contact) -> list[tuple[str, tuple[int, ...], type]]:
     """Name, shape and type of the columns of a case's walls."""
     columns: list[tuple[str, tuple[int, ...], type]] = [("active_set_changes", (), np.int64)] if contact.any else []
     for k, name in enumerate(contact.names):
-        columns += [
-            (f"wall/{name}/force", (3,), float),
-            (f"wall/{name}/moment", (3,), float),
-            (f"wall/{name}/impulse", (3,), float),
-            (f"wall/{name}/contacts", (), np.int64),
-            (f"wall/{name}/contact_time", (), float),
-            (f"wall/{name}/releases", (), np.int64),
-        ]
+        columns += [(f"wall/{name}/{what}", shape, kind) for what, shape, kind in _SUMMED]
         if contact.moving[k]:
             columns += [(f"wall/{name}/{what}", (3,), float) for what in ("position", "velocity")]
     return columns
 
 
-def contact_sums(contact: Contact, walls: WallForces) -> np.ndarray:
-    """What this rank adds to a row."""
-    log = contact.log
-    vectors = np.stack([walls.force, walls.moment, log.impulse], axis=1).ravel()
-    return np.concatenate([vectors, walls.contacts, log.releases, [float(log.changes)]])
+class ContactColumns:
+    """Sums of a row, and what is made of them; the columns are those of :func:`contact_columns`, in that order.
 
-
-def contact_values(contact: Contact, sums: np.ndarray, at: int, time: float) -> tuple[dict[str, Any], int]:
-    """Values of the columns from the sums over the ranks, which start at ``at``; and where what follows starts.
-
-    The count of changes starts anew.
+    Attributes
+    ----------
+    size : numbers of this rank's share: the changes of the active set, and 12 a wall
+    width : numbers of the columns
     """
-    n = len(contact.names)
-    vectors = sums[at : at + 9 * n].reshape(n, 3, 3)
-    contacts, releases = sums[at + 9 * n : at + 11 * n].reshape(2, n)
-    values: dict[str, Any] = {}
-    if contact.any:
-        values["active_set_changes"] = round(sums[at + 11 * n])
-        positions, rates = contact.positions(time), contact.motion.rates(time)
-    for k, name in enumerate(contact.names):
-        for i, column in enumerate(("force", "moment", "impulse")):
-            values[f"wall/{name}/{column}"] = vectors[k, i]
-        values[f"wall/{name}/contacts"] = round(contacts[k])
-        values[f"wall/{name}/contact_time"] = contact.log.time[k]
-        values[f"wall/{name}/releases"] = round(releases[k])
-        if contact.moving[k]:
-            values[f"wall/{name}/position"] = positions[k]
-            values[f"wall/{name}/velocity"] = rates[k]
-    contact.log.changes = 0
-    return values, at + 11 * n + 1
+
+    def __init__(self, contact: Contact) -> None:
+        self.contact = contact
+        walls = len(contact.names)
+        self.size = 1 + 12 * walls if contact.any else 0
+        starts = 1 + np.cumsum([0, *(12 + 6 * contact.moving)]).astype(np.int64)
+        self.width = int(starts[-1]) if contact.any else 0
+        self._at = starts[:-1, None] + np.arange(12)
+        self._moving = np.flatnonzero(contact.moving)
+        self._motion_at = starts[self._moving, None] + np.arange(12, 18)
+
+    def fill(self, sums: np.ndarray, walls: WallForces) -> None:
+        """Put this rank's share into ``sums`` (size,)."""
+        log = self.contact.log
+        sums[0] = log.changes
+        share = sums[1:].reshape(-1, 12)
+        share[:, 0:3] = walls.force
+        share[:, 3:6] = walls.moment
+        share[:, 6:9] = log.impulse
+        share[:, 9] = walls.contacts
+        share[:, 11] = log.releases
+
+    def put(self, sums: np.ndarray, time: float, values: np.ndarray) -> None:
+        """Fill the columns ``values`` (width,) of a time [s] from the sums over the ranks; the count of changes starts
+        anew."""
+        contact = self.contact
+        total = sums[1:].reshape(-1, 12)
+        total[:, 10] = contact.log.time
+        values[0] = sums[0]
+        values[self._at] = total
+        if len(self._moving):
+            motion = np.hstack([contact.positions(time), contact.motion.rates(time)])
+            values[self._motion_at] = motion[self._moving]
+        contact.log.changes = 0

@@ -59,7 +59,8 @@ class ContactLog:
         n, self._pending = self._pending, 0
         if n and len(self.time):
             flags = self._flags[:n]
-            comm.Allreduce(MPI.IN_PLACE, flags, op=MPI.MAX)
+            if comm.size > 1:
+                comm.Allreduce(MPI.IN_PLACE, flags, op=MPI.MAX)
             self.time += self._steps[:n] @ flags
 
     def share(self) -> dict[str, Any]:

@@ -284,7 +284,7 @@ class ContactRounds:
         elif self._all_pairs is not None:
             self._all_pairs.pairs.release()
         held = np.zeros(len(u), dtype=bool)
-        walls = self.contact.none()
+        walls = self.contact.nothing
         if self._frames is not None:
             at = self._frames.nodes
             force = self.strengths[:, :, None] * self._frames.normals

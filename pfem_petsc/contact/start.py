@@ -31,14 +31,14 @@ def adjust_start(case, nodes: dict[str, np.ndarray], mesh) -> int:
         return 0
     owned = mesh.n_owned
     contact = Contact(case, nodes, mesh, np.zeros((owned, 3), dtype=bool), walls)
-    points = mesh.points[:owned].copy()
+    points, way = mesh.points[:owned], np.zeros((owned, 3))
     moved = np.empty(0, dtype=np.int64)
     with agreed(mesh.comm):
         try:
-            moved, *_ = contact.explicit(points, np.ones(owned), 0.0, 1e-13 * contact.length)
+            moved, *_ = contact.explicit(points, way, np.ones(owned), 0.0, 1e-13 * contact.length)
         except SimulationFailure as failure:
             raise InputError(f"{case.source}: wall.adjust: {failure}") from failure
-    mesh.points[:owned] = points
+    points += way
     mesh.update_ghosts(mesh.points)
     a, b = mesh.bars.T
     length = np.linalg.norm(mesh.points[b] - mesh.points[a], axis=1)

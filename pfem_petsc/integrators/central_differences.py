@@ -11,11 +11,28 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..mechanics.compiled import kernel
 from .base import Balance, ExplicitScheme, NoParameters, State
 
 __all__ = ["Parameters", "Scheme"]
 
 Parameters = NoParameters
+
+
+@kernel
+def _drift(x, h, half, moved):
+    for i in range(len(half)):
+        for c in range(3):
+            moved[i, c] = x[i, c] + h * half[i, c]
+
+
+@kernel
+def _kick(u, alpha, eta, h, half, a, v):
+    for i in range(len(u)):
+        for c in range(3):
+            a[i, c] = alpha * u[i, c]
+            v[i, c] = half[i, c] + eta * u[i, c]
+            half[i, c] += u[i, c] / h
 
 
 class Scheme(ExplicitScheme):
@@ -32,14 +49,17 @@ class Scheme(ExplicitScheme):
 
     def advance(self, state: State, h: float) -> None:
         """Move to x_{n+1}, which the last balance has fixed."""
-        state.position[:] += h * state.memory["half_velocity"]
+        position = state.position
+        _drift(position, h, state.memory["half_velocity"], position)
 
     def balance(self, state: State, h: float) -> Balance:
         half = state.memory["half_velocity"]
+        predictor = np.empty_like(half)
+        _drift(state.position, h, half, predictor)
         return Balance(
             alpha=1.0 / (h * h),
             eta=0.5 / h,
-            predictor=state.position + h * half,
+            predictor=predictor,
             v_hat=half,
             a_hat=None,
             time=state.time + h,
@@ -48,7 +68,5 @@ class Scheme(ExplicitScheme):
         )
 
     def finish(self, state: State, balance: Balance, u: np.ndarray, h: float) -> None:
-        half = state.memory["half_velocity"]
-        state.a = balance.alpha * u
-        state.v = half + balance.eta * u
-        half += u / h
+        state.a, state.v = np.empty_like(u), np.empty_like(u)
+        _kick(u, balance.alpha, balance.eta, h, state.memory["half_velocity"], state.a, state.v)

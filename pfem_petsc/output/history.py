@@ -12,6 +12,7 @@ from mpi4py import MPI
 
 from ..errors import InputError
 from .hdf5 import create_growing, dataset_names, grow, write_rows, writing
+from .row import RowLayout
 
 __all__ = ["HistoryWriter", "check_columns", "create_history"]
 
@@ -84,9 +85,11 @@ class HistoryWriter:
         # What a write may take on disk: the rows, and a chunk begun in each column.
         self.reserve_bytes = self._capacity * row_bytes + len(self._datasets) * CHUNK_BYTES
         self.n_buffered = 0
-        self._buffers: dict[str, np.ndarray] = {}
-        if comm.rank == 0:
-            self._buffers = {n: np.empty((self._capacity, *d.shape[1:]), d.dtype) for n, d in self._datasets.items()}
+        self._layout = RowLayout(
+            {name: dataset.shape[1:] for name, dataset in self._datasets.items()},
+            {name: dataset.dtype for name, dataset in self._datasets.items()},
+        )
+        self._buffer = np.empty((self._capacity if comm.rank == 0 else 0, self._layout.width))
 
     @property
     def full(self) -> bool:
@@ -96,10 +99,7 @@ class HistoryWriter:
     def append(self, row: Mapping[str, Any] | None) -> None:
         """Take one row: rank 0 gives a value for each column, the others None. No communication."""
         if self._comm.rank == 0:
-            if row is None or len(row) != len(self._buffers):
-                raise ValueError(f"a history row has the columns {sorted(self._buffers)}, got {sorted(row or {})}")
-            for name, buffer in self._buffers.items():
-                buffer[self.n_buffered] = row[name]
+            self._buffer[self.n_buffered] = self._layout.vector(row if row is not None else {})
         self.n_buffered += 1
 
     def write(self) -> None:
@@ -111,8 +111,11 @@ class HistoryWriter:
             for dataset in self._datasets.values():
                 grow(dataset, self.n_rows)
         with writing(self._comm, self._path):
-            for name, buffer in self._buffers.items():
-                write_rows(self._datasets[name], first, buffer[: self.n_buffered])
+            if self._comm.rank == 0:
+                for name, (at, end, shape, _) in self._layout.places.items():
+                    dataset = self._datasets[name]
+                    rows = self._buffer[: self.n_buffered, at:end].reshape(self.n_buffered, *shape)
+                    write_rows(dataset, first, rows.astype(dataset.dtype))
         self.n_buffered = 0
 
     def commit(self) -> None:

@@ -76,7 +76,7 @@ class RunState:
             "step": stepper.state.step,
             "time": stepper.state.time,
             "stepper": {name: getattr(stepper, name) for name in stepper.kept_numbers},
-            "iterations": recorder.iterations.tolist(),
+            "iterations": list(recorder.iterations),
             "start_energy": recorder.start_energy,
             "free_walls": free.kept() if (free := self.model.contact.motion.free) is not None else None,
             "contact_times": self.model.contact.log.times(self.comm),
@@ -121,9 +121,9 @@ class RunState:
         mine = self._share(scalars["ranks"])
         stepper.energy = StrainEnergy(*mine["energy"], -1)
         walls = stepper.solution.walls
-        for name, values in mine["walls"].items():
-            like = getattr(walls, name)
-            setattr(walls, name, np.array(values, dtype=like.dtype).reshape(like.shape))
+        like = {name: getattr(walls, name) for name in mine["walls"]}
+        sums = {n: np.array(mine["walls"][n], dtype=a.dtype).reshape(a.shape) for n, a in like.items()}
+        stepper.solution.walls = dataclasses.replace(walls, **sums)
         stepper.solution.contacts = int(mine["contacts"])
         if scalars["free_walls"] is not None:
             self.model.contact.motion.free.put_back(scalars["free_walls"])
@@ -133,7 +133,7 @@ class RunState:
         """Set ledger and recorder, both made after :meth:`put_back`; gives what is known of the last row."""
         scalars = checkpoint.scalars
         ledger.work[:] = self._share(scalars["ranks"])["work"]
-        recorder.iterations[:] = scalars["iterations"]
+        recorder.iterations = [int(n) for n in scalars["iterations"]]
         recorder.start_energy = scalars["start_energy"]
         return dict(scalars["row"])
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from ..errors import SimulationFailure
 from ..integrators.base import Balance
-from .node_loops import explicit_increments
+from .node_loops import explicit_increments, hold, react
 from .stepper import Solution, Stepper
 
 __all__ = ["ExplicitStepper"]
@@ -15,9 +15,16 @@ __all__ = ["ExplicitStepper"]
 class ExplicitStepper(Stepper):
     """Solves (alpha m + eta c) u = f_ext - f_int - m a_hat - c v_hat node by node."""
 
+    renews_forces = True
+
     def __init__(self, model, scheme, h: float) -> None:
         super().__init__(model, scheme, h)
         self._none = np.empty((0, 3))
+        self._other_force = np.zeros_like(self.state.f)
+
+    def evaluate(self, commit: bool) -> None:
+        self.state.f, self._other_force = self._other_force, self.state.f
+        super().evaluate(commit)
 
     def accelerate(self, load: np.ndarray) -> np.ndarray:
         a = load / self.model.inertia.mass[:, None]
@@ -43,17 +50,16 @@ class ExplicitStepper(Stepper):
         supports = model.supports
         state.contact = self.zero
         if supports.any:
-            at = (supports.nodes, supports.components)
-            load = stiffness[supports.nodes] * u[at]
-            u[at] = supports.positions(balance.time) - balance.predictor[at]
-        walls, contacts = model.contact.none(), 0
+            load = np.empty(len(supports.nodes))
+            positions = supports.positions(balance.time)
+            hold(supports.nodes, supports.components, positions, balance.predictor, stiffness, u, load)
+        walls, contacts = model.contact.nothing, 0
         if model.contact.any:
             try:
-                nodes, correction, force, walls = model.contact.explicit(
-                    balance.predictor + u, stiffness, balance.time, 1e-13 * model.length
+                nodes, force, walls = model.contact.explicit(
+                    balance.predictor, u, stiffness, balance.time, 1e-13 * model.length
                 )
                 if len(nodes):
-                    u[nodes] += correction
                     state.contact = np.zeros_like(u)
                     state.contact[nodes] = force
                 contacts = len(nodes)
@@ -66,5 +72,5 @@ class ExplicitStepper(Stepper):
             contacts += model.pairs.explicit(balance.predictor, u, stiffness, state.contact)
         if supports.any:
             state.support = np.zeros_like(u)
-            state.support[at] = stiffness[supports.nodes] * u[at] - load - state.contact[at]
+            react(supports.nodes, supports.components, load, state.contact, stiffness, u, state.support)
         return Solution(u, state.f, walls, contacts=contacts)

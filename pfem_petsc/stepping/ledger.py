@@ -15,21 +15,23 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..mechanics.bars import StrainEnergy
-from .node_loops import node_totals, node_works
+from .node_loops import book_nodes
 
 __all__ = ["TERMS", "Ledger", "Moment"]
 
 TERMS = ("external_work", "contact_work", "damping_dissipation", "numerical_dissipation", "thermal_work")
+_NOTHING = np.empty((0, 3))
 
 
 @dataclass
 class Moment:
     """What the ledger needs of a moment; arrays (owned, 3).
 
-    Where the mass is lumped, ``a`` and ``v`` are acceleration and velocity; where it is consistent, M a and C v [N].
+    Where the mass is lumped, ``momentum``, ``a`` and ``v`` are velocity, acceleration and velocity; where it is
+    consistent, M v [kg m/s], M a and C v [N].
     """
 
-    x: np.ndarray
+    momentum: np.ndarray
     a: np.ndarray
     v: np.ndarray
     internal: np.ndarray
@@ -60,51 +62,63 @@ class Ledger:
         # the loops multiply by these: lumped values, or one where the products with the matrices are given
         self._mass = ones if inertia.products else inertia.mass
         self._damping = ones if inertia.products else inertia.damping
+        self._damping = self._damping if inertia.damped else np.empty(0)
+        self._works = np.zeros(5)
         self._before = self._moment()
+        self._book(self._before, self._before, self._before, self.stepper.state.position)
         self._thermal_before()
 
     def update(self) -> None:
         """Book the step just made."""
-        after = self._moment()
+        stepper, owned = self.stepper, self.model.mesh.n_owned
+        present = after = self._moment()
         before, self._before = self._before, after
         jumped = 0.0
-        if self.stepper.treatment is not None and self.stepper.treatment.jump is not None:
+        if stepper.treatment is not None and stepper.treatment.jump is not None:
             after, jumped = self._before_jump(after)
-        stored = after.kinetic - before.kinetic + sum(after.energy[:3]) - sum(before.energy[:3])
+        first, second = (before, after) if stepper.scheme.at_ends else 2 * (self._balanced(before),)
+        self._book(present, first, second, stepper.before[:owned])
+        stored = present.kinetic - jumped - before.kinetic + sum(present.energy[:3]) - sum(before.energy[:3])
         heating = self._heating()
-        first, second = (before, after) if self.stepper.scheme.at_ends else 2 * (self._balanced(before),)
-        works = np.zeros(5)
-        node_works(
-            before.x,
-            after.x,
+        external, contact, damping, inertial, internal = self._works.tolist()
+        self.work += (external, contact + jumped, damping, inertial + internal + heating - stored, heating)
+
+    def _book(self, present: Moment, first: Moment, second: Moment, start: np.ndarray) -> None:
+        """Kinetic energy and totals of the present, and the works from positions ``start`` (owned, 3)."""
+        state, inertia = self.stepper.state, self.model.inertia
+        present.kinetic = book_nodes(
+            start,
+            state.position,
+            inertia.mass,
             self._mass,
+            state.v,
+            present.momentum,
+            state.support,
             self._damping,
-            self.model.inertia.damped,
             first.a,
             second.a,
             first.v,
             second.v,
             first.internal,
             second.internal,
-            first.external,
-            second.external,
-            first.support,
-            second.support,
-            first.contact,
-            second.contact,
-            works,
+            *self._pair(first.external, second.external),
+            *self._pair(first.support, second.support),
+            *self._pair(first.contact, second.contact),
+            self.totals,
+            self._works,
         )
-        external, contact, damping, inertial, internal = works
-        contact += jumped
-        self.work += (external, contact, damping, inertial + internal + heating - stored, heating)
+
+    def _pair(self, first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Two arrays, or what stands for two of zeros."""
+        zero = self.stepper.zero
+        return (_NOTHING, _NOTHING) if first is zero and second is zero else (first, second)
 
     def _before_jump(self, after: Moment) -> tuple[Moment, float]:
         """The end of the step before contact changed velocities, and the energy that it gave [J]: work of contact."""
         jump = self.stepper.treatment.jump
         a, v = after.a.copy(), after.v.copy()
         a[jump.nodes], v[jump.nodes] = jump.a, jump.v
-        kinetic = after.kinetic - jump.energy
-        return replace(after, a=a, v=v, contact=self.stepper.state.contact, kinetic=kinetic), jump.energy
+        return replace(after, a=a, v=v, contact=self.stepper.state.contact), jump.energy
 
     @property
     def kinetic(self) -> float:
@@ -122,16 +136,15 @@ class Ledger:
             momentum = inertia.mass_times(state.v, np.empty_like(state.v))
             a = inertia.mass_times(state.a, np.empty_like(state.a))
             v = inertia.damping_times(state.v, np.empty_like(state.v))
-        kinetic = node_totals(inertia.mass, self._mass, state.position, state.v, momentum, state.support, self.totals)
+        internal = state.f[:owned]
         return Moment(
-            x=state.position.copy(),
+            momentum=momentum,
             a=a,
             v=v,
-            internal=state.f[:owned].copy(),
+            internal=internal if self.stepper.renews_forces else internal.copy(),
             external=state.external,
             support=state.support,
             contact=contact,
-            kinetic=kinetic,
             energy=self.stepper.energy,
         )
 
@@ -152,7 +165,7 @@ class Ledger:
             internal = stepper.solution.internal[:owned]
         elif balance.weight:
             internal = (1.0 - balance.weight) * internal + balance.weight * stepper.solution.internal[:owned]
-        return Moment(before.x, a, v, internal, state.external, state.support, state.contact)
+        return Moment(before.momentum, a, v, internal, state.external, state.support, state.contact)
 
     def _thermal_before(self) -> None:
         if self.model.temperatures.varying:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from ..mechanics.compiled import kernel
 
-__all__ = ["explicit_increments", "node_totals", "node_works"]
+__all__ = ["book_nodes", "explicit_increments", "hold", "react"]
 
 
 @kernel
@@ -33,54 +33,81 @@ def explicit_increments(external, f, mass, damping, alpha, eta, a_hat, v_hat, st
 
 
 @kernel
-def node_totals(mass, factor, x, v, p, support, totals):
-    """Kinetic energy [J]; ``totals`` (12,): momentum, angular momentum, mass times position, support force.
+def hold(nodes, components, positions, predictor, stiffness, u, load):
+    """Put prescribed components (k,) of ``u`` (owned, 3) where supports have them; ``load`` (k,) out: what would move
+    them [N]."""
+    for k in range(len(nodes)):
+        i, c = nodes[k], components[k]
+        load[k] = stiffness[i] * u[i, c]
+        u[i, c] = positions[k] - predictor[i, c]
 
-    The momentum of a node is ``factor`` times ``p``: m v, or M v with factor one.
+
+@kernel
+def react(nodes, components, load, contact, stiffness, u, support):
+    """Forces of supports into ``support`` (owned, 3) [N], from the loads that :func:`hold` found."""
+    for k in range(len(nodes)):
+        i, c = nodes[k], components[k]
+        support[i, c] = stiffness[i] * u[i, c] - load[k] - contact[i, c]
+
+
+@kernel
+def book_nodes(
+    x0, x1, mass, factor, v, p, support, damping, a0, a1, v0, v1, f0, f1, e0, e1, s0, s1, r0, r1, totals, works
+):
+    """Kinetic energy [J] at the end of a step, sums over the nodes there, and works over dx = x1 - x0 by the mean of 2
+    sets of forces.
+
+    Parameters
+    ----------
+    x0, x1 : (owned, 3) positions at start and end
+    mass : (owned,); the momentum of a node is ``factor`` (owned,) times ``p``: m v, or M v with factor one
+    v, p, support : (owned, 3) at the end
+    damping : (owned,), (0,) for none; like ``factor`` it multiplies what ``v0`` and ``v1`` hold
+    a0, a1, v0, v1, f0, f1, e0, e1, s0, s1, r0, r1 : acceleration, velocity, internal, external, support and contact
+        force at start and end of the works' rule (owned, 3); the last six may be (0, 3) for zero, in pairs
+    totals : (12,) out: momentum, angular momentum, mass times position, support force
+    works : (5,) out [J]: external with supports, contact, damping, inertial, internal
     """
+    damped = len(damping) > 0
+    loaded = len(e0) > 0
+    supported = len(s0) > 0
+    touched = len(r0) > 0
     kinetic = 0.0
     px = py = pz = lx = ly = lz = mx = my = mz = sx = sy = sz = 0.0
-    for i in range(len(v)):
+    external = contact = dissipated = inertial = internal = 0.0
+    for i in range(len(x0)):
         q = factor[i]
+        x, y, z = x1[i, 0], x1[i, 1], x1[i, 2]
         a, b, c = q * p[i, 0], q * p[i, 1], q * p[i, 2]
         kinetic += a * v[i, 0] + b * v[i, 1] + c * v[i, 2]
         px += a
         py += b
         pz += c
-        lx += x[i, 1] * c - x[i, 2] * b
-        ly += x[i, 2] * a - x[i, 0] * c
-        lz += x[i, 0] * b - x[i, 1] * a
+        lx += y * c - z * b
+        ly += z * a - x * c
+        lz += x * b - y * a
         m = mass[i]
-        mx += m * x[i, 0]
-        my += m * x[i, 1]
-        mz += m * x[i, 2]
-        sx += support[i, 0]
-        sy += support[i, 1]
-        sz += support[i, 2]
+        mx += m * x
+        my += m * y
+        mz += m * z
+        dx, dy, dz = 0.5 * (x - x0[i, 0]), 0.5 * (y - x0[i, 1]), 0.5 * (z - x0[i, 2])
+        inertial += q * (dx * (a0[i, 0] + a1[i, 0]) + dy * (a0[i, 1] + a1[i, 1]) + dz * (a0[i, 2] + a1[i, 2]))
+        internal += dx * (f0[i, 0] + f1[i, 0]) + dy * (f0[i, 1] + f1[i, 1]) + dz * (f0[i, 2] + f1[i, 2])
+        if damped:
+            w = dx * (v0[i, 0] + v1[i, 0]) + dy * (v0[i, 1] + v1[i, 1]) + dz * (v0[i, 2] + v1[i, 2])
+            dissipated += damping[i] * w
+        if loaded:
+            external += dx * (e0[i, 0] + e1[i, 0]) + dy * (e0[i, 1] + e1[i, 1]) + dz * (e0[i, 2] + e1[i, 2])
+        if supported:
+            external += dx * (s0[i, 0] + s1[i, 0]) + dy * (s0[i, 1] + s1[i, 1]) + dz * (s0[i, 2] + s1[i, 2])
+            sx += support[i, 0]
+            sy += support[i, 1]
+            sz += support[i, 2]
+        if touched:
+            contact += dx * (r0[i, 0] + r1[i, 0]) + dy * (r0[i, 1] + r1[i, 1]) + dz * (r0[i, 2] + r1[i, 2])
     totals[0], totals[1], totals[2] = px, py, pz
     totals[3], totals[4], totals[5] = lx, ly, lz
     totals[6], totals[7], totals[8] = mx, my, mz
     totals[9], totals[10], totals[11] = sx, sy, sz
+    works[0], works[1], works[2], works[3], works[4] = external, contact, dissipated, inertial, internal
     return 0.5 * kinetic
-
-
-@kernel
-def node_works(x0, x1, mass, damping, damped, a0, a1, v0, v1, f0, f1, e0, e1, s0, s1, r0, r1, works):
-    """Works over dx = x1 - x0 by the mean of two sets of forces; ``works`` (5,) [J]: external with supports, contact,
-    damping, inertial, internal."""
-    external = contact = dissipated = inertial = internal = 0.0
-    for i in range(len(x0)):
-        m = mass[i]
-        for c in range(3):
-            dx = 0.5 * (x1[i, c] - x0[i, c])
-            external += dx * (e0[i, c] + e1[i, c] + s0[i, c] + s1[i, c])
-            contact += dx * (r0[i, c] + r1[i, c])
-            inertial += m * dx * (a0[i, c] + a1[i, c])
-            internal += dx * (f0[i, c] + f1[i, c])
-            if damped:
-                dissipated += dx * damping[i] * (v0[i, c] + v1[i, c])
-    works[0] = external
-    works[1] = contact
-    works[2] = dissipated
-    works[3] = inertial
-    works[4] = internal

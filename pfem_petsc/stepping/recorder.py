@@ -7,11 +7,14 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from ..contact.history import contact_columns, contact_sums, contact_values
+from ..contact.history import ContactColumns, contact_columns
+from ..output.row import Row, RowLayout
 from .ledger import Ledger
 
 __all__ = ["Recorder"]
 
+_HEAD = 29  # numbers of a row before those of walls, pairs and probes
+_SUMS = 23  # numbers of the sums before those
 _PROBED = ("position", "velocity", "acceleration", "reaction")
 
 
@@ -23,6 +26,7 @@ class Recorder:
     columns : name to shape of a row's value
     types : name to dtype where it is not float64
     energy_scale : the largest that any energy was in the rows so far [J]
+    iterations : Newton and linear-solver iterations since the last row
     alarmed : whether any rank raised an alarm with the last row
     probe_nodes : probe name to the mesh numbers of its nodes, ascending: the order of rows in a probe's columns
     """
@@ -34,7 +38,7 @@ class Recorder:
         self.start_energy: float | None = None
         self.energy_scale = 0.0
         self.alarmed = False
-        self.iterations = np.zeros(2, dtype=np.int64)
+        self.iterations = [0, 0]
         case, mesh, comm = self.model.case, self.model.mesh, self.model.comm
         self.columns: dict[str, tuple[int, ...]] = {"time": (), "step": (), "step_size": ()}
         self.columns |= {name: () for name in ("newton_iterations", "linear_iterations", "active_contacts")}
@@ -61,79 +65,85 @@ class Recorder:
             self._probes.append((probe.name, local, np.searchsorted(everyone, ids)))
             for quantity in _PROBED:
                 self.columns[f"probe/{probe.name}/{quantity}"] = (len(everyone), 3)
+        self.layout = RowLayout(self.columns, self.types)
+        self._contact = ContactColumns(self.model.contact)
+        self._sums = np.zeros(_SUMS + self._contact.size + sum(12 * len(n) for n in self.probe_nodes.values()))
 
     def count(self, newton: int, linear: int) -> None:
         """Add the iterations of a step to those of the next row."""
-        self.iterations += (newton, linear)
+        self.iterations[0] += newton
+        self.iterations[1] += linear
 
-    def row(self, alarm: bool = False) -> dict[str, Any]:
+    def row(self, alarm: bool = False) -> Row:
         """The history row of the present state. Collective.
 
         ``alarm``: this rank has something that all must speak about; :attr:`alarmed` is then true on all.
         """
-        stepper, state, model = self.stepper, self.stepper.state, self.model
-        x = state.position
-        walls = stepper.solution.walls
-        energy = stepper.energy
-        parts = [
-            [self.ledger.kinetic, energy.elastic, energy.plastic_heat, energy.hardening],
-            self.ledger.work,
-            self.ledger.totals,
-            [float(stepper.solution.contacts)],
-            [float(alarm)],
-            contact_sums(model.contact, walls),
-        ]
-        for name, local, place in self._probes:
-            nodes = np.zeros((4, len(self.probe_nodes[name]), 3))
-            reaction = state.support[local] + state.contact[local]
-            for k, values in enumerate((x[local], state.v[local], state.a[local], reaction)):
-                nodes[k, place] = values
-            parts.append(nodes.ravel())
-        sums = np.concatenate([np.asarray(part, dtype=np.float64) for part in parts])
-        model.comm.Allreduce(MPI.IN_PLACE, sums)
+        model, sums = self.model, self._sums
+        self._fill(sums, alarm)
+        if model.comm.size > 1:
+            model.comm.Allreduce(MPI.IN_PLACE, sums)
         self.alarmed = sums[22] > 0.0
         model.contact.log.meet(model.comm)
-        return self._unpack(sums)
+        return Row(self.layout, self._unpack(sums))
 
-    def _unpack(self, sums: np.ndarray) -> dict[str, Any]:
+    def _fill(self, sums: np.ndarray, alarm: bool) -> None:
+        """This rank's share of a row."""
+        stepper, state, ledger = self.stepper, self.stepper.state, self.ledger
+        energy, solution = stepper.energy, stepper.solution
+        sums[:4] = ledger.kinetic, energy.elastic, energy.plastic_heat, energy.hardening
+        sums[4:9] = ledger.work
+        sums[9:21] = ledger.totals
+        sums[21:23] = solution.contacts, alarm
+        at = _SUMS + self._contact.size
+        if self._contact.size:
+            self._contact.fill(sums[_SUMS:at], solution.walls)
+        for name, local, place in self._probes:
+            size = 12 * len(self.probe_nodes[name])
+            nodes = sums[at : at + size].reshape(4, -1, 3)
+            nodes[:] = 0.0
+            reaction = state.support[local] + state.contact[local]
+            for k, values in enumerate((state.x[local], state.v[local], state.a[local], reaction)):
+                nodes[k, place] = values
+            at += size
+
+    def _unpack(self, sums: np.ndarray) -> np.ndarray:
+        """The vector of a row from the sums over the ranks."""
         stepper, state = self.stepper, self.stepper.state
-        kinetic, elastic, heat, hardening, external, contact, damping, numerical, thermal = sums[:9]
+        energies = sums[:9].tolist()
+        kinetic, elastic, heat, hardening, external, contact, damping, numerical, thermal = energies
         held = kinetic + elastic + heat + hardening + damping + numerical - external - contact - thermal
         if self.start_energy is None:
-            self.start_energy = float(held)
-        self.energy_scale = max(self.energy_scale, float(np.abs(sums[:9]).max()))
-        row: dict[str, Any] = {
-            "time": state.time,
-            "step": state.step,
-            "step_size": stepper.smallest,
-            "newton_iterations": int(self.iterations[0]),
-            "linear_iterations": int(self.iterations[1]),
-            "active_contacts": round(sums[21]),
-            "kinetic_energy": kinetic,
-            "elastic_energy": elastic,
-            "plastic_dissipation": heat + hardening,
-            "plastic_heat": heat,
-            "hardening_energy": hardening,
-            "damping_dissipation": damping,
-            "external_work": external,
-            "contact_work": contact,
-            "thermal_work": thermal,
-            "numerical_dissipation": numerical,
-            "energy_imbalance": held - self.start_energy,
-            "momentum": sums[9:12],
-            "angular_momentum": sums[12:15],
-            "centre_of_mass": sums[15:18] / self.model.total_mass,
-            "support_force": sums[18:21],
-        }
-        self.iterations[:] = 0
-        values, at = contact_values(self.model.contact, sums, 23, state.time)
-        row |= values
+            self.start_energy = held
+        self.energy_scale = max(self.energy_scale, *map(abs, energies))
+        vector = np.empty(self.layout.width)
+        vector[:17] = (
+            state.time,
+            state.step,
+            stepper.smallest,
+            *self.iterations,
+            sums[21],
+            kinetic,
+            elastic,
+            heat + hardening,
+            heat,
+            hardening,
+            damping,
+            external,
+            contact,
+            thermal,
+            numerical,
+            held - self.start_energy,
+        )
+        vector[17:_HEAD] = sums[9:21]
+        vector[23:26] /= self.model.total_mass
+        self.iterations = [0, 0]
+        source, at = _SUMS + self._contact.size, _HEAD + self._contact.width
+        if self._contact.size:
+            self._contact.put(sums[_SUMS:source], state.time, vector[_HEAD:at])
         if self._pairs is not None:
-            row |= {f"pair/{name}/force": force for name, force in self._pairs.totals().items()}
-        for name, nodes in self.probe_nodes.items():
-            size = 12 * len(nodes)
-            values = sums[at : at + size].reshape(4, len(nodes), 3)
-            at += size
-            for k, quantity in enumerate(_PROBED):
-                row[f"probe/{name}/{quantity}"] = values[k]
-        return row
+            for force in self._pairs.totals().values():
+                vector[at : at + 3] = force
+                at += 3
+        vector[at:] = sums[source:]
+        return vector

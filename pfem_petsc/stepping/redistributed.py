@@ -57,7 +57,7 @@ class RedistributedStepper(Stepper):
         if supports.any:
             inertia = model.inertia.mass_times(balance.alpha * u, np.empty_like(u))
             state.support[at] = (inertia - load - state.contact)[at]
-        walls = model.contact.none()
+        walls = model.contact.nothing
         if len(nodes):
             touched = np.zeros((len(nodes), len(model.contact.names)), dtype=bool)
             touched[np.arange(len(nodes)), self._wall] = strength > 0.0

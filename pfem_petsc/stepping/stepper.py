@@ -55,12 +55,15 @@ class Stepper(ABC):
     h : the case's time step [s]; ``part`` the part of it being made, ``smallest`` the smallest part of the last step
     treatment : of impact, None for the scheme's own formulas
     booking : called after each part of a step
+    before : (local, 3) positions at the start of the last part, with ghosts [m]
+    renews_forces : each evaluation of the state fills another array ``state.f``, so that the last one is kept
     kept_numbers, kept_arrays : names of attributes that, with the state, determine what comes: numbers, and arrays with
         a row for each owned node
     """
 
     kept_numbers: tuple[str, ...] = ("part", "smallest")
     kept_arrays: tuple[str, ...] = ("touching",)
+    renews_forces = False
 
     def __init__(self, model, scheme: Scheme, h: float) -> None:
         self.model = model
@@ -83,10 +86,10 @@ class Stepper(ABC):
             contact=self.zero,
             support=self.zero,
         )
-        self._before: np.ndarray | None = None  # positions at the last evaluation, with ghosts
+        self.before = mesh.points.copy()
         model.contact.state = self.state
         self.touching = model.contact.log.touching
-        self.solution = Solution(self.zero, self.state.f, model.contact.none())
+        self.solution = Solution(self.zero, self.state.f, model.contact.nothing)
 
     def start(self) -> None:
         """Complete the state at the start: velocity, internal force, acceleration. Collective."""
@@ -130,6 +133,7 @@ class Stepper(ABC):
         if self.treatment is not None:
             self.treatment.before()
         if self.scheme.leads:
+            self.before[:] = self.state.x
             self.scheme.advance(self.state, self.part)
             self._arrive(end)
             self._solve_and_finish()
@@ -159,6 +163,8 @@ class Stepper(ABC):
             self.model.contact.log.book(walls, self.part, self.model.comm)
             if self.model.contact.ties.any:
                 self.model.contact.ties.take(walls.nodes, walls.touching, walls.places, self.balance.time)
+        if not self.scheme.leads:
+            self.before[:] = state.x
         self.scheme.finish(state, self.balance, self.solution.u, self.part)
         if free is not None:
             free.finish(self.part)
@@ -185,13 +191,10 @@ class Stepper(ABC):
         mesh.update_ghosts(state.x)
         self.energy = self.model.bars.forces(state.x, state.f, commit)
         failed = self.energy.failed
-        if self._before is None:
-            self._before = np.empty_like(state.x)
-        elif failed < 0 and self.energy.shortened:
-            failed = self.model.bars.first_inverted(state.x, self._before)
+        if failed < 0 and self.energy.shortened:
+            failed = self.model.bars.first_inverted(state.x, self.before)
         if failed >= 0 and self.fault is None:
             self.fault = SimulationFailure(self._collapse(failed))
-        self._before[:] = state.x
 
     def _collapse(self, bar: int) -> str:
         mesh, state = self.model.mesh, self.state

@@ -10,6 +10,7 @@ import numpy as np
 from mpi4py import MPI
 
 from .errors import EarlyStop, PfemError, SimulationFailure
+from .mechanics.compiled import Compilation
 from .output.progress import Progress
 from .output.units import engineering
 from .output.vtkhdf import ResultWriter
@@ -77,6 +78,8 @@ class Simulation:
         check_only: bool = False,
     ) -> None:
         self._stop = StopRequest(wall_time)
+        self._progress: Progress | None = None
+        self._compilation = Compilation(self._tell_compilation, self._leave_out)
         self.case = case
         self.comm = comm if comm is not None else MPI.COMM_WORLD
         self.folder = Path(output) if output is not None else Path("results") / case.name
@@ -84,6 +87,11 @@ class Simulation:
         found = find_restart(case, self.comm, self.folder, None if check_only else restart)
         self.restart = found if isinstance(found, Restart) else None
         self._notes = [found] if isinstance(found, str) else []
+        with self._compilation:
+            self._prepare()
+
+    def _prepare(self) -> None:
+        case = self.case
         self.model = Model(case, self.comm)
         self.plan = make_plan(self.model, self.restart.attributes["plan"] if self.restart is not None else None)
         self.finished = False
@@ -97,7 +105,6 @@ class Simulation:
         self._started = False
         self._asked = 0  # code of a request to stop, zero for none
         self._writer: ResultWriter | None = None
-        self._progress: Progress | None = None
         minutes = case.output.checkpoint_minutes
         self._meetings = Meetings(self.comm, self._stop, 60.0 * minutes if minutes else None)
 
@@ -209,6 +216,10 @@ class Simulation:
         """Run step by step; the output is closed when the iteration ends."""
         if self.finished:
             return
+        with self._compilation:
+            yield from self._steps()
+
+    def _steps(self) -> Iterator[Step]:
         try:
             self.start()
             self._stop_early(self._meet())
@@ -345,6 +356,17 @@ class Simulation:
                     raise
         if self._progress is not None:
             self._progress.close(outcome)
+
+    def _tell_compilation(self) -> None:
+        text = "compiling loops for this machine, once"
+        if self._progress is not None:
+            self._progress.message(text)
+        elif self.comm.rank == 0 and not self.quiet:
+            print(text, flush=True)
+
+    def _leave_out(self, seconds: float) -> None:
+        if self._progress is not None:
+            self._progress.compiled(seconds)
 
     def gather(self, values: np.ndarray) -> np.ndarray | None:
         """An owned array (owned, ...) as a whole in mesh numbering on rank 0, None elsewhere. Collective."""

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import time
 import warnings
 from collections.abc import Callable
 from typing import Any
 
 import numba
+from numba.core import event
 
-__all__ = ["kernel"]
+__all__ = ["Compilation", "kernel"]
 
 # Contraction to fused multiply-add is the same in every compiled copy of a loop, so a bar evaluated on two ranks gives
 # the same bits on both; reassociation would not, and assuming "no NaN" would hide a blow-up.
@@ -29,3 +31,42 @@ def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
             stacklevel=2,
         )
         return numba.njit(**options)(function)
+
+
+class Compilation(event.Listener):
+    """Notices loops that are compiled by this process, not those whose machine code is on disk, while it is a context.
+
+    Parameters
+    ----------
+    begun : called before the first
+    took : called with the time that each took [s]
+    """
+
+    def __init__(self, begun: Callable[[], None], took: Callable[[float], None]) -> None:
+        self._begun, self._took = begun, took
+        self._told = False
+        self._nested = 0  # loops that are compiled for one that calls them
+        self._begin = 0.0
+
+    def __enter__(self) -> Compilation:
+        event.register("numba:compile", self)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        event.unregister("numba:compile", self)
+        self._nested = 0
+
+    def on_start(self, event: event.Event) -> None:
+        """A loop is about to be compiled."""
+        if self._nested == 0:
+            self._begin = time.perf_counter()
+            if not self._told:
+                self._told = True
+                self._begun()
+        self._nested += 1
+
+    def on_end(self, event: event.Event) -> None:
+        """It is compiled, or refused."""
+        self._nested -= 1
+        if self._nested == 0:
+            self._took(time.perf_counter() - self._begin)

@@ -88,6 +88,7 @@ class Progress:
         self._interval = FIRST_LINE
         self._next_line = self._due = self._begin + FIRST_LINE
         self._closed = False
+        self._compiling = 0.0
         if self._root and self._stream is not None and _is_terminal(self._stream):
             self._start_bar()
             self._due = self._begin + BAR_REFRESH
@@ -129,10 +130,19 @@ class Progress:
             return
         self._newton += newton
         self._linear += linear
+        first = self._last[2] == 0.0
         self._last = (step, time, dt, contacts, energy_drift)
         now = self._clock()
+        if first:
+            # compiling, loading and waiting for ranks that do so, which no later step does
+            self._marked = (now, step, time, self._newton, self._linear)
         if now >= self._due:
             self._report(now)
+
+    def compiled(self, seconds: float) -> None:
+        """Leave this time out of rates and of the time that remains: the run does not spend it again [s]."""
+        self._compiling += seconds
+        self._marked = (self._marked[0] + seconds, *self._marked[1:])
 
     def message(self, text: str, level: str = "INFO") -> None:
         """Print a text between the reports and log it with its level."""
@@ -165,8 +175,10 @@ class Progress:
             self._write(self._line(now))
         wall, steps = now - self._begin, step - self._start[0]
         text = f"{outcome}: {steps:,} steps in {duration(wall)}"
-        if steps and wall > 0:
-            text += f" ({_speed(steps / wall)})"
+        if self._compiling >= 0.1:
+            text += f", of it {duration(self._compiling)} for compiling"
+        if steps and wall > self._compiling:
+            text += f" ({_speed(steps / (wall - self._compiling))})"
         text += f", t = {engineering(time, 's')}"
         if self._newton:
             text += f", {self._newton:,} Newton and {self._linear:,} linear iterations"
@@ -194,7 +206,7 @@ class Progress:
         step, time, *_ = self._last
         if wall > 0 and step > self._marked[1]:
             new = ((step - self._marked[1]) / wall, (time - self._marked[2]) / wall)
-            # the first interval holds compilation and caches: half of it is forgotten with each line
+            # half of what was is forgotten with each line
             self._rate = new if self._rate is None else tuple(0.5 * a + 0.5 * b for a, b in zip(self._rate, new))
         if self._rate is None:
             return float("inf")

@@ -259,5 +259,7 @@ def test_parameter_of_another_scheme_is_refused_with_the_way_out():
     taken_out = ["time.integrator=houbolt", "time.beta=", "time.gamma="]
     assert Case.from_dict(data, overrides=taken_out).time.integrator == "houbolt"
     data["time"]["integrator"] = "houbolt"
-    with pytest.raises(InputError, match=r"time.beta: a key of chung_lee, newmark, not of houbolt, which takes no parameters(\n|$)"):
+    with pytest.raises(
+        InputError, match=r"time.beta: a key of chung_lee, newmark, not of houbolt, which takes no parameters(\n|$)"
+    ):
         Case.from_dict(data)

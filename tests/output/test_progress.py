@@ -92,6 +92,28 @@ def test_restart_counts_its_own_steps():
     assert "66/100" in stream.getvalue() and "ETA 4.25 s" in stream.getvalue()
 
 
+def test_first_step_and_compiling_are_no_measure_of_what_remains():
+    """Twenty seconds for the first step, and eight in a later one: the others take an eighth of a second."""
+    clock, stream = Clock(), io.StringIO()
+    progress = Progress(COMM, "Rod", 100, 1.0, stream=stream, clock=clock)
+    for step in range(1, 101):
+        clock.now += 0.125
+        if step == 1:
+            clock.now += 20.0
+        if step == 15:
+            clock.now += 8.0
+            progress.compiled(8.0)
+        progress.update(step, 0.01 * step, 0.01)
+    progress.close()
+    lines = [line for line in stream.getvalue().splitlines() if line.startswith("step")]
+    assert "1/100" in lines[0] and "ETA" in lines[0] and "steps/s" not in lines[0]
+    for line in lines[1:]:
+        left = 100 - int(line.split("/")[0].split()[-1])
+        assert "  8 steps/s" in line
+        assert f"ETA {duration(left / 8.0)}" in line
+    assert "done: 100 steps in 40.5 s, of it 8.00 s for compiling (3.1 steps/s)" in stream.getvalue()
+
+
 def test_quiet_writes_the_log_only(tmp_path, capsys):
     log = tmp_path / "results" / "log.txt"
     assert run(100, 0.125, quiet=True, log_path=log) == ""

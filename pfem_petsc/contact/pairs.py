@@ -102,12 +102,12 @@ class ContactPairs:
         """
         self.force = self.part(predictor, u, stiffness)
         self.push(contact)
-        return self.held
+        return len(self.pressed()[0])
 
-    @property
-    def held(self) -> int:
-        """Nodes of this rank that pairs hold."""
-        return int((self.mine & (self.force > 0.0)).sum())
+    def pressed(self) -> tuple[np.ndarray, np.ndarray]:
+        """Owned nodes (k,) that pairs hold, and the directions (k, 3) of their pairs."""
+        pressed = self.mine & (self.force > 0.0)
+        return self.local[pressed], np.broadcast_to(self.normals, (2, *self.normals.shape))[pressed]
 
     def release(self) -> None:
         """No pair presses."""
@@ -115,28 +115,71 @@ class ContactPairs:
 
     def part(self, predictor: np.ndarray, u: np.ndarray, stiffness: np.ndarray) -> np.ndarray:
         """Change u (owned, 3) [m] so that predictor + u keeps all pairs; the pairs' forces (p,) [N]. Collective."""
-        data = np.zeros((*self.mine.shape, 4))
-        mine = self.local[self.mine]
-        data[self.mine, :3] = predictor[mine] + u[mine]
-        data[self.mine, 3] = 1.0 / stiffness[mine]
-        self.sum(data)
-        gives = data[:, :, 3] * np.einsum("epi,pi->ep", self.free, self.normals**2)
-        short = self.gaps - self.distances(data[:, :, :3])
-        soft = gives.sum(axis=0)
-        force = np.where((short > 0.0) & (soft > 0.0), short / np.maximum(soft, 1e-300), 0.0)
-        for end, here, at, push in self._pushes(force):
-            u[at] += push * self.free[end, here] / stiffness[at, None]
+        force = np.maximum(self._needed(predictor + u, stiffness, self.gaps), 0.0)
+        self._move(u, force, stiffness)
         return force
+
+    def together(self, values: np.ndarray, mass: np.ndarray, rates: np.ndarray | float = 0.0) -> np.ndarray:
+        """Velocities or accelerations (owned, 3) at which pressed pairs part at ``rates`` (p,); momentum is kept.
+
+        Collective.
+        """
+        same = values.copy()
+        self._move(same, self._needed(values, mass, np.where(self.force > 0.0, rates, -np.inf)), mass)
+        return same
+
+    def resting(self, x: np.ndarray, v: np.ndarray, slack: float, still: float) -> np.ndarray:
+        """(p,) bool: pairs of nodes at (owned, 3) that are closed within a slack [m] and do not part or meet faster
+        than ``still`` [m/s]. Collective."""
+        ends = self.gather(np.concatenate([x, v], axis=1))
+        closed = np.abs(self.distances(ends[:, :, :3]) - self.gaps) <= slack
+        return closed & (np.abs(self.distances(ends[:, :, 3:])) <= still)
+
+    def rest(self, a: np.ndarray, mass: np.ndarray, closed: np.ndarray) -> np.ndarray:
+        """Set the forces that closed pairs (p,) need for accelerations (owned, 3) that do not bring them nearer.
+
+        Gives these forces (owned, 3) [N] on components that are free. Collective.
+        """
+        self.force = np.maximum(self._needed(a, mass, np.where(closed, 0.0, -np.inf)), 0.0)
+        change = np.zeros_like(a)
+        self._move(change, self.force, np.ones_like(mass))
+        return change
+
+    def reduced_mass(self, mass: np.ndarray) -> np.ndarray:
+        """1/(1/m_1 + 1/m_2) (p,) [kg] along the directions, from those of owned nodes (owned,). Collective."""
+        gives = (np.einsum("epi,pi->ep", self.free, self.normals**2) / self.gather(mass)).sum(axis=0)
+        return 1.0 / np.maximum(gives, 1e-300)
+
+    def keep(self, values: np.ndarray, of_pairs: np.ndarray) -> None:
+        """Put values (p,) of pressed pairs into those of owned nodes (owned,), at the second ends."""
+        here = self.mine[1] & (self.force > 0.0)
+        values[self.local[1, here]] = of_pairs[here]
 
     def push(self, contact: np.ndarray) -> None:
         """Add the pairs' forces to those on the nodes (owned, 3) [N]."""
         for _, _, at, push in self._pushes(self.force):
             contact[at] += push
 
+    def _needed(self, x: np.ndarray, stiffness: np.ndarray, least: np.ndarray) -> np.ndarray:
+        """Forces (p,) on nodes at (owned, 3) that make the distances ``least`` (p,), none where that is -inf."""
+        data = np.zeros((*self.mine.shape, 4))
+        mine = self.local[self.mine]
+        data[self.mine, :3] = x[mine]
+        data[self.mine, 3] = 1.0 / stiffness[mine]
+        self.sum(data)
+        soft = (data[:, :, 3] * np.einsum("epi,pi->ep", self.free, self.normals**2)).sum(axis=0)
+        usable = (soft > 0.0) & (least > -np.inf)
+        short = np.where(usable, least, 0.0) - self.distances(data[:, :, :3])
+        return np.where(usable, short / np.maximum(soft, 1e-300), 0.0)
+
+    def _move(self, u: np.ndarray, force: np.ndarray, stiffness: np.ndarray) -> None:
+        for end, here, at, push in self._pushes(force):
+            u[at] += push * self.free[end, here] / stiffness[at, None]
+
     def _pushes(self, force: np.ndarray) -> Iterator[tuple[int, np.ndarray, np.ndarray, np.ndarray]]:
-        """Of both ends: end, (p,) pairs that press on it here, nodes (k,), forces (k, 3) [N]."""
+        """Of both ends: end, (p,) pairs whose force acts on it here, nodes (k,), forces (k, 3) [N]."""
         for end, sign in ((0, -1.0), (1, 1.0)):
-            here = self.mine[end] & (force > 0.0)
+            here = self.mine[end] & (force != 0.0)
             yield end, here, self.local[end, here], sign * force[here, None] * self.normals[here]
 
     def totals(self) -> dict[str, np.ndarray]:

@@ -1,10 +1,11 @@
-"""Nodes that rest on walls at the start: their acceleration and the forces that hold them.
+"""Nodes that rest on walls or on each other at the start: their acceleration and the forces that hold them.
 
 A node that touches a wall and does not move along its normal is not accelerated into it: with the walls' forces r,
 
-    M a = f + r,   0 <= n . a  complementary to  the strength of r.
+    M a = f + r,   0 <= n . a  complementary to  the strength of r,
 
-An acceleration without r starts a truss at rest on a floor with a jolt of h g, which dies out slowly with some schemes.
+and likewise with n . (a_2 - a_1) of closed pairs. An acceleration without r starts a truss at rest on a floor with a
+jolt of h g, which dies out slowly with some schemes.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ def start_at_rest(model, state, accelerate: Callable[[np.ndarray], np.ndarray], 
     Returns
     -------
     WallForces or None
-        None where no node of any rank rests on a wall, or only one that lets it go.
+        None where no node of any rank rests on a wall or another node, or only on what lets it go.
     """
     contact, comm, mass = model.contact, model.comm, model.inertia.mass
     x, v = state.position, state.v
@@ -57,19 +58,26 @@ def start_at_rest(model, state, accelerate: Callable[[np.ndarray], np.ndarray], 
     inverse = 1.0 / mass[nodes][:, None]
     fixed = model.supports.fixed[nodes]
     share = 0.5 if model.inertia.consistent else 1.0
+    pairs = model.pairs
+    if pairs is not None:
+        closed = pairs.resting(x, v, slack, _SLACK * model.wave_speed)
 
     hold = np.zeros((len(nodes), 3))  # free components of the walls' forces
     strengths = np.zeros(resting.shape)
+    between = np.zeros_like(load)  # the same of the pairs' forces
     for _ in range(_ROUNDS if model.inertia.consistent else 1):
         free = state.a[nodes] - hold * inverse / share
         moved = free.copy()
         project(moved, fixed, normals, planes, 0.0, strengths)
         before, hold = hold, share * mass[nodes][:, None] * (moved - free)
         sizes = np.array([np.abs(hold - before).max(initial=0.0), np.abs(hold).max(initial=0.0)])
+        if pairs is not None:
+            earlier, between = between, pairs.rest(state.a - between / (share * mass[:, None]), share * mass, closed)
+            sizes = np.maximum(sizes, [np.abs(between - earlier).max(initial=0.0), np.abs(between).max(initial=0.0)])
         change, largest = np.max(comm.allgather(sizes), axis=0)
         if change <= 1e-13 * largest:
             break
-        total = load.copy()
+        total = load + between
         total[nodes] += hold
         state.a = accelerate(total)
     if largest == 0.0:
@@ -78,4 +86,6 @@ def start_at_rest(model, state, accelerate: Callable[[np.ndarray], np.ndarray], 
     force = strengths[:, :, None] * normals
     state.contact = np.zeros_like(load)
     state.contact[nodes] = force.sum(axis=1)
+    if pairs is not None:
+        pairs.push(state.contact)
     return contact.sums(nodes, force, x[nodes], strengths > 0.0)

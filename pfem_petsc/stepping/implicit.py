@@ -171,7 +171,7 @@ class ImplicitStepper(Stepper):
         if frames is None and not model.supports.any:
             self._keep_momentum(problem, u, g)
         state.contact, walls, self.held = contacts.forces(u)
-        held = int(self.held.sum()) + (0 if model.pairs is None else model.pairs.held)
+        held = int(self.held.sum()) + (0 if model.pairs is None else len(model.pairs.pressed()[0]))
         state.support = np.zeros_like(u)
         fixed = model.supports.fixed
         state.support[fixed] = g[fixed] - state.contact[fixed]

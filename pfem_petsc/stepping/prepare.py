@@ -139,13 +139,14 @@ def make_stepper(model, plan: Plan) -> Stepper:
     """
     _check_walls(model, plan)
     name = model.case.contact.treatment
-    if name == "scheme" and model.contact.any and (growth := held_growth(plan.scheme)) > 1.0 + 1e-9:
+    touch = model.contact.any or model.pairs is not None
+    if name == "scheme" and touch and (growth := held_growth(plan.scheme)) > 1.0 + 1e-9:
         model.warnings.append(
-            f'walls: with contact.treatment = "scheme" {model.case.time.integrator} with these parameters amplifies '
-            f"the motion of a node that a wall holds (by {growth:.3f} a step): contact chatters and gains energy; take "
+            f'contact: with contact.treatment = "scheme" {model.case.time.integrator} with these parameters amplifies '
+            f"the motion of nodes that contact holds (by {growth:.3f} a step): they chatter and gain energy; take "
             'contact.treatment = "stick"'
         )
-    if name == "scheme" or not model.contact.any:
+    if name == "scheme" or not touch:
         return _stepper(model, plan, ExplicitStepper)
     key = f'{model.case.source}: contact.treatment = "{name}"'
     if model.inertia.consistent:
@@ -166,8 +167,9 @@ def make_stepper(model, plan: Plan) -> Stepper:
 def _check_walls(model, plan: Plan) -> None:
     """Refuse what a wall asks for and the scheme cannot do."""
     if model.pairs is not None:
-        if model.case.contact.treatment != "scheme":
-            raise InputError(f'{model.case.source}: contact_pair needs contact.treatment = "scheme"')
+        if model.case.contact.treatment == "mass_redistribution":
+            key = f'{model.case.source}: contact.treatment = "mass_redistribution"'
+            raise InputError(f"{key}: only walls can take mass from nodes; take another treatment with contact_pair")
         points = model.mesh.points[: model.mesh.n_owned]
         model.pairs.check_start(points, model.length, model.case.source)
     walls = model.case.wall

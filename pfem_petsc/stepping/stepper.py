@@ -108,10 +108,12 @@ class Stepper(ABC):
         if model.inertia.damped:
             load -= model.inertia.damping_times(state.v, np.zeros_like(load))
         state.a = self.accelerate(load)
-        if model.contact.any and model.inertia.redistribution is None:
+        if (model.contact.any or model.pairs is not None) and model.inertia.redistribution is None:
             walls = start_at_rest(model, state, self.accelerate, load)
             if walls is not None:
                 self.solution.walls, self.solution.contacts = walls, int(walls.touching.any(axis=1).sum())
+                if model.pairs is not None:
+                    self.solution.contacts += len(model.pairs.pressed()[0])
         if supports.any:
             state.support = np.zeros_like(state.v)
             state.support[supports.fixed] = -(load + state.contact)[supports.fixed]

@@ -13,6 +13,7 @@ from pfem_petsc.stepping.implicit import ImplicitStepper
 EXPLICIT = [{"integrator": name} for name in ("central_differences", "chung_lee", "hulbert_chung")]
 IMPLICIT = [{"integrator": name} for name in ("newmark", "generalized_alpha", "energy_momentum", "houbolt")]
 IMPLICIT += [{"integrator": "wilson", "theta": 1.5}, {"integrator": "central_differences", "mass": "consistent"}]
+TRAPEZOID = {"integrator": "newmark", "beta": 0.25, "gamma": 0.5}
 DIRECTION = [2.0, 0.0, 0.0]
 
 
@@ -51,12 +52,12 @@ def label(time):
     return "-".join(str(value) for value in time.values())
 
 
-@pytest.mark.parametrize("time", [*EXPLICIT, *IMPLICIT], ids=label)
-def test_two_rods_are_the_symmetric_model(time, comm, shared_tmp_path, linear="auto"):
-    """Direct solver, as the models are small."""
+def collide(time, comm, shared_tmp_path, linear="auto", treatment="scheme"):
+    """Two rods against the symmetric model; the rows of the history. ``auto``: a direct solver, as they are small."""
     cases = two_rods(linear=linear), half()
     for case in cases:
         case["time"] |= time
+        case["contact"] = {"treatment": treatment}
     both = simulation(cases[0], comm, shared_tmp_path, "both")
     rows = [step.row for step in both]
     one = simulation(cases[1], comm, shared_tmp_path, "one")
@@ -75,18 +76,24 @@ def test_two_rods_are_the_symmetric_model(time, comm, shared_tmp_path, linear="a
     for name in ("contact_work", "kinetic_energy", "elastic_energy", "numerical_dissipation"):
         np.testing.assert_allclose([row[name] for row in rows], [2.0 * row[name] for row in others], atol=1e-9)
     assert max(row["active_contacts"] for row in rows) == 2
+    return rows
+
+
+@pytest.mark.parametrize("time", [*EXPLICIT, *IMPLICIT], ids=label)
+def test_two_rods_are_the_symmetric_model(time, comm, shared_tmp_path):
+    collide(time, comm, shared_tmp_path)
 
 
 @pytest.mark.parallel
 @pytest.mark.parametrize("integrator", ["chung_lee", "newmark", "energy_momentum"])
 def test_two_rods_on_ranks(integrator, comm, shared_tmp_path):
-    test_two_rods_are_the_symmetric_model({"integrator": integrator}, comm, shared_tmp_path)
+    collide({"integrator": integrator}, comm, shared_tmp_path)
 
 
 @pytest.mark.parallel
 @pytest.mark.parametrize("integrator", ["generalized_alpha"])
 def test_matrix_free_rods_are_the_symmetric_model(integrator, comm, shared_tmp_path):
-    test_two_rods_are_the_symmetric_model({"integrator": integrator}, comm, shared_tmp_path, linear="cg")
+    collide({"integrator": integrator}, comm, shared_tmp_path, linear="cg")
 
 
 @pytest.mark.parametrize("time", IMPLICIT[:-1], ids=label)
@@ -161,6 +168,42 @@ def test_explicit_steps_solve_the_variational_inequality(supported, comm, shared
 @pytest.mark.parallel
 def test_explicit_steps_on_ranks(comm, shared_tmp_path):
     test_explicit_steps_solve_the_variational_inequality(True, comm, shared_tmp_path)
+
+
+@pytest.mark.parametrize("time", [EXPLICIT[0], EXPLICIT[1], *IMPLICIT[:-1], TRAPEZOID], ids=label)
+def test_pairs_that_stick(time, comm, shared_tmp_path):
+    """No energy is gained, and the two nodes lose that of their motion against each other."""
+    rows = collide(time, comm, shared_tmp_path, treatment="stick")
+    energy = np.array([row["kinetic_energy"] + row["elastic_energy"] for row in rows])
+    assert energy.max() < energy[0] * (1.0 + 1e-6)
+    assert rows[-1]["contact_work"] < 0.0
+    if time == TRAPEZOID:
+        assert rows[-1]["contact_work"] == pytest.approx(-0.05 * energy[0], rel=0.03)
+
+
+@pytest.mark.parametrize("time", [IMPLICIT[2], TRAPEZOID], ids=label)
+def test_pairs_that_do_no_work(time, comm, shared_tmp_path):
+    rows = collide(time, comm, shared_tmp_path, treatment="conserving")
+    energy = np.array([row["kinetic_energy"] + row["elastic_energy"] for row in rows])
+    np.testing.assert_allclose(energy, energy[0], rtol=1e-4)
+    assert abs(rows[-1]["contact_work"]) < 1e-12
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("treatment", ["stick", "conserving"])
+def test_treatments_of_lattices(treatment, comm, shared_tmp_path):
+    """Thirteen pairs, one of them with a node that is held: momentum across it, and energy."""
+    case = two_lattices(shared_tmp_path / "m.vtu", "energy_momentum", step=1e-3, end=0.04, solver={"rtol": 1e-12})
+    case["contact"] = {"treatment": treatment}
+    rows = [step.row for step in simulation(case, comm, shared_tmp_path)]
+    energy = np.array([row["kinetic_energy"] + row["elastic_energy"] for row in rows])
+    momentum = np.array([row["momentum"] for row in rows])
+    np.testing.assert_allclose(momentum, np.tile(momentum[0], (len(rows), 1)), atol=1e-14)
+    assert max(abs(row["energy_imbalance"]) for row in rows) < 1e-11
+    assert max(row["active_contacts"] for row in rows) > 12
+    if treatment == "conserving":
+        np.testing.assert_allclose(energy, energy[0], rtol=1e-3)
+    assert energy.max() < energy[0] * (1.0 + 1e-6)
 
 
 def test_unequal_bodies_keep_momentum(comm, shared_tmp_path):

@@ -1,5 +1,6 @@
 """A truss that lies on a wall stays there: at rest from the first row on, with its weight as the wall's force."""
 
+import h5py
 import numpy as np
 import pytest
 from mpi4py import MPI
@@ -77,3 +78,43 @@ def test_a_truss_that_leaves_falls_freely(scheme, shared_tmp_path):
     time = history["time"][-1]
     np.testing.assert_allclose(end[:, 2], 0.5 * time - 0.5 * GRAVITY * time**2, rtol=1e-12)
     assert not history["wall/floor/force"].any()
+
+
+def stacked(scheme, mass, folder, comm):
+    """A rod that lies along another one, which is held: each node of the upper on one of the lower."""
+    n = 5
+    x = np.linspace(0.0, 1.0, n)
+    points = np.concatenate([np.stack([x, 0.0 * x, z + 0.0 * x], axis=1) for z in (0.0, 0.1)])
+    bars = [(i + k, i + k + 1) for k in (0, n) for i in range(n - 1)]
+    if comm.rank == 0:
+        with h5py.File(folder / "mesh.h5", "w") as file:
+            file["points"], file["bars"] = points, bars
+    comm.Barrier()
+    data = {
+        "mesh": {"file": "mesh.h5"},
+        "node_set": {"lower": {"indices": list(range(n))}, "upper": {"indices": list(range(n, 2 * n))}},
+        "material": {"it": {"young_modulus": 1e9, "density": 1000.0}},
+        "section": {"it": {"area": 1e-4, "material": "it"}},
+        "gravity": {"acceleration": [0.0, 0.0, -GRAVITY]},
+        "support": [{"node_set": "lower", "fix": "xyz"}],
+        "contact_pair": [{"name": "p", "first": "lower", "second": "upper", "direction": [0, 0, 1.0], "gap": 0.1}],
+        "time": {"integrator": scheme, "mass": mass, "step": 5e-5, "end": 1e-3},
+        "output": {"fields_every": 0},
+        "solver": {"rtol": 1e-12},
+    }
+    return Simulation(Case.from_dict(data, folder=folder), comm, output=folder / "it", quiet=True)
+
+
+@pytest.mark.parametrize(
+    "scheme, mass",
+    [*((scheme, "lumped") for scheme in SCHEMES), ("central_differences", "consistent"), ("newmark", "consistent")],
+)
+def test_rod_that_lies_on_another_stays_there(scheme, mass, comm, shared_tmp_path):
+    run = stacked(scheme, mass, shared_tmp_path, comm)
+    rows = [step.row for step in run]
+    weight = 0.1 * GRAVITY
+    for row in rows:
+        assert row["pair/p/force"] == pytest.approx([0.0, 0.0, weight], rel=1e-8)
+        assert row["support_force"] == pytest.approx([0.0, 0.0, 2.0 * weight], rel=1e-8)
+        assert row["active_contacts"] == 10
+    assert np.abs(run.state.v).max(initial=0.0) < 1e-12

@@ -2,8 +2,9 @@
 
 The normal velocity of a held node takes back the work W that contact did on it: m (v+^2 - v^2)/2 = -W, away from the
 wall. Its acceleration is the one without contact, so that the next step knows nothing of this contact force. Where W is
-positive and more than the node's energy, what is left is taken back in the steps to come. For schemes whose balance
-holds at x_{n+1}.
+positive and more than the node's energy, what is left is taken back in the steps to come. Of a contact pair the same
+holds for the velocity of its nodes relative to each other and their reduced mass; what is left is kept with its second
+node. For schemes whose balance holds at x_{n+1}.
 """
 
 from __future__ import annotations
@@ -28,23 +29,38 @@ class Treatment(Base):
     def after(self) -> None:
         """See :class:`~pfem_petsc.contact.treatments.base.Treatment`."""
         self.clear()
-        stepper, state, inertia = self.stepper, self.stepper.state, self.stepper.model.inertia
+        state, pairs = self.stepper.state, self.stepper.model.pairs
         debt = state.memory.setdefault("contact_debt", np.zeros_like(state.v))
+        nodes, v, a = self._off_walls(debt)
+        if pairs is not None and pairs.force.any():
+            ends, apart, free = self._apart(debt)
+            nodes, v, a = np.append(nodes, ends), np.vstack([v, apart]), np.vstack([a, free])
+        if len(nodes):
+            self.set(nodes, v, a)
+
+    def _work(self, nodes: np.ndarray) -> np.ndarray:
+        """Work (m,) [J] of contact on nodes (m,) in this part of the step."""
+        state = self.stepper.state
+        force = state.contact[nodes]
+        if self.stepper.scheme.at_ends:
+            force = 0.5 * (force + self._force[nodes])
+        return np.einsum("mi,mi->m", force, state.position[nodes] - self._start[nodes])
+
+    def _accelerations(self, nodes: np.ndarray, normal: np.ndarray) -> np.ndarray:
+        """Accelerations (m, 3), without contact along what projections (m, 3, 3) keep."""
+        state = self.stepper.state
+        force = (state.external - state.f[: len(state.a)])[nodes]
+        free = force / self.stepper.model.inertia.mass[nodes, None]
+        return state.a[nodes] + np.einsum("mij,mj->mi", normal, free - state.a[nodes])
+
+    def _off_walls(self, debt: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Nodes that walls hold (m,), their velocities and accelerations (m, 3)."""
+        stepper, state = self.stepper, self.stepper.state
         nodes, normal, speed = self.held()
-        held = np.zeros(len(state.v), dtype=bool)
-        held[nodes] = True
-        owing = np.flatnonzero((debt[:, 0] != 0.0) & ~held)
-        if len(nodes) == 0 and len(owing) == 0:
-            return
-        mass = inertia.mass[nodes]
-        way = state.position[nodes] - self._start[nodes]
-        if stepper.scheme.at_ends:
-            work = 0.5 * np.einsum("mi,mi->m", state.contact[nodes] + self._force[nodes], way)
-        else:
-            work = np.einsum("mi,mi->m", state.contact[nodes], way)
+        mass = stepper.model.inertia.mass[nodes]
         # work on a wall that moves is work done, not lost
-        work -= np.einsum("mi,mi->m", state.contact[nodes], speed) * stepper.part
-        work += debt[nodes, 0]
+        moved = np.einsum("mi,mi->m", state.contact[nodes], speed) * stepper.part
+        work = self._work(nodes) - moved + debt[nodes, 0]
         push = np.einsum("mij,mj->mi", normal, state.contact[nodes])
         out = push / np.maximum(np.linalg.norm(push, axis=1), 1e-300)[:, None]
         v = state.v[nodes]
@@ -53,8 +69,18 @@ class Treatment(Base):
         square = (relative * relative).sum(axis=1) - 2.0 * work / mass
         debt[nodes, 0] = np.where(square < 0.0, -0.5 * mass * square, 0.0)
         v = across + speed + np.sqrt(np.maximum(square, 0.0))[:, None] * out
-        owned = stepper.model.mesh.n_owned
-        free = (state.external[nodes] - state.f[:owned][nodes]) / mass[:, None]
-        a = state.a[nodes]
-        a = a + np.einsum("mij,mj->mi", normal, free - a)
-        self.set(nodes, v, a)
+        return nodes, v, self._accelerations(nodes, normal)
+
+    def _apart(self, debt: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Nodes that pairs hold (m,), their velocities and accelerations (m, 3). Collective."""
+        state, pairs, mass = self.stepper.state, self.stepper.model.pairs, self.stepper.model.inertia.mass
+        nodes, normals = pairs.pressed()
+        work = np.zeros(len(state.v))
+        work[nodes] = self._work(nodes)
+        ends = pairs.gather(np.column_stack([state.v, work, debt[:, 0]]))
+        reduced = pairs.reduced_mass(mass)
+        square = pairs.distances(ends[:, :, :3]) ** 2
+        square -= 2.0 * (ends[0, :, 3] + ends[1, :, 3] + ends[1, :, 4]) / reduced
+        pairs.keep(debt[:, 0], np.where(square < 0.0, -0.5 * reduced * square, 0.0))
+        v = pairs.together(state.v, mass, np.sqrt(np.maximum(square, 0.0)))[nodes]
+        return nodes, v, self._accelerations(nodes, normals[:, :, None] * normals[:, None, :])

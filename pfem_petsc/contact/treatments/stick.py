@@ -1,5 +1,7 @@
 """Held nodes move with the wall: their normal velocity is the wall's, and they are not accelerated.
 
+The nodes of a pressed contact pair move on together: their normal velocity is the one that keeps their momentum.
+
 On closure a node loses the kinetic energy of its approach, m v_n^2/2, an O(element length) part of the whole; on
 release it starts from rest. Energy never grows by contact with a wall at rest.
 """
@@ -21,9 +23,14 @@ class Treatment(Base):
         self.clear()
         state = self.stepper.state
         nodes, normal, speed = self.held()
-        if len(nodes) == 0:
-            return
         v, a = state.v[nodes], state.a[nodes]
         v = v - np.einsum("mij,mj->mi", normal, v) + speed
         a = a - np.einsum("mij,mj->mi", normal, a)
-        self.set(nodes, v, a)
+        pairs, mass = self.stepper.model.pairs, self.stepper.model.inertia.mass
+        if pairs is not None and pairs.force.any():
+            ends, _ = pairs.pressed()
+            nodes = np.append(nodes, ends)
+            v = np.vstack([v, pairs.together(state.v, mass)[ends]])
+            a = np.vstack([a, pairs.together(state.a, mass)[ends]])
+        if len(nodes):
+            self.set(nodes, v, a)

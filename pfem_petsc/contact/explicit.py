@@ -53,7 +53,7 @@ class ExplicitContact:
             self._room,
         )
         if stuck >= 0:
-            raise SimulationFailure(contact.no_room(nodes[stuck], offsets[stuck], time))
+            raise SimulationFailure(contact.no_room(nodes[stuck], offsets[stuck]))
         if len(nodes) == 0:
             return nodes, force, contact.nothing
         return nodes, force, WallForces(*sums, nodes, touching, places)

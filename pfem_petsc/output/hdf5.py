@@ -254,11 +254,12 @@ def require_room(comm: MPI.Comm, path: Path, n_bytes: int, target: Path | None =
                 f"{path}: gone or unreachable during the run ({os.strerror(error.errno)}); "
                 "do not move or remove the output folder of a run that is going on"
             ) from error
-        if free < n_bytes + (1 << 20):
+        needed = n_bytes + (1 << 20)
+        if free < needed:
             raise SimulationFailure(
-                f"{path}: disk full: {free / 1e6:.1f} MB are free and {n_bytes / 1e6:.1f} MB are to be written. What "
-                "was written before is complete; make room and continue with --restart, or write less (fields_every, "
-                "fields, precision in [output])"
+                f"{path}: disk full: {free / 1e6:.1f} MB are free, and the next write may take {needed / 1e6:.1f} MB. "
+                "What was written before is complete; make room and continue with --restart, or write less "
+                "(fields_every, fields, precision in [output])"
             )
 
     on_root(comm, look)

@@ -14,6 +14,7 @@ import math
 import numpy as np
 
 from ..mechanics.compiled import kernel
+from .sliding import Sliding
 
 __all__ = ["MIN_VOLUME", "NodalFrames", "build_frames"]
 
@@ -34,6 +35,7 @@ class NodalFrames:
     normals, offsets : (m, w, 3), (m, w) planes that have a row; offset -inf for the others
     oblique : whether any basis is not the identity
     contradiction : index in ``nodes`` of a node whose bounds leave it no room, -1 for none
+    sliding : drag of nodes that slip, None without friction
     """
 
     def __init__(self, nodes: np.ndarray, walls: int) -> None:
@@ -49,6 +51,7 @@ class NodalFrames:
         self.offsets = np.full((m, walls), -np.inf)
         self.oblique = False
         self.contradiction = -1
+        self.sliding: Sliding | None = None
 
     def pin(self, at: np.ndarray, values: np.ndarray, which: np.ndarray) -> None:
         """Hold the coordinates ``which`` (k, 3) of the frames ``at`` (k,) at values (k, 3) [m]."""

@@ -4,8 +4,9 @@ A node that touches a wall and does not move along its normal is not accelerated
 
     M a = f + r,   0 <= n . a  complementary to  the strength of r,
 
-and likewise with n . (a_2 - a_1) of closed pairs. An acceleration without r starts a truss at rest on a floor with a
-jolt of h g, which dies out slowly with some schemes.
+and likewise with n . (a_2 - a_1) of closed pairs. r includes friction: against the velocity of a node that slides, else
+what keeps it from sliding, if the wall can give that much. An acceleration without r starts a truss at rest on a floor
+with a jolt of h g, which dies out slowly with some schemes.
 """
 
 from __future__ import annotations
@@ -14,12 +15,14 @@ from collections.abc import Callable
 
 import numpy as np
 
+from .friction import add_friction
 from .projection import project
 
 __all__ = ["start_at_rest"]
 
 _ROUNDS = 60  # each at least halves the error
 _SLACK = 1e-12  # of lengths and wave speeds: strains that rounding makes
+_FAST = 1e12  # by so much a velocity that decides over the direction of slip is above an acceleration
 
 
 def start_at_rest(model, state, accelerate: Callable[[np.ndarray], np.ndarray], load: np.ndarray):
@@ -55,21 +58,27 @@ def start_at_rest(model, state, accelerate: Callable[[np.ndarray], np.ndarray], 
     kept = resting.any(axis=1)
     nodes, normals, resting = nodes[kept], normals[kept], resting[kept]
     planes = np.where(resting, 0.0, -np.inf)
-    inverse = 1.0 / mass[nodes][:, None]
     fixed = model.supports.fixed[nodes]
     share = 0.5 if model.inertia.consistent else 1.0
+    weight = share * mass[nodes]
     pairs = model.pairs
     if pairs is not None:
         closed = pairs.resting(x, v, slack, _SLACK * model.wave_speed)
 
     hold = np.zeros((len(nodes), 3))  # free components of the walls' forces
     strengths = np.zeros(resting.shape)
+    drag = np.zeros(normals.shape)
     between = np.zeros_like(load)  # the same of the pairs' forces
     for _ in range(_ROUNDS if model.inertia.consistent else 1):
-        free = state.a[nodes] - hold * inverse / share
+        free = state.a[nodes] - hold / weight[:, None]
         moved = free.copy()
         project(moved, fixed, normals, planes, 0.0, strengths)
-        before, hold = hold, share * mass[nodes][:, None] * (moved - free)
+        if contact.rough:
+            slack = _SLACK * model.wave_speed
+            strengths *= weight[:, None]
+            _rub(contact, nodes, v, rates, slack, weight, moved, normals, planes, strengths, drag)
+            strengths /= weight[:, None]
+        before, hold = hold, weight[:, None] * (moved - free)
         sizes = np.array([np.abs(hold - before).max(initial=0.0), np.abs(hold).max(initial=0.0)])
         if pairs is not None:
             earlier, between = between, pairs.rest(state.a - between / (share * mass[:, None]), share * mass, closed)
@@ -82,10 +91,41 @@ def start_at_rest(model, state, accelerate: Callable[[np.ndarray], np.ndarray], 
         state.a = accelerate(total)
     if largest == 0.0:
         return None
-    strengths *= share * mass[nodes][:, None]
-    force = strengths[:, :, None] * normals
+    strengths *= weight[:, None]
+    force = strengths[:, :, None] * normals + drag
     state.contact = np.zeros_like(load)
     state.contact[nodes] = force.sum(axis=1)
     if pairs is not None:
         pairs.push(state.contact)
     return contact.sums(nodes, force, x[nodes], strengths > 0.0)
+
+
+def _rub(contact, nodes, v, rates, slack, weight, a, normals, planes, pressing, drag) -> None:
+    """Friction at the start: accelerations (m, 3), pressing (m, w) and drag (m, w, 3) forces, in place.
+
+    Nodes that slide have a slip in which their velocity outweighs any acceleration; that of the others is their
+    acceleration.
+    """
+    away = v[nodes][:, None, :] - rates
+    away -= np.einsum("mwi,mwi->mw", away, normals)[:, :, None] * normals
+    slides = ((np.linalg.norm(away, axis=2) > slack) & (pressing > 0.0)).any(axis=1)
+    largest = max(float(np.abs(a).max(initial=0.0)), 1e-300)
+    for group in (slides, ~slides):
+        part = np.flatnonzero(group)
+        moved, press, pull = a[part], pressing[part], drag[part]
+        fast = np.linalg.norm(v[nodes[part]], axis=1).max(initial=0.0) + np.abs(rates).max(initial=0.0)
+        factor = _FAST * largest / fast if group is slides and fast > 0.0 else 0.0
+        add_friction(
+            moved,
+            -factor * v[nodes[part]],
+            -factor * rates,
+            contact.fixed[nodes[part]],
+            normals[part],
+            planes[part],
+            contact.friction,
+            contact.static_friction,
+            weight[part],
+            press,
+            pull,
+        )
+        a[part], pressing[part], drag[part] = moved, press, pull

@@ -17,6 +17,7 @@ from ..solvers.newton import zero_tolerance
 from ..stepping.stepper import NotConverged
 from .forces import WallForces
 from .frames import NodalFrames
+from .implicit_friction import StepFriction
 from .pair_coordinates import PairCoordinates
 from .projection import project
 
@@ -54,6 +55,7 @@ class ContactRounds:
         self._frames: NodalFrames | None = None
         self._rank: np.ndarray | None = None
         self._tied: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None  # in the frames, walls, places
+        self.friction = StepFriction(model, state, balance) if self.contact.rough else None
         self.candidates = self._expected() if self.contact.any else None
         self._all_pairs, self.pairs = pairs, None
         if pairs is not None:
@@ -86,6 +88,8 @@ class ContactRounds:
             self._frames = self.contact.frames(self.candidates, x, self.balance.time, concerned, self._rank)
             if self.contact.ties.any:
                 self._tie()
+            if self.friction is not None:
+                self.friction.apply(self._frames, x)
         return self._frames
 
     def _tie(self) -> None:
@@ -138,6 +142,10 @@ class ContactRounds:
             u = self.feasible(u - g / stiffness[:, None], stiffness)
         return u
 
+    def firm(self) -> bool:
+        """Keep the directions of slip in the next solve; whether the last one solved for them. Collective."""
+        return self.friction is not None and self._frames is not None and self.friction.firm()
+
     def bounds(self, guess: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         """Bounds on w (owned, 3): those of the frames less B predictor, and of pairs; None in free flight. Collective.
 
@@ -172,7 +180,7 @@ class ContactRounds:
             near = np.abs(w - bound) <= within
             w[near] = bound[near]
 
-    def settled(self, w: np.ndarray, u: np.ndarray, g: np.ndarray, noise: float) -> bool:
+    def settled(self, w: np.ndarray, u: np.ndarray, g: np.ndarray, noise: float, tolerance: float) -> bool:
         """Whether the solution keeps all walls and pairs; if not, the next round knows better. Collective.
 
         Parameters
@@ -180,14 +188,15 @@ class ContactRounds:
         w, u : (owned, 3) solution in the frames' coordinates and in x [m]
         g : (owned, 3) imbalance there [N]
         noise : what a free node has left of it [N]
+        tolerance : what it may have left [N]
         """
         contact = self.contact
         x = self.balance.predictor + u
-        tolerance = 1e-12 * self.model.length
+        slack = 1e-12 * self.model.length
         settled = True
         if self.pairs is not None:
             self.pairs.press(w, g, self._bounds[0], noise)
-        elif self._all_pairs is not None and self._all_pairs.broken(x, tolerance):
+        elif self._all_pairs is not None and self._all_pairs.broken(x, slack):
             self.pairs, settled = self._all_pairs, False
         if not contact.any:
             return settled
@@ -195,15 +204,22 @@ class ContactRounds:
         if self._frames is not None:
             self.strengths = self._strengths(w, g, noise)
             self._pull = np.where(contact.fixed[self.candidates], 0.0, g[self.candidates])
-        beyond = np.flatnonzero(contact.near(x, self._shifts, np.array([-tolerance])))
-        unsettled, joined = self._unexpected(beyond, x, tolerance)
+        beyond = np.flatnonzero(contact.near(x, self._shifts, np.array([-slack])))
+        unsettled, joined = self._unexpected(beyond, x, slack)
+        left = joined
+        if self.friction is not None and self._frames is not None:
+            at = self.candidates
+            known = self._frames, x[at], self._pull, self.strengths
+            self.strengths = self.friction.settle(*known, noise, tolerance)
+            left = np.union1d(left, self.friction.unsettled)
         if not contact.flat.all() and self._frames is not None:
-            unsettled = unsettled or self._off_surface(x, tolerance)
+            unsettled = unsettled or self._off_surface(x, slack)
+        unsettled = unsettled or len(left) > 0
         if self.model.comm.allreduce(int(unsettled), op=MPI.MAX) == 0:
             return settled
         self.round += 1
         if self.round >= _ROUNDS:
-            names = self.model.comm.allgather(self.model.mesh.node_ids[beyond[:3]].tolist())
+            names = self.model.comm.allgather(self.model.mesh.node_ids[left[:3]].tolist())
             shown = ", ".join(str(node) for part in names for node in part)
             raise NotConverged(
                 f"step {self.state.step + 1}, t = {self.balance.time:.6g} s: the nodes that touch walls could not be "
@@ -288,6 +304,8 @@ class ContactRounds:
         if self._frames is not None:
             at = self._frames.nodes
             force = self.strengths[:, :, None] * self._frames.normals
+            if self.friction is not None:
+                force += self.friction.drag
             touching = self.strengths > 0.0
             if self._tied is not None:
                 tied, owners, _ = self._tied

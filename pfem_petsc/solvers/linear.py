@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from petsc4py import PETSc
 
 from ..errors import InputError
 
-__all__ = ["LinearChoice", "choose_linear", "configure"]
+__all__ = ["LinearChoice", "choose_linear", "configure", "unsymmetric"]
 
 _DIRECT_BELOW = 500  # unknowns; a lattice of 3,993 takes 0.22 s to factorise, and 1 to 4 ms with conjugate gradients
 # Steps over the explicit limit up to which each is chosen. scripts/linear_solvers.py, 101,706 bars on one core, seconds
@@ -74,6 +74,14 @@ def choose_linear(
     return LinearChoice(krylov, "gamg", f"{method}, multigrid ({ratio})")
 
 
+def unsymmetric(choice: LinearChoice) -> LinearChoice:
+    """The same choice for a matrix that is not symmetric."""
+    if choice.krylov == "preonly":
+        return choice
+    preconditioner = "ilu" if choice.preconditioner == "icc" else choice.preconditioner
+    return replace(choice, krylov="gmres", preconditioner=preconditioner)
+
+
 def configure(ksp: PETSc.KSP, choice: LinearChoice, reduced: bool) -> None:
     """Set a linear solver up; options of the same prefix given by the user override it afterwards.
 
@@ -82,6 +90,8 @@ def configure(ksp: PETSc.KSP, choice: LinearChoice, reduced: bool) -> None:
     comm = ksp.comm
     pc = ksp.getPC()
     ksp.setType(choice.krylov)
+    if choice.krylov == "gmres":
+        ksp.setGMRESRestart(100)
     if choice.krylov != "preonly":
         ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
         # 101,706 bars at 2 x the explicit limit: 1e-5, 1e-4, 1e-3, 1e-2 took 30.0, 29.4, 27.0, 35.7 ms a step

@@ -110,6 +110,8 @@ class MatrixFreeHessian:
     def update(self, problem, w: np.ndarray) -> None:
         """Linearise at ``w``. Collective."""
         self._problem = problem
+        if problem.oblique:
+            self._left = problem.left()
         problem.place(problem.increment(w))
         self.model.bars.linearise(problem.x, problem.balance.weight, self._stored)
         self.mat.stateIncrease()
@@ -149,7 +151,10 @@ class MatrixFreeHessian:
                 out[moved.touched] += problem.balance.alpha * np.einsum("kij,kj->ki", moved.tensors, u[moved.touched])
         _product(self.mesh.bars, self._stored, u, out)
         if problem.oblique:
-            out[at] = np.einsum("nji,nj->ni", problem.frames.inverse, out[at])
+            if problem.sliding is not None:
+                slipping = problem.sliding.nodes
+                out[slipping] += np.einsum("nij,nj->ni", problem.sliding.stiffness, u[slipping])
+            out[at] = np.einsum("nij,nj->ni", self._left, out[at])
         if problem.pairs is not None:
             problem.pairs.gradient(out)
         if fixed is not None:
@@ -172,9 +177,10 @@ class MatrixFreeHessian:
         nodal = problem.nodal * (2.0 / 3.0 if self.model.inertia.consistent else 1.0)
         diagonal = blocks[:owned][:, [0, 3, 5]] + nodal[:, None]
         if problem.oblique:
-            inverse = problem.frames.inverse
             full = self._blocks(blocks, nodal, problem.frames.nodes)
-            diagonal[problem.frames.nodes] = np.einsum("nji,njk,nki->ni", inverse, full, inverse)
+            if problem.sliding is not None:
+                full[problem.sliding.at] += problem.sliding.stiffness
+            diagonal[problem.frames.nodes] = np.einsum("nij,njk,nki->ni", self._left, full, problem.frames.inverse)
         if problem.pairs is not None:
             problem.pairs.diagonal(self._blocks(blocks, nodal, problem.pairs.carriers), diagonal)
         if self.model.supports.any:

@@ -53,7 +53,8 @@ class NewtonSolver:
     """Solves for the position increment of a step; made once for a run.
 
     Options: prefix ``pfem_`` for free steps, ``pfem_contact_`` for steps with bounds, and
-    ``pfem_contact_full_`` where these are tried again without a line search.
+    ``pfem_contact_full_`` where these are tried again without a line search. Steps with bounds have a linear solver of
+    their own, ``bounded``.
     """
 
     def __init__(
@@ -61,12 +62,13 @@ class NewtonSolver:
         mesh,
         hessian: HessianMatrix | MatrixFreeHessian,
         choice: LinearChoice,
+        bounded: LinearChoice,
         max_newton: int,
         length: float,
     ) -> None:
         self.mesh = mesh
         self.hessian = hessian
-        self.choice = choice
+        self.choice, self.bounded = choice, bounded
         self.max_newton = max_newton
         self.length = length
         self._u = PETSc.Vec().createMPI((3 * mesh.n_owned, 3 * mesh.n_nodes), bsize=3, comm=mesh.comm)
@@ -154,10 +156,11 @@ class NewtonSolver:
     def _without_definiteness(self, snes: PETSc.SNES, start: np.ndarray, first: NewtonReport) -> NewtonReport:
         """Conjugate gradients met an indefinite tangent: the same step with a method that needs no definiteness."""
         ksp = snes.getKSP()
-        configure(ksp, LinearChoice("gmres", self.choice.preconditioner, "indefinite"), reduced=True)
-        ksp.setGMRESRestart(100)
+        bounds = snes.getType() == "vinewtonrsls"
+        choice = self.bounded if bounds else self.choice
+        configure(ksp, LinearChoice("gmres", choice.preconditioner, "indefinite"), reduced=True)
         second = self._attempt(snes, start)
-        configure(ksp, self.choice, reduced=snes.getType() == "vinewtonrsls")
+        configure(ksp, choice, reduced=bounds)
         return NewtonReport(
             second.converged, first.newton + second.newton, first.linear + second.linear, second.norm, second.why
         )
@@ -190,7 +193,7 @@ class NewtonSolver:
             ours = not options.hasName("snes_vi_zero_tolerance")
             if ours:
                 options["snes_vi_zero_tolerance"] = zero_tolerance(self.length)
-        configure(snes.getKSP(), self.choice, reduced=contact)
+        configure(snes.getKSP(), self.bounded if contact else self.choice, reduced=contact)
         snes.setFromOptions()
         if contact and ours:
             # options belong to the process: the next model has a length of its own

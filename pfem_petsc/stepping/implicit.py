@@ -13,7 +13,7 @@ from ..contact.pair_coordinates import PairCoordinates
 from ..contact.rounds import ContactRounds
 from ..errors import SimulationFailure
 from ..integrators.base import Balance
-from ..solvers.linear import LinearChoice
+from ..solvers.linear import LinearChoice, unsymmetric
 from ..solvers.matrix import HessianMatrix
 from ..solvers.matrix_free import MatrixFreeHessian
 from ..solvers.newton import NewtonReport, NewtonSolver
@@ -36,12 +36,15 @@ class ImplicitStepper(Stepper):
         if choice.matrix_free:
             self.hessian = MatrixFreeHessian(model)
         else:
-            self.hessian = HessianMatrix(model.mesh, model.supports.fixed, model.supports.any, scheme.symmetric)
+            symmetric = scheme.symmetric and not model.contact.rough
+            self.hessian = HessianMatrix(model.mesh, model.supports.fixed, model.supports.any, symmetric)
             self.hessian.rigid = choice.preconditioner == "gamg"
         self.pairs = None if model.pairs is None else PairCoordinates(model.pairs)
         if self.pairs is not None:
             self.hessian.couple(self.pairs)
-        self.newton = NewtonSolver(model.mesh, self.hessian, choice, model.case.solver.max_newton, model.length)
+        bounded = unsymmetric(choice) if model.contact.rough else choice
+        most = model.case.solver.max_newton
+        self.newton = NewtonSolver(model.mesh, self.hessian, choice, bounded, most, model.length)
         self.newton.prepare(model.contact.any or self.pairs is not None)
         self.level = 0  # the next step is made in 2**level parts
         self.message: Callable[[str], None] = lambda text: None
@@ -154,18 +157,21 @@ class ImplicitStepper(Stepper):
             bounds = contacts.bounds(guess)
             w = contacts.clipped(problem.coordinates(contacts.feasible(guess)))
             report = self.newton.solve(problem, w, tolerance, model.rounding, bounds)
-            if not report.converged and (problem.oblique or problem.pairs is not None):
+            firm = not report.converged and contacts.firm()
+            if not report.converged and not firm and (problem.oblique or problem.pairs is not None):
                 w = contacts.clipped(problem.coordinates(contacts.approach(problem, guess)))
                 report = report.then(self.newton.solve(problem, w, tolerance, model.rounding, bounds))
             newton += report.newton
             linear += report.linear
+            if firm:
+                continue
             if not report.converged:
                 raise NotConverged(self._failure(problem, w, bounds, report, tolerance))
             contacts.snap(w)
             u = problem.increment(w).copy()
             g = np.empty_like(u)
             problem.imbalance(u, g)
-            if contacts.settled(w, u, g, report.norm):
+            if contacts.settled(w, u, g, report.norm, tolerance):
                 break
             guess = u
         if frames is None and not model.supports.any:

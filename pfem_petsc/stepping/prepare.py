@@ -179,8 +179,6 @@ def _check_walls(model, plan: Plan) -> None:
         model.contact.motion.free = FreeWalls(walls, plan.scheme, model.comm)
     for k, name in enumerate(model.contact.names):
         key = f"{model.case.source}: wall {name!r}"
-        if model.contact.static_friction[k] and plan.linear is not None:
-            raise InputError(f"{key}: friction needs an explicit integrator with lumped mass")
         if model.contact.restitution[k] and not (plan.linear is None and plan.scheme.leads):
             raise InputError(f"{key}: restitution needs central_differences with lumped mass")
         if model.contact.ties.tying[k] and model.case.contact.treatment not in ("scheme", "stick"):

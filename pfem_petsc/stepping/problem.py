@@ -14,8 +14,8 @@ __all__ = ["StepProblem"]
 
 
 @kernel
-def _turn_blocks(ptr, local_columns, frame_of, inverse, values):
-    """H <- B^-T H B^-1 on the rows and columns of nodes with a frame (index -1: none)."""
+def _turn_blocks(ptr, local_columns, frame_of, left, inverse, values):
+    """H <- L H B^-1 on the rows and columns of nodes with a frame (index -1: none)."""
     block = np.zeros((3, 3))
     for row in range(len(ptr) - 1):
         width = 3 * (ptr[row + 1] - ptr[row])
@@ -32,7 +32,7 @@ def _turn_blocks(ptr, local_columns, frame_of, inverse, values):
                 for j in range(3):
                     x, y, z = block[0, j], block[1, j], block[2, j]
                     for i in range(3):
-                        block[i, j] = inverse[r, 0, i] * x + inverse[r, 1, i] * y + inverse[r, 2, i] * z
+                        block[i, j] = left[r, i, 0] * x + left[r, i, 1] * y + left[r, i, 2] * z
             if c >= 0:
                 for i in range(3):
                     x, y, z = block[i, 0], block[i, 1], block[i, 2]
@@ -46,7 +46,8 @@ def _turn_blocks(ptr, local_columns, frame_of, inverse, values):
 class StepProblem:
     """g(w) of one step, where w is the increment u from the predictor, in nodal coordinates w = B u at walls.
 
-    With ``pairs``, nodes of contact pairs have their coordinates as well.
+    With ``pairs``, nodes of contact pairs have their coordinates as well. Drag by friction is a part of g (see
+    :mod:`pfem_petsc.contact.sliding`), whose derivative is then not symmetric.
 
     Components that supports prescribe have a zero residual and a unit row: the guess carries their value.
     """
@@ -82,7 +83,9 @@ class StepProblem:
         if balance.weight < 1.0:
             known = known + (1.0 - balance.weight) * state.f[: mesh.n_owned]
         self.known = known
-        self.oblique = frames is not None and model.comm.allreduce(int(frames.oblique)) > 0
+        own = frames is not None and (frames.oblique or (frames.sliding is not None and len(frames.sliding.nodes) > 0))
+        self.oblique = frames is not None and model.comm.allreduce(int(own)) > 0
+        self.sliding = frames.sliding if self.oblique else None
         if self.oblique:
             self._share_frames()
 
@@ -145,6 +148,9 @@ class StepProblem:
         if self.oblique:
             at = self.frames.nodes
             g[at] = np.einsum("nji,nj->ni", self.frames.inverse, g[at])
+            if self.sliding is not None:
+                nodes = self.sliding.nodes
+                g[nodes] = self.sliding.couple(self.balance.predictor[nodes] + self.u[nodes], g[nodes])
         if self.pairs is not None:
             self.pairs.gradient(g)
         if self.model.supports.any:
@@ -167,8 +173,17 @@ class StepProblem:
             else:
                 bars.tangents(self.x, *arguments)
         if self.oblique:
-            _turn_blocks(matrix.pattern.ptr, matrix.local_columns, self._frame_of, self._inverse, values)
+            if self.sliding is not None:
+                matrix.add_blocks(self.sliding.nodes, self.sliding.stiffness, values)
+            _turn_blocks(matrix.pattern.ptr, matrix.local_columns, self._frame_of, self.left(), self._inverse, values)
         matrix.constrain(self.scale, values)
+
+    def left(self) -> np.ndarray:
+        """What turns the imbalance of the frames' nodes (m, 3, 3) into the residual, at the last evaluation."""
+        left = self.frames.inverse.transpose(0, 2, 1).copy()
+        if self.sliding is not None:
+            left[self.sliding.at] = self.sliding.maps @ left[self.sliding.at]
+        return left
 
     def place(self, u: np.ndarray) -> None:
         """Put the positions of all local nodes at the predictor plus u. Collective."""

@@ -44,6 +44,16 @@ WALLS = {
         *planes([[0.0, 0.3, 1.0]], [-0.02]),
     ],
 }
+for name, keys in (
+    ("plane", {"friction": 0.4}),
+    ("wedge", {"friction": 0.3, "static_friction": 0.6}),
+    ("corner", {"friction": 0.4, "velocity": [0.5, 1.0, 0.0]}),
+    ("twelve", {"friction": 0.2}),
+    ("sphere", {"friction": 0.5, "static_friction": 0.7}),
+    ("inside a sphere", {"friction": 0.3}),
+    ("cylinder and plane", {"friction": 0.3}),
+):
+    WALLS[f"rough {name}"] = [wall | keys for wall in WALLS[name]]
 SUPPORTS = [{"node_set": "held", "fix": "y"}, {"node_set": "hinged", "fix": "xz"}]
 SETS = {"held": {"nearest": [0.0, 0.0, 0.0]}, "hinged": {"nearest": [0.2, 0.1, 0.1]}}
 

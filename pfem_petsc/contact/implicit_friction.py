@@ -1,0 +1,238 @@
+"""Coulomb friction in implicit steps: who sticks and who slips, found by solves of the step.
+
+The law is that of :mod:`~pfem_petsc.contact.friction`. In a solve, a node that sticks to a wall has its tangential
+coordinates held where it would be without slip, and what is needed for that is the force of friction; one that slips is
+dragged (:mod:`~pfem_petsc.contact.sliding`). Afterwards each node's own small problem is asked what it makes of the
+outcome: with the reaction R at x and any stiffness K, the law is kept where x is the explicit solution for the free
+position x - R/K. Where it is not, that solution says what the node does in the next solve.
+
+A slipping node first keeps the direction of its drag, for which there always is a solution: where it comes out the
+wrong way round, the node sticks. Once it is known to slip, its direction is solved for as well.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .friction import add_friction
+from .projection import project
+from .sliding import Sliding
+
+__all__ = ["StepFriction"]
+
+_FIRM = 0.1  # weight of the known direction in one that is solved for; ten times as much each time that this fails
+
+
+class StepFriction:
+    """Friction in one implicit step.
+
+    Parameters
+    ----------
+    model : Model
+    state : at the start of the step
+    balance : of the step
+
+    Attributes
+    ----------
+    drag : (m, walls, 3) forces of friction on the nodes of the frames, after :meth:`settle` [N]
+    unsettled : owned nodes whose solution did not keep the law in :meth:`settle`
+    """
+
+    def __init__(self, model, state, balance) -> None:
+        self.model = model
+        self.contact = model.contact
+        self.state = state
+        shifts = self.contact.motion.shifts
+        self._way = shifts(balance.time) - shifts(state.time)
+        inertia = model.inertia
+        self._inertial = balance.alpha * inertia.mass + balance.eta * inertia.damping
+        self._stiffness = self._inertial + balance.weight * model.nodal_stiffness
+        owned, walls = self.contact.members.shape
+        self._guessed = np.zeros(owned, dtype=bool)
+        self._sticks = np.full(owned, -1)  # the wall that a node sticks to, -1 for none
+        self._directions = np.zeros((owned, walls, 3))  # d a of slipping nodes
+        self._slips = np.zeros(owned, dtype=bool)  # known to slip along its direction
+        self._forces = np.zeros((owned, 3))  # drag of each node as its own problem had it last
+        self._firmness = _FIRM
+        self._lagged = False  # the drag is a known force
+        self._failed = np.zeros(owned, dtype=bool)  # found not to stick
+        self.drag = np.zeros((0, walls, 3))
+        self.unsettled = np.empty(0, dtype=np.int64)
+
+    def apply(self, frames, x: np.ndarray) -> None:
+        """Hold the sticking nodes of the frames and drag the slipping ones, for a guess of positions (owned, 3)."""
+        nodes = frames.nodes
+        rough = self._rough(frames)
+        fresh = rough & ~self._guessed[nodes]
+        if fresh.any():
+            at = np.flatnonzero(fresh)
+            reaction = self.state.contact[nodes[at]]
+            none = np.zeros(len(at), dtype=bool)
+            own = self._local(frames, at, x[nodes[at]], reaction, none)
+            self._forces[nodes[at]] = own[2].sum(axis=1)
+            self._decide(frames, at, none, *own)
+            self._guessed[nodes[at]] = True
+        self._hold(frames, np.flatnonzero(rough & (self._sticks[nodes] >= 0)))
+        moving = rough & (self._sticks[nodes] < 0) & (self._directions[nodes] != 0.0).any(axis=(1, 2))
+        frames.sliding = self._slide(frames, np.flatnonzero(moving))
+
+    def settle(
+        self, frames, x: np.ndarray, reaction: np.ndarray, strengths: np.ndarray, noise: float, tolerance: float
+    ):
+        """Find the nodes whose solution does not keep the law; normal forces (m, walls) of all nodes of the frames [N].
+
+        Parameters
+        ----------
+        x, reaction : (m, 3) positions and forces by walls of the frames' nodes [m], [N]
+        strengths : (m, walls) normal forces as they are without friction; taken for nodes at smooth walls alone
+        noise : force that counts as none [N]
+        tolerance : of the forces [N]
+        """
+        nodes = frames.nodes
+        strengths = strengths.copy()
+        self.drag = np.zeros((*strengths.shape, 3))
+        at = np.flatnonzero(self._rough(frames))
+        slipping = self._sticks[nodes[at]] < 0
+        moved, pressing, drag, stiffness = self._local(frames, at, x[at], reaction[at], slipping)
+        self._forces[nodes[at]] = drag.sum(axis=1)
+        apart = stiffness * np.linalg.norm(moved - x[at], axis=1)
+        floor = 1e-14 * stiffness * np.abs(x[at]).sum(axis=1)
+        kept = apart <= np.maximum(max(tolerance, 2.0 * noise), floor)
+        wrong = np.flatnonzero(~kept)
+        if len(wrong):
+            parts = (moved[wrong], pressing[wrong], drag[wrong], stiffness[wrong])
+            self._decide(frames, at[wrong], slipping[wrong], *parts)
+        may = self._may_stick(nodes[at], slipping & kept, x[at], pressing, frames.normals[at])
+        trying = may.any(axis=1)
+        self._sticks[nodes[at[trying]]] = may[trying].argmax(axis=1)
+        self.unsettled = nodes[np.union1d(at[wrong], at[trying])]
+        none = pressing <= noise
+        pressing[none], drag[none] = 0.0, 0.0
+        strengths[at], self.drag[at] = pressing, drag
+        return strengths
+
+    def firm(self) -> bool:
+        """Solve for less in the next solve, the last one having failed; whether there was less to ask. Collective.
+
+        First for no directions, then not even for what normal forces make of the drag.
+        """
+        slips, moves = bool(self._slips.any()), bool((self._directions != 0.0).any())
+        turning, moving = self.model.comm.allreduce(np.array([slips, moves], dtype=np.int64)) > 0
+        self._slips[:] = False
+        self._firmness *= 10.0
+        if turning:
+            return True
+        lagged, self._lagged = self._lagged, True
+        return moving and not lagged
+
+    def _rough(self, frames) -> np.ndarray:
+        """(m,) bool: frames with a wall that has friction."""
+        return ((frames.rows >= 0) & (self.contact.static_friction > 0.0)).any(axis=1)
+
+    def _local(self, frames, at, x, reaction, slipping) -> tuple[np.ndarray, ...]:
+        """The nodes' own problems: places (k, 3), pressing (k, w) and drag (k, w, 3) forces, and stiffness (k,).
+
+        Slipping nodes are asked with the dynamic coefficient alone: whether they stick is seen when it is tried.
+        """
+        contact, nodes = self.contact, frames.nodes[at]
+        stiffness = self._stiffness[nodes]
+        fixed, normals, offsets = contact.fixed[nodes], frames.normals[at], frames.offsets[at]
+        moved = x - np.where(fixed, 0.0, reaction) / stiffness[:, None]
+        pressing, drag = np.zeros(offsets.shape), np.zeros(normals.shape)
+        project(moved, fixed, normals, offsets, 1e-13 * contact.length, pressing)
+        pressing *= stiffness[:, None]
+        for group, static in ((slipping, contact.friction), (~slipping, contact.static_friction)):
+            part = np.flatnonzero(group)
+            place, press, pull = moved[part], pressing[part], drag[part]
+            add_friction(
+                place,
+                self.state.position[nodes[part]],
+                self._way,
+                fixed[part],
+                normals[part],
+                offsets[part],
+                contact.friction,
+                static,
+                stiffness[part],
+                press,
+                pull,
+            )
+            moved[part], pressing[part], drag[part] = place, press, pull
+        return moved, pressing, drag, stiffness
+
+    def _may_stick(self, nodes, slipping, x, pressing, normals) -> np.ndarray:
+        """(k, w) bool: walls that might hold slipping nodes by their static coefficient, which is to be tried once."""
+        contact = self.contact
+        slip = x[:, None, :] - self.state.position[nodes][:, None, :] - self._way
+        slip -= np.einsum("kwi,kwi->kw", slip, normals)[:, :, None] * normals
+        # with the rest of the truss going along, inertia alone resists
+        needed = contact.friction * pressing + self._inertial[nodes, None] * np.linalg.norm(slip, axis=2)
+        may = (contact.static_friction > contact.friction) & (needed <= contact.static_friction * pressing)
+        return may & (pressing > 0.0) & (slipping & ~self._failed[nodes])[:, None]
+
+    def _decide(self, frames, at, slipping, moved, pressing, drag, stiffness) -> None:
+        """What nodes do in the next solve, from their own problems' solutions."""
+        nodes, contact = frames.nodes[at], self.contact
+        normals = frames.normals[at]
+        slip = moved[:, None, :] - self.state.position[nodes][:, None, :] - self._way
+        slip -= np.einsum("kwi,kwi->kw", slip, normals)[:, :, None] * normals
+        size = np.linalg.norm(drag, axis=2)
+        # a wall that presses with rounding alone neither holds nor drags
+        least = 1e-9 * pressing.max(axis=1, initial=0.0)
+        rubbing = (pressing > least[:, None]) & (contact.static_friction > 0.0)
+        needed = np.linalg.norm(drag - stiffness[:, None, None] * slip, axis=2)
+        limit = np.where(slipping[:, None], contact.friction, contact.static_friction) * pressing
+        slips = rubbing & (needed > (1.0 + 1e-13) * limit)
+        holds = rubbing & ~slips
+        stuck = holds.any(axis=1)
+        before, was = self._directions[nodes], self._sticks[nodes] >= 0
+        unit = np.where(slips[:, :, None], -drag / np.maximum(size, 1e-300)[:, :, None], 0.0)
+        along = np.einsum("kwi,kwi->kw", slip, before).max(axis=1, initial=0.0) > 0.0
+        self._slips[nodes] = ~stuck & ~was & along & self._guessed[nodes]
+        self._failed[nodes] |= was & ~stuck
+        self._sticks[nodes] = np.where(stuck, holds.argmax(axis=1), -1)
+        self._directions[nodes] = unit * np.maximum(contact.friction * pressing, 1e-300)[:, :, None]
+
+    def _hold(self, frames, at: np.ndarray) -> None:
+        """Hold sticking nodes where they do not slip."""
+        nodes = frames.nodes[at]
+        wall = self._sticks[nodes]
+        row = frames.rows[at, wall]
+        place = self.state.position[nodes] + self._way[wall]
+        n = frames.normals[at, wall]
+        place += (frames.offsets[at, wall] - np.einsum("ki,ki->k", n, place))[:, None] * n
+        held = np.einsum("kij,kj->ki", frames.basis[at], place)
+        which = ~self.contact.fixed[nodes] & (np.arange(3) != row[:, None])
+        slack = 1e-12 * self.contact.length
+        fits = (held >= frames.lower[at] - slack) & (held <= frames.upper[at] + slack)
+        # another wall pushes it along, or its wall has no row: it cannot stick
+        possible = (fits | ~which).all(axis=1) & (row >= 0)
+        self._sticks[nodes[~possible]] = -1
+        frames.pin(at[possible], held[possible], which[possible])
+
+    def _slide(self, frames, at: np.ndarray) -> Sliding:
+        nodes = frames.nodes[at]
+        friction = np.where((self._directions[nodes] != 0.0).any(axis=2), self.contact.friction, 0.0)
+        friction = np.where(frames.rows[at] >= 0, friction, 0.0)
+        for k in range(1, friction.shape[1]):
+            # of walls that share a bound one takes the force
+            shared = (frames.rows[at, :k] == frames.rows[at, k][:, None]) & (friction[:, :k] > 0.0)
+            friction[shared.any(axis=1), k] = 0.0
+        slips = self._slips[nodes]
+        known = np.zeros((len(at), 3))
+        if self._lagged:
+            known, friction = self._forces[nodes], np.zeros_like(friction)
+        start = np.where(slips[:, None, None], self._firmness, 1.0) * self._directions[nodes]
+        return Sliding(
+            nodes,
+            at,
+            known,
+            frames.inverse[at],
+            frames.rows[at],
+            frames.signs[at],
+            friction,
+            frames.normals[at],
+            self.state.position[nodes][:, None, :] + self._way,
+            start,
+            np.where(slips, self._stiffness[nodes], 0.0),
+        )

@@ -1,0 +1,321 @@
+"""Friction in implicit steps: closed forms, the law itself node by node, and the explicit solution in the limit."""
+
+import numpy as np
+import pytest
+from lattices import lattice_case, planes, rotation, simulation
+from mpi4py import MPI
+from turning import with_mesh_file
+
+from pfem_petsc import Case, Simulation
+
+G = 9.81
+SCHEMES = [
+    ("newmark", {}),
+    ("houbolt", {}),
+    ("generalized_alpha", {"rho_inf": 0.0}),
+    ("wilson", {"theta": 1.8}),
+    ("energy_momentum", {}),
+    ("central_differences", {"mass": "consistent"}),
+    ("newmark", {"mass": "consistent"}),
+]
+
+
+def rod(
+    integrator, parameters, friction, *, velocity=(0.0, 0.0, 0.0), angle=0.0, height=0.0, step=1e-3, end=0.1, **wall
+):
+    """A rod across a plane that is inclined along x, in axes of the plane: all its nodes do the same."""
+    floor = {"type": "plane", "name": "floor", "point": [0, 0, -height], "normal": [0, 0, 1.0], "friction": friction}
+    return {
+        "mesh": {"generator": "rod", "length": 0.2, "elements": 3},
+        "material": {"m": {"young_modulus": 1e6, "density": 1000.0}},
+        "section": {"s": {"area": 1e-5, "material": "m"}},
+        "initial": {"velocity": list(velocity)},
+        "gravity": {"acceleration": [0.0, G * np.sin(angle), -G * np.cos(angle)]},
+        "wall": [floor | wall],
+        "time": {"integrator": integrator, "step": step, "end": end, **parameters},
+        "output": {"fields_every": 0},
+        "solver": {"rtol": 1e-13},
+    }
+
+
+def rows_of(case, comm, folder, name="result"):
+    run = simulation(case, comm, folder, name)
+    return [step.row for step in run], run
+
+
+@pytest.mark.parametrize("integrator, parameters", SCHEMES + [("central_differences", {}), ("chung_lee", {})])
+def test_incline(integrator, parameters, comm, shared_tmp_path):
+    """Above the angle of friction a rod slides with g (sin - mu cos) from the first step on, below it stays."""
+    angle = 0.4
+    for friction in (0.0, 0.2, 0.4):
+        rows, run = rows_of(rod(integrator, parameters, friction, angle=angle), comm, shared_tmp_path, f"{friction}")
+        a = G * (np.sin(angle) - friction * np.cos(angle))
+        last = rows[-1]
+        for row in rows[1:]:
+            assert row["momentum"][1] / run.model.total_mass == pytest.approx(a * row["time"], abs=1e-10)
+        fallen = last["centre_of_mass"][1] - rows[0]["centre_of_mass"][1]
+        # of the second order or exact; Hu's pair adds a h t/2
+        slack = 0.6e-3 * a * last["time"] if integrator in ("newmark", "chung_lee") else 1e-5 * a
+        assert fallen == pytest.approx(0.5 * a * last["time"] ** 2, abs=slack + 1e-12)
+        force = last["wall/floor/force"] / (run.model.total_mass * G * np.cos(angle))
+        np.testing.assert_allclose(force, [0.0, -friction, 1.0], atol=1e-9)
+        assert max(abs(row["energy_imbalance"]) for row in rows) < 1e-11
+    rows, run = rows_of(rod(integrator, parameters, 0.5, angle=angle), comm, shared_tmp_path, "stays")
+    moved = run.state.position - run.mesh.points[: run.mesh.n_owned]
+    assert np.abs(moved).max(initial=0.0) < 1e-13
+    assert rows[-1]["wall/floor/force"][1] == pytest.approx(-run.model.total_mass * G * np.sin(angle), rel=1e-9)
+    assert abs(rows[-1]["contact_work"]) < 1e-14
+
+
+@pytest.mark.parametrize("integrator, parameters", SCHEMES)
+def test_sliding_to_a_stop(integrator, parameters, comm, shared_tmp_path):
+    """A rod thrown along the floor stops after v^2/(2 mu g), and all its energy went into friction."""
+    friction, speed = 0.3, 0.2
+    far = speed**2 / (2.0 * friction * G)
+    errors = []
+    for step in (1e-3, 5e-4):
+        case = rod(integrator, parameters, friction, velocity=(0.0, speed, 0.0), step=step)
+        rows, run = rows_of(case, comm, shared_tmp_path, f"{step}")
+        last = rows[-1]
+        errors.append(abs(last["centre_of_mass"][1] - rows[0]["centre_of_mass"][1] - far))
+        # with wilson and energy_momentum the velocity of a node that is held goes to and fro
+        left = 0.0 if integrator not in ("wilson", "energy_momentum") else friction * G * step
+        assert np.abs(last["momentum"]).max() <= left * run.model.total_mass + 1e-12
+        assert -last["contact_work"] == pytest.approx(0.5 * run.model.total_mass * speed**2, rel=0.06)
+        assert max(abs(row["energy_imbalance"]) for row in rows) < 1e-12
+    assert errors[1] < 0.7 * errors[0] + 1e-12 and errors[1] < 0.05 * far
+
+
+@pytest.mark.parametrize("integrator, parameters", [*SCHEMES[:5], ("central_differences", {})])
+def test_breaking_loose(integrator, parameters, comm, shared_tmp_path):
+    """Pulled ever harder, a rod at rest starts when the pull is mu_static times its weight, and mu drags it then."""
+    static, dynamic, full = 0.6, 0.3, 0.1
+    case = rod(integrator, parameters, dynamic, static_friction=static, end=full, step=5e-4)
+    case["mesh"]["elements"], case["node_set"] = 1, {"both": {"all": True}}
+    weight = 0.2e-2 * G / 2.0  # of each node
+    pull = [0.0, 2.0 * static * weight, 0.0]
+    case["load"] = [{"node_set": "both", "force": pull, "table": [[0.0, 0.0], [full, 1.0]]}]
+    rows, _ = rows_of(case, comm, shared_tmp_path)
+    start = max(row["time"] for row in rows if row["momentum"][1] < 1e-12)
+    assert start == pytest.approx(0.5 * full, abs=2.1 * 5e-4)
+    for row in rows:
+        away = row["time"] - start
+        gained = 2.0 * weight * ((static - dynamic) * away + static * away**2 / full) if away > 0.0 else 0.0
+        assert row["momentum"][1] == pytest.approx(gained, abs=2.0 * weight * static * 3 * 5e-4)
+
+
+@pytest.mark.parametrize("integrator", ["newmark", "houbolt", "energy_momentum"])
+def test_oblique_impact(integrator, comm, shared_tmp_path):
+    """Thrown flat at the floor: the tangential impulse is mu times the normal one, or what stops the rod."""
+    for friction, speed in ((0.3, 2.0), (0.8, 0.5)):
+        case = rod(integrator, {}, friction, velocity=(0.0, speed, -1.0), height=0.01, end=0.03)
+        del case["gravity"]
+        rows, run = rows_of(case, comm, shared_tmp_path, f"{friction}")
+        impulse, mass = rows[-1]["wall/floor/impulse"], run.model.total_mass
+        # the whole force of houbolt's method acts over some steps, in which the rod may leave the wall again
+        assert impulse[2] > 0.9 * mass
+        if friction == 0.3:
+            assert impulse[1] == pytest.approx(-friction * impulse[2], rel=1e-8)
+        else:
+            assert abs(impulse[1]) < friction * impulse[2]
+        assert max(abs(row["energy_imbalance"]) for row in rows) < 1e-11
+
+
+WALLS = {
+    "plane": planes([[0.3, -0.2, 1.0]], [-0.02], friction=0.4),
+    "static": planes([[0.3, -0.2, 1.0]], [-0.02], friction=0.4, static_friction=0.7),
+    "moving": planes([[0.3, -0.2, 1.0]], [-0.02], friction=0.4, velocity=[1.0, 0.5, 0.5]),
+    "corner": planes([[1.0, 0.2, 0.3], [0.1, 1.0, -0.2], [-0.3, 0.2, 1.0]], [-0.03, -0.04, -0.07], friction=0.4),
+    "sphere": [{"type": "sphere", "point": [0.1, 0.05, -0.31], "radius": 0.3, "friction": 0.5}],
+    "bowl": [{"type": "sphere", "point": [0.1, 0.05, 0.05], "radius": 0.15, "side": "inside", "friction": 0.5}],
+}
+
+
+def tumbling(walls, integrator, parameters, step=1e-3, end=0.05, **tables):
+    case = lattice_case(
+        walls,
+        velocity=[1.0, -0.5, -3.0],
+        spin=[10.0, 20.0, -15.0],
+        integrator=integrator,
+        step=step,
+        end=end,
+        gravity=[0.0, 0.0, -100.0],
+        **{"solver": {"rtol": 1e-12}, **tables},
+    )
+    case["time"] |= parameters
+    return case
+
+
+@pytest.mark.parametrize("integrator, parameters", SCHEMES)
+@pytest.mark.parametrize("name", ["plane", "static", "moving", "sphere", "bowl"])
+def test_law_of_coulomb(name, integrator, parameters, comm, shared_tmp_path):
+    """Every force of every step: within the cone, and on it against the slip where there is any."""
+    wall = WALLS[name][0]
+    run = simulation(tumbling(WALLS[name], integrator, parameters), comm, shared_tmp_path)
+    solve, stuck, slipping = run.stepper.solve, 0, 0
+
+    def observed(balance):
+        nonlocal stuck, slipping
+        state = run.state
+        before, start = state.position.copy(), state.time
+        solution = solve(balance)
+        x, r = balance.predictor + solution.u, state.contact
+        pressed = np.abs(r).max(axis=1) > 0.0
+        x, r, before = x[pressed], r[pressed], before[pressed]
+        if wall["type"] == "plane":
+            n = np.tile(wall["normal"], (len(x), 1))
+        else:
+            arm = x - np.array(wall["point"])
+            n = arm / np.linalg.norm(arm, axis=1)[:, None] * (-1.0 if wall.get("side") else 1.0)
+        strength = np.einsum("mi,mi->m", r, n)
+        drag = r - strength[:, None] * n
+        slip = x - before - (balance.time - start) * np.array(wall.get("velocity", (0.0, 0.0, 0.0)))
+        slip -= np.einsum("mi,mi->m", slip, n)[:, None] * n
+        size = np.linalg.norm(slip, axis=1)
+        largest = strength.max(initial=0.0)
+        assert (strength > 0.0).all()
+        # what is below the tolerance of the forces is no slip: k s
+        slips = size > 1e-11
+        holds = wall.get("static_friction", wall["friction"])
+        assert (np.linalg.norm(drag, axis=1)[~slips] <= holds * strength[~slips] + 1e-9 * largest).all()
+        expected = -wall["friction"] * strength[slips, None] * slip[slips] / size[slips, None]
+        assert np.abs(drag[slips] - expected).max(initial=0.0) <= 1e-6 * largest
+        stuck, slipping = stuck + int((~slips).sum()), slipping + int(slips.sum())
+        return solution
+
+    run.stepper.solve = observed
+    rows = [step.row for step in run]
+    stuck, slipping = comm.allreduce(stuck), comm.allreduce(slipping)
+    assert stuck >= 3 and slipping >= 10
+    most = max(row["kinetic_energy"] for row in rows)
+    assert max(abs(row["energy_imbalance"]) for row in rows) < 1e-9 * most
+
+
+@pytest.mark.parametrize("integrator", ["newmark", "houbolt"])
+@pytest.mark.parametrize("keys", [{}, {"static_friction": 0.6}, {"velocity": [0.0, 0.4, 0.0]}], ids=str)
+def test_implicit_steps_tend_to_the_explicit_ones(keys, integrator, comm, shared_tmp_path):
+    """A lattice that is pushed to and fro over the floor, parts of it at a time."""
+    apart = []
+    for step in (4e-4, 1e-4):
+        x = {}
+        for scheme in ("central_differences", integrator):
+            floor = planes([[0.0, 0.0, 1.0]], [0.0], friction=0.4, **keys)
+            case = lattice_case(
+                floor,
+                integrator=scheme,
+                step=step,
+                end=0.06,
+                gravity=[0.0, 0.0, -G],
+                cells=[3, 1, 1],
+                material={"damping": 2e4},
+                node_set={"end": {"box": [[-0.01, -0.01, -0.01], [0.01, 0.11, 0.11]]}},
+                load=[{"node_set": "end", "force": [0.02, 0.0, 0.0], "table": [[0, 0], [0.02, 1], [0.06, -1]]}],
+            )
+            run = simulation(case, comm, shared_tmp_path, f"{scheme} {step}")
+            for _ in run:
+                pass
+            x[scheme] = run.gather(run.state.position)
+        if comm.rank == 0:
+            far = np.abs(x["central_differences"] - run.mesh.points[: len(x[scheme])]).max()
+            apart.append(np.abs(x[integrator] - x["central_differences"]).max() / far)
+    if comm.rank == 0:
+        assert apart[1] < 0.7 * apart[0] and apart[1] < 0.001
+
+
+@pytest.mark.parametrize("name", ["plane", "static", "corner", "sphere"])
+def test_turned(name, comm, shared_tmp_path):
+    """The problem turned about is the same one."""
+    turn, x = rotation(5), {}
+    for title, by in (("as it is", None), ("turned", turn)):
+        case = tumbling(WALLS[name], "newmark", {}, end=0.03, solver={"rtol": 1e-13})
+        run = simulation(with_mesh_file(case, shared_tmp_path / f"{title}.vtu", by), comm, shared_tmp_path, title)
+        for _ in run:
+            pass
+        x[title] = run.gather(run.state.position)
+    if comm.rank == 0:
+        assert np.abs(x["turned"] - x["as it is"] @ turn.T).max() < 1e-9 * 0.2
+
+
+@pytest.mark.parametrize(
+    "solver",
+    [{"linear": "cg", "operator": "matrix_free"}, {"linear": "cg", "operator": "assembled"}, {"linear": "gamg"}],
+    ids=["matrix-free", "assembled", "gamg"],
+)
+def test_linear_solvers_agree(solver, comm, shared_tmp_path):
+    x = {}
+    for name, keys in (("mumps", {"linear": "mumps"}), ("other", solver)):
+        case = tumbling(WALLS["corner"], "newmark", {}, end=0.03, solver={"rtol": 1e-11, **keys})
+        rows, run = rows_of(case, comm, shared_tmp_path, name)
+        x[name] = run.gather(run.state.position)
+        assert max(row["active_contacts"] for row in rows) >= 2
+    if comm.rank == 0:
+        assert np.abs(x["mumps"] - x["other"]).max() < 1e-8 * 0.2
+
+
+@pytest.mark.parametrize("operator", ["assembled", "matrix_free"])
+@pytest.mark.parametrize("name", ["plane", "corner", "bowl"])
+def test_derivative_of_the_drag(name, operator, comm, shared_tmp_path):
+    """The Hessian of a step with slipping nodes is the derivative of its residual, in both forms."""
+    solver = {"rtol": 1e-12, "linear": "cg", "operator": operator}
+    run = simulation(tumbling(WALLS[name], "newmark", {}, solver=solver), comm, shared_tmp_path)
+    newton, checked = run.stepper.newton, []
+    solve = newton.solve
+    random = np.random.default_rng(1)
+
+    def compare(problem, w, *others):
+        slips = problem.sliding is not None and (problem.sliding.weight > 0.0).any()
+        if slips and (len(checked) < 5 or (problem.sliding.friction > 0.0).sum(axis=1).max() > 1):
+            at = w + 1e-6 * random.normal(size=w.shape)
+            way = random.normal(size=w.shape)
+            found, less, more = np.empty_like(w), np.empty_like(w), np.empty_like(w)
+            problem.residual(at - 1e-9 * way, less)
+            problem.residual(at + 1e-9 * way, more)
+            problem.residual(at, found)
+            run.stepper.hessian.update(problem, at)
+            x, y = run.stepper.hessian.mat.createVecs()
+            x.array[:] = way.ravel()
+            run.stepper.hessian.mat.mult(x, y)
+            derivative = (more - less) / 2e-9
+            difference = np.abs(y.array.reshape(w.shape) - derivative)[problem.sliding.nodes].max()
+            checked.append(difference / np.abs(derivative).max())
+        return solve(problem, w, *others)
+
+    newton.solve = compare
+    for _ in run:
+        pass
+    assert len(checked) >= 5 and max(checked) < 1e-5
+
+
+@pytest.mark.parametrize("integrator", ["newmark", "houbolt"])
+def test_wall_with_mass(integrator, comm, shared_tmp_path):
+    """Momentum of truss and wall together stays, and the wall is dragged along."""
+    walls = planes([[0.3, -0.2, 1.0]], [-0.02], friction=0.4, mass=0.05, name="plate")
+    case = tumbling(walls, integrator, {}, step=5e-4, end=0.03)
+    del case["gravity"]
+    rows, _ = rows_of(case, comm, shared_tmp_path)
+    total = np.array([row["momentum"] + 0.05 * row["wall/plate/velocity"] for row in rows])
+    np.testing.assert_allclose(total, total[:1].repeat(len(rows), axis=0), atol=1e-11 * np.abs(total).max())
+    assert np.abs(np.cross(rows[-1]["wall/plate/velocity"], [0.3, -0.2, 1.0])).max() > 1e-3
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("name", ["static", "corner", "sphere"])
+def test_any_number_of_ranks(name, comm, shared_tmp_path):
+    """The run on all ranks is that on one, and a run in two parts is the run in one, bit for bit."""
+    found = {}
+    for title, end in (("one", 0.03), ("two", 0.02), ("two", 0.03)):
+        # on several ranks MUMPS sums in the order in which messages come
+        case = tumbling(WALLS[name], "newmark", {}, end=end, solver={"rtol": 1e-13, "linear": "cg"})
+        case["output"]["checkpoint_every"] = 20
+        case = Case.from_dict(case, name="it")
+        run = Simulation(case, comm, output=shared_tmp_path / title, quiet=True, restart=title == "two")
+        found[title] = [step.row for step in run][-1]
+        x = run.gather(run.state.position)
+    for column, value in found["one"].items():
+        np.testing.assert_array_equal(found["two"][column], value, err_msg=column)
+    if comm.rank == 0:
+        alone = Simulation(case, MPI.COMM_SELF, output=shared_tmp_path / "alone", quiet=True)
+        row = [step.row for step in alone][-1]
+        assert np.abs(alone.gather(alone.state.position) - x).max() < 1e-10 * 0.2
+        assert row["contact_work"] == pytest.approx(found["one"]["contact_work"], rel=1e-8)
+    comm.Barrier()

@@ -7,9 +7,48 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
+from ..mechanics.compiled import kernel
+
 __all__ = ["ContactLog"]
 
 _PENDING = 4096  # steps whose contacts are kept before the ranks put them together
+
+
+@kernel
+def _compare(touching, before, nodes, now, present, releases):
+    """Bring ``touching`` (owned, w) up to date, from the nodes that touched ``before`` to what ``nodes`` (m,) touch
+    ``now`` (m, w), and count ``releases`` (w,).
+
+    ``present`` (owned,) bool is working space, all false. Gives the number of changes, and the nodes that touch.
+    """
+    walls = touching.shape[1]
+    changes = 0
+    count = 0
+    after = np.empty_like(nodes)
+    for j in range(len(nodes)):
+        i = nodes[j]
+        present[i] = True
+        any_wall = False
+        for k in range(walls):
+            if touching[i, k] != now[j, k]:
+                changes += 1
+                if touching[i, k]:
+                    releases[k] += 1
+                touching[i, k] = now[j, k]
+            any_wall = any_wall or now[j, k]
+        if any_wall:
+            after[count] = i
+            count += 1
+    for i in before:
+        if not present[i]:
+            for k in range(walls):
+                if touching[i, k]:
+                    changes += 1
+                    releases[k] += 1
+                    touching[i, k] = False
+    for i in nodes:
+        present[i] = False
+    return changes, after[:count].copy()
 
 
 class ContactLog:
@@ -31,6 +70,7 @@ class ContactLog:
         self.changes = 0
         self.time = np.zeros(n_walls)
         self._before = np.empty(0, dtype=np.int64)
+        self._present = np.zeros(n_owned, dtype=bool)
         self._pending = 0
         self._steps = np.empty(_PENDING)
         self._flags = np.empty((_PENDING, n_walls), dtype=np.uint8)
@@ -45,14 +85,10 @@ class ContactLog:
         if len(walls.nodes) == 0 and len(self._before) == 0:
             return
         self.impulse += step * walls.force
-        changed = np.union1d(self._before, walls.nodes)
-        earlier = self.touching[changed]
-        self.touching[self._before] = False
-        self.touching[walls.nodes] = walls.touching
-        now = self.touching[changed]
-        self.releases += (earlier & ~now).sum(axis=0)
-        self.changes += int((earlier != now).sum())
-        self._before = walls.nodes[walls.touching.any(axis=1)]
+        changes, self._before = _compare(
+            self.touching, self._before, walls.nodes, walls.touching, self._present, self.releases
+        )
+        self.changes += changes
 
     def meet(self, comm: MPI.Comm) -> None:
         """Bring the contact times up to date on all ranks. Collective."""

@@ -157,6 +157,20 @@ def project(x, fixed, normals, offsets, tolerance, multipliers):
                 among[count] = k
                 count += 1
         found = 0
+        if count == 1:  # mostly one plane alone is broken, and its own point breaks no other
+            k = among[0]
+            square = free[k, 0] * free[k, 0] + free[k, 1] * free[k, 1] + free[k, 2] * free[k, 2]
+            strengths[0] = -gap[k] / square
+            chosen[0] = k
+            for c in range(3):
+                move[c] = strengths[0] * free[k, c]
+            found = 1
+            for q in range(w):
+                g = gap[q] + free[q, 0] * move[0] + free[q, 1] * move[1] + free[q, 2] * move[2]
+                if q != k and usable[q] and g < -tolerance:
+                    found = 0
+            if found == 1:
+                count = 0
         while count > 0:
             found = _best_set(free, gap, among, count, tolerance, gram, rhs, factor, solution, chosen, strengths, move)
             if found == 0:

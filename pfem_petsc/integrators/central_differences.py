@@ -18,21 +18,21 @@ __all__ = ["Parameters", "Scheme"]
 
 Parameters = NoParameters
 
+# the loops run over arrays (3 n,): vector instructions take several numbers at once
+
 
 @kernel
 def _drift(x, h, half, moved):
     for i in range(len(half)):
-        for c in range(3):
-            moved[i, c] = x[i, c] + h * half[i, c]
+        moved[i] = x[i] + h * half[i]
 
 
 @kernel
 def _kick(u, alpha, eta, h, half, a, v):
     for i in range(len(u)):
-        for c in range(3):
-            a[i, c] = alpha * u[i, c]
-            v[i, c] = half[i, c] + eta * u[i, c]
-            half[i, c] += u[i, c] / h
+        a[i] = alpha * u[i]
+        v[i] = half[i] + eta * u[i]
+        half[i] += u[i] / h
 
 
 class Scheme(ExplicitScheme):
@@ -49,13 +49,13 @@ class Scheme(ExplicitScheme):
 
     def advance(self, state: State, h: float) -> None:
         """Move to x_{n+1}, which the last balance has fixed."""
-        position = state.position
-        _drift(position, h, state.memory["half_velocity"], position)
+        position = state.position.reshape(-1)
+        _drift(position, h, state.memory["half_velocity"].reshape(-1), position)
 
     def balance(self, state: State, h: float) -> Balance:
         half = state.memory["half_velocity"]
         predictor = np.empty_like(half)
-        _drift(state.position, h, half, predictor)
+        _drift(state.position.reshape(-1), h, half.reshape(-1), predictor.reshape(-1))
         return Balance(
             alpha=1.0 / (h * h),
             eta=0.5 / h,
@@ -69,4 +69,5 @@ class Scheme(ExplicitScheme):
 
     def finish(self, state: State, balance: Balance, u: np.ndarray, h: float) -> None:
         state.a, state.v = np.empty_like(u), np.empty_like(u)
-        _kick(u, balance.alpha, balance.eta, h, state.memory["half_velocity"], state.a, state.v)
+        half, a, v = (array.reshape(-1) for array in (state.memory["half_velocity"], state.a, state.v))
+        _kick(u.reshape(-1), balance.alpha, balance.eta, h, half, a, v)

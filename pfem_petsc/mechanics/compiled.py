@@ -5,6 +5,8 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Callable
+from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numba
@@ -21,7 +23,7 @@ def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a loop; the machine code is cached on disk where a folder for it can be written."""
     options: dict[str, Any] = {"fastmath": _FAST, "error_model": "numpy", "nogil": True}
     try:
-        return numba.njit(cache=True, **options)(function)
+        compiled = numba.njit(cache=True, **options)(function)
     except RuntimeError as error:
         if "no locator" not in str(error):
             raise
@@ -31,6 +33,19 @@ def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
             stacklevel=2,
         )
         return numba.njit(**options)(function)
+    file = getattr(getattr(compiled, "_cache", None), "_cache_file", None)
+    if file is not None:
+        file._source_stamp = (file._source_stamp, _stamp())
+    return compiled
+
+
+@cache
+def _stamp() -> tuple[float, int]:
+    """Newest time and total size of the files whose functions are compiled into loops of other files: Numba itself asks
+    only for the file of the loop, and would go on with what was compiled before those changed."""
+    package = Path(__file__).resolve().parent.parent
+    states = [path.stat() for folder in ("mechanics", "contact") for path in (package / folder).rglob("*.py")]
+    return max(state.st_mtime for state in states), sum(state.st_size for state in states)
 
 
 class Compilation(event.Listener):

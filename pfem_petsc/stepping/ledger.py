@@ -50,13 +50,14 @@ class Ledger:
     work : (5,) sums since the start [J]: external (supports included), contact, damping, numerical, thermal
     totals : (12,) of this rank's nodes at the present state: momentum [kg m/s], angular momentum [kg m2/s], mass times
         position [kg m], support force [N]
+    sums : (17,) both, one after the other
     """
 
     def __init__(self, stepper) -> None:
         self.stepper = stepper
         self.model = stepper.model
-        self.work = np.zeros(len(TERMS))
-        self.totals = np.zeros(12)
+        self.sums = np.zeros(len(TERMS) + 12)
+        self.work, self.totals = self.sums[: len(TERMS)], self.sums[len(TERMS) :]
         inertia = self.model.inertia
         ones = np.ones_like(inertia.mass)
         # the loops multiply by these: lumped values, or one where the products with the matrices are given

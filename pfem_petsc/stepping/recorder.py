@@ -92,8 +92,7 @@ class Recorder:
         stepper, state, ledger = self.stepper, self.stepper.state, self.ledger
         energy, solution = stepper.energy, stepper.solution
         sums[:4] = ledger.kinetic, energy.elastic, energy.plastic_heat, energy.hardening
-        sums[4:9] = ledger.work
-        sums[9:21] = ledger.totals
+        sums[4:21] = ledger.sums
         sums[21:23] = solution.contacts, alarm
         at = _SUMS + self._contact.size
         if self._contact.size:
@@ -103,8 +102,7 @@ class Recorder:
             nodes = sums[at : at + size].reshape(4, -1, 3)
             nodes[:] = 0.0
             reaction = state.support[local] + state.contact[local]
-            for k, values in enumerate((state.x[local], state.v[local], state.a[local], reaction)):
-                nodes[k, place] = values
+            nodes[:, place] = state.x[local], state.v[local], state.a[local], reaction
             at += size
 
     def _unpack(self, sums: np.ndarray) -> np.ndarray:

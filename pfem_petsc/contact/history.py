@@ -53,6 +53,10 @@ class ContactColumns:
         share[:, 9] = walls.contacts
         share[:, 11] = log.releases
 
+    def contacts(self, sums: np.ndarray) -> np.ndarray | None:
+        """Nodes (walls,) that touch each wall, from the sums over the ranks; None without walls."""
+        return sums[1 : self.size].reshape(-1, 12)[:, 9] if self.size else None
+
     def put(self, sums: np.ndarray, time: float, values: np.ndarray) -> None:
         """Fill the columns ``values`` (width,) of a time [s] from the sums over the ranks; the count of changes starts
         anew."""

@@ -90,10 +90,15 @@ class ContactLog:
         )
         self.changes += changes
 
-    def meet(self, comm: MPI.Comm) -> None:
-        """Bring the contact times up to date on all ranks. Collective."""
+    def meet(self, comm: MPI.Comm, contacts: np.ndarray | None = None) -> None:
+        """Bring the contact times up to date on all ranks. Collective.
+
+        ``contacts`` (walls,): nodes of all ranks that touch after the last step, where that is known.
+        """
         n, self._pending = self._pending, 0
-        if n and len(self.time):
+        if n == 1 and contacts is not None:
+            self.time += self._steps[0] * (contacts > 0)
+        elif n and len(self.time):
             flags = self._flags[:n]
             if comm.size > 1:
                 comm.Allreduce(MPI.IN_PLACE, flags, op=MPI.MAX)

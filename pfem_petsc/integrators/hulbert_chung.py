@@ -14,6 +14,7 @@ import numpy as np
 from pydantic import Field
 
 from ..case.base import StrictModel
+from ..mechanics.compiled import kernel
 from .base import Balance, ExplicitScheme, State, lagged_limit
 
 __all__ = ["Parameters", "Scheme"]
@@ -23,6 +24,23 @@ class Parameters(StrictModel):
     """Parameters of the explicit generalised-alpha method."""
 
     rho_b: Annotated[float, Field(ge=0.0, le=1.0)] = 0.8
+
+
+# the loops run over arrays (3 n,): vector instructions take several numbers at once
+
+
+@kernel
+def _predict(x, h, v, c, a, predictor):
+    for i in range(len(v)):
+        predictor[i] = x[i] + h * v[i] + c * a[i]
+
+
+@kernel
+def _complete(square, old, new, predictor, u, v, a, x, v1, a1):
+    for i in range(len(u)):
+        x[i] = predictor[i] + u[i]
+        a1[i] = u[i] / square
+        v1[i] = v[i] + old * a[i] + new * a1[i]
 
 
 class Scheme(ExplicitScheme):
@@ -45,10 +63,13 @@ class Scheme(ExplicitScheme):
         return lagged_limit(self.alpha_m, self.beta, self.gamma, damping_ratio)
 
     def balance(self, state: State, h: float) -> Balance:
+        x, v, a = (array.reshape(-1) for array in (state.position, state.v, state.a))
+        predictor = np.empty_like(state.v)
+        _predict(x, h, v, h * h * (0.5 - self.beta), a, predictor.reshape(-1))
         return Balance(
             alpha=(1.0 - self.alpha_m) / (self.beta * h * h),
             eta=0.0,
-            predictor=state.position + h * state.v + (h * h * (0.5 - self.beta)) * state.a,
+            predictor=predictor,
             v_hat=state.v,
             a_hat=self.alpha_m * state.a if self.alpha_m else None,
             time=state.time + h,
@@ -57,7 +78,7 @@ class Scheme(ExplicitScheme):
         )
 
     def finish(self, state: State, balance: Balance, u: np.ndarray, h: float) -> None:
-        state.position[:] = balance.predictor + u
-        a1 = u / (self.beta * h * h)
-        state.v = state.v + (h * (1.0 - self.gamma)) * state.a + (h * self.gamma) * a1
-        state.a = a1
+        v1, a1 = np.empty_like(u), np.empty_like(u)
+        arrays = (array.reshape(-1) for array in (balance.predictor, u, state.v, state.a, state.position, v1, a1))
+        _complete(self.beta * h * h, h * (1.0 - self.gamma), h * self.gamma, *arrays)
+        state.v, state.a = v1, a1

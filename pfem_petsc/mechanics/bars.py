@@ -196,7 +196,8 @@ class Bars:
 
     def fields(self, x: np.ndarray) -> dict[str, np.ndarray]:
         """Per local bar: ``strain``, ``stress`` [Pa], ``axial_force`` [N], ``plastic_strain``."""
-        out = {name: np.zeros(len(self.ends)) for name in ("strain", "stress", "axial_force", "plastic_strain")}
+        out = {name: np.empty(len(self.ends)) for name in ("strain", "stress", "axial_force")}
+        out["plastic_strain"] = np.zeros(len(self.ends))
         for block in self.blocks:
             block.kernels.fields(
                 *self._arguments(x, block),

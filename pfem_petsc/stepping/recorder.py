@@ -84,7 +84,7 @@ class Recorder:
         if model.comm.size > 1:
             model.comm.Allreduce(MPI.IN_PLACE, sums)
         self.alarmed = sums[22] > 0.0
-        model.contact.log.meet(model.comm)
+        model.contact.log.meet(model.comm, self._contact.contacts(sums[_SUMS:]))
         return Row(self.layout, self._unpack(sums))
 
     def _fill(self, sums: np.ndarray, alarm: bool) -> None:

@@ -5,9 +5,9 @@ whose free positions x break it is a problem of two nodes of stiffness k_1 and k
 
     lambda = (gap - n . (x_2 - x_1)) / (1/k_1 + 1/k_2),   x_1 -= lambda n / k_1,   x_2 += lambda n / k_2,
 
-where components that supports prescribe do not give way. Each node is in one pair at most, and no wall stops it, so
-pairs are independent of each other. The ends of a pair may be on two ranks: all ranks know all pairs. For implicit
-steps see :mod:`pfem_petsc.contact.pair_coordinates`.
+where components that supports prescribe do not give way. Where pairs share nodes, or walls stop these as well, see
+:mod:`pfem_petsc.contact.coupled`; else pairs are independent of each other. The ends of a pair may be on two ranks: all
+ranks know all pairs. For implicit steps see :mod:`pfem_petsc.contact.pair_coordinates`.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import numpy as np
 from mpi4py import MPI
 
 from ..errors import InputError
+from .coupled import CoupledPairs
 
 __all__ = ["ContactPairs"]
 
@@ -31,11 +32,13 @@ class ContactPairs:
     first, second : (p,) mesh numbers of the nodes
     normals, gaps : (p, 3), (p,) unit directions, and bounds on n . (x_second - x_first) [m]
     mine, local : (2, p) which ends this rank owns, and their owned local indices
+    coupled : CoupledPairs
     free : (2, p, 3) 1.0 where a component of an end may move, 0.0 where a support prescribes it
     force : (p,) force of each pair in the last step, positive where it presses [N]; the same on all ranks
     """
 
-    def __init__(self, case, nodes: dict[str, np.ndarray], mesh, fixed: np.ndarray, members: np.ndarray) -> None:
+    def __init__(self, case, nodes: dict[str, np.ndarray], mesh, fixed: np.ndarray, contact) -> None:
+        self.source = case.source
         self.mesh = mesh
         self.names = [pair.name for pair in case.contact_pair]
         self.normals = np.empty((0, 3))
@@ -53,27 +56,51 @@ class ContactPairs:
         ids = mesh.node_ids[: mesh.n_owned]
         order = np.argsort(ids)
         ends = np.stack([self.first, self.second])
-        everyone = ends.ravel()
-        numbers, counts = np.unique(everyone, return_counts=True)
-        if (counts > 1).any():
-            twice = numbers[counts > 1][0]
-            raise InputError(f"{case.source}: contact_pair: node {twice} is in several pairs; a node can be in one")
+        if (self.first == self.second).any():
+            itself = self.first[self.first == self.second][0]
+            raise InputError(f"{case.source}: contact_pair: node {itself} is paired with itself")
         place = np.searchsorted(ids[order], ends)
         place = np.minimum(place, max(len(ids) - 1, 0))
         self.mine = (ids[order][place] == ends) if len(ids) else np.zeros(ends.shape, dtype=bool)
         self.local = order[place] if len(ids) else np.zeros(ends.shape, dtype=np.int64)
         self.free = np.zeros((*ends.shape, 3))
         self.free[self.mine] = np.where(fixed[self.local[self.mine]], 0.0, 1.0)
-        stopped = np.zeros(ends.shape, dtype=np.int64)
-        stopped[self.mine] = members[self.local[self.mine]].any(axis=1)
-        mesh.comm.Allreduce(MPI.IN_PLACE, stopped)
-        if stopped.any():
-            raise InputError(
-                f"{case.source}: contact_pair: node {ends[stopped > 0][0]} is in a pair, and a wall stops it as well; "
-                "give the wall a node_set without it"
-            )
         mesh.comm.Allreduce(MPI.IN_PLACE, self.free)
+        self._ends = self.local[self.mine]
+        self.coupled = CoupledPairs(self, contact)
         self.release()
+
+    def check_scheme(self, on_its_own: bool, treatment: str) -> None:
+        """Refuse what shared nodes and walls at pairs do not go with.
+
+        Raises
+        ------
+        InputError
+            On all ranks. ``on_its_own``: each node is solved on its own, by an explicit scheme with lumped mass.
+        """
+        key, coupled = f"{self.source}: contact_pair", self.coupled
+        for which, what, other in (
+            (coupled.shared, "is in several pairs", "name it once"),
+            (coupled.walled, "is in a pair, and a wall stops it as well", "give the wall a node_set without it"),
+        ):
+            if which.any() and not (on_its_own and treatment == "scheme"):
+                raise InputError(
+                    f"{key}: node {coupled.numbers[which][0]} {what}, which needs an explicit integrator with lumped "
+                    f'mass and contact.treatment = "scheme"; take these, or {other}'
+                )
+        walls = coupled.contact
+        met = np.zeros(len(walls.names), dtype=np.int64)
+        met += walls.members[coupled.here].any(axis=0)
+        special = ~walls.flat | (walls.restitution > 0.0) | (walls.static_friction > 0.0) | walls.ties.tying
+        if walls.motion.free is not None:
+            special[walls.motion.free.at] = True
+        self.sum(met)
+        if (special & (met > 0)).any():
+            name = walls.names[int(np.argmax(special & (met > 0)))]
+            raise InputError(
+                f"{key}: wall {name!r} stops nodes of pairs: such a wall must be flat, without mass, friction and "
+                "restitution, and not tied; or give it a node_set without them"
+            )
 
     def check_start(self, x: np.ndarray, length: float, source: str) -> None:
         """Refuse pairs that start beyond each other by more than rounding of the model's size [m]. Collective."""
@@ -86,23 +113,39 @@ class ContactPairs:
                 "points from the first to the second, or move the mesh"
             )
 
-    def explicit(self, predictor: np.ndarray, u: np.ndarray, stiffness: np.ndarray, contact: np.ndarray) -> int:
-        """Part the pairs that free positions, predictor + u, break. Collective.
+    def explicit(
+        self,
+        predictor: np.ndarray,
+        u: np.ndarray,
+        stiffness: np.ndarray,
+        contact: np.ndarray,
+        time: float,
+        tolerance: float,
+    ) -> None:
+        """Part the pairs that free positions, predictor + u, break; walls have their turn after them. Collective.
 
         Parameters
         ----------
         predictor, u : (owned, 3) [m]; u is changed
         stiffness : (owned,) force for a displacement of a node [N/m]
         contact : (owned, 3) forces on the nodes, added to [N]
+        time : of the positions [s]
+        tolerance : a pair broken by no more counts as kept, where walls stop its nodes as well [m]
 
-        Returns
-        -------
-        int
-            Nodes of this rank that pairs hold.
+        Raises
+        ------
+        SimulationFailure
+            On all ranks, where pairs, walls and supports leave nodes no room.
         """
-        self.force = self.part(predictor, u, stiffness)
+        if self.coupled.any:
+            here = self.coupled.here
+            x = predictor[here] + u[here]
+            planes = self.coupled.planes(x, time)
+            self.force = self.coupled.forces(x, stiffness[here], self.gaps, planes, tolerance)
+            self._move(u, self.force, stiffness)
+        else:
+            self.force = self.part(predictor, u, stiffness)
         self.push(contact)
-        return len(self.pressed()[0])
 
     def pressed(self) -> tuple[np.ndarray, np.ndarray]:
         """Owned nodes (k,) that pairs hold, and the directions (k, 3) of their pairs."""
@@ -115,7 +158,8 @@ class ContactPairs:
 
     def part(self, predictor: np.ndarray, u: np.ndarray, stiffness: np.ndarray) -> np.ndarray:
         """Change u (owned, 3) [m] so that predictor + u keeps all pairs; the pairs' forces (p,) [N]. Collective."""
-        force = np.maximum(self._needed(predictor + u, stiffness, self.gaps), 0.0)
+        x = predictor[self._ends] + u[self._ends]
+        force = np.maximum(self._needed(x, stiffness, self.gaps), 0.0)
         self._move(u, force, stiffness)
         return force
 
@@ -125,7 +169,7 @@ class ContactPairs:
         Collective.
         """
         same = values.copy()
-        self._move(same, self._needed(values, mass, np.where(self.force > 0.0, rates, -np.inf)), mass)
+        self._move(same, self._needed(values[self._ends], mass, np.where(self.force > 0.0, rates, -np.inf)), mass)
         return same
 
     def resting(self, x: np.ndarray, v: np.ndarray, slack: float, still: float) -> np.ndarray:
@@ -135,12 +179,21 @@ class ContactPairs:
         closed = np.abs(self.distances(ends[:, :, :3]) - self.gaps) <= slack
         return closed & (np.abs(self.distances(ends[:, :, 3:])) <= still)
 
-    def rest(self, a: np.ndarray, mass: np.ndarray, closed: np.ndarray) -> np.ndarray:
+    def rest(self, a: np.ndarray, mass: np.ndarray, closed: np.ndarray, resting: np.ndarray) -> np.ndarray:
         """Set the forces that closed pairs (p,) need for accelerations (owned, 3) that do not bring them nearer.
 
-        Gives these forces (owned, 3) [N] on components that are free. Collective.
+        ``resting`` (owned, walls): nodes that walls do not let go either. Gives the pairs' forces (owned, 3) [N] on
+        components that are free. Collective.
         """
-        self.force = np.maximum(self._needed(a, mass, np.where(closed, 0.0, -np.inf)), 0.0)
+        least = np.where(closed, 0.0, -np.inf)
+        if self.coupled.any:
+            state, here = self.coupled.contact.state, self.coupled.here
+            normals, _ = self.coupled.planes(state.position[here], state.time)
+            planes = normals, np.where(resting[here], 0.0, -np.inf)
+            largest = self.mesh.comm.allreduce(float(np.abs(a).max(initial=0.0)), op=MPI.MAX)
+            self.force = self.coupled.forces(a[here], mass[here], least, planes, 1e-13 * largest)
+        else:
+            self.force = np.maximum(self._needed(a[self._ends], mass, least), 0.0)
         change = np.zeros_like(a)
         self._move(change, self.force, np.ones_like(mass))
         return change
@@ -158,14 +211,13 @@ class ContactPairs:
     def push(self, contact: np.ndarray) -> None:
         """Add the pairs' forces to those on the nodes (owned, 3) [N]."""
         for _, _, at, push in self._pushes(self.force):
-            contact[at] += push
+            np.add.at(contact, at, push)
 
     def _needed(self, x: np.ndarray, stiffness: np.ndarray, least: np.ndarray) -> np.ndarray:
-        """Forces (p,) on nodes at (owned, 3) that make the distances ``least`` (p,), none where that is -inf."""
+        """Forces (p,) on the ends here at (k, 3) that make the distances ``least`` (p,), none where that is -inf."""
         data = np.zeros((*self.mine.shape, 4))
-        mine = self.local[self.mine]
-        data[self.mine, :3] = x[mine]
-        data[self.mine, 3] = 1.0 / stiffness[mine]
+        data[self.mine, :3] = x
+        data[self.mine, 3] = 1.0 / stiffness[self._ends]
         self.sum(data)
         soft = (data[:, :, 3] * np.einsum("epi,pi->ep", self.free, self.normals**2)).sum(axis=0)
         usable = (soft > 0.0) & (least > -np.inf)
@@ -174,7 +226,7 @@ class ContactPairs:
 
     def _move(self, u: np.ndarray, force: np.ndarray, stiffness: np.ndarray) -> None:
         for end, here, at, push in self._pushes(force):
-            u[at] += push * self.free[end, here] / stiffness[at, None]
+            np.add.at(u, at, push * self.free[end, here] / stiffness[at, None])
 
     def _pushes(self, force: np.ndarray) -> Iterator[tuple[int, np.ndarray, np.ndarray, np.ndarray]]:
         """Of both ends: end, (p,) pairs whose force acts on it here, nodes (k,), forces (k, 3) [N]."""

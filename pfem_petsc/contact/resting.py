@@ -64,13 +64,20 @@ def start_at_rest(model, state, accelerate: Callable[[np.ndarray], np.ndarray], 
     pairs = model.pairs
     if pairs is not None:
         closed = pairs.resting(x, v, slack, _SLACK * model.wave_speed)
+        held = np.zeros(contact.members.shape, dtype=bool)
+        held[nodes] = resting
 
     hold = np.zeros((len(nodes), 3))  # free components of the walls' forces
     strengths = np.zeros(resting.shape)
     drag = np.zeros(normals.shape)
     between = np.zeros_like(load)  # the same of the pairs' forces
     for _ in range(_ROUNDS if model.inertia.consistent else 1):
-        free = state.a[nodes] - hold / weight[:, None]
+        change = np.zeros_like(load)
+        if pairs is not None:  # first, as in a step: they know what the walls do
+            earlier = between
+            between = pairs.rest(state.a - earlier / (share * mass[:, None]), share * mass, closed, held)
+            change = between - earlier
+        free = state.a[nodes] + (change[nodes] - hold) / weight[:, None]
         moved = free.copy()
         project(moved, fixed, normals, planes, 0.0, strengths)
         if contact.rough:
@@ -79,17 +86,14 @@ def start_at_rest(model, state, accelerate: Callable[[np.ndarray], np.ndarray], 
             _rub(contact, nodes, v, rates, slack, weight, moved, normals, planes, strengths, drag)
             strengths /= weight[:, None]
         before, hold = hold, weight[:, None] * (moved - free)
-        sizes = np.array([np.abs(hold - before).max(initial=0.0), np.abs(hold).max(initial=0.0)])
-        if pairs is not None:
-            earlier, between = between, pairs.rest(state.a - between / (share * mass[:, None]), share * mass, closed)
-            sizes = np.maximum(sizes, [np.abs(between - earlier).max(initial=0.0), np.abs(between).max(initial=0.0)])
-        change, largest = np.max(comm.allgather(sizes), axis=0)
-        if change <= 1e-13 * largest:
+        sizes = [np.abs(part).max(initial=0.0) for part in (hold - before, change, hold, between)]
+        last_hold, last_between, *largest = np.max(comm.allgather(sizes), axis=0)
+        if max(last_hold, last_between) <= 1e-13 * max(largest):
             break
         total = load + between
         total[nodes] += hold
         state.a = accelerate(total)
-    if largest == 0.0:
+    if max(largest) == 0.0:
         return None
     strengths *= weight[:, None]
     force = strengths[:, :, None] * normals + drag

@@ -20,6 +20,7 @@ class ExplicitStepper(Stepper):
     def __init__(self, model, scheme, h: float) -> None:
         super().__init__(model, scheme, h)
         self._none = np.empty((0, 3))
+        self._nobody = np.empty(0, dtype=np.int64)
         self._other_force = np.zeros_like(self.state.f)
 
     def evaluate(self, commit: bool) -> None:
@@ -53,24 +54,23 @@ class ExplicitStepper(Stepper):
             load = np.empty(len(supports.nodes))
             positions = supports.positions(balance.time)
             hold(supports.nodes, supports.components, positions, balance.predictor, stiffness, u, load)
-        walls, contacts = model.contact.nothing, 0
-        if model.contact.any:
-            try:
-                nodes, force, walls = model.contact.explicit(
-                    balance.predictor, u, stiffness, balance.time, 1e-13 * model.length
-                )
-                if len(nodes):
-                    state.contact = np.zeros_like(u)
-                    state.contact[nodes] = force
-                contacts = len(nodes)
-            except SimulationFailure as failure:
-                if self.fault is None:
-                    self.fault = SimulationFailure(f"{self.when(balance)}: {failure}")
-        if model.pairs is not None:
-            if state.contact is self.zero:
+        walls, held, tolerance = model.contact.nothing, self._nobody, 1e-13 * model.length
+        try:
+            if model.pairs is not None:
                 state.contact = np.zeros_like(u)
-            contacts += model.pairs.explicit(balance.predictor, u, stiffness, state.contact)
+                model.pairs.explicit(balance.predictor, u, stiffness, state.contact, balance.time, tolerance)
+                held = model.pairs.pressed()[0]
+            if model.contact.any:
+                nodes, force, walls = model.contact.explicit(balance.predictor, u, stiffness, balance.time, tolerance)
+                if len(nodes):
+                    if state.contact is self.zero:
+                        state.contact = np.zeros_like(u)
+                    state.contact[nodes] += force
+                held = nodes if model.pairs is None else np.union1d(held, nodes)
+        except SimulationFailure as failure:
+            if self.fault is None:
+                self.fault = SimulationFailure(f"{self.when(balance)}: {failure}")
         if supports.any:
             state.support = np.zeros_like(u)
             react(supports.nodes, supports.components, load, state.contact, stiffness, u, state.support)
-        return Solution(u, state.f, walls, contacts=contacts)
+        return Solution(u, state.f, walls, contacts=len(held))

@@ -70,7 +70,7 @@ class Model:
         self.contact = Contact(case, self.nodes, mesh, self.supports.fixed)
         self.pairs = None
         if case.contact_pair:
-            self.pairs = ContactPairs(case, self.nodes, mesh, self.supports.fixed, self.contact.members)
+            self.pairs = ContactPairs(case, self.nodes, mesh, self.supports.fixed, self.contact)
 
         points = mesh.points[: mesh.n_owned]
         low, high = points.min(axis=0, initial=np.inf), points.max(axis=0, initial=-np.inf)

@@ -166,17 +166,17 @@ def make_stepper(model, plan: Plan) -> Stepper:
 
 def _check_walls(model, plan: Plan) -> None:
     """Refuse what a wall asks for and the scheme cannot do."""
-    if model.pairs is not None:
-        if model.case.contact.treatment == "mass_redistribution":
-            key = f'{model.case.source}: contact.treatment = "mass_redistribution"'
-            raise InputError(f"{key}: only walls can take mass from nodes; take another treatment with contact_pair")
-        points = model.mesh.points[: model.mesh.n_owned]
-        model.pairs.check_start(points, model.length, model.case.source)
+    if model.pairs is not None and model.case.contact.treatment == "mass_redistribution":
+        key = f'{model.case.source}: contact.treatment = "mass_redistribution"'
+        raise InputError(f"{key}: only walls can take mass from nodes; take another treatment with contact_pair")
     walls = model.case.wall
     if any(wall.mass is not None for wall in walls):
         if model.case.contact.treatment != "scheme":
             raise InputError(f'{model.case.source}: wall.mass needs contact.treatment = "scheme": walls cannot jump')
         model.contact.motion.free = FreeWalls(walls, plan.scheme, model.comm)
+    if model.pairs is not None:
+        model.pairs.check_scheme(plan.linear is None, model.case.contact.treatment)
+        model.pairs.check_start(model.mesh.points[: model.mesh.n_owned], model.length, model.case.source)
     for k, name in enumerate(model.contact.names):
         key = f"{model.case.source}: wall {name!r}"
         if model.contact.restitution[k] and not (plan.linear is None and plan.scheme.leads):

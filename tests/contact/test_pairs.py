@@ -223,7 +223,7 @@ def test_unequal_bodies_keep_momentum(comm, shared_tmp_path):
         ({"gap": 0.2}, "beyond each other"),
         ({"second": "second"}, "first has 1 nodes and second 11"),
         ({"second": "rigt"}, "no node set of this name"),
-        ({"second": "left"}, "several pairs"),
+        ({"second": "left"}, "node 10 is paired with itself"),
     ],
 )
 def test_refusals(change, message, comm, shared_tmp_path):

@@ -80,8 +80,8 @@ def test_a_truss_that_leaves_falls_freely(scheme, shared_tmp_path):
     assert not history["wall/floor/force"].any()
 
 
-def stacked(scheme, mass, folder, comm):
-    """A rod that lies along another one, which is held: each node of the upper on one of the lower."""
+def stacked(scheme, mass, folder, comm, floor=False):
+    """A rod that lies along another one, which is held, or lies on a floor: each node on one of the lower."""
     n = 5
     x = np.linspace(0.0, 1.0, n)
     points = np.concatenate([np.stack([x, 0.0 * x, z + 0.0 * x], axis=1) for z in (0.0, 0.1)])
@@ -102,6 +102,9 @@ def stacked(scheme, mass, folder, comm):
         "output": {"fields_every": 0},
         "solver": {"rtol": 1e-12},
     }
+    if floor:
+        del data["support"]
+        data["wall"] = [{"name": "floor", "type": "plane", "point": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0]}]
     return Simulation(Case.from_dict(data, folder=folder), comm, output=folder / "it", quiet=True)
 
 
@@ -116,5 +119,17 @@ def test_rod_that_lies_on_another_stays_there(scheme, mass, comm, shared_tmp_pat
     for row in rows:
         assert row["pair/p/force"] == pytest.approx([0.0, 0.0, weight], rel=1e-8)
         assert row["support_force"] == pytest.approx([0.0, 0.0, 2.0 * weight], rel=1e-8)
+        assert row["active_contacts"] == 10
+    assert np.abs(run.state.v).max(initial=0.0) < 1e-12
+
+
+@pytest.mark.parametrize("scheme", SCHEMES[:3])
+def test_rods_in_a_pile_stay_there(scheme, comm, shared_tmp_path):
+    """The lower one on a floor that stops every node, the upper one on it."""
+    run = stacked(scheme, "lumped", shared_tmp_path, comm, floor=True)
+    weight = 0.1 * GRAVITY
+    for row in [step.row for step in run]:
+        assert row["pair/p/force"] == pytest.approx([0.0, 0.0, weight], rel=1e-8)
+        assert row["wall/floor/force"] == pytest.approx([0.0, 0.0, 2.0 * weight], rel=1e-8)
         assert row["active_contacts"] == 10
     assert np.abs(run.state.v).max(initial=0.0) < 1e-12

@@ -1,0 +1,154 @@
+"""Pairs that share nodes, and nodes of pairs that walls stop: the optimum of every explicit step, and its failures."""
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+from bodies import two_lattices
+from lattices import box, planes, simulation
+
+from pfem_petsc.contact.coupled import complementary
+from pfem_petsc.errors import InputError, SimulationFailure
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_complementary_is_the_best_active_set(seed):
+    """Random problems of up to six rows in four dimensions, some of them repeated, against all active sets."""
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(1, 7))
+    rows = rng.normal(size=(n, 4))
+    if n > 3 and seed % 3 == 0:
+        rows[-1] = rows[0]
+    values = rows @ rng.normal(size=4) + rng.uniform(-0.5, 1.0, n) * (seed % 2)
+    z = complementary(rows @ rows.T, values, 1e-12)
+    move = rows.T @ z
+    left = rows @ move + values
+    assert z.min() >= 0.0 and left.min() > -1e-10 and np.abs(z * left).max() < 1e-10
+    best = np.inf
+    for count in range(min(n, 4) + 1):
+        for chosen in map(list, combinations(range(n), count)):
+            trial = -np.linalg.pinv(rows[chosen]) @ values[chosen] if chosen else np.zeros(4)
+            if (rows @ trial + values).min() > -1e-9:
+                best = min(best, float(trial @ trial))
+    assert move @ move == pytest.approx(best, rel=1e-8, abs=1e-12)
+
+
+def test_rows_against_each_other_have_no_solution():
+    rows = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0]])
+    assert complementary(rows @ rows.T, np.array([-1.0, -0.5, -3.0]), 1e-12) is None
+    assert complementary(rows @ rows.T, np.array([-1.0, 1.0, -3.0]), 1e-12) == pytest.approx([1.0, 0.0, 3.0])
+
+
+WALLS = {
+    "floor": planes([[0.0, 0.1, 1.0]], [-0.001]),
+    "box": box([-0.004, -0.004, -0.004], [0.207, 0.204, 0.204]),
+    "moving": [
+        {"type": "plane", "point": [0.0, 0.0, -0.002], "normal": [0.0, 0.3, 1.0], "velocity": [0.0, 0.0, 1.0]},
+        {
+            "type": "rectangle",
+            "point": [0.21, 0.1, 0.1],
+            "normal": [-1.0, 0, 0],
+            "along": [0, 1.0, 0],
+            "size": [0.3, 0.3],
+        },
+    ],
+    "none": [],
+}
+
+
+def crowded(walls, file, integrator="central_differences", **options):
+    """Two lattices whose faces meet along two directions at once, in walls that stop every node."""
+    case = two_lattices(file, integrator, step=2e-4, end=0.02, **options)
+    other = {**case["contact_pair"][0], "name": "across", "direction": [1.0, -0.4, 0.3]}
+    case["contact_pair"].append(other)
+    case["wall"] = walls
+    return case
+
+
+@pytest.mark.parametrize("supported", [False, True], ids=["free", "supported"])
+@pytest.mark.parametrize("name", WALLS)
+def test_every_step_is_optimal(name, supported, comm, shared_tmp_path):
+    """Feasible, pressing only where closed, and pushed from the free positions by these forces and no others."""
+    supports = [{"node_set": "held", "fix": "y"}, {"node_set": "hinged", "fix": "xz"}] if supported else []
+    case = crowded(WALLS[name], shared_tmp_path / "m.vtu", supports=supports)
+    run = simulation(case, comm, shared_tmp_path)
+    stepper, pairs, contact = run.stepper, run.model.pairs, run.model.contact
+    assert pairs.coupled.shared.all()
+    solve, seen = stepper.solve, []
+
+    def checked(balance):
+        solution = solve(balance)
+        x = balance.predictor + solution.u
+        gaps = pairs.distances(pairs.gather(x)) - pairs.gaps
+        assert gaps.min() > -1e-12 and pairs.force.min() >= 0.0
+        assert np.abs(gaps[pairs.force > 0.0]).max(initial=0.0) < 1e-12
+        walls = contact.gaps(x, balance.time)
+        fixed = run.model.supports.fixed
+        if not contact.partial:
+            assert walls[~fixed.any(axis=1)].min(initial=0.0) > -1e-12
+        # what pushes a node is its pairs' and walls' forces
+        state = stepper.state
+        push = np.zeros_like(x)
+        pairs.push(push)
+        held, touching = solution.walls.nodes, solution.walls.touching
+        alone = np.setdiff1d(np.arange(len(x)), held)
+        np.testing.assert_allclose(state.contact[alone], push[alone], atol=1e-12)
+        if len(held):
+            normals, _ = contact.planes(touching, x[held], contact.motion.shifts(balance.time))
+            normals = np.where(touching[:, :, None], normals, 0.0)
+            rest = (state.contact - push)[held]
+            strengths = np.einsum("mwi,mi->mw", np.linalg.pinv(normals.transpose(0, 2, 1)), rest)
+            np.testing.assert_allclose(np.einsum("mwi,mw->mi", normals, strengths), rest, atol=1e-9)
+            assert strengths.min() > -1e-9
+            assert np.abs(np.where(touching, walls[held], 0.0)).max() < 1e-12
+        both = np.intersect1d(held, pairs.pressed()[0])
+        seen.append((comm.allreduce(len(both)), int((pairs.force > 0.0).sum())))
+        return solution
+
+    stepper.solve = checked
+    rows = [step.row for step in run]
+    assert max(count for _, count in seen) > 13
+    assert name == "none" or max(count for count, _ in seen) > 1
+    assert max(abs(row["energy_imbalance"]) for row in rows) < 1e-10
+    if name == "none" and not supported:
+        momentum = np.array([row["momentum"] for row in rows])
+        np.testing.assert_allclose(momentum, np.tile(momentum[0], (len(rows), 1)), atol=1e-13)
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("name", ["box", "moving"])
+def test_every_step_is_optimal_on_ranks(name, comm, shared_tmp_path):
+    test_every_step_is_optimal(name, True, comm, shared_tmp_path)
+
+
+@pytest.mark.parallel
+def test_no_room(comm, shared_tmp_path):
+    """A wall that drives the first body's face into the second one's, which another wall holds."""
+    walls = planes([[1.0, 0.0, 0.0]], [0.09], node_set="left") + planes([[-1.0, 0, 0]], [-0.106], node_set="right")
+    walls[0]["velocity"] = [1.0, 0.0, 0.0]
+    case = crowded(walls, shared_tmp_path / "m.vtu", velocity=(0.0, 0.0, 0.0), direction=(1.0, 0.0, 0.0))
+    with pytest.raises(SimulationFailure, match=r"step \d+, t = .* s: no positions of nodes \d+.* satisfy") as failure:
+        simulation(case, comm, shared_tmp_path).run()
+    assert comm.allgather(str(failure.value)) == [str(failure.value)] * comm.size
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        ({"integrator": "newmark"}, "is in several pairs, which needs an explicit integrator with lumped mass"),
+        ({"integrator": "newmark", "one": True}, "a wall stops it as well, which needs an explicit integrator"),
+        ({"treatment": "stick"}, "is in several pairs, which needs .* contact.treatment"),
+        ({"friction": 0.2}, "wall 'wall1' stops nodes of pairs: such a wall must be flat, without mass, friction"),
+        ({"mass": 2.0}, "such a wall must be flat, without mass"),
+        ({"tied": True}, "and not tied"),
+    ],
+)
+def test_refusals(change, message, comm, shared_tmp_path):
+    keys = {name: value for name, value in change.items() if name in ("friction", "mass", "tied")}
+    walls = planes([[0.0, 0.0, 1.0]], [-0.01], **keys)
+    case = crowded(walls, shared_tmp_path / "m.vtu", change.get("integrator", "central_differences"))
+    if change.get("one"):
+        case["contact_pair"].pop()
+    case["contact"] = {"treatment": change.get("treatment", "scheme")}
+    with pytest.raises(InputError, match=message):
+        simulation(case, comm, shared_tmp_path)

@@ -35,6 +35,7 @@ class Contact:
     log : ContactLog
     restitution, friction, static_friction : (walls,); rough : whether any wall has friction
     ties : Ties
+    rebounds : whether restitution is a bound on the next position, as for schemes that solve for it in advance
     state : of the nodes, for walls that must know where nodes come from; set by the stepper
     """
 
@@ -62,6 +63,7 @@ class Contact:
         static = [wall.friction if wall.static_friction is None else wall.static_friction for wall in walls]
         self.static_friction = np.array(static, dtype=np.float64)
         self.restitution = np.array([wall.restitution for wall in walls], dtype=np.float64)
+        self.rebounds = False
         self.rough = bool(self.static_friction.any())
         self.ties = Ties(self, walls)
         self.flat = np.array([wall.flat for wall in self.walls], dtype=bool)

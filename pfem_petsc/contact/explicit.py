@@ -115,7 +115,7 @@ class ExplicitContact:
         """Nodes (m,) near walls that do not hold them for good, places (m, 3), forces (m, w, 3), touching (m, w)."""
         shifts = self.contact.motion.shifts(time)
         near = self.contact.near(x, shifts)
-        if self.contact.restitution.any():
+        if self.contact.rebounds:
             near |= self._returning()
         if self.contact.ties.any:
             near &= ~self.contact.ties.held
@@ -147,7 +147,7 @@ class ExplicitContact:
         force = strength[:, :, None] * normals
         if self.contact.rough:
             moved, force = self._rub(nodes, free, shifts, (normals, offsets), stiffness[nodes], moved, strength, time)
-        if booked and self.contact.restitution.any():
+        if booked and self.contact.rebounds:
             self._remember_approach(nodes, free, shifts, normals, strength)
         return nodes, moved, force, np.einsum("mwi,mwi->mw", force, normals) > 0.0
 
@@ -158,7 +158,7 @@ class ExplicitContact:
 
     def _rebound(self, nodes: np.ndarray) -> np.ndarray:
         """Distances (m, walls) [m] from walls that nodes get to in this step, having hit them in the last."""
-        rebound = self.contact.state.memory.get("rebound") if self.contact.restitution.any() else None
+        rebound = self.contact.state.memory.get("rebound") if self.contact.rebounds else None
         return rebound[nodes] if rebound is not None else np.zeros((len(nodes), len(self.contact.walls)))
 
     def _remember_approach(self, nodes, free, shifts, normals, strength) -> None:

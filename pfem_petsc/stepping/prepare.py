@@ -11,6 +11,7 @@ import numpy as np
 from ..contact.free import FreeWalls
 from ..contact.held_node import held_growth
 from ..contact.treatments.mass_redistribution import redistribute
+from ..contact.treatments.restitution import Treatment as Restitution
 from ..errors import InputError
 from ..integrators.base import Scheme
 from ..registry import lookup
@@ -147,7 +148,10 @@ def make_stepper(model, plan: Plan) -> Stepper:
             'contact.treatment = "stick"'
         )
     if name == "scheme" or not touch:
-        return _stepper(model, plan, ExplicitStepper)
+        stepper = _stepper(model, plan, ExplicitStepper)
+        if model.contact.restitution.any() and not model.contact.rebounds:
+            stepper.treatment = Restitution(stepper)
+        return stepper
     key = f'{model.case.source}: contact.treatment = "{name}"'
     if model.inertia.consistent:
         raise InputError(f'{key}: needs time.mass = "lumped"')
@@ -179,13 +183,30 @@ def _check_walls(model, plan: Plan) -> None:
         model.pairs.check_start(model.mesh.points[: model.mesh.n_owned], model.length, model.case.source)
     for k, name in enumerate(model.contact.names):
         key = f"{model.case.source}: wall {name!r}"
-        if model.contact.restitution[k] and not (plan.linear is None and plan.scheme.leads):
-            raise InputError(f"{key}: restitution needs central_differences with lumped mass")
+        if model.contact.restitution[k]:
+            _check_restitution(model, plan, k, key)
         if model.contact.ties.tying[k] and model.case.contact.treatment not in ("scheme", "stick"):
             raise InputError(f'{key}: tied needs contact.treatment = "scheme" or "stick"')
-        explicit_only = model.contact.static_friction[k] or model.contact.restitution[k]
-        if explicit_only and model.case.contact.treatment != "scheme":
-            raise InputError(f'{key}: friction and restitution need contact.treatment = "scheme"')
+        if model.contact.static_friction[k] and model.case.contact.treatment != "scheme":
+            raise InputError(f'{key}: friction needs contact.treatment = "scheme"')
+
+
+def _check_restitution(model, plan: Plan, k: int, key: str) -> None:
+    treatment = model.case.contact.treatment
+    if model.inertia.consistent:
+        raise InputError(f'{key}: restitution needs time.mass = "lumped": one node\'s velocity jumps')
+    if plan.scheme.leads:
+        model.contact.rebounds = True
+        if treatment != "scheme":
+            raise InputError(f'{key}: with {model.case.time.integrator} restitution needs contact.treatment = "scheme"')
+        return
+    if treatment not in ("scheme", "stick"):
+        raise InputError(f'{key}: restitution needs contact.treatment = "scheme" or "stick"')
+    # the jump has an impulse of its own, which neither drags nor pushes a wall
+    if model.contact.static_friction[k]:
+        raise InputError(f"{key}: restitution together with friction needs central_differences")
+    if model.case.wall[k].mass is not None:
+        raise InputError(f"{key}: restitution of a wall with mass needs central_differences")
 
 
 def _stepper(model, plan: Plan, explicit: type[Stepper]) -> Stepper:

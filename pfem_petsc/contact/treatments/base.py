@@ -49,28 +49,35 @@ class Treatment(ABC):
     def after(self) -> None:
         """Called after each part of a step, before it is booked: changes v, a and memory of the state."""
 
-    def held(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Nodes that walls hold (m,), projections (m, 3, 3) on their normals, velocities (m, 3) of the walls [m/s].
+    def held(self, concerned: np.ndarray | bool = True) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Nodes that walls hold (m,), projections (m, 3, 3) on their normals, velocities (m, 3) to have there [m/s].
 
-        Of nodes that walls hold for good the projection is on all directions.
+        These are the walls' own, and :meth:`leaving` away from them. Of nodes that walls hold for good the projection
+        is on all directions. ``concerned`` (walls,) bool: of which walls; default: all.
         """
         stepper = self.stepper
         contact, walls = stepper.model.contact, stepper.solution.walls
-        touched = walls.touching.any(axis=1)
-        nodes, touching = walls.nodes[touched], walls.touching[touched]
+        touching = walls.touching & concerned
+        touched = touching.any(axis=1)
+        nodes, touching = walls.nodes[touched], touching[touched]
         shifts = contact.motion.shifts(stepper.state.time)
         normals, _ = contact.planes(touching, stepper.state.position[nodes], shifts)
         normals = np.where(touching[:, :, None], normals, 0.0)
         # the normals' pseudo-inverse serves any number of walls at a node, parallel ones too
         inverse = np.linalg.pinv(normals, rcond=1e-8) if len(nodes) else np.zeros((0, 3, normals.shape[1]))
         rates = contact.motion.rates(stepper.state.time)
-        speeds = np.einsum("miw,mw->mi", inverse, np.einsum("mwi,wi->mw", normals, rates))
+        away = np.einsum("mwi,wi->mw", normals, rates) + self.leaving(nodes, touching, normals, rates)
+        speeds = np.einsum("miw,mw->mi", inverse, away)
         normal = inverse @ normals
         if contact.ties.any:
             tied = contact.ties.held[nodes]
             normal[tied] = np.eye(3)
             speeds[tied] = rates[contact.ties.walls(nodes[tied])]
         return nodes, normal, speeds
+
+    def leaving(self, nodes: np.ndarray, touching: np.ndarray, normals: np.ndarray, rates: np.ndarray) -> np.ndarray:
+        """Velocities (m, w) at which nodes (m,) leave walls that they touch (m, w), along normals (m, w, 3) [m/s]."""
+        return np.zeros(touching.shape)
 
     def set(self, nodes: np.ndarray, v: np.ndarray, a: np.ndarray) -> None:
         """Give nodes new velocities and accelerations (m, 3), and keep what they were for the ledger."""

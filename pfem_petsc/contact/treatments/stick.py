@@ -3,29 +3,28 @@
 The nodes of a pressed contact pair move on together: their normal velocity is the one that keeps their momentum.
 
 On closure a node loses the kinetic energy of its approach, m v_n^2/2, an O(element length) part of the whole; on
-release it starts from rest. Energy never grows by contact with a wall at rest.
+release it starts from rest. Energy never grows by contact with a wall at rest. At a wall with restitution e a node that
+closes leaves with e times the velocity of its approach, and loses (1 - e^2) of that energy: see
+:mod:`~pfem_petsc.contact.treatments.restitution`.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from .base import Treatment as Base
+from .restitution import Treatment as Restitution
 
 __all__ = ["Treatment"]
 
 
-class Treatment(Base):
+class Treatment(Restitution):
     """Velocity and acceleration of held nodes as those of the wall."""
 
     def after(self) -> None:
         """See :class:`~pfem_petsc.contact.treatments.base.Treatment`."""
         self.clear()
         state = self.stepper.state
-        nodes, normal, speed = self.held()
-        v, a = state.v[nodes], state.a[nodes]
-        v = v - np.einsum("mij,mj->mi", normal, v) + speed
-        a = a - np.einsum("mij,mj->mi", normal, a)
+        nodes, v, a = self.on_walls()
         pairs, mass = self.stepper.model.pairs, self.stepper.model.inertia.mass
         if pairs is not None and pairs.force.any():
             ends, _ = pairs.pressed()

@@ -1,0 +1,168 @@
+"""Restitution by a jump of velocity: heights of bounces, moving walls, and energy that does not grow."""
+
+import numpy as np
+import pytest
+from lattices import lattice_case, planes, rotation, simulation
+from mpi4py import MPI
+from turning import with_mesh_file
+
+from pfem_petsc import Case, Simulation
+from pfem_petsc.errors import InputError
+
+G = 9.81
+SCHEMES = [
+    ("chung_lee", {}),
+    ("hulbert_chung", {"rho_b": 0.5}),
+    ("newmark", {}),
+    ("newmark", {"beta": 0.25, "gamma": 0.5}),
+    ("houbolt", {}),
+    ("generalized_alpha", {}),
+    ("energy_momentum", {}),
+]
+
+
+def bar(integrator, parameters, wall, *, velocity=0.0, gravity=G, step=1e-3, end=0.8, **tables):
+    """A bar that is level: all its nodes do the same."""
+    return {
+        "mesh": {"generator": "rod", "length": 0.2, "elements": 2},
+        "material": {"m": {"young_modulus": 1e6, "density": 1000.0}},
+        "section": {"s": {"area": 1e-5, "material": "m"}},
+        "initial": {"velocity": [0.0, 0.3, velocity]},
+        "gravity": {"acceleration": [0.0, 0.0, -gravity]},
+        "wall": [{"type": "plane", "name": "floor", "normal": [0.0, 0.0, 1.0], **wall}],
+        "time": {"integrator": integrator, "step": step, "end": end, **parameters},
+        "output": {"fields_every": 0},
+        "solver": {"rtol": 1e-13},
+        **tables,
+    }
+
+
+@pytest.mark.parametrize("treatment", ["scheme", "stick"])
+@pytest.mark.parametrize("restitution", [0.5, 0.9, 1.0])
+@pytest.mark.parametrize("integrator, parameters", SCHEMES)
+def test_heights_of_bounces(integrator, parameters, restitution, treatment, comm, shared_tmp_path):
+    """Dropped from h, a bar reaches e^(2n) h after n bounces: so its energy in flight says, to 1e-10."""
+    height = 0.1
+    case = bar(integrator, parameters, {"point": [0.0, 0.0, -height], "restitution": restitution})
+    case["contact"] = {"treatment": treatment}
+    run = simulation(case, comm, shared_tmp_path)
+    rows = [step.row for step in run]
+    mass = run.model.total_mass
+    energies = [
+        (row["kinetic_energy"] / mass - 0.5 * 0.3**2 + G * (row["centre_of_mass"][2] + height)) / (G * height)
+        for row in rows
+    ]
+    fall, bounces = np.sqrt(2.0 * height / G), 0
+    time = fall
+    for n in range(1, 5):
+        flight = 2.0 * restitution**n * fall
+        # every bounce is late by less than a step
+        inside = [e for row, e in zip(rows, energies, strict=True) if time + n * 1e-3 < row["time"] < time + flight]
+        time += flight
+        if time > 0.8 or flight < 0.05:
+            break
+        np.testing.assert_allclose(inside, restitution ** (2 * n), rtol=1e-10)
+        bounces = n
+    assert bounces >= (2 if restitution > 0.5 else 1)
+    assert max(abs(row["energy_imbalance"]) for row in rows) < 1e-14
+    np.testing.assert_allclose([row["momentum"][1] for row in rows], 0.3 * mass, rtol=1e-12)
+
+
+@pytest.mark.parametrize("integrator, parameters", [*SCHEMES, ("wilson", {"theta": 1.5})])
+def test_moving_wall(integrator, parameters, comm, shared_tmp_path):
+    """The velocity relative to the wall is turned round and multiplied by e."""
+    restitution, speed, wall = 0.6, -1.0, np.array([0.2, 0.0, 0.5])
+    keys = {"point": [0.0, 0.0, -0.05], "restitution": restitution, "velocity": wall.tolist()}
+    run = simulation(bar(integrator, parameters, keys, velocity=speed, gravity=0.0, end=0.1), comm, shared_tmp_path)
+    last = [step.row for step in run][-1]
+    expected = [0.0, 0.3, wall[2] - restitution * (speed - wall[2])]
+    np.testing.assert_allclose(last["momentum"] / run.model.total_mass, expected, atol=1e-11)
+    assert last["wall/floor/releases"] == 3
+
+
+def tumbling(integrator, parameters, restitution, end=0.05, walls=None, **tables):
+    walls = planes([[0.3, -0.2, 1.0], [1.0, 0.0, 0.1]], [-0.02, -0.03]) if walls is None else walls
+    case = lattice_case(
+        [wall | {"restitution": restitution} for wall in walls],
+        velocity=[-1.0, -0.5, -3.0],
+        spin=[10.0, 20.0, -15.0],
+        integrator=integrator,
+        end=end,
+        **{"solver": {"rtol": 1e-13}, **tables},
+    )
+    case["time"] |= parameters
+    return case
+
+
+@pytest.mark.parametrize("restitution", [0.5, 1.0])
+@pytest.mark.parametrize("integrator, parameters", SCHEMES)
+def test_energy_does_not_grow(integrator, parameters, restitution, comm, shared_tmp_path):
+    """A lattice that tumbles against two walls."""
+    case = tumbling(integrator, parameters, restitution, contact={"treatment": "stick"})
+    rows = [step.row for step in simulation(case, comm, shared_tmp_path)]
+    energy = np.array([row["kinetic_energy"] + row["elastic_energy"] for row in rows])
+    assert energy.max() < 1.01 * energy[0]
+    assert sum(row["active_set_changes"] for row in rows) >= 10
+    assert max(abs(row["energy_imbalance"]) for row in rows) < 1e-10 * energy[0]
+    if integrator == "energy_momentum" and restitution == 1.0:
+        assert energy[-1] > 0.8 * energy[0]
+
+
+@pytest.mark.parametrize("integrator", ["chung_lee", "newmark", "houbolt"])
+def test_turned(integrator, comm, shared_tmp_path):
+    """The problem turned about is the same one, at a sphere as well."""
+    ball = {"type": "sphere", "point": [0.1, 0.05, -0.31], "radius": 0.3}
+    turn, x = rotation(5), {}
+    for title, by in (("as it is", None), ("turned", turn)):
+        case = tumbling(integrator, {}, 0.7, walls=[ball], end=0.04)
+        run = simulation(with_mesh_file(case, shared_tmp_path / f"{title}.vtu", by), comm, shared_tmp_path, title)
+        rows = [step.row for step in run]
+        x[title] = run.gather(run.state.position)
+        assert rows[-1]["wall/wall1/releases"] >= 1
+    if comm.rank == 0:
+        assert np.abs(x["turned"] - x["as it is"] @ turn.T).max() < 1e-9 * 0.2
+
+
+@pytest.mark.parametrize(
+    ("integrator", "wall", "tables", "message"),
+    [
+        ("newmark", {"friction": 0.1}, {}, "restitution together with friction needs central_differences"),
+        ("newmark", {"mass": 1.0}, {}, "restitution of a wall with mass needs central_differences"),
+        ("newmark", {}, {"contact": {"treatment": "conserving"}}, 'needs contact.treatment = "scheme" or "stick"'),
+        (
+            "central_differences",
+            {},
+            {"contact": {"treatment": "stick"}},
+            'restitution needs contact.treatment = "scheme"',
+        ),
+        ("newmark", {}, {"time": {"mass": "consistent"}}, 'restitution needs time.mass = "lumped"'),
+    ],
+)
+def test_refused(integrator, wall, tables, message, comm, shared_tmp_path):
+    case = bar(integrator, {}, {"point": [0.0, 0.0, -0.1], "restitution": 0.5, **wall})
+    case["time"] |= tables.pop("time", {})
+    with pytest.raises(InputError, match=message):
+        simulation(case | tables, comm, shared_tmp_path)
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("integrator", ["chung_lee", "newmark"])
+def test_any_number_of_ranks(integrator, comm, shared_tmp_path):
+    """The run on all ranks is that on one, and a run in two parts is the run in one, bit for bit."""
+    found = {}
+    for title, end in (("one", 0.03), ("two", 0.02), ("two", 0.03)):
+        case = tumbling(integrator, {}, 0.8, end, solver={"rtol": 1e-13, "linear": "cg"})
+        case["output"]["checkpoint_every"] = 50
+        case = Case.from_dict(case, name="it")
+        run = Simulation(case, comm, output=shared_tmp_path / title, quiet=True, restart=title == "two")
+        found[title] = [step.row for step in run][-1]
+        x = run.gather(run.state.position)
+    for column, value in found["one"].items():
+        np.testing.assert_array_equal(found["two"][column], value, err_msg=column)
+    assert found["one"]["wall/wall1/releases"] >= 1
+    if comm.rank == 0:
+        alone = Simulation(case, MPI.COMM_SELF, output=shared_tmp_path / "alone", quiet=True)
+        row = [step.row for step in alone][-1]
+        assert np.abs(alone.gather(alone.state.position) - x).max() < 1e-10 * 0.2
+        assert row["wall/wall1/releases"] == found["one"]["wall/wall1/releases"]
+    comm.Barrier()

@@ -1,9 +1,10 @@
 """Walls with mass, which the forces of contact push about.
 
-A wall of mass M is one more node of the scheme, without bars: M (alpha u + a_hat) = -F(u), where F is the sum of its
-forces on the truss with the wall displaced by predictor + u. F is a monotone function of u, piecewise linear for plane
-walls in explicit steps: Newton's method ends after a few active sets. The acceleration is then taken from F itself, so
-that truss and walls together keep their momentum to rounding. Walls do not turn, and no gravity acts on them.
+A wall of mass M is one more node of the scheme, without bars: M (alpha u + a_hat) = W - F(u), where W is its weight,
+if it has one, and F the sum of its forces on the truss with the wall displaced by predictor + u. F is a monotone
+function of u, piecewise linear for plane walls in explicit steps: Newton's method ends after a few active sets. The
+acceleration is then taken from F itself, so that truss and walls together keep their momentum to rounding. Walls do
+not turn.
 """
 
 from __future__ import annotations
@@ -30,20 +31,24 @@ class FreeWalls:
     ----------
     at : (f,) which walls of the case
     state : of the walls: x is the displacement from where the case puts them (f, 3)
+    weight : (f, 3) of those on which gravity acts [N]
     """
 
-    def __init__(self, walls, scheme: Scheme, comm: MPI.Comm) -> None:
+    def __init__(self, walls, scheme: Scheme, comm: MPI.Comm, gravity: tuple[float, float, float]) -> None:
         self.at = np.array([k for k, wall in enumerate(walls) if wall.mass is not None], dtype=np.int64)
         self.mass = np.array([walls[k].mass for k in self.at])
         self.scheme, self.comm = scheme, comm
         speeds = np.array([walls[k].velocity or (0.0, 0.0, 0.0) for k in self.at])
         n = len(self.at)
+        heavy = np.array([walls[k].gravity for k in self.at], dtype=bool)
+        self.weight = np.where(heavy, self.mass, 0.0)[:, None] * np.array(gravity)
         self.state = State(np.zeros((n, 3)), speeds, *(np.zeros((n, 3)) for _ in range(5)))
         self._balance: Balance | None = None
         self._u = np.zeros((n, 3))
 
     def start(self, h: float) -> None:
-        """Set the scheme's memory up."""
+        """Set acceleration and the scheme's memory up."""
+        self.state.a = self.weight / self.mass[:, None]
         self.scheme.start(self.state, h)
 
     def begin(self, time: float, h: float) -> None:
@@ -68,8 +73,8 @@ class FreeWalls:
     def unpushed(self) -> np.ndarray:
         """Displacements (f, 3) [m] at the end of the step that is being solved if nothing touched the walls."""
         balance = self._balance
-        free = 0.0 if balance.a_hat is None else balance.a_hat / balance.alpha
-        return balance.predictor - free
+        known = 0.0 if balance.a_hat is None else balance.a_hat
+        return balance.predictor + (self.weight / self.mass[:, None] - known) / balance.alpha
 
     def solve(self, forces: Callable[[], Answer], tolerance: float) -> None:
         """Find the walls' increments. Collective.
@@ -83,7 +88,7 @@ class FreeWalls:
         balance = self._balance
         n = 3 * len(self.at)
         weight = np.repeat(balance.alpha * self.mass, 3)
-        rest = np.zeros((len(self.at), 3)) if balance.a_hat is None else self.mass[:, None] * balance.a_hat
+        rest = -self.weight if balance.a_hat is None else self.mass[:, None] * balance.a_hat - self.weight
         u = (-rest / (balance.alpha * self.mass[:, None])).ravel()
         matrix, earlier = np.diag(weight), None
         for _ in range(_ITERATIONS):

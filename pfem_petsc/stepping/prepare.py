@@ -177,7 +177,7 @@ def _check_walls(model, plan: Plan) -> None:
     if any(wall.mass is not None for wall in walls):
         if model.case.contact.treatment != "scheme":
             raise InputError(f'{model.case.source}: wall.mass needs contact.treatment = "scheme": walls cannot jump')
-        model.contact.motion.free = FreeWalls(walls, plan.scheme, model.comm)
+        model.contact.motion.free = FreeWalls(walls, plan.scheme, model.comm, tuple(model.external.gravity))
     if model.pairs is not None:
         model.pairs.check_scheme(plan.linear is None, model.case.contact.treatment)
         model.pairs.check_start(model.mesh.points[: model.mesh.n_owned], model.length, model.case.source)

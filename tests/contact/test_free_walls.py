@@ -42,6 +42,28 @@ def test_momentum_is_shared(kind, integrator, parameters, comm, shared_tmp_path)
         assert gaps.min(initial=0.0) > -2e-12 * 0.2
 
 
+@pytest.mark.parametrize("integrator, parameters", [*SCHEMES, ("generalized_alpha", {}), ("energy_momentum", {})])
+def test_wall_with_weight(integrator, parameters, comm, shared_tmp_path):
+    """It falls freely until it meets the truss, and from then on truss and wall have their weight in common."""
+    gravity, speed, mass = np.array([1.0, -2.0, -9.81]), np.array([0.0, 0.0, -1.0]), 0.03
+    walls = planes([[0.0, 0.0, -1.0]], [-0.12], mass=mass, velocity=speed.tolist(), gravity=True, name="ram")
+    walls += planes([[0.0, 0.0, -1.0]], [-0.9], mass=mass, name="light")
+    case = lattice_case(walls, integrator=integrator, end=0.04, gravity=gravity, solver={"rtol": 1e-12})
+    case["time"] |= parameters
+    run = simulation(case, comm, shared_tmp_path)
+    rows = [step.row for step in run]
+    met = next(k for k, row in enumerate(rows) if row["active_contacts"])
+    assert 20 < met < 0.7 * len(rows)
+    for row in rows[: met - 2]:
+        fallen = speed * row["time"] + 0.5 * gravity * row["time"] ** 2
+        np.testing.assert_allclose(row["wall/ram/position"] - [0.0, 0.0, 0.12], fallen, atol=1e-12)
+    total = run.model.total_mass + mass
+    for row in rows:
+        momentum = row["momentum"] + mass * row["wall/ram/velocity"]
+        np.testing.assert_allclose(momentum, mass * speed + total * gravity * row["time"], atol=1e-12)
+        np.testing.assert_array_equal(row["wall/light/velocity"], 0.0)
+
+
 def test_point_mass_hits_a_wall_with_mass(comm, shared_tmp_path):
     """A bar hits flat: with restitution e the relative velocity is turned round and multiplied by e."""
     step, e, mass = 1e-4, 0.6, 4e-3
@@ -94,6 +116,8 @@ def test_refused(comm, shared_tmp_path):
         simulation(
             lattice_case(planes([[0, 0, 1.0]], [-0.1], mass=1.0, motion=[[0.0, 0, 0, 0]])), comm, shared_tmp_path
         )
+    with pytest.raises(InputError, match="gravity = true needs the wall's mass"):
+        simulation(lattice_case(planes([[0, 0, 1.0]], [-0.1], gravity=True)), comm, shared_tmp_path)
     with pytest.raises(InputError, match="walls cannot jump"):
         case = lattice_case(planes([[0, 0, 1.0]], [-0.1], mass=1.0), contact={"treatment": "stick"})
         simulation(case, comm, shared_tmp_path)

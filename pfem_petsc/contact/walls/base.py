@@ -22,6 +22,8 @@ class WallKeys(WallParameters):
     """velocity of the wall [m/s]: constant, or that at the start for a wall with mass"""
     mass: PositiveFloat | None = None
     """mass [kg] of a wall that the forces of contact push about; it does not turn"""
+    gravity: bool = False
+    """true: gravity acts on a wall with mass as it does on the truss"""
     motion: Annotated[tuple[Row4, ...], listed] | None = None
     """rows [t, dx, dy, dz]: displacement of the wall [s, m], linear between rows, constant outside"""
     adjust: bool = False
@@ -52,6 +54,8 @@ class WallKeys(WallParameters):
     def _moves_one_way(self) -> WallKeys:
         if self.velocity is not None and self.motion is not None:
             raise ValueError("expected at most one of the keys velocity, motion")
+        if self.gravity and self.mass is None:
+            raise ValueError("gravity = true needs the wall's mass [kg]")
         if self.mass is not None and self.motion is not None:
             raise ValueError("expected at most one of the keys mass, motion")
         if self.static_friction is not None and self.static_friction < self.friction:

@@ -24,7 +24,7 @@ def wall_gaps(model) -> tuple[dict[str, str], list[str]]:
     now, then = contact.gaps(points, 0.0), contact.gaps(points + ahead * v, ahead)
     with np.errstate(invalid="ignore"):
         rate = (then - now) / ahead
-    pushed = model.external.active
+    pushed = model.external.active or contact.moving.any()  # a wall that moves may push the truss against another
     for k, name in enumerate(contact.names):
         at = int(np.argmin(now[:, k])) if len(now) else -1
         mine = (float(now[at, k]), int(mesh.node_ids[at])) if at >= 0 else (np.inf, -1)

@@ -237,6 +237,18 @@ def test_sound_cases_have_no_warnings(comm, name):
     assert warnings_before(simulation.case, simulation.model, simulation.plan) == []
 
 
+@pytest.mark.parametrize(
+    "moves", ["velocity=[0,0,0.5]", "mass=1.0, velocity=[0,0,0.5]", "motion=[[0,0,0,0],[1,0,0,0.5]]"]
+)
+def test_wall_that_moves_may_push_against_another(comm, moves):
+    """A truss at rest between a wall that rises and one that stands."""
+    walls = f"wall=[{{type='plane', point=[0,0,-0.1], normal=[0,0,1], {moves}}}, "
+    walls += "{type='plane', point=[0,0,0.9], normal=[0,0,-1]}]"
+    case = Case.load("lattice_drop", ["mesh.cells=[2,2,2]", "initial.velocity=[0,0,0]", walls])
+    simulation = Simulation(case, comm, check_only=True)
+    assert not any("no node moves" in text for text in warnings_before(case, simulation.model, simulation.plan))
+
+
 def test_memory_that_the_machine_lacks(comm, monkeypatch):
     from pfem_petsc.preflight import forecast
 

@@ -76,6 +76,7 @@ def make_kernels(response: Callable, remembers: bool, measure: Callable) -> Simp
             old_plastic = history[0][first - origin : stop - origin]
             old_accumulated = history[1][first - origin : stop - origin]
             short = 0
+            flowed = 0
             for i in range(n):
                 length = math.sqrt(work[3, i])
                 stretch = length / rests[i]
@@ -85,16 +86,17 @@ def make_kernels(response: Callable, remembers: bool, measure: Callable) -> Simp
                     strain -= shifts[i]
                 plastic = old_plastic[i] if remembers else 0.0
                 accumulated = old_accumulated[i] if remembers else 0.0
-                stress, _, plastic, accumulated, u, q, w = response(strain, p, plastic, accumulated)
+                stress, _, plastic, new, u, q, w = response(strain, p, plastic, accumulated)
                 volume = area * rests[i]
                 work[4, i] += volume * u
                 if remembers:
                     work[5, i] += volume * q
                     work[6, i] += volume * w
                     work[7, i] = plastic
-                    work[8, i] = accumulated
+                    work[8, i] = new
+                    flowed += 0 if new == accumulated else 1
                 work[3, i] = area * stress * slope / length
-            if remembers and commit:
+            if remembers and commit and flowed > 0:
                 for i in range(n):
                     old_plastic[i] = work[7, i]
                     old_accumulated[i] = work[8, i]

@@ -211,6 +211,20 @@ class Bars:
                 out["plastic_strain"][block.start : block.stop] = block.history[0]
         return out
 
+    def history(self) -> np.ndarray:
+        """Plastic history (b, 2) of all local bars, zero where a bar cannot yield."""
+        history = np.zeros((len(self.ends), 2))
+        for block in self.blocks:
+            if block.history.size:
+                history[block.start : block.stop] = block.history.T
+        return history
+
+    def put_history(self, history: np.ndarray) -> None:
+        """Set what :meth:`history` gives."""
+        for block in self.blocks:
+            if block.history.size:
+                block.history[:] = history[block.start : block.stop].T
+
     @property
     def plastic(self) -> bool:
         """Whether any bar of this rank can yield."""

@@ -161,14 +161,11 @@ class RunState:
         bars = self.model.bars
         found = {}
         if self._columns:
-            history = np.zeros((len(bars.ends), self._columns))
-            for block in bars.blocks:
-                if block.history.size:
-                    history[block.start : block.stop] = block.history.T
-            found["history"] = history
+            found["history"] = bars.history()
         if self.model.temperatures.any:
             found |= {"thermal_strain": bars.thermal, "temperature": self.model.temperatures.values}
-        return found
+        kept = {_KEPT + name: getattr(self.stepper, name) for name in self.stepper.kept_bars}
+        return found | {name: array for name, array in kept.items() if array.shape[1]}
 
     def _put_back_bars(self, checkpoint: Checkpoint) -> None:
         """Bars evaluated on two ranks get the same values on both."""
@@ -178,9 +175,9 @@ class RunState:
         for name in checkpoint.scalars["bar_arrays"]:
             values = asking.reply(checkpoint.arrays[name][asked])
             if name == "history":
-                for block in bars.blocks:
-                    if block.history.size:
-                        block.history[:] = values[block.start : block.stop].T
+                bars.put_history(values)
+            elif name.startswith(_KEPT):
+                setattr(self.stepper, name.removeprefix(_KEPT), values)
             else:
                 target = bars.thermal if name == "thermal_strain" else self.model.temperatures.values
                 target[:] = values

@@ -8,7 +8,7 @@ from petsc4py import PETSc
 
 from ..errors import InputError
 
-__all__ = ["LinearChoice", "choose_linear", "configure", "unsymmetric"]
+__all__ = ["LinearChoice", "choose_linear", "configure", "set_preconditioner", "unsymmetric"]
 
 _DIRECT_BELOW = 500  # unknowns; a lattice of 3,993 takes 0.22 s to factorise, and 1 to 4 ms with conjugate gradients
 # Steps over the explicit limit up to which each is chosen. scripts/linear_solvers.py, 101,706 bars on one core, seconds
@@ -27,6 +27,11 @@ class LinearChoice:
     preconditioner: str
     why: str
     matrix_free: bool = False
+
+    @property
+    def lagged(self) -> bool:
+        """Whether the preconditioner has a matrix of its own, of an earlier iteration."""
+        return self.preconditioner == "gamg" or (self.matrix_free and self.preconditioner == "lu")
 
 
 def choose_linear(
@@ -52,10 +57,12 @@ def choose_linear(
     InputError
         Where an operator without matrix is asked for together with what needs one.
     """
-    if operator == "matrix_free" and (request in ("gamg", "mumps") or not symmetric):
-        needs = f'solver.linear = "{request}"' if request in ("gamg", "mumps") else "this integrator"
-        raise InputError(f'solver.operator = "matrix_free": {needs} needs a matrix; take "assembled" or "auto"')
+    if operator == "matrix_free" and not symmetric:
+        raise InputError('solver.operator = "matrix_free": this integrator needs a matrix; take "assembled" or "auto"')
     free = operator != "assembled" and symmetric
+    if operator == "matrix_free" and request in ("gamg", "mumps"):
+        kind, words = ("gamg", "multigrid") if request == "gamg" else ("lu", "factorisation")
+        return LinearChoice("cg", kind, f"conjugate gradients, lagged {words}, matrix-free (asked for)", True)
     if request == "mumps" or (request == "auto" and operator != "matrix_free" and unknowns <= _DIRECT_BELOW):
         why = "asked for" if request != "auto" else f"{unknowns} unknowns, at most {_DIRECT_BELOW}"
         return LinearChoice("preonly", "lu", f"direct ({why})")
@@ -82,13 +89,16 @@ def unsymmetric(choice: LinearChoice) -> LinearChoice:
     return replace(choice, krylov="gmres", preconditioner=preconditioner)
 
 
-def configure(ksp: PETSc.KSP, choice: LinearChoice, reduced: bool) -> None:
+def configure(ksp: PETSc.KSP, choice: LinearChoice, reduced: bool, ours: object = None) -> None:
     """Set a linear solver up; options of the same prefix given by the user override it afterwards.
 
-    ``reduced``: the solver works on the inactive unknowns of a contact problem, whose matrix has no blocks.
+    Parameters
+    ----------
+    ksp : the solver
+    choice : what it is to be
+    reduced : whether it works on the inactive unknowns of a contact problem, whose matrix has no blocks
+    ours : a preconditioner of our own that PETSc is to call, instead of the choice's
     """
-    comm = ksp.comm
-    pc = ksp.getPC()
     ksp.setType(choice.krylov)
     if choice.krylov == "gmres":
         ksp.setGMRESRestart(100)
@@ -96,9 +106,16 @@ def configure(ksp: PETSc.KSP, choice: LinearChoice, reduced: bool) -> None:
         ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
         # 101,706 bars at 2 x the explicit limit: 1e-5, 1e-4, 1e-3, 1e-2 took 30.0, 29.4, 27.0, 35.7 ms a step
         ksp.setTolerances(rtol=1e-3, max_it=2000)
-    kind = choice.preconditioner
-    if kind == "gamg" and reduced and PETSc.Sys.getVersion() < (3, 19):
-        kind = "icc"  # PETSc 3.18's multigrid cannot follow an active set that changes
+    if ours is None:
+        set_preconditioner(ksp.getPC(), choice.preconditioner, reduced)
+    else:
+        ksp.getPC().setType("python")
+        ksp.getPC().setPythonContext(ours)
+
+
+def set_preconditioner(pc: PETSc.PC, kind: str, reduced: bool = False) -> None:
+    """Make a preconditioner one of the kinds of :class:`LinearChoice`, with our defaults for its options."""
+    comm = pc.comm
     if kind == "lu":
         pc.setType("lu")
         if comm.size > 1:
@@ -112,17 +129,17 @@ def configure(ksp: PETSc.KSP, choice: LinearChoice, reduced: bool) -> None:
         shift = "positive_definite" if kind == "icc" else "nonzero"
         if comm.size == 1:
             pc.setType(kind)
-            _default(ksp, "pc_factor_shift_type", shift)
+            _default(pc, "pc_factor_shift_type", shift)
         else:
-            _default(ksp, "sub_pc_type", kind)
-            _default(ksp, "sub_pc_factor_shift_type", shift)
+            _default(pc, "sub_pc_type", kind)
+            _default(pc, "sub_pc_factor_shift_type", shift)
             pc.setType("bjacobi")
     else:
         pc.setType(kind)
 
 
-def _default(ksp: PETSc.KSP, name: str, value: str) -> None:
-    options = PETSc.Options(ksp.getOptionsPrefix())
+def _default(pc: PETSc.PC, name: str, value: str) -> None:
+    options = PETSc.Options(pc.getOptionsPrefix())
     if not options.hasName(name):
         options[name] = value
 

@@ -114,7 +114,6 @@ class HessianMatrix:
     ----------
     mat : PETSc matrix
     bounded : the matrix that steps with bounds take: ``mat``, or where pairs have coordinates T^T mat T
-    rigid : whether the matrix carries the rigid motions, for multigrid
     """
 
     def __init__(self, mesh, fixed: np.ndarray, any_fixed: bool, symmetric: bool = True) -> None:
@@ -139,7 +138,6 @@ class HessianMatrix:
         self._pairs: PETSc.Mat | None = None
         self._symmetric = symmetric
         self.any_fixed = any_fixed
-        self.rigid = False
         if any_fixed:
             self._fixed = np.zeros((mesh.n_local, 3))
             self._fixed[: mesh.n_owned] = fixed
@@ -172,19 +170,13 @@ class HessianMatrix:
         """Assemble the Hessian of a problem at ``w``. Collective."""
         self.fill(lambda values: problem.hessian(w, self, values))
         if problem.pairs is not None:
-            self.mat.ptap(self._pairs, self.bounded)
-        if self.rigid:
-            self._attach_rigid_motions(problem.x)
+            self.change_coordinates()
+        elif self._pairs is not None and problem.frames is not None:
+            self.mat.copy(self.bounded, PETSc.Mat.Structure.DIFFERENT)
 
-    def _attach_rigid_motions(self, x: np.ndarray) -> None:
-        """Tell multigrid the rigid motions of the nodes where they are now: what it must not damp."""
-        coordinates = self.mat.createVecRight()
-        coordinates.setBlockSize(3)
-        coordinates.setArray(x[: self.mesh.n_owned].ravel())
-        motions = PETSc.NullSpace().createRigidBody(coordinates)
-        self.mat.setNearNullSpace(motions)
-        motions.destroy()
-        coordinates.destroy()
+    def change_coordinates(self) -> None:
+        """Make ``bounded`` from ``mat``. Collective."""
+        self.mat.ptap(self._pairs, self.bounded)
 
     def add_lumped(self, inertia: np.ndarray, values: np.ndarray) -> None:
         """Add a nodal inertia (owned,) to the diagonal."""
@@ -202,9 +194,13 @@ class HessianMatrix:
     def constrain(self, scale: float, values: np.ndarray) -> None:
         """Replace rows and columns of prescribed components by ``scale`` on the diagonal."""
         if self.any_fixed:
-            p = self.pattern
-            _constrain_rows(p.ptr, p.diagonal, self._fixed, scale, values)
-            _constrain_columns(p.ptr, self.local_columns, p.diagonal, self._fixed, values)
+            self.hold(self._fixed, scale, values)
+
+    def hold(self, held: np.ndarray, scale: float, values: np.ndarray) -> None:
+        """Replace rows and columns of components (local nodes, 3) by ``scale`` on the diagonal."""
+        p = self.pattern
+        _constrain_rows(p.ptr, p.diagonal, held, scale, values)
+        _constrain_columns(p.ptr, self.local_columns, p.diagonal, held, values)
 
     def destroy(self) -> None:
         """Free the PETSc matrices."""

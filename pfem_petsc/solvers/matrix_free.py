@@ -83,6 +83,34 @@ class _Restriction:
         d.setArray(self.whole.diagonal().reshape(-1)[self.kept])
 
 
+class _Extension:
+    """H of all unknowns, where rows and columns of those that walls hold are those of a unit matrix, scaled."""
+
+    def __init__(self, whole: MatrixFreeHessian) -> None:
+        self.whole = whole
+        self.kept: np.ndarray | None = None
+        local, total = 3 * whole.mesh.n_owned, 3 * whole.mesh.n_nodes
+        self.mat = PETSc.Mat().createPython(((local, total), (local, total)), self, comm=whole.mesh.comm)
+        self.mat.setBlockSize(3)
+        self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+        self.mat.setUp()
+
+    def mult(self, mat: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """Y = H x; called by PETSc."""
+        whole, kept = self.whole, self.kept
+        if kept is None:
+            whole.mult(mat, x, y)
+            return
+        given = x.getArray(readonly=True)
+        u = whole._u[: whole.mesh.n_owned].reshape(-1)
+        u[:] = 0.0
+        u[kept] = given[kept]
+        whole.apply()
+        with y as out:
+            out[:] = whole._problem.scale * given
+            out[kept] = whole._out[: whole.mesh.n_owned].reshape(-1)[kept]
+
+
 class MatrixFreeHessian:
     """Stands where :class:`~pfem_petsc.solvers.matrix.HessianMatrix` stands, for symmetric schemes.
 
@@ -91,6 +119,8 @@ class MatrixFreeHessian:
     mat : PETSc matrix of type python
     bounded : the matrix that steps with bounds take: the same
     """
+
+    _extension: _Extension | None = None
 
     def __init__(self, model) -> None:
         self.model = model
@@ -113,8 +143,19 @@ class MatrixFreeHessian:
         if problem.oblique:
             self._left = problem.left()
         problem.place(problem.increment(w))
-        self.model.bars.linearise(problem.x, problem.balance.weight, self._stored)
+        self.linearise(problem.x)
         self.mat.stateIncrease()
+
+    def linearise(self, x: np.ndarray) -> None:
+        """Take the tangents of the bars at positions (local nodes, 3)."""
+        self.model.bars.linearise(x, self._problem.balance.weight, self._stored)
+
+    @property
+    def extension(self) -> _Extension:
+        """The operator that preconditioners of all unknowns may use, also where the system has some of them only."""
+        if self._extension is None:
+            self._extension = _Extension(self)
+        return self._extension
 
     def mult(self, mat: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Y = H x; called by PETSc."""
@@ -205,3 +246,5 @@ class MatrixFreeHessian:
         if mat is None and self.mat is not None:
             matrix, self.mat = self.mat, None
             matrix.destroy()
+            if self._extension is not None:
+                self._extension.mat.destroy()

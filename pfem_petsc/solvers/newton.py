@@ -10,6 +10,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from ..errors import InputError
+from .lagged import LaggedPreconditioner, Preconditioning
 from .linear import LinearChoice, configure
 from .matrix import HessianMatrix
 from .matrix_free import MatrixFreeHessian
@@ -55,6 +56,11 @@ class NewtonSolver:
     Options: prefix ``pfem_`` for free steps, ``pfem_contact_`` for steps with bounds, and
     ``pfem_contact_full_`` where these are tried again without a line search. Steps with bounds have a linear solver of
     their own, ``bounded``.
+
+    Attributes
+    ----------
+    problem : the one being solved
+    lagged : preconditioner for all of them, None where PETSc makes one from the operator
     """
 
     def __init__(
@@ -65,8 +71,10 @@ class NewtonSolver:
         bounded: LinearChoice,
         max_newton: int,
         length: float,
+        lagged: LaggedPreconditioner | None = None,
     ) -> None:
         self.mesh = mesh
+        self.lagged = lagged
         self.hessian = hessian
         self.choice, self.bounded = choice, bounded
         self.max_newton = max_newton
@@ -76,7 +84,8 @@ class NewtonSolver:
         self._lower = self._u.duplicate()
         self._upper = self._u.duplicate()
         self._solvers: dict[tuple[bool, bool], PETSc.SNES] = {}
-        self._problem: Problem | None = None
+        self.problem: Problem | None = None
+        self._ours: dict[tuple[bool, bool], Preconditioning] = {}
         self._previous = np.inf
 
     def solve(
@@ -100,7 +109,7 @@ class NewtonSolver:
             Lower and upper bounds on u [m]; infinite where there is none.
         """
         snes = self._solver(bounds is not None)
-        self._problem = problem
+        self.problem = problem
         self._tolerance, self._floor = max(tolerance, floor), floor
         if bounds is not None:
             lower, upper = bounds
@@ -109,6 +118,9 @@ class NewtonSolver:
             snes.setVariableBounds(self._lower, self._upper)
         start = u.copy()
         report = self._attempt(snes, start)
+        if not report.converged and self.lagged is not None and not self.lagged.fresh:
+            self.lagged.drop()
+            report = report.then(self._attempt(snes, start))
         if not report.converged and "INDEFINITE" in report.why or "BREAKDOWN" in report.why:
             report = self._without_definiteness(snes, start, report)
         if not report.converged and bounds is not None and "LINE_SEARCH" in report.why:
@@ -158,9 +170,10 @@ class NewtonSolver:
         ksp = snes.getKSP()
         bounds = snes.getType() == "vinewtonrsls"
         choice = self.bounded if bounds else self.choice
-        configure(ksp, LinearChoice("gmres", choice.preconditioner, "indefinite"), reduced=True)
+        ours = self._ours.get((bounds, False))
+        configure(ksp, LinearChoice("gmres", choice.preconditioner, "indefinite"), True, ours)
         second = self._attempt(snes, start)
-        configure(ksp, choice, reduced=bounds)
+        configure(ksp, choice, bounds, ours)
         return NewtonReport(
             second.converged, first.newton + second.newton, first.linear + second.linear, second.norm, second.why
         )
@@ -193,7 +206,9 @@ class NewtonSolver:
             ours = not options.hasName("snes_vi_zero_tolerance")
             if ours:
                 options["snes_vi_zero_tolerance"] = zero_tolerance(self.length)
-        configure(snes.getKSP(), self.bounded if contact else self.choice, reduced=contact)
+        if self.lagged is not None:
+            self._ours[key] = Preconditioning(self.lagged, self, snes, bounded=contact)
+        configure(snes.getKSP(), self.bounded if contact else self.choice, contact, self._ours.get(key))
         snes.setFromOptions()
         if contact and ours:
             # options belong to the process: the next model has a length of its own
@@ -204,11 +219,11 @@ class NewtonSolver:
     def _residual(self, snes: PETSc.SNES, u: PETSc.Vec, g: PETSc.Vec) -> None:
         shape = (self.mesh.n_owned, 3)
         with g as out:
-            self._problem.residual(u.getArray(readonly=True).reshape(shape), out.reshape(shape))
+            self.problem.residual(u.getArray(readonly=True).reshape(shape), out.reshape(shape))
 
     def _hessian(self, snes: PETSc.SNES, u: PETSc.Vec, matrix: PETSc.Mat, preconditioner: PETSc.Mat) -> None:
         array = u.getArray(readonly=True).reshape(self.mesh.n_owned, 3)
-        self.hessian.update(self._problem, array)
+        self.hessian.update(self.problem, array)
 
     def _converged(self, snes: PETSc.SNES, iteration: int, norms: tuple[float, float, float]) -> int:
         norm = norms[2]

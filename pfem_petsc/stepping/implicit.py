@@ -13,6 +13,7 @@ from ..contact.pair_coordinates import PairCoordinates
 from ..contact.rounds import ContactRounds
 from ..errors import SimulationFailure
 from ..integrators.base import Balance
+from ..solvers.lagged import LaggedPreconditioner
 from ..solvers.linear import LinearChoice, unsymmetric
 from ..solvers.matrix import HessianMatrix
 from ..solvers.matrix_free import MatrixFreeHessian
@@ -28,23 +29,29 @@ _HALVINGS = 10  # most halvings of a step: to 1/1024
 class ImplicitStepper(Stepper):
     """Newton's method on the free step; a variational inequality once a node can reach a wall."""
 
-    kept_numbers = (*Stepper.kept_numbers, "level")
-    kept_arrays = (*Stepper.kept_arrays, "held")
+    kept_numbers = (*Stepper.kept_numbers, "level", "lagged_count")
+    kept_arrays = (*Stepper.kept_arrays, "held", "lagged_place")
+    kept_bars = ("lagged_history",)
 
     def __init__(self, model, scheme, h: float, choice: LinearChoice) -> None:
         super().__init__(model, scheme, h)
+        symmetric = scheme.symmetric and not model.contact.rough
         if choice.matrix_free:
             self.hessian = MatrixFreeHessian(model)
         else:
-            symmetric = scheme.symmetric and not model.contact.rough
             self.hessian = HessianMatrix(model.mesh, model.supports.fixed, model.supports.any, symmetric)
-            self.hessian.rigid = choice.preconditioner == "gamg"
+        self.lagged = None
+        if choice.lagged:
+            free = self.hessian if choice.matrix_free else None
+            self.lagged = LaggedPreconditioner(model, choice.preconditioner, symmetric, free)
         self.pairs = None if model.pairs is None else PairCoordinates(model.pairs)
         if self.pairs is not None:
             self.hessian.couple(self.pairs)
+            if self.lagged is not None:
+                self.lagged.matrix.couple(self.pairs)
         bounded = unsymmetric(choice) if model.contact.rough else choice
         most = model.case.solver.max_newton
-        self.newton = NewtonSolver(model.mesh, self.hessian, choice, bounded, most, model.length)
+        self.newton = NewtonSolver(model.mesh, self.hessian, choice, bounded, most, model.length, self.lagged)
         self.newton.prepare(model.contact.any or self.pairs is not None)
         self.level = 0  # the next step is made in 2**level parts
         self.message: Callable[[str], None] = lambda text: None
@@ -91,6 +98,39 @@ class ImplicitStepper(Stepper):
         """Free the PETSc objects."""
         self.newton.destroy()
         self.hessian.destroy()
+        if self.lagged is not None:
+            self.lagged.destroy()
+
+    @property
+    def lagged_count(self) -> list[float]:
+        """See :class:`~pfem_petsc.solvers.lagged.LaggedPreconditioner`."""
+        return self.lagged.count if self.lagged is not None else []
+
+    @lagged_count.setter
+    def lagged_count(self, count: list[float]) -> None:
+        # solver settings may change at a restart
+        if self.lagged is not None and count:
+            self.lagged.count = count
+
+    @property
+    def lagged_history(self) -> np.ndarray:
+        """See :class:`~pfem_petsc.solvers.lagged.LaggedPreconditioner`."""
+        return self.lagged.history if self.lagged is not None else np.empty((len(self.model.mesh.bars), 0))
+
+    @lagged_history.setter
+    def lagged_history(self, history: np.ndarray) -> None:
+        if self.lagged is not None:
+            self.lagged.history = history
+
+    @property
+    def lagged_place(self) -> np.ndarray:
+        """See :class:`~pfem_petsc.solvers.lagged.LaggedPreconditioner`."""
+        return self.lagged.place if self.lagged is not None else np.empty((self.model.mesh.n_owned, 0))
+
+    @lagged_place.setter
+    def lagged_place(self, place: np.ndarray) -> None:
+        if self.lagged is not None:
+            self.lagged.place = place
 
     def accelerate(self, load: np.ndarray) -> np.ndarray:
         inertia, fixed = self.model.inertia, self.model.supports.fixed

@@ -158,8 +158,12 @@ class StepProblem:
 
     def hessian(self, w: np.ndarray, matrix: HessianMatrix, values: np.ndarray) -> None:
         """Add dg/dw to the values of an assembled matrix, in which pairs have no coordinates yet. Collective."""
-        inertia, balance = self.model.inertia, self.balance
         self.place(self.increment(w))
+        self.hessian_here(matrix, values)
+
+    def hessian_here(self, matrix: HessianMatrix, values: np.ndarray) -> None:
+        """As :meth:`hessian`, at the positions :attr:`x`, ghosts included. Collective."""
+        inertia, balance = self.model.inertia, self.balance
         if not inertia.consistent:
             matrix.add_lumped(self.nodal, values)
             if inertia.redistribution is not None:

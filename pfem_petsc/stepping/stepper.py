@@ -57,12 +57,13 @@ class Stepper(ABC):
     booking : called after each part of a step
     before : (local, 3) positions at the start of the last part, with ghosts [m]
     renews_forces : each evaluation of the state fills another array ``state.f``, so that the last one is kept
-    kept_numbers, kept_arrays : names of attributes that, with the state, determine what comes: numbers, and arrays with
-        a row for each owned node
+    kept_numbers, kept_arrays, kept_bars : names of attributes that, with the state, determine what comes: numbers,
+        arrays with a row for each owned node, and for each local bar
     """
 
     kept_numbers: tuple[str, ...] = ("part", "smallest")
     kept_arrays: tuple[str, ...] = ("touching",)
+    kept_bars: tuple[str, ...] = ()
     renews_forces = False
 
     def __init__(self, model, scheme: Scheme, h: float) -> None:

@@ -115,7 +115,11 @@ def test_rods_in_any_direction(time, comm, shared_tmp_path):
 
 
 @pytest.mark.parallel
-@pytest.mark.parametrize("solver", [{}, {"operator": "matrix_free"}, {"linear": "gamg"}], ids=str)
+@pytest.mark.parametrize(
+    "solver",
+    [{}, {"operator": "matrix_free"}, {"linear": "gamg"}, {"linear": "gamg", "operator": "matrix_free"}],
+    ids=str,
+)
 def test_lattices_turned(solver, comm, shared_tmp_path):
     """Thirteen pairs, oblique to the faces they are on; what solves the steps and in which frame does not matter."""
     turn, found = rotation(5), []
@@ -133,6 +137,25 @@ def test_lattices_turned(solver, comm, shared_tmp_path):
     np.testing.assert_allclose(found[1][0], found[0][0], atol=1e-9 * np.abs(found[0][0]).max())
     if comm.rank == 0:
         np.testing.assert_allclose(found[1][1] @ turn, found[0][1], atol=1e-10)
+
+
+@pytest.mark.parametrize("linear", ["mumps", "gamg"])
+def test_a_wall_while_pairs_are_apart(linear, comm, shared_tmp_path):
+    """The first rod springs back to a wall behind it, with the second one far away: few iterations, as for the pair."""
+    found = []
+    for name in ("cg", linear):
+        case = two_rods("newmark", linear=name)
+        case["node_set"]["back"] = {"nearest": [0.0, 0, 0]}
+        case["wall"] = [
+            {"name": "back", "type": "plane", "point": [-0.02, 0, 0], "normal": [1.0, 0, 0], "node_set": "back"}
+        ]
+        run = simulation(case, comm, shared_tmp_path, name)
+        rows = [step.row for step in run]
+        apart = [row for row in rows if row["wall/back/force"][0] > 0.0 and row["time"] > 3.0]
+        assert len(apart) > 5 and all(row["pair/faces/force"][0] == 0.0 for row in apart)
+        assert max(row["newton_iterations"] for row in apart) <= 4
+        found.append(run.gather(run.state.position))
+    np.testing.assert_allclose(found[1], found[0], atol=1e-10)
 
 
 @pytest.mark.parametrize("supported", [False, True], ids=["free", "supported"])

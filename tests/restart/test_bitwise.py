@@ -17,6 +17,7 @@ TWO_RODS = (
     "wall=[]",
     "contact_pair=[{name='faces', first='tip', second='other', direction=[1.0, 0.0, 0.0]}]",
 )
+LAGGED = ("mesh.cells=[4,4,4]", "time.end=5e-5", "time.step=1e-6")
 CASES = {
     "central differences": ("rod_impact", SHORT),
     "consistent mass": ("rod_impact", (*SHORT, "time.mass=consistent")),
@@ -27,6 +28,18 @@ CASES = {
     "hulbert_chung": ("rod_impact", (*SHORT, "time.integrator=hulbert_chung")),
     "souza_moura": ("rod_impact", (*SHORT, "time.integrator=souza_moura")),
     "generalized_alpha": ("rod_impact", (*SHORT, "time.integrator=generalized_alpha")),
+    "lagged multigrid": (
+        "lattice_drop",
+        (*LAGGED, "time.integrator=newmark", "solver.linear=gamg", "solver.operator=matrix_free"),
+    ),
+    "lagged multigrid, assembled": (
+        "lattice_drop",
+        (*LAGGED, "time.integrator=energy_momentum", "solver.linear=gamg"),
+    ),
+    "lagged factorisation": (
+        "rod_impact",
+        (*SHORT, "time.integrator=newmark", "solver.linear=mumps", "solver.operator=matrix_free"),
+    ),
     "energy_momentum": ("rod_impact", (*SHORT, "time.integrator=energy_momentum")),
     "stick": ("rod_impact", (*SHORT, "time.integrator=newmark", "contact.treatment=stick")),
     "conserving": ("rod_impact", (*SHORT, "time.integrator=newmark", "contact.treatment=conserving")),

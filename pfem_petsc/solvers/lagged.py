@@ -1,0 +1,236 @@
+"""A preconditioner from an assembled Hessian that serves many Newton iterations, of free steps and those with bounds.
+
+The matrix is that of all unknowns. Where walls hold some of them, their rows and columns are those of a unit matrix;
+the residual of the reduced system, of the inactive unknowns, is extended by zeros. So the blocks of three unknowns and
+the rigid motions stay what multigrid needs, and an active set that changes costs no set-up.
+"""
+
+from __future__ import annotations
+
+import atexit
+import weakref
+
+import numpy as np
+from petsc4py import PETSc
+
+from .linear import set_preconditioner
+from .matrix import HessianMatrix
+from .matrix_free import MatrixFreeHessian
+
+__all__ = ["LaggedPreconditioner", "Preconditioning"]
+
+# A set-up costs about as much as this many iterations: a new one is due when the iterations beyond those of the first
+# solve after the last one add up to it. 101,706 bars, one core: multigrid 0.33 s and 3.7 ms, LU 1.9 s and 0.05 s.
+_SET_UP = {"gamg": 90, "lu": 40}
+
+
+class LaggedPreconditioner:
+    """The preconditioner, and when to make it anew.
+
+    It is kept through the Newton iterations of a problem, and from step to step as long as temperatures are constant
+    and neither oblique walls nor pairs are in contact: it can then be made again after a restart from the place and the
+    plastic history it belongs to, which checkpoints hold.
+
+    Options: prefix ``pfem_assembled_``.
+
+    Parameters
+    ----------
+    model : Model
+    kind : of preconditioner, ``gamg`` or ``lu``
+    symmetric : whether the Hessian is
+    operator : whose products multigrid smooths with on the finest level, where the Hessian is not assembled: a third of
+        the time less than with the matrix
+
+    Attributes
+    ----------
+    place : (owned, 6) positions where the Hessian was taken [m] and whether walls held a component; (owned, 0) where
+        the next problem needs a new one
+    history : (b, 2) plastic history there, (b, 0) where no bar can yield
+    count : what else decides when it is made anew: the Hessian's coefficients, iterations of the first solve with it,
+        iterations of later solves beyond that, and those of the last solve
+    fresh : whether it belongs to the operator of the last Newton iteration
+    """
+
+    def __init__(self, model, kind: str, symmetric: bool, operator: MatrixFreeHessian | None = None) -> None:
+        mesh = model.mesh
+        self.mesh = mesh
+        self.kind = kind
+        self.operator = operator
+        self.matrix = HessianMatrix(mesh, model.supports.fixed, model.supports.any, symmetric)
+        self.bars = model.bars
+        self.plastic = model.comm.allreduce(int(model.bars.plastic)) > 0
+        self.outlasts = not model.temperatures.varying
+        self.place = np.zeros((mesh.n_owned, 0))
+        self.history = np.zeros((len(mesh.bars), 0))
+        self.count = [0.0] * 6
+        self.fresh = False
+        self._inner: PETSc.PC | None = None
+        self._fixed = np.flatnonzero(model.supports.fixed)
+        self._problem = None
+        self._kept: np.ndarray | None = None
+        self._right, self._left = self.matrix.mat.createVecs()
+        self._new_inner(self.matrix.mat)  # options that PETSc refuses are found before the first step
+
+    def drop(self) -> None:
+        """Have the next Newton iteration make a new one."""
+        self._problem = None
+        self.place = self.place[:, :0]
+
+    def renew(self, problem, kept: np.ndarray | None) -> None:
+        """Make it anew if that is due; called at each Newton iteration. Collective.
+
+        Parameters
+        ----------
+        problem : StepProblem, placed where the Hessian is wanted
+        kept : this rank's unknowns that the system has, local and ascending; None for all
+        """
+        *coefficients, first, beyond, last = self.count
+        if last and not first:
+            first = last
+        else:
+            beyond += max(last - first, 0.0)
+        balance = problem.balance
+        wanted = [balance.alpha, balance.eta, balance.weight]
+        due = beyond > _SET_UP.get(self.kind, 0)
+        own = problem.oblique or problem.pairs is not None or balance.from_start
+        usable = self.outlasts and not own
+        self._kept = kept
+        if problem is not self._problem:
+            due |= not usable or wanted != coefficients or not self.place.shape[1]
+            if not due and self._problem is None:
+                self._make_again(problem)
+        if due:
+            held = np.zeros((self.mesh.n_local, 3))
+            if kept is not None:
+                held[: self.mesh.n_owned] = 1.0
+                held[: self.mesh.n_owned].reshape(-1)[kept] = 0.0
+            self._make(problem, held)
+            first = beyond = 0.0
+            owned = self.mesh.n_owned
+            self.place = np.hstack([problem.x[:owned], held[:owned]]) if usable else np.zeros((owned, 0))
+            if self.plastic and usable:
+                self.history = self.bars.history()
+        self.fresh = due
+        self._problem = problem
+        self.count = [*wanted, first, beyond, 0.0]
+
+    def _make_again(self, problem) -> None:
+        """After a restart: what was there before, from the operator where it was made."""
+        here, kept, owned = problem.x.copy(), self._kept, self.mesh.n_owned
+        held = np.zeros((self.mesh.n_local, 3))
+        problem.x[:owned], held[:owned] = self.place[:, :3], self.place[:, 3:]
+        self.mesh.update_ghosts(problem.x)
+        self._kept = np.flatnonzero(held[:owned] == 0.0)
+        if self.plastic:
+            history = self.bars.history()
+            self.bars.put_history(self.history)
+        if self.operator is not None:
+            self.operator.linearise(problem.x)
+        self._make(problem, held)
+        problem.x[:], self._kept = here, kept
+        if self.plastic:
+            self.bars.put_history(history)
+        if self.operator is not None:
+            self.operator.linearise(here)
+
+    def _make(self, problem, held: np.ndarray) -> None:
+        matrix = self.matrix
+        self.mesh.update_ghosts(held)
+
+        def add(values: np.ndarray) -> None:
+            problem.hessian_here(matrix, values)
+            if problem.pairs is None and held.any():
+                matrix.hold(held, problem.scale, values)
+
+        matrix.fill(add)
+        if problem.pairs is not None:
+            matrix.change_coordinates()
+            first, owned = 3 * self.mesh.first_node, self.mesh.n_owned
+            rows = np.flatnonzero(held[:owned]) + first
+            matrix.bounded.setOption(PETSc.Mat.Option.KEEP_NONZERO_PATTERN, True)
+            matrix.bounded.zeroRowsColumns(rows.astype(PETSc.IntType), problem.scale)
+        # from nothing: a hierarchy that was made before would be another one after a restart
+        self._new_inner(matrix.mat if problem.pairs is None else matrix.bounded)
+        x = problem.x[: self.mesh.n_owned]
+        centre = self.mesh.comm.allreduce(x.sum(axis=0)) / self.mesh.n_nodes
+        # multigrid makes the rigid motions from them, which it must not damp. MatNullSpaceCreateRigidBody would make
+        # them orthogonal, with rounding that PETSc 3.26 does not repeat
+        self._inner.setCoordinates(x - centre)
+        self._set_kept()
+        options = PETSc.Options()
+        ours = self.mesh.comm.size > 1 and not options.hasName("matptap_via")
+        if ours:
+            # PETSc's default adds up what other ranks send in the order of arrival: no two runs are the same
+            options["matptap_via"] = "allatonce_merged"
+        self._inner.setUp()
+        if ours:
+            options.delValue("matptap_via")
+
+    def _new_inner(self, matrix: PETSc.Mat) -> None:
+        if self._inner is not None:
+            self._inner.destroy()
+        self._inner = PETSc.PC().create(self.mesh.comm)
+        self._inner.setOptionsPrefix("pfem_assembled_")
+        self._inner.setOperators(matrix if self.operator is None else self.operator.extension.mat, matrix)
+        set_preconditioner(self._inner, self.kind)
+        self._inner.setUseAmat(self.operator is not None)
+        self._inner.setFromOptions()
+
+    def _set_kept(self) -> None:
+        if self.operator is not None:
+            self.operator.extension.kept = self._kept
+
+    def apply(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """Y = P x for the unknowns kept, see :meth:`renew`. Collective."""
+        self.count[-1] += 1.0
+        self._set_kept()
+        kept = self._kept
+        if kept is None:
+            self._inner.apply(x, y)
+            self._hold(y)
+            return
+        self._right.set(0.0)
+        self._right.array[kept] = x.getArray(readonly=True)
+        self._inner.apply(self._right, self._left)
+        self._hold(self._left)
+        y.setArray(self._left.getArray(readonly=True)[kept])
+
+    def _hold(self, y: PETSc.Vec) -> None:
+        """Multigrid's coarse corrections would move prescribed components, whose residual is zero whatever they are."""
+        if len(self._fixed):
+            with y as out:
+                out[self._fixed] = 0.0
+
+    def destroy(self) -> None:
+        """Free the PETSc objects."""
+        for thing in (self._inner, self._right, self._left, self.matrix):
+            thing.destroy()
+
+
+class Preconditioning:
+    """What PETSc calls for one nonlinear solver; the preconditioner behind it is the same for all."""
+
+    def __init__(self, shared: LaggedPreconditioner, solver, snes: PETSc.SNES, bounded: bool) -> None:
+        self.shared = shared
+        self.first = 3 * shared.mesh.first_node
+        # PETSc's solver owns this object
+        self.solver = weakref.ref(solver)
+        self.snes = weakref.ref(snes)
+        self.bounded = bounded
+        atexit.register(_let_go, self.snes)
+
+    def setUp(self, pc: PETSc.PC) -> None:  # noqa: N802 - PETSc's name
+        """The operator has changed; called by PETSc."""
+        kept = self.snes().getVIInactiveSet().getIndices() - self.first if self.bounded else None
+        self.shared.renew(self.solver().problem, kept)
+
+    def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """Y = P x; called by PETSc."""
+        self.shared.apply(x, y)
+
+
+def _let_go(reference: weakref.ref) -> None:
+    """Take our preconditioner from a solver that is still there when Python ends: PETSc 3.18 would call it later."""
+    snes = reference()
+    if snes:
+        snes.getKSP().getPC().setType("none")

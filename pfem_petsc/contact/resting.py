@@ -22,7 +22,7 @@ __all__ = ["start_at_rest"]
 
 _ROUNDS = 60  # each at least halves the error
 _SLACK = 1e-12  # of lengths and wave speeds: strains that rounding makes
-_FAST = 1e12  # by so much a velocity that decides over the direction of slip is above an acceleration
+_FAST = 1e16  # by so much a velocity that decides over the direction of slip is above an acceleration
 
 
 def start_at_rest(model, state, accelerate: Callable[[np.ndarray], np.ndarray], load: np.ndarray):
@@ -113,7 +113,7 @@ def _rub(contact, nodes, v, rates, slack, weight, a, normals, planes, pressing, 
     away = v[nodes][:, None, :] - rates
     away -= np.einsum("mwi,mwi->mw", away, normals)[:, :, None] * normals
     slides = ((np.linalg.norm(away, axis=2) > slack) & (pressing > 0.0)).any(axis=1)
-    largest = max(float(np.abs(a).max(initial=0.0)), 1e-300)
+    largest = max(float(np.abs(a).max(initial=0.0)), float((pressing / weight[:, None]).max(initial=0.0)))
     for group in (slides, ~slides):
         part = np.flatnonzero(group)
         moved, press, pull = a[part], pressing[part], drag[part]

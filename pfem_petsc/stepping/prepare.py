@@ -187,8 +187,8 @@ def _check_walls(model, plan: Plan) -> None:
             _check_restitution(model, plan, k, key)
         if model.contact.ties.tying[k] and model.case.contact.treatment not in ("scheme", "stick"):
             raise InputError(f'{key}: tied needs contact.treatment = "scheme" or "stick"')
-        if model.contact.static_friction[k] and model.case.contact.treatment != "scheme":
-            raise InputError(f'{key}: friction needs contact.treatment = "scheme"')
+        if model.contact.static_friction[k] and model.case.contact.treatment not in ("scheme", "stick"):
+            raise InputError(f'{key}: friction needs contact.treatment = "scheme" or "stick"')
 
 
 def _check_restitution(model, plan: Plan, k: int, key: str) -> None:

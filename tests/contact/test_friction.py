@@ -106,6 +106,8 @@ def test_pulled_by_a_moving_floor(comm, shared_tmp_path):
 def test_refused(comm, shared_tmp_path):
     with pytest.raises(InputError, match="no less than friction"):
         simulation(block("central_differences", 0.5, static=0.2), comm, shared_tmp_path)
+    with pytest.raises(InputError, match='friction needs contact.treatment = "scheme" or "stick"'):
+        simulation(block("newmark", 0.5) | {"contact": {"treatment": "conserving"}}, comm, shared_tmp_path)
 
 
 @pytest.mark.parametrize("restitution", [0.0, 0.5, 0.8, 1.0])

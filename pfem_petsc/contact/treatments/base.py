@@ -52,8 +52,8 @@ class Treatment(ABC):
     def held(self, concerned: np.ndarray | bool = True) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Nodes that walls hold (m,), projections (m, 3, 3) on their normals, velocities (m, 3) to have there [m/s].
 
-        These are the walls' own, and :meth:`leaving` away from them. Of nodes that walls hold for good the projection
-        is on all directions. ``concerned`` (walls,) bool: of which walls; default: all.
+        These are the walls' own, and :meth:`leaving` away from them. Of nodes that walls hold for good or by friction
+        the projection is on all directions. ``concerned`` (walls,) bool: of which walls; default: all.
         """
         stepper = self.stepper
         contact, walls = stepper.model.contact, stepper.solution.walls
@@ -73,11 +73,19 @@ class Treatment(ABC):
             tied = contact.ties.held[nodes]
             normal[tied] = np.eye(3)
             speeds[tied] = rates[contact.ties.walls(nodes[tied])]
+        stuck = self.sticking(nodes, touching, normals)
+        holds = stuck.any(axis=1)
+        normal[holds] = np.eye(3)
+        speeds[holds] = rates[stuck[holds].argmax(axis=1)]
         return nodes, normal, speeds
 
     def leaving(self, nodes: np.ndarray, touching: np.ndarray, normals: np.ndarray, rates: np.ndarray) -> np.ndarray:
         """Velocities (m, w) at which nodes (m,) leave walls that they touch (m, w), along normals (m, w, 3) [m/s]."""
         return np.zeros(touching.shape)
+
+    def sticking(self, nodes: np.ndarray, touching: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        """(m, w) bool: walls whose friction keeps nodes (m,) that touch them (m, w) from slipping."""
+        return np.zeros(touching.shape, dtype=bool)
 
     def set(self, nodes: np.ndarray, v: np.ndarray, a: np.ndarray) -> None:
         """Give nodes new velocities and accelerations (m, 3), and keep what they were for the ledger."""

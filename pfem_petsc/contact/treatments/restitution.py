@@ -18,6 +18,8 @@ from .base import Treatment as Base
 
 __all__ = ["Treatment"]
 
+_STILL = 1e-13  # of the model's length: a slip that is rounding
+
 
 class Treatment(Base):
     """Nodes that close against walls with restitution leave them."""
@@ -25,10 +27,12 @@ class Treatment(Base):
     def before(self) -> None:
         """Keep who touches what, and how nodes move."""
         self._touched = self.stepper.touching.copy()
-        if not self.stepper.model.contact.restitution.any():
+        contact, state = self.stepper.model.contact, self.stepper.state
+        if contact.rough or contact.restitution.any():
+            self._time, self._place = state.time, state.position.copy()
+        if not contact.restitution.any():
             return
-        state = self.stepper.state
-        self._time, self._place, self._speed = state.time, state.position.copy(), state.v
+        self._speed = state.v
         self._free = self._without_contact(np.arange(len(state.v)))
 
     def _without_contact(self, nodes: np.ndarray) -> np.ndarray:
@@ -48,17 +52,32 @@ class Treatment(Base):
 
     def leaving(self, nodes: np.ndarray, touching: np.ndarray, normals: np.ndarray, rates: np.ndarray) -> np.ndarray:
         """See :class:`~pfem_petsc.contact.treatments.base.Treatment`."""
-        contact, state = self.stepper.model.contact, self.stepper.state
+        contact = self.stepper.model.contact
         if not contact.restitution.any():
             return np.zeros(touching.shape)
-        way = contact.motion.shifts(state.time) - contact.motion.shifts(self._time)
-        moved = (state.position - self._place)[nodes][:, None, :] - way
+        moved = self._moved(nodes)
         speed = np.einsum("mwi,mwi->mw", normals, self._speed[nodes][:, None, :] - rates)
         distance = np.maximum(-np.einsum("mwi,mwi->mw", normals, moved), 0.0)
         towards = -np.einsum("mwi,mi->mw", normals, self._free[nodes])
         impact = np.sqrt(np.maximum(speed * speed + 2.0 * towards * distance, 0.0))
         fresh = touching & ~self._touched[nodes]
         return np.where(fresh & (speed < 0.0), contact.restitution * impact, 0.0)
+
+    def sticking(self, nodes: np.ndarray, touching: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        """See :class:`~pfem_petsc.contact.treatments.base.Treatment`."""
+        model = self.stepper.model
+        if not model.contact.rough:
+            return np.zeros(touching.shape, dtype=bool)
+        slip = self._moved(nodes)
+        slip -= np.einsum("mwi,mwi->mw", slip, normals)[:, :, None] * normals
+        still = np.linalg.norm(slip, axis=2) <= _STILL * model.length
+        return touching & still & (model.contact.static_friction > 0.0)
+
+    def _moved(self, nodes: np.ndarray) -> np.ndarray:
+        """How nodes (m,) moved in this step relative to the walls (m, w, 3) [m]."""
+        contact, state = self.stepper.model.contact, self.stepper.state
+        way = contact.motion.shifts(state.time) - contact.motion.shifts(self._time)
+        return (state.position[nodes] - self._place[nodes])[:, None, :] - way
 
     def on_walls(self, concerned: np.ndarray | bool = True) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Nodes that walls hold (m,), and velocities and accelerations (m, 3) that they get [m/s], [m/s2]."""

@@ -1,5 +1,7 @@
 """Held nodes move with the wall: their normal velocity is the wall's, and they are not accelerated.
 
+Where friction keeps them from slipping, or a tied wall, that holds in all directions.
+
 The nodes of a pressed contact pair move on together: their normal velocity is the one that keeps their momentum.
 
 On closure a node loses the kinetic energy of its approach, m v_n^2/2, an O(element length) part of the whole; on

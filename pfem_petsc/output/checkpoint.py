@@ -87,7 +87,6 @@ def write_checkpoint(
     """
     require_parallel_hdf5(comm)
     path = Path(path)
-    temporary = path.with_name(path.name + ".tmp")
     slabs = {name: order.to_slab(np.asarray(array)) for name, (order, array) in arrays.items()}
     shapes = {name: ((arrays[name][0].n_global, *slab.shape[1:]), slab.dtype) for name, slab in slabs.items()}
     n_bytes = sum(dtype.itemsize * int(np.prod(shape, dtype=np.int64)) for shape, dtype in shapes.values())
@@ -95,7 +94,7 @@ def write_checkpoint(
     checks = {name: checksum(comm, slab, arrays[name][0].first) for name, slab in slabs.items()}
     state = json.dumps({"scalars": dict(scalars), "attributes": dict(attributes)}, default=_plain)
     try:
-        create_new(temporary, comm, _create, shapes, checks, state, userblock_size=seal_size(len(shapes)))
+        temporary = create_new(path, comm, _create, shapes, checks, state, userblock_size=seal_size(len(shapes)))
     except InputError as error:
         raise SimulationFailure(f"{path}: no checkpoint could be written: {error}") from error
 

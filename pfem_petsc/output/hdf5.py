@@ -65,12 +65,12 @@ def require_parallel_hdf5(comm: MPI.Comm) -> None:
 
 def create_new(
     path: Path, comm: MPI.Comm, build: Callable[..., None], *arguments: Any, userblock_size: int = 0
-) -> None:
-    """Make an HDF5 file with its whole structure on rank 0, under a temporary name, then rename it to ``path``.
+) -> Path:
+    """Make an HDF5 file with its whole structure on rank 0, under a temporary name, which is given back.
 
-    ``build(file, *arguments)`` fills it; the first ``userblock_size`` bytes are left to the caller. Nobody sees the
-    file under its own name before the structure is complete. Serial creation makes the structure the same for any
-    number of ranks, and an unwritable folder the same error on all of them. Collective.
+    ``build(file, *arguments)`` fills it; the first ``userblock_size`` bytes are left to the caller. Serial creation
+    makes the structure the same for any number of ranks, and an unwritable folder the same error on all of them.
+    Collective.
 
     Raises
     ------
@@ -78,13 +78,13 @@ def create_new(
         On all ranks, when the folder cannot be written, or is not the same folder on all of them.
     """
 
+    temporary = path.with_name(path.name + ".new")
+
     def create() -> None:
-        temporary = path.with_name(path.name + ".new")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             with h5py.File(temporary, "w", locking=False, userblock_size=userblock_size) as file:
                 build(file, *arguments)
-            os.replace(temporary, path)
         except (OSError, RuntimeError) as error:
             number = getattr(error, "errno", None)
             raise InputError(
@@ -96,13 +96,14 @@ def create_new(
     with agreed(comm):
         # A network file system may take a moment to show a new file on other machines.
         deadline = time.monotonic() + 5.0
-        while not path.exists():
+        while not temporary.exists():
             if time.monotonic() > deadline:
                 raise InputError(
                     f"{path}: made by rank 0, but rank {comm.rank} on {MPI.Get_processor_name()} does not see it: "
                     "choose an output folder (-o) that all machines share"
                 )
             time.sleep(0.1)
+    return temporary
 
 
 def open_shared(path: Path, comm: MPI.Comm) -> h5py.File:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -101,6 +102,7 @@ class ResultWriter:
         self.counted = mesh.counted
         self.node_order = mesh.node_order
         self.bar_order = mesh.bar_order
+        self._unpublished: Path | None = None  # what the file is called until something complete is in it
         self._fields = {"PointData": sorted(point_fields), "CellData": sorted(cell_fields)}
         self._file: h5py.File | None = None
         # Why no more can be written, and whether the open file can still be closed.
@@ -110,14 +112,16 @@ class ResultWriter:
         described = describe_run(comm, attributes)
         sizes = (self.n_nodes, self.n_bars)
         if append_after_step is None:
-            create_new(self.path, comm, create_result, *sizes, columns, column_types, case_text, described)
+            self._unpublished = create_new(
+                self.path, comm, create_result, *sizes, columns, column_types, case_text, described
+            )
         else:
             last = last or (append_after_step, append_after_step)
             on_root(
                 comm, reopen, self.path, append_after_step, last, sizes, self._fields, columns, case_text, described
             )
         with writing(comm, self.path):
-            self._file = open_shared(self.path, comm)
+            self._file = open_shared(self._unpublished or self.path, comm)
         vtk, steps = self._file["VTKHDF"], self._file["VTKHDF/Steps"]
         self._per_step = {name: steps[name] for name in PER_STEP}
         self._times = steps["Values"]
@@ -193,6 +197,7 @@ class ResultWriter:
                 if self.comm.rank == 0:
                     write_rows(self._times, n, np.array([time], dtype=np.float64))
                 file.flush()
+            self._publish()
         self.n_snapshots = n + 1
 
     def append_history(self, row: Mapping[str, Any] | None) -> None:
@@ -217,6 +222,7 @@ class ResultWriter:
             self._history.commit()
             with writing(self.comm, self.path):
                 file.flush()
+            self._publish()
 
     def close(self) -> None:
         """Write what is in memory and close the file; again: nothing. Collective."""
@@ -232,6 +238,7 @@ class ResultWriter:
             else:
                 with writing(self.comm, self.path):
                     file.close()
+                self._publish()
 
     def __enter__(self) -> ResultWriter:
         return self
@@ -258,9 +265,21 @@ class ResultWriter:
             self._failure = error if known else SimulationFailure(f"{self.path}: a write was interrupted: {error!r}")
             raise
 
+    def _publish(self) -> None:
+        """Give the file its own name, the first time: a kill before may leave one that HDF5 cannot open.
+
+        The first flush puts down links to new objects before the superblock that says how far the file reaches.
+        """
+        if self._unpublished is None:
+            return
+        with writing(self.comm, self.path):
+            if self.comm.rank == 0:
+                os.replace(self._unpublished, self.path)
+        self._unpublished = None
+
     def _require_room(self, n_bytes: int) -> None:
         try:
-            require_room(self.comm, self.path, n_bytes + self._history.reserve_bytes)
+            require_room(self.comm, self.path, n_bytes + self._history.reserve_bytes, target=self._unpublished)
         except SimulationFailure as error:
             self._failure = error
             raise

@@ -125,7 +125,8 @@ def test_readable_while_it_is_written(shared_tmp_path):
     truss = Truss(COMM)
     writer = ResultWriter(path, COMM, truss.mesh, **options())
     if COMM.rank == 0:
-        assert len(open_result(path).times) == 0
+        # a kill now would leave a file that nobody can open
+        assert not path.exists()
     result = None
     for i, step in enumerate(WRITTEN):
         write(writer, truss, range(step, step + 5))

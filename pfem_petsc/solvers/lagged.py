@@ -1,6 +1,7 @@
 """A preconditioner from an assembled Hessian that serves many Newton iterations, of free steps and those with bounds.
 
-The matrix is that of all unknowns. Where walls hold some of them, their rows and columns are those of a unit matrix;
+The matrix has the geometric stiffness of bars in tension only, and is definite where the Hessian is not: beyond
+buckling. It is that of all unknowns. Where walls hold some of them, their rows and columns are those of a unit matrix;
 the residual of the reduced system, of the inactive unknowns, is extended by zeros. So the blocks of three unknowns and
 the rigid motions stay what multigrid needs, and an active set that changes costs no set-up.
 """
@@ -37,9 +38,10 @@ class LaggedPreconditioner:
     ----------
     model : Model
     kind : of preconditioner, ``gamg`` or ``lu``
-    symmetric : whether the Hessian is
-    operator : whose products multigrid smooths with on the finest level, where the Hessian is not assembled: a third of
-        the time less than with the matrix
+    symmetric : whether the Hessian is, friction included
+    definite : whether it is without friction, and so has a definite part
+    matrix_free : whether multigrid smooths on the finest level with products bar by bar, of the same matrix: it saves a
+        third of the time
 
     Attributes
     ----------
@@ -48,14 +50,16 @@ class LaggedPreconditioner:
     history : (b, 2) plastic history there, (b, 0) where no bar can yield
     count : what else decides when it is made anew: the Hessian's coefficients, iterations of the first solve with it,
         iterations of later solves beyond that, and those of the last solve
-    fresh : whether it belongs to the operator of the last Newton iteration
+    carried : whether it was made for an earlier problem
     """
 
-    def __init__(self, model, kind: str, symmetric: bool, operator: MatrixFreeHessian | None = None) -> None:
+    def __init__(self, model, kind: str, symmetric: bool, definite: bool, matrix_free: bool) -> None:
         mesh = model.mesh
         self.mesh = mesh
         self.kind = kind
-        self.operator = operator
+        # of symmetric schemes: the stiffness of the bars, and its products
+        self.product = MatrixFreeHessian(model) if definite else None
+        self._smooth = matrix_free and kind == "gamg"
         self.matrix = HessianMatrix(mesh, model.supports.fixed, model.supports.any, symmetric)
         self.bars = model.bars
         self.plastic = model.comm.allreduce(int(model.bars.plastic)) > 0
@@ -63,7 +67,7 @@ class LaggedPreconditioner:
         self.place = np.zeros((mesh.n_owned, 0))
         self.history = np.zeros((len(mesh.bars), 0))
         self.count = [0.0] * 6
-        self.fresh = False
+        self.carried = False
         self._inner: PETSc.PC | None = None
         self._fixed = np.flatnonzero(model.supports.fixed)
         self._problem = None
@@ -96,6 +100,7 @@ class LaggedPreconditioner:
         usable = self.outlasts and not own
         self._kept = kept
         if problem is not self._problem:
+            self.carried = True
             due |= not usable or wanted != coefficients or not self.place.shape[1]
             if not due and self._problem is None:
                 self._make_again(problem)
@@ -110,35 +115,37 @@ class LaggedPreconditioner:
             self.place = np.hstack([problem.x[:owned], held[:owned]]) if usable else np.zeros((owned, 0))
             if self.plastic and usable:
                 self.history = self.bars.history()
-        self.fresh = due
+        self.carried &= not due
         self._problem = problem
         self.count = [*wanted, first, beyond, 0.0]
 
     def _make_again(self, problem) -> None:
         """After a restart: what was there before, from the operator where it was made."""
-        here, kept, owned = problem.x.copy(), self._kept, self.mesh.n_owned
+        here, owned = problem.x.copy(), self.mesh.n_owned
         held = np.zeros((self.mesh.n_local, 3))
         problem.x[:owned], held[:owned] = self.place[:, :3], self.place[:, 3:]
         self.mesh.update_ghosts(problem.x)
-        self._kept = np.flatnonzero(held[:owned] == 0.0)
         if self.plastic:
             history = self.bars.history()
             self.bars.put_history(self.history)
-        if self.operator is not None:
-            self.operator.linearise(problem.x)
         self._make(problem, held)
-        problem.x[:], self._kept = here, kept
+        problem.x[:] = here
         if self.plastic:
             self.bars.put_history(history)
-        if self.operator is not None:
-            self.operator.linearise(here)
 
     def _make(self, problem, held: np.ndarray) -> None:
         matrix = self.matrix
         self.mesh.update_ghosts(held)
 
+        stored = None
+        if self.product is not None:
+            self.product.linearise(problem)
+            self.product.make_definite()
+            stored = self.product.stored
+            self.product.extension.kept = np.flatnonzero(held[: self.mesh.n_owned] == 0.0)
+
         def add(values: np.ndarray) -> None:
-            problem.hessian_here(matrix, values)
+            problem.hessian_here(matrix, values, stored)
             if problem.pairs is None and held.any():
                 matrix.hold(held, problem.scale, values)
 
@@ -156,7 +163,6 @@ class LaggedPreconditioner:
         # multigrid makes the rigid motions from them, which it must not damp. MatNullSpaceCreateRigidBody would make
         # them orthogonal, with rounding that PETSc 3.26 does not repeat
         self._inner.setCoordinates(x - centre)
-        self._set_kept()
         options = PETSc.Options()
         ours = self.mesh.comm.size > 1 and not options.hasName("matptap_via")
         if ours:
@@ -171,19 +177,14 @@ class LaggedPreconditioner:
             self._inner.destroy()
         self._inner = PETSc.PC().create(self.mesh.comm)
         self._inner.setOptionsPrefix("pfem_assembled_")
-        self._inner.setOperators(matrix if self.operator is None else self.operator.extension.mat, matrix)
+        self._inner.setOperators(self.product.extension.mat if self._smooth else matrix, matrix)
         set_preconditioner(self._inner, self.kind)
-        self._inner.setUseAmat(self.operator is not None)
+        self._inner.setUseAmat(self._smooth)
         self._inner.setFromOptions()
-
-    def _set_kept(self) -> None:
-        if self.operator is not None:
-            self.operator.extension.kept = self._kept
 
     def apply(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Y = P x for the unknowns kept, see :meth:`renew`. Collective."""
         self.count[-1] += 1.0
-        self._set_kept()
         kept = self._kept
         if kept is None:
             self._inner.apply(x, y)
@@ -203,8 +204,9 @@ class LaggedPreconditioner:
 
     def destroy(self) -> None:
         """Free the PETSc objects."""
-        for thing in (self._inner, self._right, self._left, self.matrix):
-            thing.destroy()
+        for thing in (self._inner, self._right, self._left, self.matrix, self.product):
+            if thing is not None:
+                thing.destroy()
 
 
 class Preconditioning:

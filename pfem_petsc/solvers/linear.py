@@ -105,7 +105,7 @@ def configure(ksp: PETSc.KSP, choice: LinearChoice, reduced: bool, ours: object 
     if choice.krylov != "preonly":
         ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
         # 101,706 bars at 2 x the explicit limit: 1e-5, 1e-4, 1e-3, 1e-2 took 30.0, 29.4, 27.0, 35.7 ms a step
-        ksp.setTolerances(rtol=1e-3, max_it=2000)
+        ksp.setTolerances(rtol=1e-3, max_it=2000 if ours is None else 500)
     if ours is None:
         set_preconditioner(ksp.getPC(), choice.preconditioner, reduced)
     else:

@@ -80,6 +80,23 @@ def _add_lumped(ptr, diagonal, inertia, values):
 
 
 @kernel
+def _add_bars(bars, stored, ptr, slots, values):
+    for k in range(len(bars)):
+        for s in range(4):
+            slot = slots[k, s]
+            if slot < 0:
+                continue
+            row = bars[k, s // 2]
+            sign = 1.0 if s % 2 == 0 else -1.0
+            width = 3 * (ptr[row + 1] - ptr[row])
+            at = 6 * ptr[row] + 3 * slot
+            for i in range(3):
+                for j in range(3):
+                    values[at + i * width + j] += sign * stored[k, 3] * stored[k, i] * stored[k, j]
+                values[at + i * (width + 1)] += sign * stored[k, 4]
+
+
+@kernel
 def _constrain_rows(ptr, diagonal, fixed, scale, values):
     for row in range(len(diagonal)):
         width = 3 * (ptr[row + 1] - ptr[row])
@@ -181,6 +198,10 @@ class HessianMatrix:
     def add_lumped(self, inertia: np.ndarray, values: np.ndarray) -> None:
         """Add a nodal inertia (owned,) to the diagonal."""
         _add_lumped(self.pattern.ptr, self.pattern.diagonal, inertia, values)
+
+    def add_bars(self, stored: np.ndarray, values: np.ndarray) -> None:
+        """Add the bars' stiffness from what :meth:`~pfem_petsc.mechanics.bars.Bars.linearise` stores, (b, 5)."""
+        _add_bars(self.mesh.bars, stored, self.pattern.ptr, self.pattern.slots, values)
 
     def add_blocks(self, nodes: np.ndarray, blocks: np.ndarray, values: np.ndarray) -> None:
         """Add blocks (k, 3, 3) to the diagonal blocks of owned nodes (k,), each there once."""

@@ -118,6 +118,7 @@ class MatrixFreeHessian:
     ----------
     mat : PETSc matrix of type python
     bounded : the matrix that steps with bounds take: the same
+    stored : (b, 5) what the product needs of each bar, see :meth:`~pfem_petsc.mechanics.bars.Bars.linearise`
     """
 
     _extension: _Extension | None = None
@@ -131,7 +132,7 @@ class MatrixFreeHessian:
         self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         self.mat.setUp()
         self.bounded = self.mat
-        self._stored = np.zeros((len(mesh.bars), 5))
+        self.stored = np.zeros((len(mesh.bars), 5))
         self._u = np.zeros((mesh.n_local, 3))
         self._out = np.zeros((mesh.n_local, 3))
         self._fixed = model.supports.fixed
@@ -139,20 +140,26 @@ class MatrixFreeHessian:
 
     def update(self, problem, w: np.ndarray) -> None:
         """Linearise at ``w``. Collective."""
+        problem.place(problem.increment(w))
+        self.linearise(problem)
+        self.mat.stateIncrease()
+
+    def linearise(self, problem) -> None:
+        """As :meth:`update`, at the positions where the problem is placed."""
         self._problem = problem
         if problem.oblique:
             self._left = problem.left()
-        problem.place(problem.increment(w))
-        self.linearise(problem.x)
-        self.mat.stateIncrease()
+        self.model.bars.linearise(problem.x, problem.balance.weight, self.stored)
 
-    def linearise(self, x: np.ndarray) -> None:
-        """Take the tangents of the bars at positions (local nodes, 3)."""
-        self.model.bars.linearise(x, self._problem.balance.weight, self._stored)
+    def make_definite(self) -> None:
+        """Leave out what the stiffness of bars has of negative eigenvalues: in compression, and of laws that soften."""
+        axial = np.maximum(self.stored[:, 3] + self.stored[:, 4], 0.0)
+        np.maximum(self.stored[:, 4], 0.0, out=self.stored[:, 4])
+        np.subtract(axial, self.stored[:, 4], out=self.stored[:, 3])
 
     @property
     def extension(self) -> _Extension:
-        """The operator that preconditioners of all unknowns may use, also where the system has some of them only."""
+        """The operator with rows and columns of a unit matrix for unknowns that walls hold."""
         if self._extension is None:
             self._extension = _Extension(self)
         return self._extension
@@ -190,7 +197,7 @@ class MatrixFreeHessian:
             if inertia.redistribution is not None:
                 moved = inertia.redistribution
                 out[moved.touched] += problem.balance.alpha * np.einsum("kij,kj->ki", moved.tensors, u[moved.touched])
-        _product(self.mesh.bars, self._stored, u, out)
+        _product(self.mesh.bars, self.stored, u, out)
         if problem.oblique:
             if problem.sliding is not None:
                 slipping = problem.sliding.nodes
@@ -209,7 +216,7 @@ class MatrixFreeHessian:
         """Diagonal of H (owned, 3)."""
         problem, owned = self._problem, self.mesh.n_owned
         blocks = np.zeros((self.mesh.n_local, 6))
-        _diagonal(self.mesh.bars, self._stored, blocks)
+        _diagonal(self.mesh.bars, self.stored, blocks)
         if self.model.inertia.redistribution is not None:
             moved = self.model.inertia.redistribution
             upper = moved.tensors.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]

@@ -118,7 +118,7 @@ class NewtonSolver:
             snes.setVariableBounds(self._lower, self._upper)
         start = u.copy()
         report = self._attempt(snes, start)
-        if not report.converged and self.lagged is not None and not self.lagged.fresh:
+        if not report.converged and self.lagged is not None and self.lagged.carried:
             self.lagged.drop()
             report = report.then(self._attempt(snes, start))
         if not report.converged and "INDEFINITE" in report.why or "BREAKDOWN" in report.why:

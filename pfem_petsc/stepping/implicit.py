@@ -42,8 +42,9 @@ class ImplicitStepper(Stepper):
             self.hessian = HessianMatrix(model.mesh, model.supports.fixed, model.supports.any, symmetric)
         self.lagged = None
         if choice.lagged:
-            free = self.hessian if choice.matrix_free else None
-            self.lagged = LaggedPreconditioner(model, choice.preconditioner, symmetric, free)
+            self.lagged = LaggedPreconditioner(
+                model, choice.preconditioner, symmetric, scheme.symmetric, choice.matrix_free
+            )
         self.pairs = None if model.pairs is None else PairCoordinates(model.pairs)
         if self.pairs is not None:
             self.hessian.couple(self.pairs)

@@ -161,8 +161,11 @@ class StepProblem:
         self.place(self.increment(w))
         self.hessian_here(matrix, values)
 
-    def hessian_here(self, matrix: HessianMatrix, values: np.ndarray) -> None:
-        """As :meth:`hessian`, at the positions :attr:`x`, ghosts included. Collective."""
+    def hessian_here(self, matrix: HessianMatrix, values: np.ndarray, stored: np.ndarray | None = None) -> None:
+        """As :meth:`hessian`, at the positions :attr:`x`, ghosts included. Collective.
+
+        With ``stored`` (b, 5) the stiffness of the bars is that of its numbers, see ``Bars.linearise``.
+        """
         inertia, balance = self.model.inertia, self.balance
         if not inertia.consistent:
             matrix.add_lumped(self.nodal, values)
@@ -174,6 +177,9 @@ class StepProblem:
             bars, arguments = self.model.bars, (balance.weight, coefficients, matrix.pattern, values)
             if balance.from_start:
                 bars.step_tangents(self.state.x, self.x, *arguments)
+            elif stored is not None:
+                bars.tangents(self.x, 0.0, *arguments[1:])
+                matrix.add_bars(stored, values)
             else:
                 bars.tangents(self.x, *arguments)
         if self.oblique:

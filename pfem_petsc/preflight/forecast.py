@@ -9,6 +9,7 @@ import numpy as np
 from mpi4py import MPI
 
 from ..output.units import duration, engineering
+from ..solvers.linear import DIRECT
 
 __all__ = ["checkpoint_bytes", "forecast", "memory_of_machine", "memory_warning", "result_bytes"]
 
@@ -93,7 +94,7 @@ def _needed(model, plan) -> float:
     """Of this rank, at most [B]."""
     bars = len(model.mesh.bars)
     kind = "" if plan.linear is None else plan.linear.preconditioner
-    if kind == "lu":
+    if kind in DIRECT:
         # fill in three dimensions: the factors of n unknowns have of the order of n^(4/3) entries
         each = _PER_BAR_FACTORISED * max(1.0, (model.mesh.n_bars / _FACTORISED_AT) ** (1.0 / 3.0))
     else:
@@ -106,5 +107,5 @@ def _seconds(model, plan) -> float:
     bars = max(model.comm.allgather(len(model.mesh.bars)))
     if plan.linear is None:
         return plan.steps * (_SECONDS_PER_STEP + _SECONDS_EXPLICIT * bars)
-    iterations = 50.0 if plan.linear.preconditioner != "lu" else 100.0
+    iterations = 50.0 if plan.linear.preconditioner not in DIRECT else 100.0
     return plan.steps * (10.0 * _SECONDS_PER_STEP + _SECONDS_PER_ITERATION * iterations * bars)

@@ -21,8 +21,8 @@ from .matrix_free import MatrixFreeHessian
 __all__ = ["LaggedPreconditioner", "Preconditioning"]
 
 # A set-up costs about as much as this many iterations: a new one is due when the iterations beyond those of the first
-# solve after the last one add up to it. 101,706 bars, one core: multigrid 0.33 s and 3.7 ms, LU 1.9 s and 0.05 s.
-_SET_UP = {"gamg": 90, "lu": 40}
+# solve after the last one add up to it. 101,706 bars, one core: multigrid 0.33 s and 3.7 ms, MUMPS 2.3 s and 0.04 s.
+_SET_UP = {"gamg": 90, "lu": 40, "mumps": 55}
 
 
 class LaggedPreconditioner:
@@ -37,7 +37,7 @@ class LaggedPreconditioner:
     Parameters
     ----------
     model : Model
-    kind : of preconditioner, ``gamg`` or ``lu``
+    kind : of preconditioner, ``gamg``, ``lu`` or ``mumps``
     symmetric : whether the Hessian is, friction included
     definite : whether it is without friction, and so has a definite part
     matrix_free : whether multigrid smooths on the finest level with products bar by bar, of the same matrix: it saves a

@@ -8,13 +8,16 @@ from petsc4py import PETSc
 
 from ..errors import InputError
 
-__all__ = ["LinearChoice", "choose_linear", "configure", "set_preconditioner", "unsymmetric"]
+__all__ = ["DIRECT", "LinearChoice", "choose_linear", "configure", "set_preconditioner", "unsymmetric"]
 
-_DIRECT_BELOW = 500  # unknowns; a lattice of 3,993 takes 0.22 s to factorise, and 1 to 4 ms with conjugate gradients
-# Steps over the explicit limit up to which each is chosen. scripts/linear_solvers.py, 101,706 bars on one core, seconds
-# a Newmark step at 1, 10, 100, 1000 x: matrix-free Jacobi 0.015, 0.046, 0.13, 0.15; point-block Jacobi 0.091, 0.16,
-# 0.30, 0.36; incomplete Cholesky 0.082, 0.15, 0.34, 0.42; multigrid 0.55, 0.60, 0.58, 0.60 (docs/linear_solvers.md).
-_MATRIX_FREE_UP_TO = 3000.0
+DIRECT = ("lu", "mumps")
+"""Preconditioners that solve: PETSc's own factorisation, for small matrices, and MUMPS where PETSc has it."""
+
+_DIRECT_BELOW = 500  # unknowns; a lattice of 3,993 takes 0.06 s to factorise, and 1 to 4 ms with conjugate gradients
+# Steps over the explicit limit up to which each is chosen, from scripts/linear_solvers.py (docs/linear_solvers.md)
+_JACOBI_FREE_UP_TO = 30.0
+_MULTIGRID_FROM = 10  # steps, over which its first set-up pays
+# with an assembled matrix
 _JACOBI_UP_TO = 5.0
 _CHOLESKY_UP_TO = 50.0
 
@@ -31,11 +34,17 @@ class LinearChoice:
     @property
     def lagged(self) -> bool:
         """Whether the preconditioner has a matrix of its own, of an earlier iteration."""
-        return self.preconditioner == "gamg" or (self.matrix_free and self.preconditioner == "lu")
+        return self.preconditioner == "gamg" or (self.matrix_free and self.preconditioner in DIRECT)
 
 
 def choose_linear(
-    request: str, unknowns: int, step_ratio: float, symmetric: bool = True, operator: str = "auto"
+    request: str,
+    unknowns: int,
+    step_ratio: float,
+    symmetric: bool = True,
+    operator: str = "auto",
+    steps: int = _MULTIGRID_FROM,
+    impact: bool = False,
 ) -> LinearChoice:
     """Resolve ``solver.linear`` and ``solver.operator``.
 
@@ -51,6 +60,10 @@ def choose_linear(
         Whether the matrix is; GMRES and incomplete LU stand in for conjugate gradients and Cholesky where it is not.
     operator : str
         ``auto``, ``assembled`` or ``matrix_free``.
+    steps : int
+        Of the run.
+    impact : bool
+        Whether there is contact or yielding, where tangents change too much for a preconditioner to last.
 
     Raises
     ------
@@ -60,25 +73,32 @@ def choose_linear(
     if operator == "matrix_free" and not symmetric:
         raise InputError('solver.operator = "matrix_free": this integrator needs a matrix; take "assembled" or "auto"')
     free = operator != "assembled" and symmetric
-    if operator == "matrix_free" and request in ("gamg", "mumps"):
-        kind, words = ("gamg", "multigrid") if request == "gamg" else ("lu", "factorisation")
-        return LinearChoice("cg", kind, f"conjugate gradients, lagged {words}, matrix-free (asked for)", True)
-    if request == "mumps" or (request == "auto" and operator != "matrix_free" and unknowns <= _DIRECT_BELOW):
-        why = "asked for" if request != "auto" else f"{unknowns} unknowns, at most {_DIRECT_BELOW}"
-        return LinearChoice("preonly", "lu", f"direct ({why})")
     krylov, method = ("cg", "conjugate gradients") if symmetric else ("gmres", "GMRES")
+    direct = DIRECT[unknowns > _DIRECT_BELOW]
+    if request == "mumps" and operator == "matrix_free":
+        return LinearChoice("cg", direct, "conjugate gradients, lagged factorisation, matrix-free (asked for)", True)
+    if request == "mumps":
+        return LinearChoice("preonly", direct, "direct (asked for)")
+    if request == "auto" and operator != "matrix_free" and unknowns <= _DIRECT_BELOW:
+        return LinearChoice("preonly", direct, f"direct ({unknowns} unknowns, at most {_DIRECT_BELOW})")
+    words = f"{method}, lagged multigrid, {'matrix-free' if free else 'assembled'}"
     if request == "gamg":
-        return LinearChoice(krylov, "gamg", f"{method}, multigrid (asked for)")
+        return LinearChoice(krylov, "gamg", f"{words} (asked for)", free)
     ratio = f"step is {step_ratio:.3g} x the explicit limit"
-    if free and (operator == "matrix_free" or request == "cg" or step_ratio <= _MATRIX_FREE_UP_TO):
-        return LinearChoice(krylov, "jacobi", f"{method}, Jacobi, matrix-free ({ratio})", matrix_free=True)
+    if free:
+        if request == "cg" or step_ratio <= _JACOBI_FREE_UP_TO:
+            return LinearChoice(krylov, "jacobi", f"{method}, Jacobi, matrix-free ({ratio})", True)
+        if impact or steps < _MULTIGRID_FROM:
+            short = "contact or yielding" if impact else f"{steps} steps"
+            return LinearChoice(krylov, "jacobi", f"{method}, Jacobi, matrix-free ({ratio}, {short})", True)
+        return LinearChoice(krylov, "gamg", f"{words} ({ratio})", True)
     if request == "cg" or step_ratio <= _JACOBI_UP_TO:
         return LinearChoice(krylov, "pbjacobi", f"{method}, point-block Jacobi ({ratio})")
     if step_ratio <= _CHOLESKY_UP_TO:
         if symmetric:
             return LinearChoice(krylov, "icc", f"{method}, incomplete Cholesky ({ratio})")
         return LinearChoice(krylov, "ilu", f"{method}, incomplete LU ({ratio})")
-    return LinearChoice(krylov, "gamg", f"{method}, multigrid ({ratio})")
+    return LinearChoice(krylov, "gamg", f"{words} ({ratio})")
 
 
 def unsymmetric(choice: LinearChoice) -> LinearChoice:
@@ -116,13 +136,13 @@ def configure(ksp: PETSc.KSP, choice: LinearChoice, reduced: bool, ours: object 
 def set_preconditioner(pc: PETSc.PC, kind: str, reduced: bool = False) -> None:
     """Make a preconditioner one of the kinds of :class:`LinearChoice`, with our defaults for its options."""
     comm = pc.comm
-    if kind == "lu":
+    if kind in DIRECT:
         pc.setType("lu")
-        if comm.size > 1:
-            if _has_mumps():
-                pc.setFactorSolverType("mumps")
-            else:
-                pc.setType("redundant")
+        # PETSc's own takes 57 s for a lattice of 101,706 bars and MUMPS 2.3 s, but 0.5 ms less for one of 200
+        if (kind == "mumps" or comm.size > 1) and _has_mumps():
+            pc.setFactorSolverType("mumps")
+        elif comm.size > 1:
+            pc.setType("redundant")
     elif kind == "pbjacobi":
         pc.setType("jacobi" if reduced else "pbjacobi")
     elif kind in ("icc", "ilu"):

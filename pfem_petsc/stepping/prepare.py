@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -42,6 +42,7 @@ class Plan:
     critical_step : largest stable step of the scheme [s], infinite where unconditionally stable
     frequency : bounds on the highest natural frequency [rad/s]
     linear : linear solver, None where every node is solved on its own
+    asked : what the case asks for of it, ``solver.linear`` and ``solver.operator``
     """
 
     scheme: Scheme
@@ -50,10 +51,12 @@ class Plan:
     critical_step: float
     frequency: Frequency
     linear: LinearChoice | None
+    asked: tuple[str, str] = ("auto", "auto")
 
     def record(self) -> dict[str, Any]:
         """What a restart must not work out anew, in numbers that keep their last bit."""
-        return {"step": self.step, "frequency": list(self.frequency)}
+        linear = None if self.linear is None else {"asked": list(self.asked), "choice": asdict(self.linear)}
+        return {"step": self.step, "frequency": list(self.frequency), "linear": linear}
 
 
 def make_plan(model, recorded: Mapping[str, Any] | None = None) -> Plan:
@@ -108,17 +111,27 @@ def make_plan(model, recorded: Mapping[str, Any] | None = None) -> Plan:
                 f'beyond {critical:.6g} s for this model; take a smaller step or time.step = "auto"'
             )
         steps = _steps_to(time.end, step, case.source)
+    asked = case.solver.linear, case.solver.operator
     linear = None
     if not scheme.explicit or model.inertia.consistent:
-        over = step * frequency.upper / 2.0
-        over = 0.0 if scheme.explicit else over
-        try:
-            linear = choose_linear(
-                case.solver.linear, 3 * model.mesh.n_nodes, over, scheme.symmetric, case.solver.operator
-            )
-        except InputError as error:
-            raise InputError(f"{case.source}: {error}") from error
-    return Plan(scheme, step, steps, critical, frequency, linear)
+        kept = None if recorded is None else recorded.get("linear")
+        if kept is not None and tuple(kept["asked"]) == asked:
+            linear = LinearChoice(**kept["choice"])
+        else:
+            linear = _linear(model, scheme, 0.0 if scheme.explicit else step * frequency.upper / 2.0, steps)
+    return Plan(scheme, step, steps, critical, frequency, linear, asked)
+
+
+def _linear(model, scheme: Scheme, over: float, steps: int) -> LinearChoice:
+    """The choice for steps ``over`` times the limit of central differences."""
+    case = model.case
+    yielding = any(material.yield_stress is not None for material in case.material.values())
+    impact = yielding or model.contact.any or model.pairs is not None
+    solver, unknowns = case.solver, 3 * model.mesh.n_nodes
+    try:
+        return choose_linear(solver.linear, unknowns, over, scheme.symmetric, solver.operator, steps, impact)
+    except InputError as error:
+        raise InputError(f"{case.source}: {error}") from error
 
 
 def _steps_to(end: float, step: float, source: str) -> int:

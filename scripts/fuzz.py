@@ -2,8 +2,9 @@
 
     .venv/bin/python scripts/fuzz.py --mutants 10000
 
-A traceback, a status other than 0 and 2, a message without the file, no answer within a minute and a process that dies
-all count. Every mutant has a seed: ``--seed 1234 --mutants 1 --keep DIR`` makes it again. Status 0 when nothing counts.
+A traceback, a status other than 0 and 2, a message without the file, of a case without key or line, no answer within a
+minute and a process that dies all count. Cases are the built-in ones, meshes of every format. Every mutant has a seed:
+``--seed 1234 --mutants 1 --keep DIR`` makes it again. Status 0 when nothing counts.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from collections import Counter
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "faults"))
@@ -35,6 +37,7 @@ def main() -> int:
     if arguments.worker:
         return _work(arguments.seed, arguments.mutants, folder)
     bad = 0
+    kinds: Counter[str] = Counter()
     at, end = arguments.seed, arguments.seed + arguments.mutants
     while at < end:
         count = min(BATCH, end - at)
@@ -44,6 +47,7 @@ def main() -> int:
         for text in done.stdout.splitlines():
             if text.startswith("tried "):
                 tried += 1
+                kinds[text.split(" ", 2)[2]] += 1
             elif text.startswith("BAD "):
                 bad += 1
                 print(text, flush=True)
@@ -57,6 +61,8 @@ def main() -> int:
         print(f"{at - arguments.seed} mutants, {bad} bad", flush=True)
     if arguments.keep is None:
         shutil.rmtree(folder)
+    for kind, count in sorted(kinds.items()):
+        print(f"{count:6}  {kind}")
     print(f"{arguments.mutants} mutants from seed {arguments.seed}: {bad} bad")
     return 1 if bad else 0
 
@@ -67,10 +73,11 @@ def _work(seed: int, count: int, folder: Path) -> int:
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     texts, meshes = small_cases(), sound_meshes(folder / "sound")
     for mutant in range(seed, seed + count):
-        told = try_one(mutant, folder, texts, meshes)
-        if told:
+        kind, told = try_one(mutant, folder, texts, meshes)
+        if kind == "bad":
             print(f"BAD {mutant}: {' | '.join(told.split(chr(10)))[:600]}", flush=True)
-        print(f"tried {mutant}", flush=True)
+        what = "case" if mutant % 3 < 2 else "mesh"
+        print(f"tried {mutant} {what}: {kind}", flush=True)
     return 0
 
 

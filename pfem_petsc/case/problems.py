@@ -123,7 +123,9 @@ class Problems:
         where: Path = (*path, *item["loc"])
         kind, value, context = item["type"], item["input"], item.get("ctx", {})
         field = model.model_fields.get(str(item["loc"][0])) if item["loc"] else None
-        about = f" ({field.description.strip().rstrip('.')})" if field is not None and field.description else ""
+        about = (
+            f" ({' '.join(field.description.split()).rstrip('.')})" if field is not None and field.description else ""
+        )
         if kind == "extra_forbidden":
             key = str(item["loc"][-1])
             owners = [name for name, keys in siblings().items() if key in keys] if len(item["loc"]) == 1 else []

@@ -153,7 +153,8 @@ def _read_text(path: Path) -> str:
     try:
         return path.read_bytes().decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: a case file is TOML text in UTF-8, but byte {error.start} is not") from error
+        line = error.object[: error.start].count(b"\n") + 1
+        raise InputError(f"{path}: line {line}: a case file is TOML text in UTF-8, and this is not") from error
     except FileNotFoundError as error:
         names = built_in_cases()
         near = difflib.get_close_matches(str(path), names, n=1)

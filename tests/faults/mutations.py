@@ -17,6 +17,10 @@ from pfem_petsc.cli.main import main
 sys.path.insert(0, str(Path(__file__).parent.parent / "mesh"))
 from samples import GMSH, write_hdf5, write_vtk  # noqa: E402
 
+# What a refusal names besides the file: of a case a key or a line, of a mesh a section, line, dataset, node or bar.
+OF_A_CASE = re.compile(r"line \d+|end of document|^(no |the table )?\[|^[\w.\[\]\"'\\-]+( = | \(|: )|^\.\.\. and")
+OF_A_MESH = re.compile(r"section \$|line \d+|/\w+|node \d|bar \d|\$MeshFormat|the name of a section")
+
 LIMIT = 60  # seconds that a check may take, on a machine with other work
 
 ODD = [
@@ -157,8 +161,8 @@ def _ring(*_: object) -> None:
     raise TooSlow
 
 
-def verdict(path: Path) -> str:
-    """Check a case; empty where it is accepted or refused as it should be, else what went wrong."""
+def verdict(path: Path, place: re.Pattern[str]) -> tuple[str, str]:
+    """Check a case: ``accepted``, refused by ``file and place`` or ``file alone``, or ``bad`` and what went wrong."""
     out, err = io.StringIO(), io.StringIO()
     signal.signal(signal.SIGALRM, _ring)
     signal.alarm(LIMIT)
@@ -166,25 +170,27 @@ def verdict(path: Path) -> str:
         with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
             status = main(["check", str(path)])
     except TooSlow:
-        return f"hangs: no answer in {LIMIT} s"
+        return "bad", f"hangs: no answer in {LIMIT} s"
     except BaseException as error:  # noqa: BLE001 - nothing may come out of main
-        return f"raises {type(error).__name__}: {error}"
+        return "bad", f"raises {type(error).__name__}: {error}"
     finally:
         signal.alarm(0)
     said = err.getvalue()
     if "Traceback" in said or "internal error" in said:
-        return f"status {status}: {said}"
+        return "bad", f"status {status}: {said}"
     if status == 0:
-        return "" if "error" not in said else f"status 0, but: {said}"
+        return ("accepted", "") if "error" not in said else ("bad", f"status 0, but: {said}")
     if status != 2:
-        return f"status {status}: {said}"
+        return "bad", f"status {status}: {said}"
     if not said.startswith("error: ") or str(path.parent) not in said:
-        return f"does not name the file: {said}"
-    return ""
+        return "bad", f"does not name the file: {said}"
+    lines = said.strip().removeprefix("error: ").split("\n")
+    named = all(place.search(line.partition(": ")[2] if ": " in line else line) for line in lines)
+    return ("file and place" if named else "file alone"), said
 
 
-def try_one(seed: int, folder: Path, texts: list[str], meshes: list[Path]) -> str:
-    """Write the mutant of a seed and check it; two thirds are cases, the rest meshes."""
+def try_one(seed: int, folder: Path, texts: list[str], meshes: list[Path]) -> tuple[str, str]:
+    """Write the mutant of a seed and check it: verdict and text. Two thirds are cases, which must name their place."""
     chance = random.Random(seed)
     path = folder / "case.toml"
     if seed % 3 < 2:
@@ -193,8 +199,9 @@ def try_one(seed: int, folder: Path, texts: list[str], meshes: list[Path]) -> st
             path.write_bytes(mutated_text(text, chance).encode("utf-8", "surrogateescape"))
         else:
             path.write_bytes(mutated_bytes(text.encode(), chance))
-    else:
-        sound = chance.choice(meshes)
-        (folder / sound.name).write_bytes(mutated_bytes(sound.read_bytes(), chance))
-        path.write_text(CASE_OF_A_MESH.format(name=sound.name))
-    return verdict(path)
+        kind, said = verdict(path, OF_A_CASE)
+        return ("bad", f"names neither key nor line: {said}") if kind == "file alone" else (kind, said)
+    sound = chance.choice(meshes)
+    (folder / sound.name).write_bytes(mutated_bytes(sound.read_bytes(), chance))
+    path.write_text(CASE_OF_A_MESH.format(name=sound.name))
+    return verdict(path, OF_A_MESH)

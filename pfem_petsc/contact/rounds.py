@@ -12,7 +12,6 @@ import numpy as np
 from mpi4py import MPI
 
 from ..integrators.base import Balance, State
-from ..parallel.agreement import agreed
 from ..solvers.newton import zero_tolerance
 from ..stepping.stepper import NotConverged
 from .forces import WallForces
@@ -87,20 +86,10 @@ class ContactRounds:
                 concerned = concerned & ~self.contact.ties.held[self.candidates][:, None]
             self._frames = self.contact.frames(self.candidates, x, self.balance.time, concerned, self._rank)
             if self.contact.ties.any:
-                self._tie()
+                self._tied = self.contact.ties.pin(self._frames, self.balance.time)
             if self.friction is not None:
                 self.friction.apply(self._frames, x)
         return self._frames
-
-    def _tie(self) -> None:
-        """Hold tied nodes at their places. Collective."""
-        contact = self.contact
-        nodes, walls, places = contact.ties.targets(self.balance.time)
-        with agreed(self.model.comm):
-            contact.ties.check(nodes, walls, places, self.balance.time)
-        at = np.searchsorted(self.candidates, nodes)
-        self._frames.pin(at, places, ~contact.fixed[nodes])
-        self._tied = at, walls, places
 
     def feasible(self, u: np.ndarray, stiffness: np.ndarray | None = None) -> np.ndarray:
         """The increment (owned, 3) nearest to a guess that keeps the frames' planes and the pairs. Collective.

@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..errors import SimulationFailure
+from ..parallel.agreement import agreed
 
 __all__ = ["Ties"]
 
@@ -68,6 +69,25 @@ class Ties:
         places = np.where(self.contact.fixed[nodes], x[nodes], places)
         self.check(nodes, walls, places, time)
         return nodes, walls, places, stiffness[nodes, None] * (places - x[nodes])
+
+    def pin(self, frames, time: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Hold the tied nodes of an implicit step, of which there are frames. Collective.
+
+        Returns
+        -------
+        (places among the frames (m,), walls (m,), places at ``time`` (m, 3) [m])
+
+        Raises
+        ------
+        SimulationFailure
+            On all ranks: a node was carried through another wall.
+        """
+        nodes, walls, places = self.targets(time)
+        with agreed(self.contact.mesh.comm):
+            self.check(nodes, walls, places, time)
+        at = np.searchsorted(frames.nodes, nodes)
+        frames.pin(at, places, ~self.contact.fixed[nodes])
+        return at, walls, places
 
     def check(self, nodes: np.ndarray, walls: np.ndarray, places: np.ndarray, time: float) -> None:
         """Refuse to carry nodes at (m, 3) through walls other than their own (m,).

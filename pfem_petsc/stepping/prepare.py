@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -129,9 +129,12 @@ def _linear(model, scheme: Scheme, over: float, steps: int) -> LinearChoice:
     impact = yielding or model.contact.any or model.pairs is not None
     solver, unknowns = case.solver, 3 * model.mesh.n_nodes
     try:
-        return choose_linear(solver.linear, unknowns, over, scheme.symmetric, solver.operator, steps, impact)
+        choice = choose_linear(solver.linear, unknowns, over, scheme.symmetric, solver.operator, steps, impact)
     except InputError as error:
         raise InputError(f"{case.source}: {error}") from error
+    if model.contact.rough and choice.krylov == "cg":
+        return replace(choice, why=f"{choice.why}; GMRES near walls with friction")
+    return choice
 
 
 def _steps_to(end: float, step: float, source: str) -> int:

@@ -171,8 +171,11 @@ def tumbling(walls, integrator, parameters, step=1e-3, end=0.05, **tables):
     return case
 
 
-@pytest.mark.parametrize("integrator, parameters", SCHEMES)
-@pytest.mark.parametrize("name", ["plane", "static", "moving", "sphere", "bowl"])
+@pytest.mark.parametrize(
+    ("name", "integrator", "parameters"),
+    [("plane", *scheme) for scheme in SCHEMES]
+    + [(name, *SCHEMES[k]) for k in (0, 1, 4) for name in ("static", "moving", "sphere", "bowl")],
+)
 def test_law_of_coulomb(name, integrator, parameters, comm, shared_tmp_path):
     """Every force of every step: within the cone, and on it against the slip where there is any."""
     wall = WALLS[name][0]
@@ -216,8 +219,10 @@ def test_law_of_coulomb(name, integrator, parameters, comm, shared_tmp_path):
     assert max(abs(row["energy_imbalance"]) for row in rows) < 1e-9 * most
 
 
-@pytest.mark.parametrize("integrator", ["newmark", "houbolt"])
-@pytest.mark.parametrize("keys", [{}, {"static_friction": 0.6}, {"velocity": [0.0, 0.4, 0.0]}], ids=str)
+@pytest.mark.parametrize(
+    ("integrator", "keys"),
+    [("houbolt", {}), ("newmark", {"static_friction": 0.6}), ("newmark", {"velocity": [0.0, 0.4, 0.0]})],
+)
 def test_implicit_steps_tend_to_the_explicit_ones(keys, integrator, comm, shared_tmp_path):
     """A lattice that is pushed to and fro over the floor, parts of it at a time."""
     apart = []
@@ -229,12 +234,12 @@ def test_implicit_steps_tend_to_the_explicit_ones(keys, integrator, comm, shared
                 floor,
                 integrator=scheme,
                 step=step,
-                end=0.06,
+                end=0.04,
                 gravity=[0.0, 0.0, -G],
                 cells=[3, 1, 1],
                 material={"damping": 2e4},
                 node_set={"end": {"box": [[-0.01, -0.01, -0.01], [0.01, 0.11, 0.11]]}},
-                load=[{"node_set": "end", "force": [0.02, 0.0, 0.0], "table": [[0, 0], [0.02, 1], [0.06, -1]]}],
+                load=[{"node_set": "end", "force": [0.02, 0.0, 0.0], "table": [[0, 0], [0.015, 1], [0.04, -1]]}],
             )
             run = simulation(case, comm, shared_tmp_path, f"{scheme} {step}")
             for _ in run:

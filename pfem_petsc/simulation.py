@@ -12,6 +12,7 @@ from mpi4py import MPI
 from .errors import EarlyStop, PfemError, SimulationFailure
 from .mechanics.compiled import Compilation
 from .output.progress import Progress
+from .output.row import Row
 from .output.units import engineering
 from .output.vtkhdf import ResultWriter
 from .parallel.petsc_log import lay_over, staged
@@ -21,6 +22,7 @@ from .preflight.summary import summarise
 from .restart.checkpoints import Checkpoints
 from .restart.folder import RESULT, Restart, find_restart, finished, prepare_folder
 from .restart.stop import Meetings, StopRequest
+from .stepping.batch import Batches
 from .stepping.blowup import BlowUp
 from .stepping.fields import Fields
 from .stepping.ledger import Ledger
@@ -103,10 +105,11 @@ class Simulation:
         self.row: dict[str, Any] | None = None
         self._last_snapshot = -1  # its step
         self._started = False
+        self._batches = Batches()
         self._asked = 0  # code of a request to stop, zero for none
         self._writer: ResultWriter | None = None
         minutes = case.output.checkpoint_minutes
-        self._meetings = Meetings(self.comm, self._stop, 60.0 * minutes if minutes else None)
+        self.meetings = Meetings(self.comm, self._stop, 60.0 * minutes if minutes else None)
 
     @property
     def state(self):  # noqa: ANN201
@@ -162,7 +165,7 @@ class Simulation:
             self._progress.message(f"{self.folder}: held results, which are in {aside} now")
         if self.restart is None:
             self.stepper.start()
-            self._meet()
+            self.meet()
         self.ledger = Ledger(self.stepper)
         self.stepper.booking = self._book
         if hasattr(self.stepper, "message"):
@@ -219,11 +222,20 @@ class Simulation:
         with self._compilation:
             yield from self._steps()
 
-    def _steps(self) -> Iterator[Step]:
+    def batches(self) -> Iterator[Step]:
+        """Run as iteration does, but give only some of the steps: those between may be made by one compiled call."""
+        if self.finished:
+            return
+        with self._compilation:
+            yield from self._steps(together=True)
+
+    def _steps(self, together: bool = False) -> Iterator[Step]:
         try:
             self.start()
-            self._stop_early(self._meet())
+            self._stop_early(self.meet())
             while self.state.step < self.plan.steps:
+                if together:
+                    self._batches.advance(self)
                 yield self._advance()
                 self._stop_early(self._asked)
             # where a run that was killed after its last checkpoint had not got to it
@@ -255,7 +267,7 @@ class Simulation:
         """
         if self.finished and self.comm.rank == 0 and not self.quiet:
             print(f"{self.folder}: finished already: the results reach t = {engineering(self.case.time.end, 's')}")
-        for _ in self:
+        for _ in self.batches():
             pass
         return 0
 
@@ -271,12 +283,12 @@ class Simulation:
         if step % output.history_every == 0:
             row = self._record()
         elif snapshot or checkpoint or last:
-            self._asked = self._meet()
-        if self._meetings.due(step):
-            self._asked = self._meet()
+            self._asked = self.meet()
+        if self.meetings.due(step):
+            self._asked = self.meet()
         if snapshot:
             self._snapshot()
-        if checkpoint or self._meetings.checkpoint_due:
+        if checkpoint or self.meetings.checkpoint_due:
             self._checkpoint()
         if last:
             row = self._complete()
@@ -296,11 +308,15 @@ class Simulation:
         """A history row, unless a rank has a fault, which is raised on all."""
         row = self.recorder.row(alarm=self.stepper.fault is not None or self._stop.code != 0)
         if self.recorder.alarmed:
-            self._asked = self._meet()
+            self._asked = self.meet()
+        self.take(row)
+        return row
+
+    def take(self, row: Row) -> None:
+        """Look at a row, keep it and add it to the history."""
         self.blow_up.check(row, self.state)
         self.row = row
         self._writer.append_history(row if self.comm.rank == 0 else None)
-        return row
 
     def _complete(self) -> dict[str, Any]:
         """Bring checkpoint and results to the end of the run, and give its last row.
@@ -316,15 +332,15 @@ class Simulation:
             self._snapshot()
         return self.row
 
-    def _meet(self) -> int:
+    def meet(self) -> int:
         """All ranks agree on faults, which are raised on all, and on a request to stop: its code, or zero."""
-        return self._meetings.meet(self.state.step, self.stepper.fault)
+        return self.meetings.meet(self.state.step, self.stepper.fault)
 
     def _checkpoint(self) -> None:
         """Results first: what the checkpoint goes on from must be in them."""
         self._writer.flush_history()
         self._checkpoints.write(self.ledger, self.recorder, self.row, self._last_snapshot)
-        self._meetings.checkpoint_written()
+        self.meetings.checkpoint_written()
 
     def _stop_early(self, code: int) -> None:
         """Leave with a checkpoint where a request says so, unless the run is at its end."""

@@ -35,6 +35,7 @@ class Contact:
     log : ContactLog
     restitution, friction, static_friction : (walls,); rough : whether any wall has friction
     ties : Ties
+    plain : whether walls are flat and do nothing but stop nodes
     rebounds : whether restitution is a bound on the next position, as for schemes that solve for it in advance
     state : of the nodes, for walls that must know where nodes come from; set by the stepper
     """
@@ -73,6 +74,7 @@ class Contact:
         for k in np.flatnonzero(self.flat):
             self.normals[k], self._offsets[k] = self.walls[k].normal, self.walls[k].offset
         self._explicit = ExplicitContact(self)
+        self.plain = self._explicit.plain
         ends = np.stack([-mesh.points.min(axis=0, initial=np.inf), mesh.points.max(axis=0, initial=-np.inf)])
         mesh.comm.Allreduce(MPI.IN_PLACE, ends, op=MPI.MAX)
         self.length = float(ends.sum(axis=0).max())

@@ -16,12 +16,17 @@ _CURVED_ROUNDS = 100  # projections of a step until tangent planes and positions
 
 
 class ExplicitContact:
-    """Projects free positions onto what the walls of a :class:`~pfem_petsc.contact.contact.Contact` allow."""
+    """Projects free positions onto what the walls of a :class:`~pfem_petsc.contact.contact.Contact` allow.
+
+    Attributes
+    ----------
+    plain : flat walls without friction, restitution, ends or ties: one compiled pass does all
+    """
 
     def __init__(self, contact) -> None:
         self.contact = contact
         plain = contact.flat.all() and not (contact.rough or contact.partial or contact.ties.any)
-        self._plain = bool(plain and not contact.restitution.any())  # one compiled pass does all
+        self.plain = bool(plain and not contact.restitution.any())
         self._room = np.empty(len(contact.members) if plain else 0, dtype=np.int64)
 
     def press(
@@ -31,7 +36,7 @@ class ExplicitContact:
         contact = self.contact
         if contact.motion.free is not None:
             self.push_walls(predictor + u, stiffness, time, tolerance)
-        if self._plain:
+        if self.plain:
             return self._press_planes(predictor, u, stiffness, time, tolerance)
         nodes, correction, force, walls = self.project(predictor + u, stiffness, time, tolerance)
         u[nodes] += correction

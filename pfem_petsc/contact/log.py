@@ -9,13 +9,13 @@ from mpi4py import MPI
 
 from ..mechanics.compiled import kernel
 
-__all__ = ["ContactLog"]
+__all__ = ["ContactLog", "compare_contacts"]
 
 _PENDING = 4096  # steps whose contacts are kept before the ranks put them together
 
 
 @kernel
-def _compare(touching, before, nodes, now, present, releases):
+def compare_contacts(touching, before, nodes, now, present, releases):
     """Bring ``touching`` (owned, w) up to date, from the nodes that touched ``before`` to what ``nodes`` (m,) touch
     ``now`` (m, w), and count ``releases`` (w,).
 
@@ -60,6 +60,8 @@ class ContactLog:
     impulse : (walls, 3) of each wall's force on this rank's nodes since the start [N s]
     releases : (walls,) how often nodes of this rank let go of each wall
     changes : nodes and walls of this rank that met or parted since the last row of the history
+    last : (m,) nodes that touch any wall after the last step
+    present : (owned,) bool, working space of :func:`compare_contacts`
     time : (walls,) for how long any node of the model has touched each wall [s]; the same on all ranks
     """
 
@@ -69,26 +71,30 @@ class ContactLog:
         self.releases = np.zeros(n_walls, dtype=np.int64)
         self.changes = 0
         self.time = np.zeros(n_walls)
-        self._before = np.empty(0, dtype=np.int64)
-        self._present = np.zeros(n_owned, dtype=bool)
+        self.last = np.empty(0, dtype=np.int64)
+        self.present = np.zeros(n_owned, dtype=bool)
         self._pending = 0
         self._steps = np.empty(_PENDING)
         self._flags = np.empty((_PENDING, n_walls), dtype=np.uint8)
 
     def book(self, walls, step: float, comm: MPI.Comm) -> None:
         """Book the forces of a step of so many seconds. Collective where many have come together."""
+        self.note(walls.contacts > 0, step, comm)
+        if len(walls.nodes) == 0 and len(self.last) == 0:
+            return
+        self.impulse += step * walls.force
+        changes, self.last = compare_contacts(
+            self.touching, self.last, walls.nodes, walls.touching, self.present, self.releases
+        )
+        self.changes += changes
+
+    def note(self, touched: np.ndarray, step: float, comm: MPI.Comm) -> None:
+        """Take note of which walls (walls,) bool were touched in a step. Collective where many have come together."""
         if self._pending >= _PENDING:
             self.meet(comm)
         self._steps[self._pending] = step
-        self._flags[self._pending] = walls.contacts > 0
+        self._flags[self._pending] = touched
         self._pending += 1
-        if len(walls.nodes) == 0 and len(self._before) == 0:
-            return
-        self.impulse += step * walls.force
-        changes, self._before = _compare(
-            self.touching, self._before, walls.nodes, walls.touching, self._present, self.releases
-        )
-        self.changes += changes
 
     def meet(self, comm: MPI.Comm, contacts: np.ndarray | None = None) -> None:
         """Bring the contact times up to date on all ranks. Collective.
@@ -131,4 +137,4 @@ class ContactLog:
         self._steps[:n] = times["steps"]
         self._flags[:n] = np.array(times["flags"], dtype=np.uint8).reshape(n, len(self.time))
         self.touching = touching
-        self._before = np.flatnonzero(touching.any(axis=1))
+        self.last = np.flatnonzero(touching.any(axis=1))

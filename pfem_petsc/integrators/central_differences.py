@@ -14,7 +14,7 @@ import numpy as np
 from ..mechanics.compiled import kernel
 from .base import Balance, ExplicitScheme, NoParameters, State
 
-__all__ = ["Parameters", "Scheme"]
+__all__ = ["Parameters", "Scheme", "drift", "kick"]
 
 Parameters = NoParameters
 
@@ -22,13 +22,15 @@ Parameters = NoParameters
 
 
 @kernel
-def _drift(x, h, half, moved):
+def drift(x, h, half, moved):
+    """``moved`` = x + h half."""
     for i in range(len(half)):
         moved[i] = x[i] + h * half[i]
 
 
 @kernel
-def _kick(u, alpha, eta, h, half, a, v):
+def kick(u, alpha, eta, h, half, a, v):
+    """Acceleration and velocity of the balance, and ``half`` half a step later."""
     for i in range(len(u)):
         a[i] = alpha * u[i]
         v[i] = half[i] + eta * u[i]
@@ -50,12 +52,12 @@ class Scheme(ExplicitScheme):
     def advance(self, state: State, h: float) -> None:
         """Move to x_{n+1}, which the last balance has fixed."""
         position = state.position.reshape(-1)
-        _drift(position, h, state.memory["half_velocity"].reshape(-1), position)
+        drift(position, h, state.memory["half_velocity"].reshape(-1), position)
 
     def balance(self, state: State, h: float) -> Balance:
         half = state.memory["half_velocity"]
         predictor = np.empty_like(half)
-        _drift(state.position.reshape(-1), h, half.reshape(-1), predictor.reshape(-1))
+        drift(state.position.reshape(-1), h, half.reshape(-1), predictor.reshape(-1))
         return Balance(
             alpha=1.0 / (h * h),
             eta=0.5 / h,
@@ -70,4 +72,4 @@ class Scheme(ExplicitScheme):
     def finish(self, state: State, balance: Balance, u: np.ndarray, h: float) -> None:
         state.a, state.v = np.empty_like(u), np.empty_like(u)
         half, a, v = (array.reshape(-1) for array in (state.memory["half_velocity"], state.a, state.v))
-        _kick(u.reshape(-1), balance.alpha, balance.eta, h, half, a, v)
+        kick(u.reshape(-1), balance.alpha, balance.eta, h, half, a, v)

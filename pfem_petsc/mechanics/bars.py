@@ -16,7 +16,7 @@ from .materials import elastic, elastoplastic
 from .strain import MEASURES
 from .sweep import Sweep, make_sweep
 
-__all__ = ["BarBlock", "Bars", "StrainEnergy"]
+__all__ = ["BarBlock", "Bars", "StrainEnergy", "first_inverted"]
 
 
 class StrainEnergy(NamedTuple):
@@ -61,7 +61,7 @@ def _rest_lengths(points, bars, rest):
 
 
 @kernel
-def _first_inverted(x, before, bars, rest):
+def first_inverted(x, before, bars, rest):
     """First bar that is shortened and points back against where it pointed before, or -1."""
     for k in range(len(bars)):
         a = bars[k, 0]
@@ -161,7 +161,7 @@ class Bars:
 
         Its length alone does not tell: in one step a bar jumps over zero. Stretched bars are not looked at.
         """
-        return _first_inverted(x, before, self.ends, self.rest)
+        return first_inverted(x, before, self.ends, self.rest)
 
     def tangents(self, x: np.ndarray, weight: float, inertia: list[float], pattern, values: np.ndarray) -> None:
         """Add ``weight`` K_t(x) and the consistent inertia (a coefficient per block) to a matrix's values."""

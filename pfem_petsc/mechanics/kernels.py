@@ -15,7 +15,7 @@ from types import SimpleNamespace
 import numpy as np
 from numba.extending import register_jitable
 
-from .compiled import kernel
+from .compiled import inlined, kernel
 from .sweep import CHUNK
 
 __all__ = ["COLLAPSED_STRETCH", "SHORTENED_STRETCH", "make_kernels"]
@@ -34,8 +34,8 @@ def make_kernels(response: Callable, remembers: bool, measure: Callable) -> Simp
     the law does not remember. No array goes into an inner function: counting its references costs more than the bar.
     """
 
-    @kernel
-    def forces(x, heads, starts, chunks, counted, far, rest, thermal, p, area, history, commit, f):
+    @inlined
+    def sweep_forces(x, heads, starts, chunks, counted, far, rest, thermal, p, area, history, commit, f):
         """Add internal forces to ``f``; sums over counted bars: elastic, heat, hardening [J]; first failed or -1;
         whether any bar is so short that it may have turned over.
 
@@ -135,6 +135,8 @@ def make_kernels(response: Callable, remembers: bool, measure: Callable) -> Simp
         if counted == len(chunks) - 1:
             elastic, heat, hardening = work[4].sum(), work[5].sum(), work[6].sum()
         return elastic, heat, hardening, failed, shortened
+
+    forces = kernel(sweep_forces)
 
     @register_jitable
     def stiffness(dx, dy, dz, rest, shift, p, area, plastic, accumulated):
@@ -262,4 +264,6 @@ def make_kernels(response: Callable, remembers: bool, measure: Callable) -> Simp
             stress_out[k] = stress
             force_out[k] = area * stress * slope
 
-    return SimpleNamespace(forces=forces, tangents=tangents, product=product, linearise=linearise, fields=fields)
+    return SimpleNamespace(
+        forces=forces, sweep_forces=sweep_forces, tangents=tangents, product=product, linearise=linearise, fields=fields
+    )

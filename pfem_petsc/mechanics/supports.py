@@ -16,7 +16,7 @@ class Supports:
     Attributes
     ----------
     fixed : (owned, 3) bool
-    any : whether any component of the whole model is prescribed
+    any : whether any component of the whole model is prescribed; moving : whether any of this rank moves
     nodes, components : (k,) indices of the prescribed components, in order of the nodes
     """
 
@@ -46,6 +46,7 @@ class Supports:
         self._start = mesh.points[: mesh.n_owned][self.fixed]
         self._moved = np.zeros((mesh.n_owned, 3))
         self._motions = motions
+        self.moving = bool(motions)
         self.any = bool(case.support)
 
     def positions(self, time: float) -> np.ndarray:

@@ -93,6 +93,10 @@ class Meetings:
         """Whether all ranks meet after this step: the same answer on all."""
         return step >= self._next
 
+    def steps_left(self, step: int) -> int:
+        """Steps from here to the next meeting."""
+        return self._next - step
+
     def meet(self, step: int, fault: PfemError | None) -> int:
         """Agree; gives the code of a request to stop, or zero. Collective.
 

@@ -13,7 +13,12 @@ __all__ = ["ExplicitStepper"]
 
 
 class ExplicitStepper(Stepper):
-    """Solves (alpha m + eta c) u = f_ext - f_int - m a_hat - c v_hat node by node."""
+    """Solves (alpha m + eta c) u = f_ext - f_int - m a_hat - c v_hat node by node.
+
+    Attributes
+    ----------
+    other_force : (local, 3) internal force before the last evaluation [N], to be written to by the next
+    """
 
     renews_forces = True
 
@@ -21,10 +26,10 @@ class ExplicitStepper(Stepper):
         super().__init__(model, scheme, h)
         self._none = np.empty((0, 3))
         self._nobody = np.empty(0, dtype=np.int64)
-        self._other_force = np.zeros_like(self.state.f)
+        self.other_force = np.zeros_like(self.state.f)
 
     def evaluate(self, commit: bool) -> None:
-        self.state.f, self._other_force = self._other_force, self.state.f
+        self.state.f, self.other_force = self.other_force, self.state.f
         super().evaluate(commit)
 
     def accelerate(self, load: np.ndarray) -> np.ndarray:

@@ -121,6 +121,11 @@ class Ledger:
         a[jump.nodes], v[jump.nodes] = jump.a, jump.v
         return replace(after, a=a, v=v, contact=self.stepper.state.contact), jump.energy
 
+    def resume(self, kinetic: float) -> None:
+        """Go on from the present state, with its kinetic energy [J], after steps that others booked in :attr:`sums`."""
+        self._before = self._moment()
+        self._before.kinetic = kinetic
+
     @property
     def kinetic(self) -> float:
         """Kinetic energy of this rank's nodes [J]."""

@@ -69,6 +69,17 @@ class Recorder:
         self._contact = ContactColumns(self.model.contact)
         self._sums = np.zeros(_SUMS + self._contact.size + sum(12 * len(n) for n in self.probe_nodes.values()))
 
+    @property
+    def width(self) -> int:
+        """Numbers that a row sums up."""
+        return len(self._sums)
+
+    def probed(self) -> tuple[np.ndarray, np.ndarray]:
+        """Nodes of all probes in the order of their columns, where one rank has all of them, and where each starts."""
+        nodes = [local[np.argsort(place)] for _, local, place in self._probes]
+        starts = np.cumsum([0, *(len(part) for part in nodes)])
+        return np.concatenate(nodes or [np.empty(0)]).astype(np.int64), starts.astype(np.int64)
+
     def count(self, newton: int, linear: int) -> None:
         """Add the iterations of a step to those of the next row."""
         self.iterations[0] += newton
@@ -83,6 +94,11 @@ class Recorder:
         self._fill(sums, alarm)
         if model.comm.size > 1:
             model.comm.Allreduce(MPI.IN_PLACE, sums)
+        return self.row_of(sums)
+
+    def row_of(self, sums: np.ndarray) -> Row:
+        """The row of the state's step and time from its sums (width,) over all ranks. Collective."""
+        model = self.model
         self.alarmed = sums[22] > 0.0
         model.contact.log.meet(model.comm, self._contact.contacts(sums[_SUMS:]))
         return Row(self.layout, self._unpack(sums))

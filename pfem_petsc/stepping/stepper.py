@@ -197,9 +197,10 @@ class Stepper(ABC):
         if failed < 0 and self.energy.shortened:
             failed = self.model.bars.first_inverted(state.x, self.before)
         if failed >= 0 and self.fault is None:
-            self.fault = SimulationFailure(self._collapse(failed))
+            self.fault = SimulationFailure(self.collapse(failed))
 
-    def _collapse(self, bar: int) -> str:
+    def collapse(self, bar: int) -> str:
+        """What to tell about a bar (local index) that failed in the step being made."""
         mesh, state = self.model.mesh, self.state
         a, b = mesh.bars[bar]
         # the step is counted when it is complete, its time is set on arrival

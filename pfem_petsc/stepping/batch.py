@@ -1,0 +1,179 @@
+"""Runs of steps between which nothing happens but rows of the history: made by one compiled call where that can be."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..contact.forces import WallForces
+from ..errors import SimulationFailure
+from ..integrators.central_differences import Scheme as CentralDifferences
+from ..mechanics.bars import StrainEnergy
+from .explicit import ExplicitStepper
+from .march import BarArrays, Buffers, NodeArrays, ProbeArrays, WallArrays, make_march
+from .stepper import Solution
+
+__all__ = ["MOST", "WORTH", "Batch", "Batches"]
+
+MOST = 512
+"""Steps of one call, at most: their sums are kept."""
+
+WORTH = 1000
+"""Fewest steps of a run for which the loop over steps is compiled, once, in some seconds."""
+
+_FEWEST = 8  # steps that are worth one call
+_NODES = 50_000  # beyond, what Python needs between the loops is less than a hundredth, and memory counts
+
+
+class Batch:
+    """Makes several steps at once.
+
+    Attributes
+    ----------
+    sums : (:data:`MOST`, width) of each step, what :meth:`~pfem_petsc.stepping.recorder.Recorder.row` sums up
+    """
+
+    def __init__(self, stepper, ledger, recorder) -> None:
+        self.stepper, self.ledger = stepper, ledger
+        model = stepper.model
+        self.model = model
+        block = model.bars.blocks[0]
+        self._march = make_march(block.kernels.sweep_forces)
+        bars = model.bars
+        law = (bars.far, bars.rest, bars.thermal, block.parameters, block.area, block.history)
+        self._bars = BarArrays(bars.ends, tuple(block.sweep), *law)
+        supports, inertia, contact = model.supports, model.inertia, model.contact
+        nothing = np.empty((0, 3))
+        external = stepper.state.external if model.external.active else nothing
+        damping = inertia.damping if inertia.damped else np.empty(0)
+        held = supports.positions(0.0)
+        self._nodes = NodeArrays(inertia.mass, damping, external, supports.nodes, supports.components, held)
+        log = contact.log
+        walls = (contact.fixed, contact.normals, contact.plane_offsets(0.0), contact.everyone, contact.members)
+        room = np.empty(len(inertia.mass), dtype=np.int64)
+        work = (room, log.touching, log.present, log.releases, log.impulse)
+        self._walls = WallArrays(*walls, 1e-13 * model.length, *work)
+        self._probes = ProbeArrays(*recorder.probed())
+        self.sums = np.zeros((MOST, recorder.width))
+        self._spare = [np.zeros_like(stepper.state.v) for _ in range(4)]
+
+    @staticmethod
+    def serves(stepper) -> bool:
+        """Whether the steps of this run are so plain that one loop can make several."""
+        from petsc4py import PETSc
+
+        model = stepper.model
+        contact = model.contact
+        plain = (
+            # what is logged are the methods of single steps
+            not PETSc.Log.isActive()
+            and model.comm.size == 1
+            and model.mesh.n_nodes <= _NODES
+            and type(stepper) is ExplicitStepper
+            and isinstance(stepper.scheme, CentralDifferences)
+            and stepper.treatment is None
+            and model.pairs is None
+            and len(model.bars.blocks) == 1
+            and not model.temperatures.varying
+            and not any(table is not None for _, _, table in model.external.loads)
+            and not model.supports.moving
+        )
+        return plain and (not contact.any or (contact.plain and not contact.moving.any()))
+
+    def make(self, count: int) -> tuple[int, np.ndarray]:
+        """Make up to ``count`` steps; the number made, and who touched walls in each (steps, walls) bool.
+
+        Fewer are made where a bar fails, a node finds no room or the energy is lost: the stepper has the fault.
+        """
+        stepper, ledger, state = self.stepper, self.ledger, self.stepper.state
+        log, scheme = self.model.contact.log, stepper.scheme
+        begin = state.step
+        walls = len(self.model.contact.walls)
+        a_next, v_next, support_next, contact_next = self._spare
+        contact_next[:] = 0.0
+        last = [state.a, state.v, state.support, state.contact]
+        support, contact = (np.zeros_like(state.v) if array is stepper.zero else array for array in last[2:])
+        buffers = Buffers(
+            state.f, stepper.other_force, last[0], a_next, last[1], v_next, support, support_next, contact, contact_next
+        )
+        energies = (ledger.kinetic, *(float(part) for part in stepper.energy[:3]))
+        half = state.memory["half_velocity"]
+        done, failed, turned, stuck, offsets, after, energies, u, touched, log.last = self._march(
+            count,
+            stepper.h,
+            state.x,
+            stepper.before,
+            half,
+            self._bars,
+            self._nodes,
+            self._walls,
+            self._probes,
+            buffers,
+            log.last,
+            ledger.sums,
+            energies,
+            self.sums,
+        )
+        state.f, stepper.other_force, state.a, a_next, state.v, v_next, support, support_next, contact, contact_next = (
+            after
+        )
+        self._spare = [a_next, v_next, support_next, contact_next]
+        state.support = support if self.model.supports.any else stepper.zero
+        state.contact = contact if len(touched[3]) else stepper.zero
+        stepper.energy = StrainEnergy(*energies[1:], failed)
+        nothing = self.model.contact.nothing
+        stepper.solution = Solution(u, state.f, WallForces(*touched) if walls else nothing, contacts=len(touched[3]))
+        stepper.balance = scheme.balance(state, stepper.h)
+        state.step, state.time = begin + done - 1, (begin + done) * stepper.h
+        if failed >= 0 or turned >= 0:
+            stepper.fault = SimulationFailure(stepper.collapse(max(failed, turned)))
+        state.step += 1
+        if stuck >= 0 and stepper.fault is None:
+            text = self.model.contact.no_room(touched[3][stuck], offsets[stuck])
+            stepper.fault = SimulationFailure(f"{stepper.when(stepper.balance)}: {text}")
+        ledger.resume(energies[0])
+        flags = self.sums[:done, 24 : 24 + 12 * walls].reshape(done, walls, 12)[:, :, 9] > 0.0
+        return done, flags
+
+
+class Batches:
+    """Finds the steps of a run that can be made together, and makes them."""
+
+    def __init__(self) -> None:
+        self._batch: Batch | None = None
+        self._refused = False
+
+    def advance(self, simulation) -> None:
+        """Make the steps before the next after which more is to be done than a row of the history.
+
+        Raises
+        ------
+        SimulationFailure
+            As a single step of the simulation does.
+        """
+        case, stepper, state = simulation.case, simulation.stepper, simulation.state
+        output, begin, end = case.output, state.step, simulation.plan.steps
+        left = [simulation.meetings.steps_left(begin), end - begin]
+        left += [every - begin % every for every in (output.fields_every, output.checkpoint_every) if every]
+        count = min(*left, MOST + 1) - 1
+        if self._refused or count < _FEWEST or end < WORTH:
+            return
+        if self._batch is None:
+            self._refused = not Batch.serves(stepper)
+            if self._refused:
+                return
+            self._batch = Batch(stepper, simulation.ledger, simulation.recorder)
+        made, touched = self._batch.make(count)
+        failed = stepper.fault is not None
+        contact = simulation.model.contact
+        for k in range(made - failed):
+            sums = self._batch.sums[k]
+            state.step, state.time = begin + k + 1, (begin + k + 1) * stepper.h
+            if contact.any:
+                contact.log.note(touched[k], stepper.h, simulation.comm)
+                contact.log.changes += int(sums[23])
+                sums[23] = contact.log.changes
+            if state.step % output.history_every == 0:
+                simulation.take(simulation.recorder.row_of(sums))
+        if failed:
+            state.step, state.time = begin + made, (begin + made) * stepper.h
+            simulation.meet()

@@ -1,0 +1,259 @@
+"""Many steps of central differences in one compiled call, where nothing between them needs Python.
+
+One rank, lumped mass, bars of one section, flat walls at rest or none, loads and supports that do not change: the loops
+are those of single steps, in the same order, so the results are the same. A step of a few thousand bars takes about as
+long as Python takes to call its loops one by one; here it does not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+
+from ..contact.flat import press_planes
+from ..contact.log import compare_contacts
+from ..integrators.central_differences import drift, kick
+from ..mechanics.bars import first_inverted
+from ..mechanics.compiled import kernel
+from .node_loops import book_nodes, explicit_increments, hold, react
+
+__all__ = ["BarArrays", "Buffers", "NodeArrays", "ProbeArrays", "WallArrays", "make_march"]
+
+
+class BarArrays(NamedTuple):
+    """Arguments of a law's loop over the bars; see :mod:`~pfem_petsc.mechanics.kernels`."""
+
+    ends: np.ndarray
+    sweep: tuple
+    far: np.ndarray
+    rest: np.ndarray
+    thermal: np.ndarray
+    parameters: tuple
+    area: float
+    history: np.ndarray
+
+
+class NodeArrays(NamedTuple):
+    """What stays as it is at the nodes; ``damping`` (0,) and ``external`` (0, 3) for none."""
+
+    mass: np.ndarray
+    damping: np.ndarray
+    external: np.ndarray
+    support_nodes: np.ndarray
+    support_components: np.ndarray
+    support_positions: np.ndarray
+
+
+class WallArrays(NamedTuple):
+    """Flat walls and their log; see :mod:`~pfem_petsc.contact.flat` and :mod:`~pfem_petsc.contact.log`."""
+
+    fixed: np.ndarray
+    normals: np.ndarray
+    offsets: np.ndarray
+    everyone: np.ndarray
+    members: np.ndarray
+    tolerance: float
+    room: np.ndarray
+    touching: np.ndarray
+    present: np.ndarray
+    releases: np.ndarray
+    impulse: np.ndarray
+
+
+class ProbeArrays(NamedTuple):
+    """Nodes (m,) of all probes, one after the other, and where each probe starts (probes + 1,)."""
+
+    nodes: np.ndarray
+    starts: np.ndarray
+
+
+class Buffers(NamedTuple):
+    """Arrays (n, 3) that are filled in turn: of the last step, and to be filled by the next.
+
+    Those for the forces of walls hold zeros, but for what the last step has put into the first of them.
+    """
+
+    f: np.ndarray
+    f_next: np.ndarray
+    a: np.ndarray
+    a_next: np.ndarray
+    v: np.ndarray
+    v_next: np.ndarray
+    support: np.ndarray
+    support_next: np.ndarray
+    contact: np.ndarray
+    contact_next: np.ndarray
+
+
+@cache
+def make_march(forces: Callable) -> Callable:
+    """The loop over steps for the bars' loop ``forces`` of a law and strain measure.
+
+    Its arguments: most steps; step [s]; positions, those of the step before, velocities at half steps (n, 3); arrays of
+    bars, nodes, walls, probes and buffers; nodes (m,) that touch walls; ledger's sums (17,); kinetic, elastic, heat and
+    hardening energy [J]; and ``sums`` (count, width), which takes what a row of the history sums up, of each step.
+
+    It gives the number of steps made, the first bar that collapsed in the last of them or -1, the first that went
+    through zero length or -1, the node that found no room or -1 with the offsets of its planes, the buffers, the four energies, increments (n, 3), and of the last step what
+    :func:`~pfem_petsc.contact.flat.press_planes` tells of nodes and walls.
+    """
+
+    @kernel
+    def march(count, h, x, before, half, bars, nodes, walls, probes, buffers, touched, ledger, energies, sums):
+        n = len(x)
+        n_walls = len(walls.offsets)
+        f, f1, a, a1, v, v1, support, support1, contact, contact1 = buffers
+        kinetic, elastic, heat, hardening = energies
+        alpha = 1.0 / (h * h)
+        eta = 0.5 / h
+        nothing = np.empty((0, 3))
+        flat_x, flat_before, flat_half = x.reshape(-1), before.reshape(-1), half.reshape(-1)
+        predictor, u = np.empty((n, 3)), np.empty((n, 3))
+        stiffness = np.empty(n)
+        load = np.empty(len(nodes.support_nodes))
+        works, totals = np.empty(5), np.empty(12)
+        supported = len(nodes.support_nodes) > 0
+        rates = half if len(nodes.damping) > 0 else nothing
+        near = np.empty(0, dtype=np.int64)
+        stuck_offsets = np.empty((0, n_walls))
+        force, moment = np.zeros((n_walls, 3)), np.zeros((n_walls, 3))
+        contacts = np.zeros(n_walls, dtype=np.int64)
+        touching, places = np.empty((0, n_walls), dtype=np.bool_), np.empty((0, 3))
+        pressed, pressed_before = touched, touched  # nodes with entries in the two arrays of wall forces
+        failed = -1
+        turned = -1
+        stuck = -1
+        done = 0
+        for step in range(count):
+            flat_before[:] = flat_x
+            drift(flat_x, h, flat_half, flat_x)
+            f, f1 = f1, f
+            f[:] = 0.0
+            elastic1, heat1, hardening1, failed, shortened = forces(
+                x, *bars.sweep, bars.far, bars.rest, bars.thermal, bars.parameters, bars.area, bars.history, True, f
+            )
+            turned = -1
+            if failed < 0 and shortened:
+                turned = first_inverted(x, before, bars.ends, bars.rest)
+            drift(flat_x, h, flat_half, predictor.reshape(-1))
+            explicit_increments(nodes.external, f, nodes.mass, nodes.damping, alpha, eta, nothing, rates, stiffness, u)
+            if supported:
+                hold(
+                    nodes.support_nodes,
+                    nodes.support_components,
+                    nodes.support_positions,
+                    predictor,
+                    stiffness,
+                    u,
+                    load,
+                )
+            changes = 0
+            contact, contact1 = contact1, contact
+            pressed, pressed_before = pressed_before, pressed
+            for i in pressed:
+                contact[i] = 0.0
+            if n_walls > 0:
+                near, stuck, stuck_offsets, total, touching, places, force, contacts, moment = press_planes(
+                    predictor,
+                    u,
+                    walls.fixed,
+                    walls.normals,
+                    walls.offsets,
+                    walls.everyone,
+                    walls.members,
+                    walls.tolerance,
+                    stiffness,
+                    walls.room,
+                )
+                for j in range(len(near)):
+                    contact[near[j]] = total[j]
+                pressed = near
+                if len(near) > 0 or len(touched) > 0:
+                    for k in range(n_walls):
+                        for c in range(3):
+                            walls.impulse[k, c] += h * force[k, c]
+                    changes, touched = compare_contacts(
+                        walls.touching, touched, near, touching, walls.present, walls.releases
+                    )
+            if supported:
+                support, support1 = support1, support
+                react(nodes.support_nodes, nodes.support_components, load, contact, stiffness, u, support)
+            a, a1 = a1, a
+            v, v1 = v1, v
+            kick(u.reshape(-1), alpha, eta, h, flat_half, a.reshape(-1), v.reshape(-1))
+            any_contact = len(pressed) > 0 or len(pressed_before) > 0
+            kinetic1 = book_nodes(
+                before,
+                x,
+                nodes.mass,
+                nodes.mass,
+                v,
+                v,
+                support if supported else nothing,
+                nodes.damping,
+                a1,
+                a,
+                v1,
+                v,
+                f1,
+                f,
+                nodes.external,
+                nodes.external,
+                support1 if supported else nothing,
+                support if supported else nothing,
+                contact1 if any_contact else nothing,
+                contact if any_contact else nothing,
+                totals,
+                works,
+            )
+            stored = kinetic1 - kinetic + (elastic1 + heat1 + hardening1) - (elastic + heat + hardening)
+            kinetic, elastic, heat, hardening = kinetic1, elastic1, heat1, hardening1
+            for k in range(3):
+                ledger[k] += works[k]
+            ledger[3] += works[3] + works[4] - stored
+            ledger[5:] = totals
+            row = sums[step]
+            row[0], row[1], row[2], row[3] = kinetic, elastic, heat, hardening
+            row[4:21] = ledger
+            row[21], row[22] = len(near), 0.0
+            at = 23
+            if n_walls > 0:
+                row[23] = changes
+                for k in range(n_walls):
+                    at = 24 + 12 * k
+                    row[at : at + 3] = force[k]
+                    row[at + 3 : at + 6] = moment[k]
+                    row[at + 6 : at + 9] = walls.impulse[k]
+                    row[at + 9], row[at + 10], row[at + 11] = contacts[k], 0.0, walls.releases[k]
+                at = 24 + 12 * n_walls
+            for p in range(len(probes.starts) - 1):
+                first, size = probes.starts[p], probes.starts[p + 1] - probes.starts[p]
+                for j in range(size):
+                    i = probes.nodes[first + j]
+                    for c in range(3):
+                        row[at + 3 * j + c] = x[i, c]
+                        row[at + 3 * (size + j) + c] = v[i, c]
+                        row[at + 3 * (2 * size + j) + c] = a[i, c]
+                        row[at + 3 * (3 * size + j) + c] = contact[i, c] + (support[i, c] if supported else 0.0)
+                at += 12 * size
+            done += 1
+            if failed >= 0 or turned >= 0 or stuck >= 0 or not np.isfinite(kinetic + elastic):
+                break
+        after = (f, f1, a, a1, v, v1, support, support1, contact, contact1)
+        return (
+            done,
+            failed,
+            turned,
+            stuck,
+            stuck_offsets,
+            after,
+            (kinetic, elastic, heat, hardening),
+            u,
+            (force, contacts, moment, near, touching, places),
+            touched,
+        )
+
+    return march

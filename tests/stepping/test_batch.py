@@ -1,0 +1,102 @@
+"""Steps made together by one compiled call: the same to the last bit as steps made one by one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from pfem_petsc import Case, Simulation, open_result
+from pfem_petsc.errors import EarlyStop, SimulationFailure
+from pfem_petsc.stepping import batch
+
+LATTICE = {
+    "mesh": {"generator": "lattice", "kind": "cubic", "cells": [2, 2, 2], "pitch": 0.01},
+    "node_set": {"foot": {"group": "bottom"}, "corner": {"nearest": [0.02, 0.02, 0.02]}},
+    "material": {"it": {"young_modulus": 110e9, "density": 4500.0, "damping": 2e4}},
+    "section": {"it": {"area": 1e-6, "material": "it"}},
+    "initial": {"velocity": [3.0, 1.0, -20.0]},
+    "time": {"integrator": "central_differences", "step": 2e-7, "end": 1.2e-4},
+    "output": {"fields_every": 150, "history_every": 3, "probe": [{"name": "feet", "node_set": "foot"}]},
+}
+PLASTIC = {"yield_stress": 100e6, "isotropic_hardening": 1e9, "kinematic_hardening": 2e9}
+FLOOR = {"name": "floor", "type": "plane", "point": [0, 0, -1e-5], "normal": [0.0, 0.1, 1.0]}
+SIDE = {"name": "side", "type": "plane", "point": [0.0201, 0, 0], "normal": [-1.0, 0.0, 0.0], "node_set": "foot"}
+
+CASES = {
+    "flying": {},
+    "walls": {"wall": [FLOOR, SIDE]},
+    "yielding": {"material": {"it": LATTICE["material"]["it"] | PLASTIC}, "wall": [FLOOR]},
+    "held": {"support": [{"node_set": "foot", "fix": "xz"}], "gravity": {"acceleration": [0.0, 0.0, -1e4]}},
+    "held and loaded": {
+        "support": [{"node_set": "foot", "fix": "z"}],
+        "load": [{"node_set": "corner", "force": [10.0, 0.0, 0.0]}],
+        "wall": [SIDE | {"node_set": "foot"}],
+    },
+}
+
+
+@pytest.fixture
+def at_once(monkeypatch):
+    """Short runs are made in batches too."""
+    monkeypatch.setattr(batch, "WORTH", 1)
+
+
+def case(changes, **time):
+    return Case.from_dict(LATTICE | changes | {"time": LATTICE["time"] | time})
+
+
+def made(case, folder, together):
+    simulation = Simulation(case, output=folder, quiet=True)
+    steps = list(simulation.batches() if together else simulation)
+    return simulation, len(steps)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_batches_are_the_single_steps(name, at_once, tmp_path):
+    one, count = made(case(CASES[name]), tmp_path / "one", False)
+    many, fewer = made(case(CASES[name]), tmp_path / "many", True)
+    assert count == 600 and fewer < 100
+    first, second = open_result(tmp_path / "one"), open_result(tmp_path / "many")
+    assert sorted(first.history) == sorted(second.history)
+    for column in first.history:
+        np.testing.assert_array_equal(first.history[column], second.history[column], err_msg=column)
+    for what in ("x", "v", "a", "f", "contact", "support"):
+        np.testing.assert_array_equal(getattr(one.state, what), getattr(many.state, what), err_msg=what)
+    assert np.abs(first.history["energy_imbalance"]).max() < 1e-11 * first.history["kinetic_energy"].max()
+    for k in range(len(first.times)):
+        np.testing.assert_array_equal(first.field("velocity", k), second.field("velocity", k))
+
+
+@pytest.mark.parametrize("other", ["chung_lee", "newmark"])
+def test_other_integrators_take_single_steps(other, at_once, tmp_path):
+    _, count = made(case({}, integrator=other, end=2e-6), tmp_path / "out", True)
+    assert count == 10
+
+
+def test_a_stopped_run_of_batches_goes_on_to_the_same_end(at_once, tmp_path, monkeypatch):
+    walls = CASES["yielding"]
+    whole, _ = made(case(walls), tmp_path / "whole", True)
+    simulation = Simulation(case(walls), output=tmp_path / "part", quiet=True)
+    with pytest.raises(EarlyStop):
+        for step in simulation.batches():
+            if step.step > 200:
+                simulation._stop._signal = 15
+    assert 200 < simulation.state.step < 600
+    rest = Simulation(case(walls), output=tmp_path / "part", restart=True, quiet=True)
+    rest.run()
+    np.testing.assert_array_equal(whole.state.x, rest.state.x)
+    first, second = open_result(tmp_path / "whole"), open_result(tmp_path / "part")
+    for column in first.history:
+        np.testing.assert_array_equal(first.history[column], second.history[column], err_msg=column)
+
+
+def test_a_failure_is_that_of_single_steps(at_once, tmp_path):
+    crushed = {"initial": {"velocity": [0.0, 0.0, -2e4]}, "wall": [FLOOR]}
+    texts, steps = [], []
+    for together in (False, True):
+        with pytest.raises(SimulationFailure) as failure:
+            made(case(crushed), tmp_path / str(together), together)
+        texts.append(str(failure.value))
+        steps.append(open_result(tmp_path / str(together)).history["step"])
+    assert "bar" in texts[0] and texts[0] == texts[1]
+    np.testing.assert_array_equal(steps[0], steps[1])

@@ -1,14 +1,15 @@
 """Coordinates of implicit steps in which every contact pair is a bound on one unknown.
 
-Of a pair with d . (x_c - x_o) >= gap, the node c that carries the bound has the coordinates w_c, the other node keeps
-its own: with the free part of d at c of length l and direction m, b = (free part of d at o)/l, and the reflection H
-that takes the axis e of the unknown into m,
+A pair bounds the distance d . (x_c - x_o), of which the node c carries the bound and o is the other one. With y the
+coordinates of both, those of their frames where walls are near (u = B^-1 y), else u_o = y_o and u_c = H y_c with the
+reflection H that takes an axis into the direction of d, the distance is alpha . y_c - beta . y_o. It takes the place
+of a coordinate s of y_c that no wall bounds:
 
-    w_o = u_o,   w_c = H u_c - (b . u_o) e,   and back   u_c = H (w_c + (b . w_o) e),
+    w_s = (alpha . y_c - beta . y_o)/|alpha_s|,   all others w = y,   and back   y_s = r_c . w_c + r_o . w_o.
 
-so that e . w_c = m . u_c - b . u_o is the distance over l. The gradient follows: g_c <- H g_c, then
-g_o <- g_o + b (e . g_c), and the pair's force is e . g_c / l. What supports prescribe is no part of m and b: it moves
-the bound. The two nodes may be on two ranks. The coordinates are the same for every step, as the directions are.
+The gradient follows, g_c <- g_c - g_s e_s + g_s r_c, g_o <- g_o + g_s r_o, and the pair's force is g_s/|alpha_s| then.
+What supports prescribe is no part of alpha and beta: it moves the bound. The two nodes may be on two ranks. Where
+walls stop no node of a pair the coordinates are the same for all steps.
 """
 
 from __future__ import annotations
@@ -16,11 +17,13 @@ from __future__ import annotations
 import numpy as np
 from petsc4py import PETSc
 
+from .frames import NodalFrames
 from .pairs import ContactPairs
 
 __all__ = ["PairCoordinates"]
 
 _THIN = 1e-6  # length of a direction's free part below which supports alone decide
+_LEAST = 0.1  # |alpha_s| at a node with a frame below which the pair must wait
 
 
 class PairCoordinates:
@@ -34,24 +37,73 @@ class PairCoordinates:
     def __init__(self, pairs: ContactPairs) -> None:
         self.pairs = pairs
         lengths = np.sqrt(np.einsum("epi,pi->ep", pairs.free, pairs.normals**2))
-        self._at = np.flatnonzero(lengths.max(axis=0, initial=0.0) > _THIN)
-        carrier = np.where(lengths[1] >= (1.0 - 1e-12) * lengths[0], 1, 0)[self._at]
-        at, other = self._at, 1 - carrier
-        self._length = lengths[carrier, at]
-        direction = np.where(carrier == 1, 1.0, -1.0)[:, None] * pairs.normals[at]
-        self._share = direction * pairs.free[other, at] / self._length[:, None]
-        along = direction * pairs.free[carrier, at] / self._length[:, None]
-        self._slot = np.abs(along).argmax(axis=1) if len(at) else np.zeros(0, dtype=np.int64)
-        mirror = -along
-        mirror[np.arange(len(at)), self._slot] += 1.0
+        self._usable = lengths.max(axis=0, initial=0.0) > _THIN
+        self._place(
+            np.tile(np.eye(3), (*pairs.mine.shape, 1, 1)), np.zeros(pairs.mine.shape, dtype=bool), pairs.free > 0.0
+        )
+
+    def place(self, frames: NodalFrames | None) -> None:
+        """Take the frames of a solve; None where no wall is near. Collective."""
+        pairs = self.pairs
+        if not pairs.coupled.walled.any():
+            return
+        owned = pairs.mesh.n_owned
+        data = np.zeros((owned, 13))
+        data[:, [0, 4, 8]] = 1.0
+        if frames is not None:
+            at = frames.nodes
+            data[at, :9] = frames.inverse.reshape(-1, 9)
+            data[at, 9] = 1.0
+            data[at, 10:] = np.isfinite(frames.lower) | np.isfinite(frames.upper)
+        ends = pairs.gather(data)
+        room = (pairs.free > 0.0) & (ends[:, :, 10:] == 0.0)
+        self._place(ends[:, :, :9].reshape(*pairs.mine.shape, 3, 3), ends[:, :, 9] > 0.0, room)
+
+    def _place(self, inverse: np.ndarray, framed: np.ndarray, room: np.ndarray) -> None:
+        """Choose who carries the bounds, and in which coordinate.
+
+        ``inverse`` (2, p, 3, 3), ``framed`` (2, p): of the ends' frames; ``room`` (2, p, 3): coordinates to be had.
+        """
+        pairs = self.pairs
+        direction = np.array([-1.0, 1.0])[:, None, None] * pairs.normals
+        free = pairs.free > 0.0
+        part = np.where(free, np.einsum("epji,pj->epi", inverse, pairs.normals), 0.0)
+        plain = np.linalg.norm(part, axis=2)
+        best = np.where(framed, np.abs(np.where(room, part, 0.0)).max(axis=2), plain)
+        fits = best > np.where(framed, _LEAST, _THIN)
+        best = np.where(fits, best, 0.0)
+        self._at = at = np.flatnonzero(fits.any(axis=0))
+        self.waiting = np.setdiff1d(np.flatnonzero(self._usable), at)
+        carrier = np.where(best[1] >= (1.0 - 1e-12) * best[0], 1, 0)[at]
+        other, every = 1 - carrier, np.arange(len(at))
+        alpha, beta = (
+            np.where(free, np.einsum("epji,epj->epi", inverse, direction), 0.0)[e, at] for e in (carrier, other)
+        )
+        beta = -beta  # of the other end: d is the same for both
+        slot = (
+            np.abs(np.where(room[carrier, at], alpha, 0.0)).argmax(axis=1) if len(at) else np.zeros(0, dtype=np.int64)
+        )
+        along = alpha / np.maximum(np.linalg.norm(alpha, axis=1), 1e-300)[:, None]
+        mirror = np.where(framed[carrier, at][:, None], 0.0, -along)
+        mirror[every, slot] += ~framed[carrier, at]
         square = np.einsum("pi,pi->p", mirror, mirror)
         scale = np.divide(2.0, square, out=np.zeros_like(square), where=square > 0.0)
-        self._turn = np.eye(3) - scale[:, None, None] * mirror[:, :, None] * mirror[:, None, :]
-        self._along = along
-        self._carries, self._shares = pairs.mine[carrier, at], pairs.mine[other, at]
-        self.carriers, self._other = pairs.local[carrier, at][self._carries], pairs.local[other, at][self._shares]
-        self._slots = self._slot[self._carries]
-        self._turns, self._shared = self._turn[self._carries], self._share[self._shares]
+        turn = np.eye(3) - scale[:, None, None] * mirror[:, :, None] * mirror[:, None, :]
+        # without a frame the reflection leaves the carrier's part of the distance in its coordinate alone
+        unframed = ~framed[carrier, at]
+        lengths = np.linalg.norm(alpha, axis=1)
+        alpha[unframed] = 0.0
+        alpha[every[unframed], slot[unframed]] = lengths[unframed]
+        self._length = np.abs(alpha[every, slot])
+        sign = np.where(alpha[every, slot] < 0.0, -1.0, 1.0)
+        own = -(sign / self._length)[:, None] * alpha
+        own[every, slot] = sign
+        share = (sign / self._length)[:, None] * beta
+        self._ends = pairs.mine[carrier, at], pairs.mine[other, at]
+        here, there = self._ends
+        self.carriers, self._other = pairs.local[carrier, at][here], pairs.local[other, at][there]
+        self._slots, self._turns, self._own = slot[here], turn[here], own[here]
+        self._share, self._shared = share[here], share[there]
 
     def _across(self, here: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Numbers (p,) that the owners of some ends know, on all ranks. Collective."""
@@ -59,96 +111,134 @@ class PairCoordinates:
         data[here] = values
         return self.pairs.sum(data)
 
-    def _of_others(self, u: np.ndarray) -> np.ndarray:
-        """B . u_o of the pairs carried here. Collective."""
-        return self._across(self._shares, np.einsum("pi,pi->p", self._shared, u[self._other]))[self._carries]
+    def _of_others(self, w: np.ndarray) -> np.ndarray:
+        """r_o . w_o of the pairs carried here. Collective."""
+        carries, shares = self._ends
+        return self._across(shares, np.einsum("pi,pi->p", self._shared, w[self._other]))[carries]
 
     def increment(self, w: np.ndarray) -> None:
-        """Turn w (owned, 3) into u, in place. Collective."""
-        w[self.carriers, self._slots] += self._of_others(w)
-        w[self.carriers] = np.einsum("pij,pj->pi", self._turns, w[self.carriers])
+        """Turn w (owned, 3) into coordinates of the frames, or u where there are none, in place. Collective."""
+        y = w[self.carriers]
+        y[np.arange(len(y)), self._slots] = np.einsum("pi,pi->p", self._own, y) + self._of_others(w)
+        w[self.carriers] = np.einsum("pij,pj->pi", self._turns, y)
 
-    def coordinates(self, u: np.ndarray) -> None:
-        """Turn u (owned, 3) into w, in place. Collective."""
-        u[self.carriers] = np.einsum("pij,pj->pi", self._turns, u[self.carriers])
-        u[self.carriers, self._slots] -= self._of_others(u)
+    def coordinates(self, y: np.ndarray) -> None:
+        """Turn what :meth:`increment` gives (owned, 3) into w, in place. Collective."""
+        w, every = np.einsum("pij,pj->pi", self._turns, y[self.carriers]), np.arange(len(self.carriers))
+        sign = self._own[every, self._slots]
+        rest = np.einsum("pi,pi->p", self._own, w) - sign * w[every, self._slots] + self._of_others(y)
+        w[every, self._slots] = sign * (w[every, self._slots] - rest)
+        y[self.carriers] = w
 
     def gradient(self, g: np.ndarray) -> None:
-        """Turn a gradient (owned, 3) by u into that by w, in place. Collective."""
-        g[self.carriers] = np.einsum("pij,pj->pi", self._turns, g[self.carriers])
-        pull = self._across(self._carries, g[self.carriers, self._slots])[self._shares]
-        g[self._other] += pull[:, None] * self._shared
+        """Turn a gradient (owned, 3) by what :meth:`increment` gives into that by w, in place. Collective."""
+        carries, shares = self._ends
+        y, every = np.einsum("pij,pj->pi", self._turns, g[self.carriers]), np.arange(len(self.carriers))
+        pull = y[every, self._slots].copy()
+        y[every, self._slots] = 0.0
+        g[self.carriers] = y + pull[:, None] * self._own
+        g[self._other] += self._across(carries, pull)[shares, None] * self._shared
 
     def diagonal(self, blocks: np.ndarray, diagonal: np.ndarray) -> None:
         """Put the diagonal (owned, 3) of T^T H T in place of that of H at pairs; bars between the ends are left out.
 
         ``blocks`` (carriers, 3, 3): the diagonal blocks of H there. Collective.
         """
+        carries, shares = self._ends
+        every = np.arange(len(self.carriers))
         turned = np.einsum("pji,pjk,pkl->pil", self._turns, blocks, self._turns)
-        diagonal[self.carriers] = np.einsum("pii->pi", turned)
-        stiff = self._across(self._carries, diagonal[self.carriers, self._slots])[self._shares]
-        diagonal[self._other] += stiff[:, None] * self._shared**2
+        stiff = turned[every, self._slots, self._slots].copy()
+        own = np.tile(np.eye(3), (len(every), 1, 1))
+        own[every, self._slots] = self._own
+        diagonal[self.carriers] = np.einsum("pji,pjk,pki->pi", own, turned, own)
+        diagonal[self._other] += self._across(carries, stiff)[shares, None] * self._shared**2
 
     def matrix(self) -> PETSc.Mat:
-        """T with u = T w, which whoever calls must destroy. Collective."""
-        mesh = self.pairs.mesh
+        """T of :meth:`increment`, with places for any choice of carriers; the caller destroys it. Collective."""
+        mesh, pairs = self.pairs.mesh, self.pairs
         first, total = 3 * mesh.first_node, 3 * mesh.n_nodes
-        node = self._across(self._shares, mesh.first_node + self._other).astype(np.int64)[self._carries]
-        along, share = self._along[self._carries], self._share[self._carries]
+        numbers = pairs.gather(np.arange(mesh.first_node, mesh.first_node + mesh.n_owned)[:, None].astype(float))
+        numbers = numbers[:, :, 0].astype(np.int64)
+        ends = pairs.local[pairs.mine]
+        partners = numbers[::-1][pairs.mine]
+        both = np.sort(np.stack([mesh.first_node + ends, partners], axis=1), axis=1)
         count = np.ones(3 * mesh.n_owned, dtype=np.int64)
-        rows = (3 * self.carriers[:, None] + np.arange(3)).ravel()
+        rows = (3 * ends[:, None] + np.arange(3)).ravel()
         count[rows] = 6
         pointers = np.append(0, np.cumsum(count)).astype(PETSc.IntType)
         columns = np.zeros(pointers[-1], dtype=PETSc.IntType)
-        values = np.ones(pointers[-1])
-        plain = np.ones(3 * mesh.n_owned, dtype=bool)
-        plain[rows] = False
-        columns[pointers[:-1][plain]] = first + np.flatnonzero(plain)
-        place = pointers[rows][:, None] + np.arange(6)
-        own = first + 3 * self.carriers[:, None] + np.arange(3)
-        both = np.concatenate([own, 3 * node[:, None] + np.arange(3)], axis=1)
-        entries = np.concatenate([self._turns, along[:, :, None] * share[:, None, :]], axis=2)
-        order = both.argsort(axis=1)  # PETSc takes rows with ascending columns
-        columns[place] = np.repeat(np.take_along_axis(both, order, axis=1), 3, axis=0)
-        values[place] = np.take_along_axis(entries, order[:, None, :], axis=2).reshape(-1, 6)
+        plain = np.setdiff1d(np.arange(3 * mesh.n_owned), rows)
+        columns[pointers[plain]] = first + plain
+        wide = (3 * both[:, :, None] + np.arange(3)).reshape(-1, 6)
+        columns[pointers[rows][:, None] + np.arange(6)] = np.repeat(wide, 3, axis=0)
+        self._pattern = pointers, columns
         matrix = PETSc.Mat().create(comm=mesh.comm)
         matrix.setSizes(((3 * mesh.n_owned, total), (3 * mesh.n_owned, total)), bsize=3)
         matrix.setType(PETSc.Mat.Type.AIJ)
-        matrix.setPreallocationCSR((pointers, columns, values))
-        matrix.assemble()
+        matrix.setPreallocationCSR((pointers, columns))
+        self._numbers = numbers
+        self.refresh(matrix)
         return matrix
+
+    def refresh(self, matrix: PETSc.Mat) -> None:
+        """Bring T up to date with the frames. Collective."""
+        pairs, mesh = self.pairs, self.pairs.mesh
+        pointers, columns = self._pattern
+        local = columns - 3 * mesh.first_node
+        values = np.zeros(len(columns))
+        # rows of nodes that carry nothing are those of the unit matrix
+        values[local == np.repeat(np.arange(3 * mesh.n_owned), np.diff(pointers))] = 1.0
+        place = pointers[3 * self.carriers[:, None] + np.arange(3)][:, :, None] + np.arange(6)
+        every = np.arange(len(self.carriers))
+        own = np.tile(np.eye(3), (len(every), 1, 1))
+        own[every, self._slots] = self._own
+        own = self._turns @ own
+        share = self._turns[every, :, self._slots][:, :, None] * self._share[:, None, :]
+        partner = np.zeros(mesh.n_owned, dtype=np.int64)
+        partner[pairs.local[pairs.mine]] = self._numbers[::-1][pairs.mine]
+        low = (mesh.first_node + self.carriers < partner[self.carriers])[:, None, None]
+        values[place] = np.where(low, np.concatenate([own, share], axis=2), np.concatenate([share, own], axis=2))
+        matrix.setValuesCSR(pointers, columns, values)
+        matrix.assemble()
 
     def reached(self, x: np.ndarray, move: np.ndarray, contact: np.ndarray, slack: float) -> bool:
         """Whether pairs can meet in a step: ends at (owned, 3) that move so far, or pressed before. Collective."""
         data = self.pairs.gather(np.concatenate([x + move, move, contact], axis=1))
         reach = 0.5 * np.linalg.norm(data[:, :, 3:6], axis=2).sum(axis=0) + slack
         near = self.pairs.distances(data[:, :, :3]) - self.pairs.gaps < reach
-        return bool((near | data[0, :, 6:].any(axis=1))[self._at].any())
+        return bool((near | data[0, :, 6:].any(axis=1))[self._usable].any())
 
     def broken(self, x: np.ndarray, tolerance: float) -> bool:
         """Whether positions (owned, 3) break a pair by more than a tolerance [m]. Collective."""
         short = self.pairs.gaps - self.pairs.distances(self.pairs.gather(x))
-        return bool((short[self._at] > tolerance).any())
+        return bool((short[self._usable] > tolerance).any())
 
-    def bound(self, predictor: np.ndarray, u: np.ndarray, lower: np.ndarray) -> None:
-        """Write the bounds on w into (owned, 3); of increments u, only what supports prescribe is used. Collective."""
-        ends = self.pairs.gather(np.concatenate([predictor, u], axis=1))
-        x = ends[:, :, :3] + np.where(self.pairs.free > 0.0, 0.0, ends[:, :, 3:])
-        room = (self.pairs.gaps - self.pairs.distances(x))[self._at] / self._length
-        lower[self.carriers, self._slots] = room[self._carries]
+    def blocked(self, x: np.ndarray, tolerance: float) -> np.ndarray:
+        """Pairs that found no coordinate, and that positions (owned, 3) break by more than a tolerance. Collective."""
+        if len(self.waiting) == 0:
+            return self.waiting
+        short = self.pairs.gaps - self.pairs.distances(self.pairs.gather(x))
+        return self.waiting[short[self.waiting] > tolerance]
+
+    def bound(self, x: np.ndarray, w: np.ndarray, lower: np.ndarray) -> None:
+        """Write the bounds on w into (owned, 3), from positions (owned, 3) and their w. Collective."""
+        room = (self.pairs.gaps - self.pairs.distances(self.pairs.gather(x)))[self._at] / self._length
+        lower[self.carriers, self._slots] = w[self.carriers, self._slots] + room[self._ends[0]]
 
     def press(self, w: np.ndarray, g: np.ndarray, lower: np.ndarray, noise: float) -> None:
         """Set the pairs' forces. Collective.
 
         Parameters
         ----------
-        w, g : (owned, 3) solution in these coordinates [m], and imbalance by u there [N]
+        w, g : (owned, 3) solution in these coordinates [m], and the residual of its increment's coordinates [N]
         lower : (owned, 3) bounds on w [m]
-        noise : of the imbalance [N]
+        noise : of the residual [N]
         """
         at, slot = self.carriers, self._slots
-        pull = np.einsum("pi,pi->p", self._along[self._carries], g[at])
+        every = np.arange(len(at))
+        turned = np.einsum("pij,pj->pi", self._turns, g[at])
+        pull = self._own[every, slot] * turned[every, slot]
         pressed = (w[at, slot] <= lower[at, slot]) & (pull > noise)
-        strength = self._across(self._carries, np.where(pressed, pull, 0.0)) / self._length
+        strength = self._across(self._ends[0], np.where(pressed, pull, 0.0)) / self._length
         self.pairs.release()
         self.pairs.force[self._at] = strength

@@ -79,15 +79,17 @@ class ContactPairs:
             On all ranks. ``on_its_own``: each node is solved on its own, by an explicit scheme with lumped mass.
         """
         key, coupled = f"{self.source}: contact_pair", self.coupled
-        for which, what, other in (
-            (coupled.shared, "is in several pairs", "name it once"),
-            (coupled.walled, "is in a pair, and a wall stops it as well", "give the wall a node_set without it"),
-        ):
-            if which.any() and not (on_its_own and treatment == "scheme"):
-                raise InputError(
-                    f"{key}: node {coupled.numbers[which][0]} {what}, which needs an explicit integrator with lumped "
-                    f'mass and contact.treatment = "scheme"; take these, or {other}'
-                )
+        if coupled.shared.any() and not on_its_own:
+            raise InputError(
+                f"{key}: node {coupled.numbers[coupled.shared][0]} is in several pairs, which needs an explicit "
+                "integrator with lumped mass"
+            )
+        if coupled.any and treatment != "scheme":
+            which = coupled.shared | coupled.walled
+            raise InputError(
+                f"{key}: node {coupled.numbers[which][0]} is in several pairs, or a wall stops it as well, which needs "
+                'contact.treatment = "scheme"'
+            )
         walls = coupled.contact
         met = np.zeros(len(walls.names), dtype=np.int64)
         met += walls.members[coupled.here].any(axis=0)
@@ -208,9 +210,9 @@ class ContactPairs:
         here = self.mine[1] & (self.force > 0.0)
         values[self.local[1, here]] = of_pairs[here]
 
-    def push(self, contact: np.ndarray) -> None:
-        """Add the pairs' forces to those on the nodes (owned, 3) [N]."""
-        for _, _, at, push in self._pushes(self.force):
+    def push(self, contact: np.ndarray, factor: float = 1.0) -> None:
+        """Add the pairs' forces, times a factor, to those on the nodes (owned, 3) [N]."""
+        for _, _, at, push in self._pushes(factor * self.force):
             np.add.at(contact, at, push)
 
     def _needed(self, x: np.ndarray, stiffness: np.ndarray, least: np.ndarray) -> np.ndarray:

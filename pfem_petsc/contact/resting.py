@@ -72,12 +72,12 @@ def start_at_rest(model, state, accelerate: Callable[[np.ndarray], np.ndarray], 
     drag = np.zeros(normals.shape)
     between = np.zeros_like(load)  # the same of the pairs' forces
     for _ in range(_ROUNDS if model.inertia.consistent else 1):
-        change = np.zeros_like(load)
+        apart = state.a - between / (share * mass[:, None])
+        apart[nodes] -= hold / weight[:, None]
+        earlier = between
         if pairs is not None:  # first, as in a step: they know what the walls do
-            earlier = between
-            between = pairs.rest(state.a - earlier / (share * mass[:, None]), share * mass, closed, held)
-            change = between - earlier
-        free = state.a[nodes] + (change[nodes] - hold) / weight[:, None]
+            between = pairs.rest(apart, share * mass, closed, held)
+        free = apart[nodes] + between[nodes] / weight[:, None]
         moved = free.copy()
         project(moved, fixed, normals, planes, 0.0, strengths)
         if contact.rough:
@@ -86,7 +86,7 @@ def start_at_rest(model, state, accelerate: Callable[[np.ndarray], np.ndarray], 
             _rub(contact, nodes, v, rates, slack, weight, moved, normals, planes, strengths, drag)
             strengths /= weight[:, None]
         before, hold = hold, weight[:, None] * (moved - free)
-        sizes = [np.abs(part).max(initial=0.0) for part in (hold - before, change, hold, between)]
+        sizes = [np.abs(part).max(initial=0.0) for part in (hold - before, between - earlier, hold, between)]
         last_hold, last_between, *largest = np.max(comm.allgather(sizes), axis=0)
         if max(last_hold, last_between) <= 1e-13 * max(largest):
             break

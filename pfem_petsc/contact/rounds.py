@@ -89,6 +89,8 @@ class ContactRounds:
                 self._tied = self.contact.ties.pin(self._frames, self.balance.time)
             if self.friction is not None:
                 self.friction.apply(self._frames, x)
+        if self.pairs is not None:
+            self.pairs.place(self._frames)
         return self._frames
 
     def feasible(self, u: np.ndarray, stiffness: np.ndarray | None = None) -> np.ndarray:
@@ -135,10 +137,10 @@ class ContactRounds:
         """Keep the directions of slip in the next solve; whether the last one solved for them. Collective."""
         return self.friction is not None and self._frames is not None and self.friction.firm()
 
-    def bounds(self, guess: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    def bounds(self, guess: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
         """Bounds on w (owned, 3): those of the frames less B predictor, and of pairs; None in free flight. Collective.
 
-        ``guess`` (owned, 3): of u, whose prescribed components hold.
+        ``guess``, ``w`` (owned, 3): of u, with prescribed components as they will be, and the same as w.
         """
         self._bounds = None
         frames = self._frames
@@ -152,7 +154,7 @@ class ContactRounds:
             lower[at] = frames.lower - base
             upper[at] = frames.upper - base
         if self.pairs is not None:
-            self.pairs.bound(self.balance.predictor, guess, lower)
+            self.pairs.bound(self.balance.predictor + guess, w, lower)
         self._bounds = lower, upper
         return self._bounds
 
@@ -184,7 +186,8 @@ class ContactRounds:
         slack = 1e-12 * self.model.length
         settled = True
         if self.pairs is not None:
-            self.pairs.press(w, g, self._bounds[0], noise)
+            g = self._press(w, g, noise)
+            self._check_waiting(x, slack)
         elif self._all_pairs is not None and self._all_pairs.broken(x, slack):
             self.pairs, settled = self._all_pairs, False
         if not contact.any:
@@ -216,6 +219,27 @@ class ContactRounds:
             )
         self._join(joined, x)
         return False
+
+    def _press(self, w: np.ndarray, g: np.ndarray, noise: float) -> np.ndarray:
+        """Set the pairs' forces; what of the imbalance (owned, 3) walls must bear. Collective."""
+        turned, rest = g.copy(), g.copy()
+        if self._frames is not None:
+            at = self._frames.nodes
+            turned[at] = np.einsum("nji,nj->ni", self._frames.inverse, g[at])
+        self.pairs.press(w, turned, self._bounds[0], noise)
+        self.pairs.pairs.push(rest, -1.0)
+        return rest
+
+    def _check_waiting(self, x: np.ndarray, slack: float) -> None:
+        """Pairs that found no coordinate beside the walls at both their nodes must not be broken. Collective."""
+        blocked = self.pairs.blocked(x, slack)
+        if len(blocked):
+            pairs = self.pairs.pairs
+            raise NotConverged(
+                f"step {self.state.step + 1}, t = {self.balance.time:.6g} s: walls take all directions in which nodes "
+                f"{pairs.first[blocked[0]]} and {pairs.second[blocked[0]]} of contact_pair "
+                f"{pairs.names[pairs.table[blocked[0]]]!r} can part; take an explicit integrator"
+            )
 
     def _strengths(self, w: np.ndarray, g: np.ndarray, noise: float) -> np.ndarray:
         frames = self._frames
@@ -301,6 +325,6 @@ class ContactRounds:
                 force[tied, owners] = self._pull[tied]
                 touching[tied, owners] = True
             walls = self.contact.sums(at, force, (self.balance.predictor + u)[at], touching)
-            total[at] = force.sum(axis=1)
+            total[at] += force.sum(axis=1)
             held[at] = touching.any(axis=1)
         return total, walls, held

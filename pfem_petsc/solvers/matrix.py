@@ -178,7 +178,7 @@ class HessianMatrix:
 
     def couple(self, pairs) -> None:
         """Give steps with bounds the :class:`~pfem_petsc.contact.pair_coordinates.PairCoordinates`. Collective."""
-        self._pairs = pairs.matrix()
+        self._coordinates, self._pairs = pairs, pairs.matrix()
         self.fill(lambda values: None)
         self.bounded = self.mat.ptap(self._pairs)
         self.bounded.setOption(PETSc.Mat.Option.SYMMETRIC, self._symmetric)
@@ -193,6 +193,8 @@ class HessianMatrix:
 
     def change_coordinates(self) -> None:
         """Make ``bounded`` from ``mat``. Collective."""
+        if self._coordinates.pairs.coupled.walled.any():
+            self._coordinates.refresh(self._pairs)
         self.mat.ptap(self._pairs, self.bounded)
 
     def add_lumped(self, inertia: np.ndarray, values: np.ndarray) -> None:

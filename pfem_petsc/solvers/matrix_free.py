@@ -179,11 +179,11 @@ class MatrixFreeHessian:
         if fixed is not None:
             held = problem.scale * u[:owned][fixed]
             u[:owned][fixed] = 0.0
+        if problem.pairs is not None:
+            problem.pairs.increment(u)
         if problem.oblique:
             at = problem.frames.nodes
             u[at] = np.einsum("nij,nj->ni", problem.frames.inverse, u[at])
-        if problem.pairs is not None:
-            problem.pairs.increment(u)
         self.mesh.update_ghosts(u)
         inertia, bars = self.model.inertia, self.model.bars
         if inertia.consistent:
@@ -230,7 +230,13 @@ class MatrixFreeHessian:
                 full[problem.sliding.at] += problem.sliding.stiffness
             diagonal[problem.frames.nodes] = np.einsum("nij,njk,nki->ni", self._left, full, problem.frames.inverse)
         if problem.pairs is not None:
-            problem.pairs.diagonal(self._blocks(blocks, nodal, problem.pairs.carriers), diagonal)
+            carriers = problem.pairs.carriers
+            full = self._blocks(blocks, nodal, carriers)
+            if problem.oblique:
+                framed, at, place = np.intersect1d(carriers, problem.frames.nodes, return_indices=True)
+                inverse = problem.frames.inverse[place]
+                full[at] = inverse.transpose(0, 2, 1) @ full[at] @ inverse
+            problem.pairs.diagonal(full, diagonal)
         if self.model.supports.any:
             diagonal[self._fixed] = problem.scale
         return diagonal

@@ -195,8 +195,10 @@ class ImplicitStepper(Stepper):
             except SimulationFailure as failure:
                 raise SimulationFailure(f"{self.when(balance)}: {failure}") from failure
             problem = StepProblem(model, state, balance, state.external, frames, contacts.pairs)
-            bounds = contacts.bounds(guess)
-            w = contacts.clipped(problem.coordinates(contacts.feasible(guess)))
+            near = contacts.feasible(guess)
+            w = problem.coordinates(near)
+            bounds = contacts.bounds(near, w)
+            w = contacts.clipped(w)
             report = self.newton.solve(problem, w, tolerance, model.rounding, bounds)
             firm = not report.converged and contacts.firm()
             if not report.converged and not firm and (problem.oblique or problem.pairs is not None):
@@ -218,12 +220,14 @@ class ImplicitStepper(Stepper):
         if frames is None and not model.supports.any:
             self._keep_momentum(problem, u, g)
         state.contact, walls, self.held = contacts.forces(u)
-        held = int(self.held.sum()) + (0 if model.pairs is None else len(model.pairs.pressed()[0]))
+        held = np.flatnonzero(self.held)
+        if model.pairs is not None:
+            held = np.union1d(held, model.pairs.pressed()[0])
         state.support = np.zeros_like(u)
         fixed = model.supports.fixed
         state.support[fixed] = g[fixed] - state.contact[fixed]
         internal = problem.f if balance.weight else state.f
-        return Solution(u, internal, walls, newton, linear, held)
+        return Solution(u, internal, walls, newton, linear, len(held))
 
     def _keep_momentum(self, problem: StepProblem, u: np.ndarray, g: np.ndarray) -> None:
         """Take the net force that the solver has left from a free truss, by a translation, which strains no bar.

@@ -103,11 +103,11 @@ class StepProblem:
     def increment(self, w: np.ndarray) -> np.ndarray:
         """u (owned, 3) for w. Collective."""
         self.u[:] = w
-        if self.oblique:
-            at = self.frames.nodes
-            self.u[at] = np.einsum("nij,nj->ni", self.frames.inverse, w[at])
         if self.pairs is not None:
             self.pairs.increment(self.u)
+        if self.oblique:
+            at = self.frames.nodes
+            self.u[at] = np.einsum("nij,nj->ni", self.frames.inverse, self.u[at])
         return self.u
 
     def coordinates(self, u: np.ndarray) -> np.ndarray:

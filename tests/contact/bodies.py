@@ -10,11 +10,20 @@ from pfem_petsc.mesh import load_slab
 
 
 def two_lattices(
-    file, integrator, *, turn=None, step=2e-4, end=0.02, direction=(1.0, 0.1, -0.2), velocity=(2.0, 0.3, -0.2), **tables
+    file,
+    integrator,
+    *,
+    turn=None,
+    step=2e-4,
+    end=0.02,
+    direction=(1.0, 0.1, -0.2),
+    velocity=(2.0, 0.3, -0.2),
+    cells=(1, 2, 2),
+    **tables,
 ):
     """Octet lattices of pitch 0.1 m, shaken, 3 mm apart; the direction of their pairs is oblique to their faces."""
     turn = np.eye(3) if turn is None else turn
-    slab = load_slab(Case.from_dict(lattice_case([], cells=(1, 2, 2))).mesh, MPI.COMM_SELF)
+    slab = load_slab(Case.from_dict(lattice_case([], cells=cells)).mesh, MPI.COMM_SELF)
     one, n = slab.points, len(slab.points)
     points = np.vstack([one, one + [0.103, 0.0, 0.0]])
     points += 1e-3 * np.random.default_rng(3).uniform(-1.0, 1.0, points.shape)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from bodies import two_lattices
+from lattices import planes
 
 from pfem_petsc import Case
 from pfem_petsc.contact.pair_coordinates import PairCoordinates
@@ -19,7 +20,7 @@ SUPPORTS = [{"node_set": "held", "fix": "y"}, {"node_set": "hinged", "fix": "xz"
 
 @pytest.fixture(params=[(), SUPPORTS], ids=["free", "supported"])
 def model(request, comm, shared_tmp_path):
-    case = two_lattices(shared_tmp_path / "mesh.vtu", "newmark", supports=request.param)
+    case = two_lattices(shared_tmp_path / "mesh.vtu", "newmark", supports=request.param, cells=(1, 1, 1))
     return Model(Case.from_dict(case), comm)
 
 
@@ -63,7 +64,7 @@ def test_matrix_gradient_and_inverse(model, comm):
     np.testing.assert_allclose(whole(pairs.increment, model, comm), matrix, atol=1e-15)
     np.testing.assert_allclose(whole(pairs.gradient, model, comm), matrix.T, atol=1e-15)
     np.testing.assert_allclose(whole(pairs.coordinates, model, comm), np.linalg.inv(matrix), atol=1e-13)
-    assert (np.abs(matrix - np.eye(len(matrix))) > 1e-3).any(axis=1).sum() == 39  # 13 carriers
+    assert (np.abs(matrix - np.eye(len(matrix))) > 1e-3).any(axis=1).sum() == 15  # 5 carriers
     fixed = np.zeros(len(matrix), dtype=bool)
     fixed[3 * model.mesh.first_node :][: 3 * model.mesh.n_owned] = model.supports.fixed.ravel()
     fixed = comm.allreduce(fixed.astype(int)) > 0
@@ -78,24 +79,58 @@ def test_bounds_are_the_distances(model, comm):
     u = rng.normal(size=(model.mesh.n_nodes, 3))[model.mesh.node_ids[: model.mesh.n_owned]]
     x = model.mesh.points[: model.mesh.n_owned]
     lower = np.full(u.shape, -np.inf)
-    pairs.bound(x, u, lower)
-    assert comm.allreduce(int(np.isfinite(lower).sum())) == 13
     w = u.copy()
     pairs.coordinates(w)
+    pairs.bound(x + u, w, lower)
+    assert comm.allreduce(int(np.isfinite(lower).sum())) == 5
     on = np.where(np.isfinite(lower), lower, w)
     closed = on.copy()
     pairs.increment(closed)
     np.testing.assert_allclose(model.pairs.distances(model.pairs.gather(x + closed)), model.pairs.gaps, atol=1e-13)
     np.testing.assert_array_equal(closed[model.supports.fixed], u[model.supports.fixed])
-    model.pairs.force = 1.0 + np.arange(13.0)
+    model.pairs.force = 1.0 + np.arange(5.0)
     g = np.zeros_like(u)
     model.pairs.push(g)
     model.pairs.release()
     pairs.press(on, g, lower, 1e-9)
-    np.testing.assert_allclose(model.pairs.force, 1.0 + np.arange(13.0), rtol=1e-13)
+    np.testing.assert_allclose(model.pairs.force, 1.0 + np.arange(5.0), rtol=1e-13)
 
 
-def test_both_operators_are_the_congruent_matrix(model, comm):
+@pytest.fixture(params=[(), SUPPORTS], ids=["free", "supported"])
+def walled(request, comm, shared_tmp_path):
+    case = two_lattices(shared_tmp_path / "walled.vtu", "newmark", supports=request.param, cells=(1, 1, 1))
+    case["wall"] = planes([[0.0, 0.3, 1.0], [0.2, 0.1, -1.0]], [-0.002, -0.3])
+    return Model(Case.from_dict(case), comm)
+
+
+def framed(model, pairs):
+    """Frames of nodes near walls that stop them, low ones with the first, high ones with both."""
+    x = model.mesh.points[: model.mesh.n_owned]
+    nodes = np.flatnonzero((x[:, 2] < 0.02) | (x[:, 2] > 0.08))
+    concerned = np.stack([np.ones(len(nodes), dtype=bool), x[nodes, 2] > 0.05], axis=1)
+    frames = model.contact.frames(nodes, x, 0.0, concerned)
+    pairs.place(frames)
+    return frames
+
+
+def test_matrix_gradient_and_inverse_beside_walls(walled, comm):
+    pairs = PairCoordinates(walled.pairs)
+    mat = pairs.matrix()
+    framed(walled, pairs)
+    pairs.refresh(mat)
+    matrix = dense(mat, comm)
+    mat.destroy()
+    np.testing.assert_allclose(whole(pairs.increment, walled, comm), matrix, atol=1e-14)
+    np.testing.assert_allclose(whole(pairs.gradient, walled, comm), matrix.T, atol=1e-14)
+    np.testing.assert_allclose(whole(pairs.coordinates, walled, comm), np.linalg.inv(matrix), atol=1e-12)
+    assert len(pairs.waiting) == 0
+
+
+def test_both_operators_are_the_congruent_matrix_beside_walls(walled, comm):
+    test_both_operators_are_the_congruent_matrix(walled, comm, beside=True)
+
+
+def test_both_operators_are_the_congruent_matrix(model, comm, beside=False):
     stepper = make_stepper(model, make_plan(model))
     stepper.start()
     state = stepper.state
@@ -103,12 +138,13 @@ def test_both_operators_are_the_congruent_matrix(model, comm):
     pairs = stepper.pairs
     rng = np.random.default_rng(2)
     u = 1e-3 * rng.normal(size=(model.mesh.n_nodes, 3))[model.mesh.node_ids[: model.mesh.n_owned]]
-    plain = StepProblem(model, state, balance, state.external, None)
-    coupled = StepProblem(model, state, balance, state.external, None, pairs)
+    frames = framed(model, pairs) if beside else None
+    plain = StepProblem(model, state, balance, state.external, frames)
+    coupled = StepProblem(model, state, balance, state.external, frames, pairs)
     w = coupled.coordinates(u)
     np.testing.assert_allclose(coupled.increment(w), u, atol=1e-17)
     assembled, free = HessianMatrix(model.mesh, model.supports.fixed, model.supports.any), MatrixFreeHessian(model)
-    assembled.update(plain, u)
+    assembled.update(plain, plain.coordinates(u))
     hessian = dense(assembled.mat, comm)
     mat = pairs.matrix()
     matrix = dense(mat, comm)

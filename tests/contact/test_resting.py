@@ -123,7 +123,7 @@ def test_rod_that_lies_on_another_stays_there(scheme, mass, comm, shared_tmp_pat
     assert np.abs(run.state.v).max(initial=0.0) < 1e-12
 
 
-@pytest.mark.parametrize("scheme", SCHEMES[:3])
+@pytest.mark.parametrize("scheme", SCHEMES)
 def test_rods_in_a_pile_stay_there(scheme, comm, shared_tmp_path):
     """The lower one on a floor that stops every node, the upper one on it."""
     run = stacked(scheme, "lumped", shared_tmp_path, comm, floor=True)

@@ -75,8 +75,9 @@ class Treatment(ABC):
             speeds[tied] = rates[contact.ties.walls(nodes[tied])]
         stuck = self.sticking(nodes, touching, normals)
         holds = stuck.any(axis=1)
-        normal[holds] = np.eye(3)
-        speeds[holds] = rates[stuck[holds].argmax(axis=1)]
+        if holds.any():  # there may be no walls at all, but pairs
+            normal[holds] = np.eye(3)
+            speeds[holds] = rates[stuck[holds].argmax(axis=1)]
         return nodes, normal, speeds
 
     def leaving(self, nodes: np.ndarray, touching: np.ndarray, normals: np.ndarray, rates: np.ndarray) -> np.ndarray:

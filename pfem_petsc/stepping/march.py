@@ -96,9 +96,10 @@ def make_march(forces: Callable) -> Callable:
     bars, nodes, walls, probes and buffers; nodes (m,) that touch walls; ledger's sums (17,); kinetic, elastic, heat and
     hardening energy [J]; and ``sums`` (count, width), which takes what a row of the history sums up, of each step.
 
-    It gives the number of steps made, the first bar that collapsed in the last of them or -1, the first that went
-    through zero length or -1, the node that found no room or -1 with the offsets of its planes, the buffers, the four energies, increments (n, 3), and of the last step what
-    :func:`~pfem_petsc.contact.flat.press_planes` tells of nodes and walls.
+    It gives the number of steps made; of the last of them the first bar that collapsed and the first that went through
+    zero length, or -1, and the node that found no room, or -1, with the offsets of its planes; the buffers; the four
+    energies; increments (n, 3); what :func:`~pfem_petsc.contact.flat.press_planes` tells of nodes and walls; and the
+    nodes that touch walls.
     """
 
     @kernel

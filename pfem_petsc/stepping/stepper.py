@@ -112,9 +112,10 @@ class Stepper(ABC):
         if (model.contact.any or model.pairs is not None) and model.inertia.redistribution is None:
             walls = start_at_rest(model, state, self.accelerate, load)
             if walls is not None:
-                self.solution.walls, self.solution.contacts = walls, int(walls.touching.any(axis=1).sum())
+                held = walls.nodes[walls.touching.any(axis=1)]
                 if model.pairs is not None:
-                    self.solution.contacts += len(model.pairs.pressed()[0])
+                    held = np.union1d(held, model.pairs.pressed()[0])
+                self.solution.walls, self.solution.contacts = walls, len(held)
         if supports.any:
             state.support = np.zeros_like(state.v)
             state.support[supports.fixed] = -(load + state.contact)[supports.fixed]

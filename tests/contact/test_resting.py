@@ -128,6 +128,8 @@ def test_rods_in_a_pile_stay_there(scheme, comm, shared_tmp_path):
     """The lower one on a floor that stops every node, the upper one on it."""
     run = stacked(scheme, "lumped", shared_tmp_path, comm, floor=True)
     weight = 0.1 * GRAVITY
+    run.start()
+    assert comm.allreduce(run.stepper.solution.contacts) == 10
     for row in [step.row for step in run]:
         assert row["pair/p/force"] == pytest.approx([0.0, 0.0, weight], rel=1e-8)
         assert row["wall/floor/force"] == pytest.approx([0.0, 0.0, 2.0 * weight], rel=1e-8)

@@ -16,27 +16,38 @@ __all__ = ["MatrixFreeHessian"]
 
 
 @kernel
-def _product(bars, stored, u, out):
-    for k in range(len(bars)):
-        a = bars[k, 0]
-        b = bars[k, 1]
-        dx = u[b, 0] - u[a, 0]
-        dy = u[b, 1] - u[a, 1]
-        dz = u[b, 2] - u[a, 2]
-        nx = stored[k, 0]
-        ny = stored[k, 1]
-        nz = stored[k, 2]
-        along = stored[k, 3] * (nx * dx + ny * dy + nz * dz)
-        across = stored[k, 4]
-        fx = along * nx + across * dx
-        fy = along * ny + across * dy
-        fz = along * nz + across * dz
-        out[a, 0] -= fx
-        out[a, 1] -= fy
-        out[a, 2] -= fz
-        out[b, 0] += fx
-        out[b, 1] += fy
-        out[b, 2] += fz
+def _product(heads, starts, far, stored, u, out):
+    """Add K u to ``out``, run by run of a :class:`~pfem_petsc.mechanics.sweep.Sweep`."""
+    for run in range(len(heads)):
+        a = heads[run]
+        ux = u[a, 0]
+        uy = u[a, 1]
+        uz = u[a, 2]
+        sx = 0.0
+        sy = 0.0
+        sz = 0.0
+        for k in range(starts[run], starts[run + 1]):
+            b = far[k]
+            dx = u[b, 0] - ux
+            dy = u[b, 1] - uy
+            dz = u[b, 2] - uz
+            nx = stored[k, 0]
+            ny = stored[k, 1]
+            nz = stored[k, 2]
+            along = stored[k, 3] * (nx * dx + ny * dy + nz * dz)
+            across = stored[k, 4]
+            fx = along * nx + across * dx
+            fy = along * ny + across * dy
+            fz = along * nz + across * dz
+            sx += fx
+            sy += fy
+            sz += fz
+            out[b, 0] += fx
+            out[b, 1] += fy
+            out[b, 2] += fz
+        out[a, 0] -= sx
+        out[a, 1] -= sy
+        out[a, 2] -= sz
 
 
 @kernel
@@ -197,7 +208,8 @@ class MatrixFreeHessian:
             if inertia.redistribution is not None:
                 moved = inertia.redistribution
                 out[moved.touched] += problem.balance.alpha * np.einsum("kij,kj->ki", moved.tensors, u[moved.touched])
-        _product(self.mesh.bars, self.stored, u, out)
+        for block in bars.blocks:
+            _product(block.sweep.heads, block.sweep.starts, bars.far, self.stored, u, out)
         if problem.oblique:
             if problem.sliding is not None:
                 slipping = problem.sliding.nodes

@@ -32,7 +32,7 @@ SOLVERS = {
     "auto": (),
 }
 CHOLESKY = {"pfem_pc_type": "bjacobi", "pfem_sub_pc_type": "icc"}
-FACTORISED_UP_TO = 100_000  # unknowns; the factors of a lattice of 10^6 bars do not fit into 24 GB
+FACTORISED_UP_TO = 100_000  # unknowns; a lattice of 10^6 bars would take some 15 GB and minutes
 ENDED = 10.0  # times the best
 
 

@@ -22,6 +22,7 @@ EVENTS: dict[str, tuple[str, ...]] = {
     "pfemSolve": ("stepper.solve",),
     "pfemResidual": ("stepper.newton._residual",),
     "pfemHessian": ("stepper.newton._hessian",),
+    "pfemPreconditioner": ("stepper.lagged.renew",),
     "pfemContact": ("model.contact.explicit", "model.contact.near", "model.contact.frames"),
     "pfemLedger": ("stepper.booking",),
     "pfemHistory": ("_record",),

@@ -14,9 +14,10 @@ from ..solvers.linear import DIRECT
 __all__ = ["checkpoint_bytes", "forecast", "memory_of_machine", "memory_warning", "result_bytes"]
 
 # Resident memory of a rank beyond an empty one, a bar of it [B]; measured with lattices of 10^5 to 5 x 10^5 bars: 131
-# explicit, 171 matrix-free, 510 assembled, 1580 with multigrid; 580 factorised at 1.7 x 10^4 bars, where fill begins.
+# explicit, 171 matrix-free, 510 assembled, 1580 with multigrid; factorised by MUMPS 4,200 at 2.7 x 10^4 and 8,200 at
+# 1.7 x 10^5 bars.
 _PER_BAR = {"": 150.0, "jacobi": 200.0, "pbjacobi": 550.0, "icc": 800.0, "ilu": 800.0, "gamg": 1700.0}
-_PER_BAR_FACTORISED, _FACTORISED_AT = 600.0, 1.7e4
+_PER_BAR_FACTORISED, _FACTORISED_AT = 4200.0, 2.7e4
 _EMPTY = 2.2e8  # of a process with all libraries loaded [B]
 # Seconds a bar and step or iteration, one core, and seconds a step beyond.
 _SECONDS_EXPLICIT = 1.5e-8
@@ -96,7 +97,7 @@ def _needed(model, plan) -> float:
     kind = "" if plan.linear is None else plan.linear.preconditioner
     if kind in DIRECT:
         # fill in three dimensions: the factors of n unknowns have of the order of n^(4/3) entries
-        each = _PER_BAR_FACTORISED * max(1.0, (model.mesh.n_bars / _FACTORISED_AT) ** (1.0 / 3.0))
+        each = _PER_BAR_FACTORISED * (model.mesh.n_bars / _FACTORISED_AT) ** (1.0 / 3.0)
     else:
         each = _PER_BAR.get(kind, max(_PER_BAR.values()))
     return _EMPTY + each * bars

@@ -22,7 +22,7 @@ from .preflight.summary import summarise
 from .restart.checkpoints import Checkpoints
 from .restart.folder import RESULT, Restart, find_restart, finished, prepare_folder
 from .restart.stop import Meetings, StopRequest
-from .stepping.batch import Batches
+from .stepping.batch import WORTH, Batches
 from .stepping.blowup import BlowUp
 from .stepping.fields import Fields
 from .stepping.ledger import Ledger
@@ -105,7 +105,6 @@ class Simulation:
         self.row: dict[str, Any] | None = None
         self._last_snapshot = -1  # its step
         self._started = False
-        self._batches = Batches()
         self._asked = 0  # code of a request to stop, zero for none
         self._writer: ResultWriter | None = None
         minutes = case.output.checkpoint_minutes
@@ -222,20 +221,23 @@ class Simulation:
         with self._compilation:
             yield from self._steps()
 
-    def batches(self) -> Iterator[Step]:
-        """Run as iteration does, but give only some of the steps: those between may be made by one compiled call."""
+    def batches(self, worth: int = WORTH) -> Iterator[Step]:
+        """Run as iteration does, but give only some of the steps: those between may be made by one compiled call.
+
+        ``worth``: steps of a run for which that call is compiled, which takes some seconds when it is first met.
+        """
         if self.finished:
             return
         with self._compilation:
-            yield from self._steps(together=True)
+            yield from self._steps(Batches(worth))
 
-    def _steps(self, together: bool = False) -> Iterator[Step]:
+    def _steps(self, batches: Batches | None = None) -> Iterator[Step]:
         try:
             self.start()
             self._stop_early(self.meet())
             while self.state.step < self.plan.steps:
-                if together:
-                    self._batches.advance(self)
+                if batches is not None:
+                    batches.advance(self)
                 yield self._advance()
                 self._stop_early(self._asked)
             # where a run that was killed after its last checkpoint had not got to it

@@ -121,7 +121,7 @@ def steps_of(mode: str, bars: int) -> int:
     """Steps that are timed: enough for the clock, few enough for the slowest."""
     if mode.startswith("implicit"):
         return 5 if bars < 50_000 else 3
-    return 1000 if bars < 50_000 else 40 if bars < 500_000 else 8
+    return 200 if bars < 50_000 else 40 if bars < 500_000 else 8
 
 
 def compare(mode: str, cells: int, codes: list[Code], pythons: dict[str, str], repeats: int) -> list[dict]:

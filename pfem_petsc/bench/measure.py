@@ -83,19 +83,21 @@ def time_job(
         simulation = Simulation(case, comm, output=folder, quiet=True)
         ready = perf_counter()
         times, cpu, newton, linear = [], 0.0, 0, 0
-        count = steps
-        running = iter(simulation)
+        count = None
+        running = simulation.batches(worth=1)  # as a long run
         next(running)
         first = perf_counter() - ready
+        last = next(running).step  # loads what makes several steps at once
         before, cpu_before = perf_counter(), process_time()
         for step in running:
             now = perf_counter()
-            times.append(now - before)
+            made, last = step.step - last, step.step
+            times += [(now - before) / made] * made
             newton += step.newton
             linear += step.linear
-            if len(times) == 2:  # the same on all ranks
+            if count is None and len(times) >= 2:  # the same on all ranks
                 count = comm.bcast(max(int(seconds / max(min(times), 1e-9)), _FEWEST))
-            if len(times) >= count:
+            if count is not None and len(times) >= count:
                 break
             before = perf_counter()
         cpu = (process_time() - cpu_before) / len(times)

@@ -18,7 +18,7 @@ MOST = 512
 """Steps of one call, at most: their sums are kept."""
 
 WORTH = 1000
-"""Fewest steps of a run for which the loop over steps is compiled, once, in some seconds."""
+"""Steps of a run for which the loop over steps is compiled: some seconds, once."""
 
 _FEWEST = 8  # steps that are worth one call
 _NODES = 50_000  # beyond, what Python needs between the loops is less than a hundredth, and memory counts
@@ -136,9 +136,15 @@ class Batch:
 
 
 class Batches:
-    """Finds the steps of a run that can be made together, and makes them."""
+    """Finds the steps of a run that can be made together, and makes them.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    worth : fewest steps of a run for which the loop over steps is compiled
+    """
+
+    def __init__(self, worth: int = WORTH) -> None:
+        self._worth = worth
         self._batch: Batch | None = None
         self._refused = False
 
@@ -155,7 +161,7 @@ class Batches:
         left = [simulation.meetings.steps_left(begin), end - begin]
         left += [every - begin % every for every in (output.fields_every, output.checkpoint_every) if every]
         count = min(*left, MOST + 1) - 1
-        if self._refused or count < _FEWEST or end < WORTH:
+        if self._refused or count < _FEWEST or end < self._worth:
             return
         if self._batch is None:
             self._refused = not Batch.serves(stepper)

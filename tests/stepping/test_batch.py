@@ -7,7 +7,6 @@ import pytest
 
 from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.errors import EarlyStop, SimulationFailure
-from pfem_petsc.stepping import batch
 
 LATTICE = {
     "mesh": {"generator": "lattice", "kind": "cubic", "cells": [2, 2, 2], "pitch": 0.01},
@@ -35,24 +34,18 @@ CASES = {
 }
 
 
-@pytest.fixture
-def at_once(monkeypatch):
-    """Short runs are made in batches too."""
-    monkeypatch.setattr(batch, "WORTH", 1)
-
-
 def case(changes, **time):
     return Case.from_dict(LATTICE | changes | {"time": LATTICE["time"] | time})
 
 
 def made(case, folder, together):
     simulation = Simulation(case, output=folder, quiet=True)
-    steps = list(simulation.batches() if together else simulation)
+    steps = list(simulation.batches(worth=1) if together else simulation)
     return simulation, len(steps)
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_batches_are_the_single_steps(name, at_once, tmp_path):
+def test_batches_are_the_single_steps(name, tmp_path):
     one, count = made(case(CASES[name]), tmp_path / "one", False)
     many, fewer = made(case(CASES[name]), tmp_path / "many", True)
     assert count == 600 and fewer < 100
@@ -68,29 +61,30 @@ def test_batches_are_the_single_steps(name, at_once, tmp_path):
 
 
 @pytest.mark.parametrize("other", ["chung_lee", "newmark"])
-def test_other_integrators_take_single_steps(other, at_once, tmp_path):
+def test_other_integrators_take_single_steps(other, tmp_path):
     _, count = made(case({}, integrator=other, end=2e-6), tmp_path / "out", True)
     assert count == 10
 
 
-def test_a_stopped_run_of_batches_goes_on_to_the_same_end(at_once, tmp_path, monkeypatch):
+def test_a_stopped_run_of_batches_goes_on_to_the_same_end(tmp_path):
     walls = CASES["yielding"]
     whole, _ = made(case(walls), tmp_path / "whole", True)
     simulation = Simulation(case(walls), output=tmp_path / "part", quiet=True)
     with pytest.raises(EarlyStop):
-        for step in simulation.batches():
+        for step in simulation.batches(worth=1):
             if step.step > 200:
                 simulation._stop._signal = 15
     assert 200 < simulation.state.step < 600
     rest = Simulation(case(walls), output=tmp_path / "part", restart=True, quiet=True)
-    rest.run()
+    for _ in rest.batches(worth=1):
+        pass
     np.testing.assert_array_equal(whole.state.x, rest.state.x)
     first, second = open_result(tmp_path / "whole"), open_result(tmp_path / "part")
     for column in first.history:
         np.testing.assert_array_equal(first.history[column], second.history[column], err_msg=column)
 
 
-def test_a_failure_is_that_of_single_steps(at_once, tmp_path):
+def test_a_failure_is_that_of_single_steps(tmp_path):
     crushed = {"initial": {"velocity": [0.0, 0.0, -2e4]}, "wall": [FLOOR]}
     texts, steps = [], []
     for together in (False, True):

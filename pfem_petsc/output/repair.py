@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -16,6 +18,9 @@ from .layout import PER_STEP, complete_rows, complete_snapshots, field_datasets
 from .provenance import read_attributes, write_case
 
 __all__ = ["reopen", "repair"]
+
+COPIED = 1 << 28
+"""Files up to this size [B] are repaired for a restart as a copy, which then takes the file's place."""
 
 
 def repair(path: Path | str, last: tuple[int, int] | None = None) -> tuple[int, int]:
@@ -46,12 +51,15 @@ def repair(path: Path | str, last: tuple[int, int] | None = None) -> tuple[int, 
         if last is not None:
             n_snapshots = int(np.searchsorted(file["snapshots/step"][:n_snapshots], last[0], side="right"))
             n_rows = int(np.searchsorted(history["step"][:n_rows], last[1], side="right"))
-        # VTK's reader crashes on more times than steps: the times go first.
+        # A kill in between leaves a file that VTK reads: it crashes on more times than steps, so the times go first; it
+        # finds nothing for steps without data, so the data go last.
         if len(steps["Values"]) > n_snapshots:
             grow(steps["Values"], n_snapshots)
         write_rows(steps["Values"], 0, file["snapshots/time"][: len(steps["Values"])])
         file.flush()
         steps.attrs.modify("NSteps", np.int64(n_snapshots))
+        history.attrs.modify("rows", np.int64(n_rows))
+        file.flush()
         for name in PER_STEP:
             grow(steps[name], n_snapshots)
         for name in ("step", "time"):
@@ -68,7 +76,6 @@ def repair(path: Path | str, last: tuple[int, int] | None = None) -> tuple[int, 
             grow(dataset, n_snapshots * n)
         for name in dataset_names(history):
             grow(history[name], n_rows)
-        history.attrs.modify("rows", np.int64(n_rows))
     fsync_all(path)
     return n_snapshots, n_rows
 
@@ -104,8 +111,41 @@ def reopen(
     InputError
         When the file is missing, damaged, or of another mesh, other fields or columns.
     """
-    n_snapshots, _ = repair(path, last)
-    with h5py.File(path, "r+", locking=False) as file:
+    size = path.stat().st_size if path.is_file() else 0
+    # A kill between the few writes that replace the case would leave a file that HDF5 cannot open; a copy costs little
+    # but where the file is large.
+    copied = 0 < size <= COPIED and shutil.disk_usage(path.parent).free > 2 * size
+    target = path.with_name(path.name + ".new") if copied else path
+    try:
+        if copied:
+            shutil.copyfile(path, target)
+        _reopen(path, target, after_step, last, sizes, fields, columns, case_text, attributes)
+        if copied:
+            fsync_all(target)
+            os.replace(target, path)
+    except InputError as error:
+        raise InputError(str(error).replace(str(target), str(path))) from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot be prepared for a restart: {error.strerror}; write elsewhere (-o)") from error
+    finally:
+        if copied:
+            target.unlink(missing_ok=True)
+
+
+def _reopen(
+    path: Path,
+    target: Path,
+    after_step: int,
+    last: tuple[int, int],
+    sizes: tuple[int, int],
+    fields: Mapping[str, list[str]],
+    columns: Mapping[str, tuple[int, ...]],
+    case_text: str,
+    attributes: Mapping[str, Any],
+) -> None:
+    """As :func:`reopen`, on the file ``target``; messages name ``path``."""
+    n_snapshots, _ = repair(target, last)
+    with h5py.File(target, "r+", locking=False) as file:
         vtk = file["VTKHDF"]
         has = (int(vtk["NumberOfPoints"][0]), int(vtk["NumberOfCells"][0]))
         if has != sizes:

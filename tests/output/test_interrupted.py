@@ -113,6 +113,28 @@ def written(path, steps=range(23)):
     return truss
 
 
+def test_repair_killed_between_its_flushes_leaves_a_file_that_vtk_reads(tmp_path, monkeypatch):
+    """Times never outnumber steps, nor steps or rows what they count: what is counted goes last."""
+    path = tmp_path / "result.vtkhdf"
+    written(path)
+    states = []
+    flush = h5py.File.flush
+
+    def watched(file):
+        flush(file)
+        steps, rows = file["VTKHDF/Steps"], file["history"].attrs["rows"]
+        data = min(
+            len(file["VTKHDF/Points"]) // 23, len(file["VTKHDF/CellData/stress"]) // 41, len(file["snapshots/time"])
+        )
+        states.append((len(steps["Values"]), int(steps.attrs["NSteps"]), data, int(rows), len(file["history/time"])))
+
+    monkeypatch.setattr(h5py.File, "flush", watched)
+    assert repair(path, (8, 8)) == (2, 9)
+    assert states[0][0] == 2
+    assert states[0][1:] == (5, 5, 23, 23)
+    assert states[1] == (2, 2, 5, 9, 23)
+
+
 def longer_values(file):
     file["VTKHDF/Steps/Values"].resize(6, axis=0)
 

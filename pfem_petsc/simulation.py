@@ -11,6 +11,7 @@ from mpi4py import MPI
 
 from .errors import EarlyStop, PfemError, SimulationFailure
 from .mechanics.compiled import Compilation
+from .output.opening import open_progress, open_result_file
 from .output.progress import Progress
 from .output.row import Row
 from .output.units import engineering
@@ -20,7 +21,7 @@ from .preflight.forecast import forecast
 from .preflight.inspection import inspect, warnings_before
 from .preflight.summary import summarise
 from .restart.checkpoints import Checkpoints
-from .restart.folder import RESULT, Restart, find_restart, finished, prepare_folder
+from .restart.folder import Restart, find_restart, finished, prepare_folder
 from .restart.stop import Meetings, StopRequest
 from .stepping.batch import WORTH, Batches
 from .stepping.blowup import BlowUp
@@ -88,7 +89,7 @@ class Simulation:
         self.quiet = quiet
         found = find_restart(case, self.comm, self.folder, None if check_only else restart)
         self.restart = found if isinstance(found, Restart) else None
-        self._notes = [found] if isinstance(found, str) else []
+        self.notes = [found] if isinstance(found, str) else []
         with self._compilation:
             self._prepare()
 
@@ -97,7 +98,7 @@ class Simulation:
         self.model = Model(case, self.comm)
         self.plan = make_plan(self.model, self.restart.attributes["plan"] if self.restart is not None else None)
         self.finished = False
-        if self.restart is not None and self.restart.continues or self._notes:
+        if self.restart is not None and self.restart.continues or self.notes:
             self.finished = finished(case, self.comm, self.folder, self.plan.step * self.plan.steps)
         self.model.contact.check_start(self.model.mesh.points[: self.model.mesh.n_owned], self.model.length)
         self.stepper = make_stepper(self.model, self.plan)
@@ -143,25 +144,7 @@ class Simulation:
             # before anything in the folder changes: it may be refused
             checkpoint = self._checkpoints.take_back(self.restart)
         aside = prepare_folder(self.comm, self.folder, self.restart)
-        self._progress = Progress(
-            self.comm,
-            self.case.title,
-            self.plan.steps,
-            self.plan.step * self.plan.steps,
-            self.quiet,
-            self.folder / "log.txt",
-            start_step=self.state.step,
-            start_time=self.state.time,
-        )
-        self._progress.summary(self.summary())
-        for warning in self.model.warnings + warnings_before(self.case, self.model, self.plan):
-            self._progress.warning(warning)
-        if self.plan.scheme.notice:
-            self._progress.message(self.plan.scheme.notice)
-        for note in self._notes:
-            self._progress.message(note)
-        if aside is not None:
-            self._progress.message(f"{self.folder}: held results, which are in {aside} now")
+        self._progress = open_progress(self, aside)
         if self.restart is None:
             self.stepper.start()
             self.meet()
@@ -182,37 +165,10 @@ class Simulation:
                 f"restart from {self.restart.path}: step {self.state.step}, t = {engineering(self.state.time, 's')}"
                 + changes
             )
-        self._writer = ResultWriter(
-            self.folder / RESULT,
-            self.comm,
-            self.mesh,
-            point_fields=self.fields.points,
-            cell_fields=self.fields.cells,
-            columns=self.recorder.columns,
-            column_types=self.recorder.types,
-            case_text=self.case.to_toml(),
-            attributes=self._attributes(),
-            precision=self.case.output.precision,
-            append_after_step=self.state.step if continues else None,
-            last=self.restart.last if continues else None,
-        )
+        self._writer = open_result_file(self, continues)
         if not continues:
             self._record()
             self._snapshot()
-
-    def _attributes(self) -> dict[str, Any]:
-        plan = self.plan
-        attributes: dict[str, Any] = {
-            "name": self.case.name,
-            "folder": str(self.case.folder.resolve()),
-            "time_step": plan.step,
-            "steps": plan.steps,
-            "linear_solver": plan.linear.why if plan.linear is not None else "none",
-            "partitioner": self.mesh.partitioner,
-        }
-        for name, nodes in self.recorder.probe_nodes.items():
-            attributes[f"probe_nodes/{name}"] = nodes.tolist()
-        return attributes
 
     def __iter__(self) -> Iterator[Step]:
         """Run step by step; the output is closed when the iteration ends."""

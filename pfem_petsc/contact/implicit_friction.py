@@ -90,7 +90,7 @@ class StepFriction:
         noise : force that counts as none [N]
         tolerance : of the forces [N]
         """
-        nodes = frames.nodes
+        nodes, contact = frames.nodes, self.contact
         strengths = strengths.copy()
         self.drag = np.zeros((*strengths.shape, 3))
         at = np.flatnonzero(self._rough(frames))
@@ -98,7 +98,8 @@ class StepFriction:
         moved, pressing, drag, stiffness = self._local(frames, at, x[at], reaction[at], slipping)
         self._forces[nodes[at]] = drag.sum(axis=1)
         apart = stiffness * np.linalg.norm(moved - x[at], axis=1)
-        floor = 1e-14 * stiffness * np.abs(x[at]).sum(axis=1)
+        # rounding of positions, and of the frames' coordinates on the way to them
+        floor = 2e-14 * stiffness * (np.abs(x[at]).sum(axis=1) + contact.length)
         kept = apart <= np.maximum(max(tolerance, 2.0 * noise), floor)
         wrong = np.flatnonzero(~kept)
         if len(wrong):

@@ -6,7 +6,9 @@ A file that is no mesh of bars: status 3 and the reason on stdout.
 
 from __future__ import annotations
 
+import resource
 import sys
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,6 +23,11 @@ def main(path: str, result: str) -> int:
     """Read ``path``, write ``points``, ``bars`` and ``node_groups/<name>``, ``bar_groups/<name>`` to ``result``."""
     from vtkmodules.vtkCommonCore import vtkOutputWindow, vtkStringOutputWindow
 
+    # a damaged file can ask for any memory, and filling that takes a machine's time: compressed files need 200 times
+    # their size at most, arrays and copies included
+    _, most = resource.getrlimit(resource.RLIMIT_AS)
+    enough = (4 << 30) + 200 * Path(path).stat().st_size
+    resource.setrlimit(resource.RLIMIT_AS, (enough if most == resource.RLIM_INFINITY else min(enough, most), most))
     listener = vtkStringOutputWindow()
     vtkOutputWindow.SetInstance(listener)
     reader = _reader(path)

@@ -26,7 +26,7 @@ def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
     """
     n = parameters.elements
     check_size(n + 1, "mesh.elements")
-    check_length(parameters.length / n, "mesh.length / mesh.elements")
+    check_length(parameters.length / n, "mesh.length (over mesh.elements)")
     first_node, last_node = slab_range(n + 1, rank, size)
     first_bar, last_bar = slab_range(n, rank, size)
     points = np.zeros((last_node - first_node, 3))

@@ -28,7 +28,7 @@ def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
     """
     n = parameters.elements
     check_size(2 * (n + 1), "mesh.elements")
-    check_length(parameters.length / n, "mesh.length / mesh.elements")
+    check_length(parameters.length / n, "mesh.length (over mesh.elements)")
     first_node, last_node = slab_range(2 * (n + 1), rank, size)
     first_bar, last_bar = slab_range(2 * n, rank, size)
     numbers = np.arange(first_node, last_node)

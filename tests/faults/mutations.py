@@ -18,7 +18,9 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "mesh"))
 from samples import GMSH, write_hdf5, write_vtk  # noqa: E402
 
 # What a refusal names besides the file: of a case a key or a line, of a mesh a section, line, dataset, node or bar.
-OF_A_CASE = re.compile(r"line \d+|end of document|^(no |the table )?\[|^[\w.\[\]\"'\\-]+( = | \(|: )|^\.\.\. and|^wall '")
+OF_A_CASE = re.compile(
+    r"line \d+|end of document|^(no |the table )?\[|^[\w.\[\]\"'\\-]+( = | \(|: )|^\.\.\. and|^wall '"
+)
 OF_A_MESH = re.compile(r"section \$|line \d+|/\w+|node \d|bar \d|\$MeshFormat|the name of a section")
 
 LIMIT = 60  # seconds that a check may take, on a machine with other work

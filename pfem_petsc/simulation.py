@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from mpi4py import MPI
 
-from .errors import EarlyStop, PfemError, SimulationFailure
+from .errors import EarlyStop, InputError, PfemError, SimulationFailure
 from .mechanics.compiled import Compilation
 from .output.opening import open_progress, open_result_file
 from .output.progress import Progress
@@ -188,6 +188,11 @@ class Simulation:
             yield from self._steps(Batches(worth))
 
     def _steps(self, batches: Batches | None = None) -> Iterator[Step]:
+        if self._started and self._writer is None and self.state.step < self.plan.steps:
+            raise InputError(
+                f"{self.folder}: the results of this simulation were closed at step {self.state.step}, when its "
+                "iteration ended; go on with a new Simulation with restart=True, from a checkpoint"
+            )
         try:
             self.start()
             self._stop_early(self.meet())
@@ -224,7 +229,7 @@ class Simulation:
             On all ranks; what was recorded before is in the result file.
         """
         if self.finished and self.comm.rank == 0 and not self.quiet:
-            print(f"{self.folder}: finished already: the results reach t = {engineering(self.case.time.end, 's')}")
+            print(f"{self.folder}: finished already: the results have t = {engineering(self.case.time.end, 's')}")
         for _ in self.batches():
             pass
         return 0

@@ -22,11 +22,11 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "restart"))
 
-from kills import KINDS, VtkReader, assert_readable, differences, killed, run  # noqa: E402
+from kills import KINDS, LEFT_OVER, VtkReader, assert_readable, differences, killed, run  # noqa: E402
 
 EVERY = (7, 40, 1000)  # steps between checkpoints: many, some, none before the end
 MOST = 4  # kills of a run before it is let go on to its end
-COUNTED = ("kills", "before 1st checkpoint", "runs", "unreadable", "different", "failed")
+COUNTED = ("kills", "before 1st checkpoint", "runs", "launcher left", "unreadable", "different", "failed")
 
 
 def main() -> int:
@@ -90,6 +90,7 @@ def _one_run(
         if how == "done before":
             break
         count["kills"] += 1
+        count["launcher left"] += LEFT_OVER in how
         count["before 1st checkpoint"] += not (work / "checkpoint.h5").exists()
         for path in folder.glob("killed*/result.vtkhdf"):
             try:

@@ -102,7 +102,10 @@ def _put(data: dict[str, Any], parts: list[str], value: Any, where: str) -> tupl
         last = k == len(parts) - 1
         if isinstance(here, list):
             if not part.isdigit() or int(part) > len(here):
-                raise InputError(f"{where}: {part!r} is not one of the places of this list: 0 to {len(here)}")
+                raise InputError(
+                    f"{where}: {part!r} is not one of the places of this list: 0 to {len(here)}, of which the last is "
+                    "for a new one"
+                )
             key: str | int = int(part)
             if key == len(here):
                 here.append({})

@@ -39,12 +39,12 @@ class WallMotion:
             shifts[self.free.at] = self.free.displacements(time)
         return shifts
 
-    def rates(self, time: float) -> np.ndarray:
-        """Velocities (w, 3) [m/s] at a time [s]; in a table's kinks, that before."""
+    def rates(self, time: float, ahead: bool = False) -> np.ndarray:
+        """Velocities (w, 3) [m/s] at a time [s]; in a table's kinks that before, or that ahead."""
         rates = self._velocities.copy()
         for k, table in enumerate(self._tables):
             if table is not None:
-                row = np.searchsorted(table.times, time) - 1
+                row = np.searchsorted(table.times, time, side="right" if ahead else "left") - 1
                 inside = 0 <= row < len(table.times) - 1
                 if inside:
                     rates[k] = np.diff(table.values[row : row + 2], axis=0)[0] / np.diff(table.times[row : row + 2])

@@ -44,7 +44,7 @@ def start_at_rest(model, state, accelerate: Callable[[np.ndarray], np.ndarray], 
     """
     contact, comm, mass = model.contact, model.comm, model.inertia.mass
     x, v = state.position, state.v
-    shifts, rates = contact.motion.shifts(state.time), contact.motion.rates(state.time)
+    shifts, rates = contact.motion.shifts(state.time), contact.motion.rates(state.time, ahead=True)
     slack = _SLACK * model.length
     nodes = np.flatnonzero(contact.near(x, shifts, np.array([slack])))
     concerned = contact.members[nodes]
@@ -122,7 +122,7 @@ def _rub(contact, nodes, v, rates, slack, weight, a, normals, planes, pressing, 
         add_friction(
             moved,
             -factor * v[nodes[part]],
-            -factor * rates,
+            factor * rates,
             contact.fixed[nodes[part]],
             normals[part],
             planes[part],

@@ -16,7 +16,7 @@ def warnings_before(case, model, plan) -> list[str]:
     """What looks wrong and is cheap to find: for every start. Collective."""
     texts = odd_numbers(case, model) + memory_warning(case, model, plan) + wall_gaps(model)[1]
     count, nodes, first = count_parts(model.mesh)
-    if count > 1:
+    if count > 1 and model.pairs is None:  # pairs are between bodies
         texts.append(
             f"the truss is in {count} parts that no bar connects; the smallest has {nodes} nodes, node {first} among "
             "them"

@@ -22,9 +22,15 @@ def wall_gaps(model) -> tuple[dict[str, str], list[str]]:
     fastest = max(comm.allgather(float(np.abs(v).max(initial=0.0))))
     ahead = 1e-6 * model.length / fastest if fastest > 0.0 else 1e-9
     now, then = contact.gaps(points, 0.0), contact.gaps(points + ahead * v, ahead)
+    free = contact.motion.free
+    if free is not None:  # not under way yet: the nodes' way as these walls see it
+        for k, speed in zip(free.at, free.state.v, strict=True):
+            seen = contact.gap(k, points + ahead * (v - speed), contact.motion.shifts(0.0))
+            then[:, k] = np.where(contact.members[:, k], seen, np.inf)
     with np.errstate(invalid="ignore"):
         rate = (then - now) / ahead
-    pushed = model.external.active or contact.moving.any()  # a wall that moves may push the truss against another
+    # a wall that moves, or the other node of a pair, may push the truss against this one
+    pushed = model.external.active or contact.moving.any() or model.pairs is not None
     for k, name in enumerate(contact.names):
         at = int(np.argmin(now[:, k])) if len(now) else -1
         mine = (float(now[at, k]), int(mesh.node_ids[at])) if at >= 0 else (np.inf, -1)

@@ -122,14 +122,14 @@ class Batch:
         stepper.energy = StrainEnergy(*energies[1:], failed)
         nothing = self.model.contact.nothing
         stepper.solution = Solution(u, state.f, WallForces(*touched) if walls else nothing, contacts=len(touched[3]))
-        stepper.balance = scheme.balance(state, stepper.h)
         state.step, state.time = begin + done - 1, (begin + done) * stepper.h
+        stepper.balance = scheme.balance(state, stepper.h)
         if failed >= 0 or turned >= 0:
             stepper.fault = SimulationFailure(stepper.collapse(max(failed, turned)))
-        state.step += 1
-        if stuck >= 0 and stepper.fault is None:
+        elif stuck >= 0:
             text = self.model.contact.no_room(touched[3][stuck], offsets[stuck])
             stepper.fault = SimulationFailure(f"{stepper.when(stepper.balance)}: {text}")
+        state.step += 1
         ledger.resume(energies[0])
         flags = self.sums[:done, 24 : 24 + 12 * walls].reshape(done, walls, 12)[:, :, 9] > 0.0
         return done, flags

@@ -34,6 +34,11 @@ class BlowUp:
         """
         held = row["kinetic_energy"] + row["elastic_energy"]
         when = f"step {state.step}, t = {state.time:.6g} s"
+        if not np.isfinite(held) and state.step == 0:
+            raise SimulationFailure(
+                f"{when}: the energy is not finite at the start{self._where(state)}: correct loads, velocities and "
+                "material (SI units)"
+            )
         if not np.isfinite(held):
             raise SimulationFailure(
                 f"{when}: the energy is not finite: the motion blew up{self._where(state)}; take a smaller time.step"

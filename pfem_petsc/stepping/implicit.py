@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import atexit
+import gc
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -20,6 +22,10 @@ from ..solvers.matrix_free import MatrixFreeHessian
 from ..solvers.newton import NewtonReport, NewtonSolver
 from .problem import StepProblem
 from .stepper import NotConverged, Solution, Stepper
+
+# What PETSc holds when it is finalised, after Python, cannot call Python any more: matrices and preconditioners of
+# ours that wait in cycles of references are let go before.
+atexit.register(gc.collect)
 
 __all__ = ["ImplicitStepper"]
 

@@ -135,3 +135,34 @@ def test_rods_in_a_pile_stay_there(scheme, comm, shared_tmp_path):
         assert row["wall/floor/force"] == pytest.approx([0.0, 0.0, 2.0 * weight], rel=1e-8)
         assert row["active_contacts"] == 10
     assert np.abs(run.state.v).max(initial=0.0) < 1e-12
+
+
+BELTS = {
+    "velocity": [{"velocity": [1.0, 0.0, 0.0]}, 1.0],
+    "backwards": [{"velocity": [-1.0, 0.0, 0.0]}, -1.0],
+    "table": [{"motion": [[0.0, 0.0, 0.0, 0.0], [1.0, 1.0, 0.0, 0.0]]}, 1.0],
+}
+
+
+@pytest.mark.parametrize("belt", BELTS)
+@pytest.mark.parametrize("scheme", ["central_differences", "newmark", "generalized_alpha", "energy_momentum"])
+def test_a_block_on_a_belt_is_dragged_along_from_the_start(scheme, belt, comm, shared_tmp_path):
+    """With v = mu g t until it has the belt's speed."""
+    keys, direction = BELTS[belt]
+    floor = {"name": "belt", "type": "plane", "point": [0, 0, 0], "normal": [0.0, 0.0, 1.0], "friction": 0.3}
+    data = {
+        "mesh": {"generator": "rod", "length": 0.1, "elements": 2},
+        "material": {"it": {"young_modulus": 1e6, "density": 1000.0}},
+        "section": {"it": {"area": 1e-2, "material": "it"}},
+        "gravity": {"acceleration": [0.0, 0.0, -GRAVITY]},
+        "wall": [floor | keys],
+        "time": {"integrator": scheme, "step": 1e-3, "end": 0.1},
+        "output": {"fields_every": 0},
+        "solver": {"rtol": 1e-12},
+    }
+    run = Simulation(Case.from_dict(data), comm, output=shared_tmp_path / "it", quiet=True)
+    run.start()
+    first = run.row
+    assert first["wall/belt/force"] == pytest.approx([direction * 0.3 * GRAVITY, 0.0, GRAVITY], rel=1e-9, abs=1e-9)
+    last = [step.row for step in run][-1]
+    assert last["momentum"][0] == pytest.approx(direction * 0.3 * GRAVITY * 0.1, rel=1e-2)

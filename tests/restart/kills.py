@@ -84,6 +84,10 @@ def processes_of(process: subprocess.Popen, ranks: int) -> list[int]:
     return found
 
 
+LEFT_OVER = ", and the launcher did not notice"
+"""mpirun of Open MPI 4 was seen, once in a hundred, not to reap the rank that was killed; it is killed then too."""
+
+
 def killed(
     kind: Kind,
     ranks: int,
@@ -122,8 +126,12 @@ def killed(
         pids = processes_of(process, ranks)
         for pid in pids if chance.random() < 0.5 else pids[:1]:
             os.kill(pid, signal.SIGKILL)
-        process.wait(timeout=60.0)
-        return f"killed {process_time:.3f} s after {'the first words' if steps_only else 'the start'} ({started:.2f} s)"
+        how = f"killed {process_time:.3f} s after {'the first words' if steps_only else 'the start'} ({started:.2f} s)"
+        try:
+            process.wait(timeout=30.0)
+        except subprocess.TimeoutExpired:
+            how += LEFT_OVER
+        return how
     finally:
         if process.poll() is None:
             os.killpg(process.pid, signal.SIGKILL)

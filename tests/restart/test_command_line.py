@@ -57,7 +57,7 @@ def test_finished_run(tmp_path, capsys, every):
     before = (tmp_path / "done" / "result.vtkhdf").read_bytes()
     capsys.readouterr()
     assert main([*words, "--restart"]) == 0
-    assert "finished already: the results reach t = 500.0 ms" in capsys.readouterr().out
+    assert "finished already: the results have t = 500.0 ms" in capsys.readouterr().out
     assert (tmp_path / "done" / "result.vtkhdf").read_bytes() == before
     assert [path.name for path in tmp_path.iterdir()] == ["done"]
 

@@ -3,6 +3,9 @@
 All ranks run the same tests in step. The outcome of each phase of a test (set-up, call, tear-down) is agreed on, so a
 failure on one rank is a failure everywhere, with that rank's report. A rank that waits for the others too long, as
 when one of them left a collective call early by an exception, says so and ends the run. Only rank 0 prints.
+
+On three ranks and more, which share two cores, tests with many sets of parameters run every third of them
+(``--all-sets``: all).
 """
 
 from __future__ import annotations
@@ -34,6 +37,14 @@ settings.register_profile("ranks", derandomize=True, deadline=None, database=Non
 settings.load_profile("ranks")
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--all-sets",
+        action="store_true",
+        help="on three ranks and more: all sets of parameters of each test, not every third",
+    )
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_configure(config: pytest.Config) -> None:
     if AGREEMENT is not None:
@@ -63,10 +74,21 @@ def pytest_unconfigure(config: pytest.Config) -> None:
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     if AGREEMENT is None:
         return
-    serial = [item for item in items if item.get_closest_marker("parallel") is None]
-    if serial:
-        config.hook.pytest_deselected(items=serial)
-        items[:] = [item for item in items if item.get_closest_marker("parallel") is not None]
+    kept = [item for item in items if item.get_closest_marker("parallel") is not None]
+    if WORLD.size > 2 and not config.option.all_sets:
+        kept = thinned(kept)
+    chosen = set(kept)
+    config.hook.pytest_deselected(items=[item for item in items if item not in chosen])
+    items[:] = kept
+
+
+def thinned(items: list[pytest.Item]) -> list[pytest.Item]:
+    """Every test function, of those with more than three sets of parameters every third set."""
+    sets: dict[tuple[Path, str], list[pytest.Item]] = {}
+    for item in items:
+        sets.setdefault((item.path, getattr(item, "originalname", item.name)), []).append(item)
+    chosen = {item for group in sets.values() for item in (group if len(group) <= 3 else group[::3])}
+    return [item for item in items if item in chosen]
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -111,15 +112,41 @@ def reopen(
     InputError
         When the file is missing, damaged, or of another mesh, other fields or columns.
     """
+    with _replaced(path) as target:
+        n_snapshots, _ = repair(target, last)
+        with h5py.File(target, "r+", locking=False) as file:
+            vtk = file["VTKHDF"]
+            has = (int(vtk["NumberOfPoints"][0]), int(vtk["NumberOfCells"][0]))
+            if has != sizes:
+                raise InputError(
+                    f"{path}: has {has[0]} nodes and {has[1]} bars, the case has {sizes[0]} and {sizes[1]}: it was "
+                    "written with another mesh; restart the case it belongs to, or write elsewhere (-o)"
+                )
+            for kind, names in fields.items():
+                if n_snapshots and sorted(vtk[kind]) != names:
+                    raise InputError(
+                        f"{path}: has the fields {', '.join(sorted(vtk[kind])) or 'none'} ({kind}), the case asks for "
+                        f"{', '.join(names) or 'none'}: keep [output] fields as it was, or write elsewhere (-o)"
+                    )
+            check_columns(file, path, columns)
+            earlier = list(read_attributes(file["case"]).get("restarts_after_step", []))
+            write_case(file, case_text, {**attributes, "restarts_after_step": [*earlier, after_step]})
+
+
+@contextmanager
+def _replaced(path: Path) -> Iterator[Path]:
+    """The file to work on for a restart, which takes the place of ``path`` in the end; messages name that.
+
+    A kill between the few writes that replace the case would leave a file that HDF5 cannot open; a copy costs little
+    but where the file is large: that one is worked on itself.
+    """
     size = path.stat().st_size if path.is_file() else 0
-    # A kill between the few writes that replace the case would leave a file that HDF5 cannot open; a copy costs little
-    # but where the file is large.
     copied = 0 < size <= COPIED and shutil.disk_usage(path.parent).free > 2 * size
     target = path.with_name(path.name + ".new") if copied else path
     try:
         if copied:
             shutil.copyfile(path, target)
-        _reopen(path, target, after_step, last, sizes, fields, columns, case_text, attributes)
+        yield target
         if copied:
             fsync_all(target)
             os.replace(target, path)
@@ -130,35 +157,3 @@ def reopen(
     finally:
         if copied:
             target.unlink(missing_ok=True)
-
-
-def _reopen(
-    path: Path,
-    target: Path,
-    after_step: int,
-    last: tuple[int, int],
-    sizes: tuple[int, int],
-    fields: Mapping[str, list[str]],
-    columns: Mapping[str, tuple[int, ...]],
-    case_text: str,
-    attributes: Mapping[str, Any],
-) -> None:
-    """As :func:`reopen`, on the file ``target``; messages name ``path``."""
-    n_snapshots, _ = repair(target, last)
-    with h5py.File(target, "r+", locking=False) as file:
-        vtk = file["VTKHDF"]
-        has = (int(vtk["NumberOfPoints"][0]), int(vtk["NumberOfCells"][0]))
-        if has != sizes:
-            raise InputError(
-                f"{path}: has {has[0]} nodes and {has[1]} bars, the case has {sizes[0]} and {sizes[1]}: it was written "
-                "with another mesh; restart the case it belongs to, or write elsewhere (-o)"
-            )
-        for kind, names in fields.items():
-            if n_snapshots and sorted(vtk[kind]) != names:
-                raise InputError(
-                    f"{path}: has the fields {', '.join(sorted(vtk[kind])) or 'none'} ({kind}), the case asks for "
-                    f"{', '.join(names) or 'none'}: keep [output] fields as it was, or write elsewhere (-o)"
-                )
-        check_columns(file, path, columns)
-        earlier = list(read_attributes(file["case"]).get("restarts_after_step", []))
-        write_case(file, case_text, {**attributes, "restarts_after_step": [*earlier, after_step]})

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import hashlib
+import pickle
 import time
 import warnings
 from collections.abc import Callable
-from functools import cache
-from pathlib import Path
+from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
 import numba
+import numpy as np
 from numba.core import event
+from numba.core.caching import IndexDataCacheFile
+from numba.core.dispatcher import Dispatcher
 from numba.extending import register_jitable
 
-__all__ = ["Compilation", "inlined", "kernel"]
+__all__ = ["Compilation", "code_digest", "inlined", "kernel"]
 
 # Neither contraction to fused multiply-add nor reassociation: what a loop gives must not depend on how it was compiled,
 # alone or into a loop over steps, for one bar or for eight at once, so that a bar evaluated on two ranks has the same
@@ -37,8 +41,9 @@ def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
         )
         return numba.njit(**options)(function)
     file = getattr(getattr(compiled, "_cache", None), "_cache_file", None)
-    if file is not None:
-        file._source_stamp = (file._source_stamp, _stamp())
+    if isinstance(file, IndexDataCacheFile):
+        file.__class__ = _CacheFile
+        file._function = function
     return compiled
 
 
@@ -47,13 +52,102 @@ def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
     return register_jitable(fastmath=_FAST, error_model="numpy")(function)
 
 
-@cache
-def _stamp() -> tuple[float, int]:
-    """Newest time and total size of the files whose functions are compiled into loops of other files: Numba itself asks
-    only for the file of the loop, and would go on with what was compiled before those changed."""
-    package = Path(__file__).resolve().parent.parent
-    states = [path.stat() for folder in ("mechanics", "contact") for path in (package / folder).rglob("*.py")]
-    return max(state.st_mtime for state in states), sum(state.st_size for state in states)
+class _CacheFile(IndexDataCacheFile):
+    """Index of the machine code of one loop on disk: valid for the code that it was compiled from, wherever that is.
+
+    Numba's own stamp is time and size of the loop's file: it keeps machine code whose inlined functions have changed in
+    other files, and drops it when a comment has.
+    """
+
+    _function: Callable[..., Any]
+    _digest: str | None = None
+
+    @property
+    def _source_stamp(self) -> str:
+        # not when the loop is defined: functions below it in its file do not exist yet
+        if self._digest is None:
+            self._digest = code_digest(self._function)
+        return self._digest
+
+    @_source_stamp.setter
+    def _source_stamp(self, stamp: Any) -> None:
+        """Numba's own stamp is not used."""
+
+    def _load_index(self) -> dict[Any, str]:
+        try:
+            return super()._load_index()
+        except (pickle.UnpicklingError, EOFError, ValueError, TypeError, AttributeError, IndexError, ImportError):
+            return {}  # truncated or damaged: compiled anew and overwritten
+
+    def load(self, key: Any) -> Any:
+        try:
+            return super().load(key)
+        except (pickle.UnpicklingError, EOFError, ValueError, TypeError, AttributeError, IndexError, ImportError):
+            return None
+
+    def save(self, key: Any, data: Any) -> None:
+        try:
+            super().save(key, data)
+        except OSError as error:
+            warnings.warn(f"compiled code cannot be kept for the next start: {error}", stacklevel=2)
+
+
+def code_digest(function: Callable[..., Any]) -> str:
+    """Digest of the byte code of a function and of all that it refers to: functions, constants, types of records.
+
+    Machine code depends on nothing else of the program; compiled functions that are called are followed as well.
+    """
+    digest = hashlib.sha256()
+    seen: set[int] = set()
+
+    def code(part: CodeType) -> None:
+        digest.update(part.co_code)
+        digest.update(repr((part.co_names, part.co_varnames, part.co_freevars)).encode())
+        for constant in part.co_consts:
+            value(constant)
+
+    def value(thing: Any) -> None:
+        if isinstance(thing, CodeType):
+            code(thing)
+        elif isinstance(thing, Dispatcher):
+            value(thing.py_func)
+        elif isinstance(thing, FunctionType):
+            if id(thing) in seen:
+                return
+            seen.add(id(thing))
+            called = thing.__code__
+            code(called)
+            for cell in thing.__closure__ or ():
+                value(cell.cell_contents)
+            for name in _global_names(called):
+                if name in thing.__globals__:
+                    digest.update(name.encode())
+                    value(thing.__globals__[name])
+        elif isinstance(thing, np.ndarray):
+            digest.update(repr((thing.shape, thing.dtype)).encode() + thing.tobytes())
+        elif isinstance(thing, ModuleType):
+            digest.update(thing.__name__.encode())
+        elif isinstance(thing, type):
+            digest.update(repr((thing.__qualname__, getattr(thing, "_fields", ()))).encode())
+        elif isinstance(thing, (tuple, list, frozenset)):
+            for part in sorted(thing, key=repr) if isinstance(thing, frozenset) else thing:
+                value(part)
+        elif isinstance(thing, (bool, int, float, complex, str, bytes, type(None), type(...), np.generic)):
+            digest.update(repr(thing).encode())
+        else:
+            digest.update(type(thing).__qualname__.encode())
+
+    value(function)
+    return digest.hexdigest()
+
+
+def _global_names(code: CodeType) -> set[str]:
+    """Names that a function and those nested in it may look up globally."""
+    names = set(code.co_names)
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            names |= _global_names(constant)
+    return names
 
 
 class Compilation(event.Listener):

@@ -1,5 +1,6 @@
 """Loops that are compiled by a process are noticed, those that are loaded are not, and a run says so."""
 
+import importlib
 import sys
 
 import numba
@@ -64,3 +65,41 @@ def test_run_says_that_it_compiles(tmp_path, monkeypatch, capsys):
     Simulation(Case.load("rod_impact", ["time.end=0.2"]), output=tmp_path / "it").run()
     said = capsys.readouterr().out
     assert said.count("compiling loops for this machine, once") == 1
+
+
+def test_machine_code_is_never_older_than_what_a_loop_inlines(tmp_path, monkeypatch):
+    """A function in a file of its own changes: the loop that compiles it in gives the new value."""
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    names = ("inlined_by_a_test", "loop_of_a_test")
+    (tmp_path / "loop_of_a_test.py").write_text(
+        "from pfem_petsc.mechanics.compiled import kernel\nfrom inlined_by_a_test import law\n"
+        "\n@kernel\ndef loop(x):\n    return law(x)\n"
+    )
+
+    def result(body: str) -> tuple[float, int]:
+        source = f"from pfem_petsc.mechanics.compiled import inlined\nFACTOR = 2.0\n@inlined\ndef law(x):\n    {body}\n"
+        (tmp_path / "inlined_by_a_test.py").write_text(source)
+        for name in names:
+            sys.modules.pop(name, None)
+        importlib.invalidate_caches()
+        took = []
+        with Compilation(lambda: None, took.append):
+            value = importlib.import_module("loop_of_a_test").loop(3.0)
+        return value, len(took)
+
+    assert result("return FACTOR * x") == (6.0, 1)
+    assert result("return FACTOR * x  # a comment changes nothing") == (6.0, 0)
+    assert result("return FACTOR + x") == (5.0, 1)
+    for name in names:
+        sys.modules.pop(name, None)
+
+
+@pytest.mark.parametrize("suffix", ["nbi", "nbc"])
+def test_damaged_machine_code_is_compiled_anew(module, tmp_path, suffix):
+    assert module().outer(3.0) == 7.0
+    damaged = [path for path in tmp_path.rglob(f"*.{suffix}") if "outer" in path.name]
+    assert damaged
+    for path in damaged:
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    assert module().outer(3.0) == 7.0

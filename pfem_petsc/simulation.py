@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import weakref
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -94,6 +94,7 @@ class Simulation:
         self.comm = comm if comm is not None else MPI.COMM_WORLD
         self.folder = Path(output) if output is not None else Path("results") / case.name
         self.quiet = quiet
+        self.on_steps: list[tuple[Callable[[Step], object], int]] = []
         self._closed = False
         self._lock = FolderLock(self.folder)
         weakref.finalize(self, _let_go, self._stop, self._lock)
@@ -153,7 +154,9 @@ class Simulation:
 
     def _usable(self) -> None:
         if self._closed:
-            raise InputError(f"{self.folder}: this simulation was closed; go on with a new Simulation with restart=True")
+            raise InputError(
+                f"{self.folder}: this simulation was closed; go on with a new Simulation with restart=True"
+            )
 
     @property
     def finished(self) -> bool:
@@ -182,6 +185,23 @@ class Simulation:
         entries, warnings = inspect(self.case, self.model)
         entries |= forecast(self.case, self.model, self.plan, self.fields, recorder.columns, recorder.types)
         return entries, self.model.warnings + warnings_before(self.case, self.model, self.plan) + warnings
+
+    def on_step(self, function: Callable[[Step], object], every: int = 1) -> None:
+        """Have a function called on all ranks after each step whose number is a multiple of ``every``.
+
+        It gets the finished :class:`Step` and may look at :attr:`state` and call what is collective; what it gives is
+        not looked at. With ``every`` large, :meth:`run` still makes the steps between by one compiled call. Functions
+        are called in the order in which they were given.
+
+        Raises
+        ------
+        InputError
+            ``every`` is not a positive whole number.
+        """
+        self._usable()
+        if not isinstance(every, int | np.integer) or isinstance(every, bool) or every < 1:
+            raise InputError(f"on_step: every = {every!r}: give a positive whole number of steps")
+        self.on_steps.append((function, int(every)))
 
     @staged
     def start(self) -> None:
@@ -326,7 +346,11 @@ class Simulation:
         self._progress.update(
             step, self.state.time, stepper.h, solution.newton, solution.linear, self.row["active_contacts"], drift
         )
-        return Step(step, self.state.time, solution.newton, solution.linear, row)
+        made = Step(step, self.state.time, solution.newton, solution.linear, row)
+        for function, every in self.on_steps:
+            if step % every == 0:
+                function(made)
+        return made
 
     def _book(self) -> None:
         """Energies and iterations of a step, or of each part of a halved one."""

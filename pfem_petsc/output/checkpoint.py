@@ -35,7 +35,14 @@ from .hdf5 import (
 )
 from .integrity import check_seal, checksum, seal, seal_size, way_out
 
-__all__ = ["Checkpoint", "OpenCheckpoint", "newest_checkpoint", "read_checkpoint", "read_checkpoint_header", "write_checkpoint"]
+__all__ = [
+    "Checkpoint",
+    "OpenCheckpoint",
+    "newest_checkpoint",
+    "read_checkpoint",
+    "read_checkpoint_header",
+    "write_checkpoint",
+]
 
 NAME, PREVIOUS = "checkpoint.h5", "checkpoint-previous.h5"
 
@@ -204,7 +211,9 @@ class OpenCheckpoint:
             for name, order in orders.items():
                 if name not in file["arrays"]:
                     known = ", ".join(sorted(file["arrays"])) or "none"
-                    raise InputError(f"{path}: has no array {name!r} (it has {known}): it belongs to another kind of run")
+                    raise InputError(
+                        f"{path}: has no array {name!r} (it has {known}): it belongs to another kind of run"
+                    )
                 dataset = file["arrays"][name]
                 if len(dataset) != order.n_global:
                     raise InputError(

@@ -279,11 +279,12 @@ class Progress:
                 self._bar.console.print(text, markup=False, highlight=False)
             else:
                 print(text, file=self._stream, flush=True)
-        except BrokenPipeError:
+        except OSError:  # the reader, or the terminal, has gone
             if self._stream is sys.stdout:
                 # what Python itself flushes at exit must find an open end
                 os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             self._stream = None
+            self._bar = None
             self._log_line("nobody reads stdout any more: the run goes on and reports here only", "WARNING")
 
     def _log_line(self, text: str, level: str) -> None:

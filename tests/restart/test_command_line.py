@@ -272,9 +272,12 @@ def test_checkpoint_written_anew_between_set_up_and_start(copy):
 
 
 def test_checkpoints_by_the_clock(tmp_path):
+    """Due whenever the ranks meet: after the first step, and at the end."""
     folder = tmp_path / "minutes"
-    words = ["rod_impact", "-o", str(folder), "--quiet", "--set", "time.end=1000", "output.checkpoint_minutes=0.002"]
-    assert main([*words, "--wall-time", "1.0"]) == 4
+    assert (
+        main(["rod_impact", "-o", str(folder), "--quiet", "--set", "time.end=0.1", "output.checkpoint_minutes=1e-9"])
+        == 0
+    )
     assert (folder / "checkpoint-previous.h5").is_file()
 
 
@@ -288,7 +291,7 @@ def undisturbed(tmp_path_factory):
     folder = tmp_path_factory.mktemp("undisturbed")
     for ranks in (1, 2):
         line = command(ranks, *STOPPED_WORDS, folder / str(ranks))
-        done = subprocess.run(line, env=environment(), capture_output=True, text=True, timeout=120)
+        done = subprocess.run(line, env=environment(), capture_output=True, text=True, timeout=300)
         assert done.returncode == 0, done.stderr
     return folder
 
@@ -313,7 +316,7 @@ def test_signal_stops_with_a_checkpoint_and_the_restart_is_bitwise(tmp_path, und
     assert status == 4, said
     assert f"stopped: {signal.Signals(number).name} received" in said
     assert said.count("stopped: ") == 1
-    done = subprocess.run([*line, "--restart"], env=environment(), capture_output=True, text=True, timeout=120)
+    done = subprocess.run([*line, "--restart"], env=environment(), capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     assert differences(folder / "result.vtkhdf", undisturbed / str(ranks) / "result.vtkhdf") == {}
 
@@ -329,7 +332,7 @@ def test_launcher_that_ends_its_ranks_leaves_them_time_for_a_checkpoint(tmp_path
     assert said.count("stopped: SIGTERM received") == 1
     reached = int(re.search(r"step (\d+) is finished", said).group(1))
     line.append(f"--set=time.end={(reached + 50) * 5e-7}")
-    done = subprocess.run([*line, "--restart"], env=environment(), capture_output=True, text=True, timeout=120)
+    done = subprocess.run([*line, "--restart"], env=environment(), capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     np.testing.assert_array_equal(steps(folder)[0], range(reached + 51))
 
@@ -342,7 +345,7 @@ def signalled(line, ranks, folder, number, whom):
     pids = processes_of(process, ranks)
     for pid in {"last rank": pids[-1:], "all ranks": pids, "launcher": [process.pid]}[whom]:
         os.kill(pid, number)
-    said = process.communicate(timeout=60)[1]
+    said = process.communicate(timeout=300)[1]
     return process.returncode, said
 
 

@@ -34,7 +34,7 @@ def ground(t):
     return 0.02 * e * p, 0.02 * (e1 * p + e * b * q), 0.02 * (e2 * p + 2 * e1 * b * q - e * b * b * p)
 
 
-def oscillator(scheme, support, end=1.5, damping=0.0, mass="lumped"):
+def oscillator(scheme, support, end=0.75, damping=0.0, mass="lumped"):
     """One bar along x, whose free end has the circular frequency OMEGA relative to the base."""
     integrator, parameters = ALL[scheme]
     young = OMEGA**2 / (2.0 if mass == "lumped" else 3.0)
@@ -93,7 +93,7 @@ def test_acceleration_record_against_exact_integration(scheme, comm, shared_tmp_
     assert np.abs(history["energy_imbalance"]).max() < 1e-9 * history["kinetic_energy"].max()
 
 
-@pytest.mark.parametrize("scheme", SECOND_ORDER)
+@pytest.mark.parametrize("scheme", ["trapezoid", "central_differences", "hulbert_chung"])
 def test_displacement_record(scheme, comm, shared_tmp_path):
     """Rows of displacements every 20 ms: the floor's acceleration is the ground's, not that of kinks at the rows."""
     x, _, a = ground(TIMES)
@@ -101,10 +101,10 @@ def test_displacement_record(scheme, comm, shared_tmp_path):
     time = history["time"]
     _, _, smooth = ground(time)
     floor = history["probe/base/acceleration"][:, 0, 0]
-    assert np.abs(floor - smooth)[40:-40].max() < 0.02 * np.abs(smooth).max()
+    assert np.abs(floor - smooth)[40:].max() < 0.02 * np.abs(smooth).max()
     exact = response(TIMES, a, time)
     # the record's own resolution: its accelerations by the spline differ by (omega 20 ms)^2/12 from the ground's
-    assert np.abs(relative(history) - exact)[:-40].max() < 0.03 * np.abs(exact).max()
+    assert np.abs(relative(history) - exact).max() < 0.03 * np.abs(exact).max()
 
 
 RAMP = [[0.0, 0.0, 0.0, 0.0], [0.1, 0.02, 0.0, 0.0], [0.2, 0.02, 0.0, 0.0]]
@@ -130,7 +130,7 @@ def test_nothing_rings_after_the_stop(scheme, interpolation, comm, shared_tmp_pa
 def test_reactions_of_a_body_carried_along(scheme, mass, comm, shared_tmp_path):
     """All nodes prescribed: reactions are mass times acceleration (and damping times velocity), node by node."""
     values = ground(TIMES)[2]
-    case = oscillator(scheme, {"acceleration": rows(values)}, end=0.5, damping=3.0, mass=mass).to_dict()
+    case = oscillator(scheme, {"acceleration": rows(values)}, end=0.2, damping=3.0, mass=mass).to_dict()
     case["support"][1]["node_set"] = "all"
     history = run(Case.from_dict(case), shared_tmp_path)
     half = {"energy_momentum": 0.5, "generalized_alpha": 4.0 / 9.0}.get(scheme, 0.0)
@@ -145,7 +145,7 @@ def test_reactions_of_a_body_carried_along(scheme, mass, comm, shared_tmp_path):
     assert total == pytest.approx(expected + 3.0 * speed, abs=1e-9 * np.abs(values).max())
 
 
-@pytest.mark.parametrize("scheme", ["trapezoid", "energy_momentum", "central_differences", "wilson"])
+@pytest.mark.parametrize("scheme", ["trapezoid", "central_differences"])
 def test_tower_against_its_modes(scheme, comm, shared_tmp_path):
     """A braced tower on shaken ground: the top moves on it by the sum of its modes' exact responses."""
     integrator, parameters = ALL[scheme]
@@ -156,7 +156,7 @@ def test_tower_against_its_modes(scheme, comm, shared_tmp_path):
         "material": {"m": {"young_modulus": 2e5, "density": 100.0}},
         "section": {"s": {"area": 1e-2, "material": "m"}},
         "support": [{"node_set": "base", "fix": "xyz", "acceleration": rows(values)}],
-        "time": {"integrator": integrator, "step": STEP, "end": 1.5, **parameters},
+        "time": {"integrator": integrator, "step": STEP, "end": 0.6, **parameters},
         "output": {
             "fields_every": 0,
             "history_every": 10,

@@ -94,6 +94,7 @@ class Scheme(ABC):
         balance work over the whole step
     solves_end : the position solved for is x_{n+1}
     symmetric : whether the Hessian is
+    dissipates : whether the scheme takes energy from high frequencies
     notice : what users must be told when they choose it; empty for nothing
     """
 
@@ -102,6 +103,7 @@ class Scheme(ABC):
     at_ends = True
     solves_end = True
     symmetric = True
+    dissipates = True
     notice = ""
 
     def __init__(self, parameters: StrictModel) -> None:
@@ -114,8 +116,11 @@ class Scheme(ABC):
     def start(self, state: State, h: float) -> None:
         """Set memory up from the complete state at the start (x, v, a); nothing by default."""
 
-    def restart(self, state: State, nodes: np.ndarray, h: float) -> None:
-        """Make what is remembered of some owned nodes agree with v and a, which contact changed; nothing by default."""
+    def restart(self, state: State, nodes: np.ndarray | tuple[np.ndarray, np.ndarray], h: float) -> None:
+        """Make what is remembered of some owned nodes agree with v and a, which contact or supports changed.
+
+        ``nodes`` : (m,), or (nodes, components), both (m,). Nothing by default.
+        """
 
     def step_changed(self, state: State) -> None:
         """Forget what holds for the old step only; the state (x, v, a) is complete. Nothing by default."""

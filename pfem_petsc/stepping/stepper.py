@@ -98,27 +98,26 @@ class Stepper(ABC):
         state.v = model.initial_velocity()
         supports = model.supports
         if supports.any:
-            # nodes that are moved start with the velocity of their motion
-            tick = 1e-3 * self.h
-            rate = (supports.positions(tick) - supports.positions(0.0)) / tick
-            state.v[supports.nodes, supports.components] = rate
+            state.position[supports.at] = supports.positions(0.0)
+            state.v[supports.at] = supports.rates(0.0, 0.0)[0]
         self.evaluate(commit=True)
         if model.external.active:
             state.external = model.external.at(0.0, np.empty_like(state.v))
         load = state.external - state.f[: model.mesh.n_owned]
         if model.inertia.damped:
             load -= model.inertia.damping_times(state.v, np.zeros_like(load))
-        state.a = self.accelerate(load)
+        state.a = self._acceleration(load)
         if (model.contact.any or model.pairs is not None) and model.inertia.redistribution is None:
-            walls = start_at_rest(model, state, self.accelerate, load)
+            walls = start_at_rest(model, state, self._acceleration, load)
             if walls is not None:
                 held = walls.nodes[walls.touching.any(axis=1)]
                 if model.pairs is not None:
                     held = np.union1d(held, model.pairs.pressed()[0])
                 self.solution.walls, self.solution.contacts = walls, len(held)
         if supports.any:
+            inertial = model.inertia.mass_times(state.a, np.empty_like(state.a))
             state.support = np.zeros_like(state.v)
-            state.support[supports.fixed] = -(load + state.contact)[supports.fixed]
+            state.support[supports.fixed] = (inertial - load - state.contact)[supports.fixed]
         self.scheme.start(state, self.h)
         if model.contact.motion.free is not None:
             model.contact.motion.free.start(self.h)
@@ -139,10 +138,15 @@ class Stepper(ABC):
         if self.scheme.leads:
             self.before[:] = self.state.x
             self.scheme.advance(self.state, self.part)
+            if self.model.supports.moving:
+                self.state.position[self.model.supports.at] = self.model.supports.positions(end)
             self._arrive(end)
             self._solve_and_finish()
         else:
             self._solve_and_finish()
+            if self.model.supports.moving:
+                self.state.position[self.model.supports.at] = self.model.supports.positions(end)
+                self._take_rates(end)
             self._arrive(end)
         if self.treatment is not None:
             self.treatment.after()
@@ -157,6 +161,8 @@ class Stepper(ABC):
     def _solve_and_finish(self) -> None:
         state = self.state
         self.balance = self.scheme.balance(state, self.part)
+        if self.model.supports.moving:
+            self._prescribe(self.balance)
         free = self.model.contact.motion.free
         if free is not None:
             free.begin(state.time, self.part)
@@ -170,8 +176,43 @@ class Stepper(ABC):
         if not self.scheme.leads:
             self.before[:] = state.x
         self.scheme.finish(state, self.balance, self.solution.u, self.part)
+        if self.scheme.leads and self.model.supports.moving:
+            self._take_rates(state.time)
         if free is not None:
             free.finish(self.part)
+
+    def _prescribe(self, balance: Balance) -> None:
+        """Put what supports prescribe into a balance, whose increments are zero there: exact position, velocity and
+        acceleration, where the scheme's formulas would make velocity and acceleration of positions, and ring."""
+        supports = self.model.supports
+        forces_hold = sum(weight * time for weight, time in balance.loads)
+        v, a = supports.rates(forces_hold, self.part)
+        balance.predictor = balance.predictor.copy()
+        balance.predictor[supports.at] = supports.positions(balance.time)
+        balance.v_hat = np.zeros_like(self.state.v) if balance.v_hat is None else balance.v_hat.copy()
+        balance.v_hat[supports.at] = v
+        balance.a_hat = np.zeros_like(self.state.v) if balance.a_hat is None else balance.a_hat.copy()
+        balance.a_hat[supports.at] = a
+
+    def _take_rates(self, time: float) -> None:
+        """Velocity and acceleration of prescribed components at a time, and what the scheme remembers of them."""
+        supports, state = self.model.supports, self.state
+        state.v[supports.at], state.a[supports.at] = supports.rates(time, self.part)
+        self.scheme.restart(state, supports.at, self.part)
+        if self.scheme.leads:
+            way = supports.positions(self.balance.time) - state.position[supports.at]
+            state.memory["half_velocity"][supports.at] = way / self.part
+
+    def _acceleration(self, load: np.ndarray) -> np.ndarray:
+        """Acceleration (owned, 3) with M a = load [N] on free components, on others as prescribed. Collective."""
+        supports = self.model.supports
+        if not supports.moving:
+            return self.accelerate(load)
+        carried = np.zeros_like(load)
+        carried[supports.at] = supports.rates(self.state.time, 0.0)[1]
+        a = self.accelerate(load - self.model.inertia.mass_times(carried, np.empty_like(load)))
+        a[supports.at] = carried[supports.at]
+        return a
 
     def _load(self, balance: Balance) -> np.ndarray:
         if not self.model.external.active:

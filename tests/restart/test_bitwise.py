@@ -18,6 +18,8 @@ TWO_RODS = (
     "contact_pair=[{name='faces', first='tip', second='other', direction=[1.0, 0.0, 0.0]}]",
 )
 LAGGED = ("mesh.cells=[4,4,4]", "time.end=5e-5", "time.step=1e-6")
+ROWS = "[[0, 0, 0, 0], [0.02, 1e-3, 0, 0], [0.06, 0, 0, 2e-3], [0.1, 0, 0, 0]]"
+MOVED = f"support=[{{node_set='hinge', fix='xyz', motion={ROWS}}}]"
 CASES = {
     "central differences": ("rod_impact", SHORT),
     "consistent mass": ("rod_impact", (*SHORT, "time.mass=consistent")),
@@ -56,6 +58,9 @@ CASES = {
     "plastic, implicit": ("bar_collision_plastic", ("time.end=8e-5", "time.integrator=newmark")),
     "plastic lattice": ("lattice_drop", LATTICE),
     "supported, multistep": ("pendulum", ("time.end=0.15", "time.integrator=houbolt")),
+    "moved, explicit": ("pendulum", ("time.end=0.15", MOVED)),
+    "moved, multistep": ("pendulum", ("time.end=0.15", MOVED, "time.integrator=houbolt")),
+    "moved, beyond the step": ("pendulum", ("time.end=0.15", MOVED, "time.integrator=wilson", "time.theta=1.6")),
     "heated": (
         "pendulum",
         ("time.end=0.15", "material.default.thermal_expansion=1e-5")

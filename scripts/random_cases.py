@@ -117,7 +117,7 @@ class Study:
             shutil.rmtree(self.folder / str(seed), ignore_errors=True)
         with self._lock:
             bad = len({seed for cause, found in self.faults.items() if not cause.startswith(LOOSE) for seed, _ in found})
-            print(f"{sum(self.statuses.values())} cases, {bad} with a fault", flush=True)
+            print(f"{sum(n for what, n in self.statuses.items() if what.startswith("status"))} cases, {bad} with a fault", flush=True)
 
     def _note(self, seed: int, told: dict) -> None:
         with self._lock:

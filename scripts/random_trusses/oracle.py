@@ -5,7 +5,8 @@ Each check gives faults, (cause, detail). Tolerances:
 - positions against walls: 1e-9 of the truss's size (1e-6 with float32); `wilson` keeps walls at t + theta h and not at
   the end of the step, so that a node may be as far beyond as it moves in (theta - 1) h, twice at most
 - balance of energy: 1e-7 of the largest energy; above 1e-9 it is counted apart
-- gain of energy from contact and the scheme without a warning: 0.05 of the largest energy
+- gain of energy from contact and the scheme without a warning: 0.05 of the largest energy in the mean over the last
+  quarter of the run, or 0.5 at any time
 - dissipations: 1e-9 of it below zero; contact work at walls at rest: 1e-3 of it above zero
 - momentum: 1e-9 of the largest momentum or impulse
 """
@@ -23,8 +24,8 @@ from pfem_petsc.output.result import Result
 __all__ = ["check_result", "energy_scale"]
 
 Faults = list[tuple[str, str]]
-ENERGIES = ("kinetic_energy", "elastic_energy", "plastic_dissipation", "damping_dissipation", "external_work")
-ENERGIES += ("contact_work", "thermal_work", "numerical_dissipation")
+_ENDS = ("_energy", "_dissipation", "_work")
+LOSSES = ("numerical_dissipation", "impact_dissipation", "friction_dissipation")
 
 
 def check_result(folder: Path, warned: list[str]) -> Faults:
@@ -36,14 +37,15 @@ def check_result(folder: Path, warned: list[str]) -> Faults:
     if faults:
         return faults
     faults += _walls(result, case, history)
-    faults += _energy(case, history, warned)
+    size = float(np.ptp(result.positions(0), axis=0).max()) if len(result.times) else 1.0
+    faults += _energy(case, history, warned, size)
     faults += _momentum(case, history)
     return faults
 
 
 def energy_scale(history: dict[str, np.ndarray]) -> float:
     """The largest of all energies, works and dissipations of a run [J]."""
-    return max(float(np.abs(history[name]).max()) for name in ENERGIES)
+    return max(float(np.abs(column).max()) for name, column in history.items() if name.endswith(_ENDS))
 
 
 def _finite(result: Result, history: dict[str, np.ndarray]) -> Faults:
@@ -147,9 +149,11 @@ def _wilson(case: Case, history: dict[str, np.ndarray], result: Result) -> float
     return 2.0 * (case.time.scheme.theta - 1.0) * float(history["step_size"].max()) * (fastest + sum(walls))
 
 
-def _energy(case: Case, history: dict[str, np.ndarray], warned: list[str]) -> Faults:
+def _energy(case: Case, history: dict[str, np.ndarray], warned: list[str], size: float) -> Faults:
     scale = energy_scale(history)
-    if not scale > 0.0:
+    # below: a truss at rest, whose energies are squares of rounding errors
+    strongest = max(m.young_modulus for m in case.material.values()) * max(s.area for s in case.section.values())
+    if not scale > 1e-24 * strongest * size:
         return []
     faults: Faults = []
     imbalance = np.abs(history["energy_imbalance"])
@@ -164,13 +168,17 @@ def _energy(case: Case, history: dict[str, np.ndarray], warned: list[str]) -> Fa
         if name in history and history[name].min() < -1e-9 * scale:
             faults.append((f"{name} negative", f"{history[name].min() / scale:.3g} of the largest energy"))
     moving = any(wall.velocity or wall.motion or wall.mass for wall in case.wall)
-    contact, numerical = history["contact_work"], history["numerical_dissipation"]
+    lost = sum(history[name] for name in LOSSES if name in history)
     told = any("energy" in text or "amplifies" in text for text in warned)
-    if not moving and contact.max() > 1e-3 * scale and not told:
-        faults.append(("contact work positive", f"{contact.max() / scale:.3g} of the largest energy"))
-    gain = -numerical if moving else contact - numerical
-    if gain.max() > 0.05 * scale and not told:
-        faults.append(("energy grows without a warning", f"{gain.max() / scale:.3g} of the largest energy"))
+    work = history["contact_work"] - (lost - history["numerical_dissipation"])
+    if not moving and work.max() > 1e-3 * scale and not told:
+        faults.append(("contact work positive", f"{work.max() / scale:.3g} of the largest energy"))
+    # the energies of explicit schemes swing with their highest modes: what stays counts, and what is beyond all measure
+    gain = -lost if moving else history["contact_work"] - lost
+    stays = float(gain[-max(len(gain) // 4, 1) :].mean())
+    if (stays > 0.05 * scale or gain.max() > 0.5 * scale) and not told:
+        cause = "energy grows without a warning"
+        faults.append((cause, f"{gain.max() / scale:.3g} of the largest energy, {stays / scale:.3g} at the end"))
     return faults
 
 

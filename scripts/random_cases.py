@@ -3,11 +3,11 @@
     .venv/bin/python scripts/random_cases.py --seeds 0:1000 --jobs 2 --keep failing
     .venv/bin/python scripts/random_cases.py --cases failing/*.toml
 
-Cases are drawn over all documented keys and their combinations, one a seed. Each is run on one rank and on three, in one
-process for many cases; every third one is also stopped in the middle and continued. Checked are: status 0, 2 or 3, with a
-message where it is not 0; no node beyond a wall, finite results, the balance of energy, its growth, dissipations,
-momentum, ranks against each other to 1e-9 and, bit for bit, the continued run. A case that crashes or hangs is found and
-left behind. Status 0 when nothing is wrong.
+Cases are drawn over all documented keys and their combinations, one a seed. Each is run on one rank and on three, in
+one process for many cases; every third one is also stopped in the middle and continued. Checked are: status 0, 2 or 3,
+with a message where it is not 0; no node beyond a wall, finite results, the balance of energy, its growth,
+dissipations, momentum, ranks against each other to 1e-9 and, bit for bit, the continued run. A case that crashes or
+hangs is found and left behind. Status 0 when nothing is wrong.
 """
 
 from __future__ import annotations
@@ -116,8 +116,9 @@ class Study:
         for seed in seeds:
             shutil.rmtree(self.folder / str(seed), ignore_errors=True)
         with self._lock:
-            bad = len({seed for cause, found in self.faults.items() if not cause.startswith(LOOSE) for seed, _ in found})
-            print(f"{sum(n for what, n in self.statuses.items() if what.startswith("status"))} cases, {bad} with a fault", flush=True)
+            bad = {seed for cause, found in self.faults.items() if not cause.startswith(LOOSE) for seed, _ in found}
+            cases = sum(count for what, count in self.statuses.items() if what.startswith("status"))
+            print(f"{cases} cases, {len(bad)} with a fault", flush=True)
 
     def _note(self, seed: int, told: dict) -> None:
         with self._lock:

@@ -1,5 +1,6 @@
 """Signals from the first moment of the program on, and what becomes of them after a run."""
 
+import gc
 import os
 import pty
 import signal
@@ -121,6 +122,7 @@ def test_handlers_are_given_back(tmp_path, handlers, end):
         if end == "close":
             one.close()
         del one
+        gc.collect()
     assert mine(handlers)
     assert not (tmp_path / "out.lock").exists()
 

@@ -4,6 +4,16 @@ Nodal arrays are those of the state, of the scheme's memory and of the stepper; 
 the thermal strains. Internal forces and energies are saved rather than computed again: of a bar that yields the second
 evaluation may differ from the first in the last digit. Sums that each rank has for itself (works, energies, wall
 forces) are saved rank by rank, and given back so on as many ranks; on others the total goes to rank 0.
+
+Where what decides is kept: positions, velocities, accelerations, forces and the scheme's memory (tied nodes and what a
+treatment of impact changed are part of it): arrays of the state. Who touches walls, nodes held in the last step, place
+of the kept preconditioner: arrays of the stepper. Level of halving, part and smallest part of the step, counts of the
+kept preconditioner: its numbers. Plastic history, thermal strains, history of the kept preconditioner: arrays of the
+bars. Walls with mass: ``free_walls``, their last increment included. Forces of pairs: ``pairs``. Works and energies:
+``ranks``. Energy at the start, the largest energy, iterations since the last row: the recorder's. Rows seen, strange ones
+and energy put in: ``blow_up``. Contact times and impulses: the contact log's. Time step, frequencies and linear solver:
+the plan in the attributes. Newton's method, Krylov methods, candidates for contact and friction begin anew each step.
+What goes with the clock (meetings, progress, wall time) begins anew with each run, and decides nothing of the results.
 """
 
 from __future__ import annotations

@@ -10,8 +10,8 @@ treatment of impact changed are part of it): arrays of the state. Who touches wa
 of the kept preconditioner: arrays of the stepper. Level of halving, part and smallest part of the step, counts of the
 kept preconditioner: its numbers. Plastic history, thermal strains, history of the kept preconditioner: arrays of the
 bars. Walls with mass: ``free_walls``, their last increment included. Forces of pairs: ``pairs``. Works and energies:
-``ranks``. Energy at the start, the largest energy, iterations since the last row: the recorder's. Rows seen, strange ones
-and energy put in: ``blow_up``. Contact times and impulses: the contact log's. Time step, frequencies and linear solver:
+``ranks``. Energy at the start, the largest energy, iterations since the last row: the recorder's. Rows seen, strange
+ones and energy put in: ``blow_up``. Contact times and impulses: the contact log's. Time step, frequencies and linear solver:
 the plan in the attributes. Newton's method, Krylov methods, candidates for contact and friction begin anew each step.
 What goes with the clock (meetings, progress, wall time) begins anew with each run, and decides nothing of the results.
 """

@@ -11,7 +11,7 @@ of the kept preconditioner: arrays of the stepper. Level of halving, part and sm
 kept preconditioner: its numbers. Plastic history, thermal strains, history of the kept preconditioner: arrays of the
 bars. Walls with mass: ``free_walls``, their last increment included. Forces of pairs: ``pairs``. Works and energies:
 ``ranks``. Energy at the start, the largest energy, iterations since the last row: the recorder's. Rows seen, strange
-ones and energy put in: ``blow_up``. Contact times and impulses: the contact log's. Time step, frequencies and linear solver:
+ones and energy put in: ``blow_up``. Contact times and impulses: the contact log's. Time step and linear solver:
 the plan in the attributes. Newton's method, Krylov methods, candidates for contact and friction begin anew each step.
 What goes with the clock (meetings, progress, wall time) begins anew with each run, and decides nothing of the results.
 """

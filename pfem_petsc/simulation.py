@@ -10,6 +10,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from mpi4py import MPI
 
+from .contact.alarm import check_positions
 from .errors import EarlyStop, InputError, PfemError, SimulationFailure
 from .mechanics.compiled import Compilation
 from .output.lock import FolderLock
@@ -413,6 +414,7 @@ class Simulation:
     def _snapshot(self) -> None:
         if not self.case.output.fields_every and 0 < self.state.step < self.plan.steps:
             return
+        check_positions(self.stepper)
         state, fields = self.state, self.fields
         self._writer.write_snapshot(
             state.time, state.step, state.position, fields.at_nodes(state), fields.at_bars(state)

@@ -109,3 +109,5 @@ class Solver(StrictModel):
     """absolute tolerance of the residual [N]; default: from the model's force scale"""
     max_newton: PositiveInt = 50
     """Newton iterations allowed in a step"""
+    guard: bool = True
+    """whether converged implicit steps that have nothing to do with the state before them are made in smaller parts"""

@@ -36,6 +36,11 @@ def _materials(case) -> Iterator[str]:
                 f"{key}.yield_stress = {material.yield_stress:g} Pa is reached at a strain of "
                 f"{material.yield_stress / material.young_modulus:.3g}; {_HINT}"
             )
+        if material.yield_stress is not None and material.isotropic_hardening + material.kinematic_hardening == 0.0:
+            yield (
+                f"{key} yields without hardening: of bars in a row one alone takes all plastic strain, more of it the "
+                "shorter it is, so that results depend on the mesh; give isotropic_hardening or kinematic_hardening"
+            )
 
 
 def _sections(case) -> Iterator[str]:

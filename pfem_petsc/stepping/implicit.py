@@ -20,6 +20,7 @@ from ..solvers.linear import LinearChoice, unsymmetric
 from ..solvers.matrix import HessianMatrix
 from ..solvers.matrix_free import MatrixFreeHessian
 from ..solvers.newton import NewtonReport, NewtonSolver
+from .guard import StepGuard
 from .problem import StepProblem
 from .stepper import NotConverged, Solution, Stepper
 
@@ -30,6 +31,7 @@ atexit.register(gc.collect)
 __all__ = ["ImplicitStepper"]
 
 _HALVINGS = 10  # most halvings of a step: to 1/1024
+_WAY_OUT = "Take a smaller time.step; where such jumps are meant, solver.guard = false"
 
 
 class ImplicitStepper(Stepper):
@@ -60,6 +62,8 @@ class ImplicitStepper(Stepper):
         most = model.case.solver.max_newton
         self.newton = NewtonSolver(model.mesh, self.hessian, choice, bounded, most, model.length, self.lagged)
         self.newton.prepare(model.contact.any or self.pairs is not None)
+        self.guard = StepGuard(model) if model.case.solver.guard else None
+        self._after = np.zeros_like(self.state.x)
         self.level = 0  # the next step is made in 2**level parts
         self.message: Callable[[str], None] = lambda text: None
         self.held = np.zeros(model.mesh.n_owned, dtype=bool)  # nodes held by walls in the last step
@@ -144,10 +148,8 @@ class ImplicitStepper(Stepper):
         if not inertia.consistent:
             a = load / inertia.mass[:, None]
             if inertia.redistribution is not None:
-                at, tensors = inertia.redistribution.touched, inertia.redistribution.tensors
-                matrices = inertia.mass[at, None, None] * np.eye(3) + tensors
-                inverse = np.linalg.pinv(matrices, rcond=1e-10, hermitian=True)
-                a[at] = np.einsum("kij,kj->ki", inverse, load[at])
+                at = inertia.redistribution.touched
+                a[at] = np.einsum("kij,kj->ki", inertia.redistribution.inverse(inertia.mass, fixed), load[at])
             a[fixed] = 0.0
             return a
         mass = HessianMatrix(self.model.mesh, fixed, self.model.supports.any)
@@ -174,6 +176,33 @@ class ImplicitStepper(Stepper):
         matrix.constrain(float(model.inertia.mass.max(initial=1.0)), values)
 
     def solve(self, balance: Balance) -> Solution:
+        state, pairs = self.state, self.model.pairs
+        kept = state.contact, state.support, self.held, None if pairs is None else pairs.force.copy()
+        solution = self._with_walls(balance)
+        # an explicit scheme with consistent mass has one solution only
+        if self.guard is not None and balance.weight:
+            reason = self._suspicion(balance, solution)
+            if reason is not None:
+                state.contact, state.support, self.held, force = kept
+                if pairs is not None:
+                    pairs.force[:] = force
+                raise NotConverged(f"{self.when(balance)}: {reason}. {_WAY_OUT}")
+        return solution
+
+    def _suspicion(self, balance: Balance, solution: Solution) -> str | None:
+        """What the guard finds wrong with a solution, None for nothing. Collective."""
+        state, model = self.state, self.model
+        owned, h = model.mesh.n_owned, balance.time - state.time
+        self._after[:owned] = balance.predictor + solution.u
+        model.mesh.update_ghosts(self._after)
+        move = self._after[:owned] - state.position
+        momentum = model.inertia.mass_times(state.v, np.empty_like(state.v))
+        work = state.external + state.contact + state.support
+        energy = 0.5 * float((momentum * state.v).sum()) + 0.5 * float(np.abs(work * move).sum())
+        return self.guard.check(state.x, self._after, state.position + h * state.v, energy)
+
+    def _with_walls(self, balance: Balance) -> Solution:
+        """Solve a balance together with the motion of walls with mass. Collective."""
         free = self.model.contact.motion.free
         guess = self._guess(balance)
         if free is None:

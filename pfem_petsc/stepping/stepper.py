@@ -13,6 +13,7 @@ from ..contact.resting import start_at_rest
 from ..errors import SimulationFailure
 from ..integrators.base import Balance, Scheme, State
 from ..mechanics.bars import StrainEnergy
+from .collapse import tell_collapse
 
 __all__ = ["NotConverged", "Solution", "Stepper"]
 
@@ -243,20 +244,7 @@ class Stepper(ABC):
 
     def collapse(self, bar: int) -> str:
         """What to tell about a bar (local index) that failed in the step being made."""
-        mesh, state = self.model.mesh, self.state
-        a, b = mesh.bars[bar]
-        # the step is counted when it is complete, its time is set on arrival
-        step = state.step + (state.time > (state.step + 1e-9) * self.h)
-        when = f"step {step}, t = {state.time:.6g} s"
-        name = f"bar {mesh.bar_ids[bar]} between nodes {mesh.node_ids[a]} and {mesh.node_ids[b]}"
-        length = float(np.linalg.norm(state.x[b] - state.x[a]))
-        if not np.isfinite(length):
-            return f"{when}: the positions of {name} are not finite: the motion blew up; take a smaller time step"
-        how = f"collapsed to {length:.3g} m" if bar == self.energy.failed else "gone through zero length"
-        return (
-            f"{when}: {name} has {how}, from {self.model.bars.rest[bar]:.3g} m; the impact is too "
-            "strong for a truss model: take a lower speed, a stronger material, or a smaller time step"
-        )
+        return tell_collapse(self, bar)
 
     @abstractmethod
     def accelerate(self, load: np.ndarray) -> np.ndarray:

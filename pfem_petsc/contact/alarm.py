@@ -1,0 +1,78 @@
+"""The alarm of contact: a node beyond a wall where results are written is an error, whatever treatment let it pass.
+
+Positions that a step was solved for keep every wall to rounding, with all schemes and treatments; so they are what is
+looked at. With Wilson's method these are x_tau at t + theta h, not x1, which may lie beyond a wall by no more than the
+way from one to the other, (theta - 1) h v. No wall at all is
+
+- a rectangle, which nodes pass beside,
+- a wall whose ``node_set`` does not contain the node,
+- one along whose normal supports prescribe the node: they decide over walls.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from mpi4py import MPI
+
+from ..errors import SimulationFailure
+
+__all__ = ["TOLERANCE", "check_positions"]
+
+TOLERANCE = 1e-9
+"""Depth over the model's size (extent, or distance from the origin where that is more) that counts as being on the
+wall: 4e6 times rounding. Steps keep walls to 1e-12; walls that are almost parallel, walls with mass and nodes tied to
+one wall and carried along another to 1e-9; losses of contact seen are from 1e-4 on."""
+
+_THIN = 1e-12  # squared length of a normal's free part below which supports alone decide
+
+
+def check_positions(stepper) -> None:
+    """Refuse a state with a node beyond a wall. One pass over the nodes and one reduction. Collective.
+
+    Parameters
+    ----------
+    stepper : Stepper
+        At the end of a step.
+
+    Raises
+    ------
+    SimulationFailure
+        On all ranks: the wall, its deepest node and depth, how many there are, the step, and what to do.
+    """
+    model, state, balance = stepper.model, stepper.state, stepper.balance
+    contact, comm = model.contact, model.comm
+    if not contact.any:
+        return
+    x, time = state.position, state.time
+    if not stepper.scheme.solves_end:
+        if balance is None:  # at the start, or right after a restart: looked at before
+            return
+        x, time = balance.predictor + stepper.solution.u, balance.time
+    gaps = contact.gaps(x, time)
+    gaps[:, [wall.partial for wall in contact.walls]] = np.inf
+    tolerance = TOLERANCE * max(model.length, model.reach)
+    # NaN is no number that a wall could be kept with, but has its own message
+    suspects = np.flatnonzero((gaps < -tolerance).any(axis=1))
+    if len(suspects):
+        every = np.ones((len(suspects), len(contact.walls)), dtype=bool)
+        normals, _ = contact.planes(every, x[suspects], contact.motion.shifts(time))
+        free = np.where(contact.fixed[suspects][:, None, :], 0.0, normals)
+        gaps[suspects] = np.where((free * free).sum(axis=2) > _THIN, gaps[suspects], np.inf)
+        suspects = suspects[(gaps[suspects] < -tolerance).any(axis=1)]
+    if comm.allreduce(len(suspects), op=MPI.MAX) == 0:
+        return
+    deepest = (0.0, -1, -1)
+    if len(suspects):
+        at, wall = np.unravel_index(int(gaps[suspects].argmin()), (len(suspects), len(contact.walls)))
+        deepest = (float(gaps[suspects[at], wall]), int(model.mesh.node_ids[suspects[at]]), int(wall))
+    depth, node, wall = min(comm.allgather(deepest))
+    count = comm.allreduce(int((gaps[:, wall] < -tolerance).sum()))
+    case = model.case
+    others = "another contact.treatment or time.integrator"
+    if case.contact.treatment != "scheme":
+        others = f'contact.treatment = "scheme" instead of "{case.contact.treatment}"'
+    raise SimulationFailure(
+        f"step {state.step}, t = {time:.6g} s: node {node} is {-depth:.3g} m beyond wall {contact.names[wall]!r} "
+        f"({count} node{'s' if count > 1 else ''} in all), which contact has not kept: what was computed since it "
+        f"passed is wrong; take a smaller time.step, or {others}"
+    )

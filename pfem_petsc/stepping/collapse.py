@@ -1,0 +1,78 @@
+"""What to tell about a bar that collapsed: what is known, and the likelier cause."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..contact.held_node import held_growth
+from ..output.units import engineering
+
+__all__ = ["tell_collapse"]
+
+_STRONG = 1.0
+"""Speed of an impact over the bars' wave speed from which on it crushes them: the strain behind the wave is v/c."""
+
+
+def tell_collapse(stepper, bar: int) -> str:
+    """Message about a bar (local index) that failed in the step being made. Of this rank alone."""
+    model, state = stepper.model, stepper.state
+    mesh = model.mesh
+    a, b = mesh.bars[bar]
+    # the step is counted when it is complete, its time is set on arrival
+    step = state.step + (state.time > (state.step + 1e-9) * stepper.h)
+    when = f"step {step}, t = {state.time:.6g} s"
+    name = f"bar {mesh.bar_ids[bar]} between nodes {mesh.node_ids[a]} and {mesh.node_ids[b]}"
+    way = state.x[b] - state.x[a]
+    length, rest = float(np.linalg.norm(way)), float(model.bars.rest[bar])
+    if not np.isfinite(length):
+        return f"{when}: the positions of {name} are not finite: the motion blew up; take a smaller time step"
+    how = f"collapsed to {length:.3g} m" if bar == stepper.energy.failed else "gone through zero length"
+    past = stepper.before[b] - stepper.before[a]
+    speed = float(np.linalg.norm(way - past)) / stepper.part
+    block = next(block for block in model.bars.blocks if block.start <= bar < block.stop)
+    wave = float(np.sqrt(block.parameters[0] / block.density))
+    return (
+        f"{when}: {name} has {how}, from {rest:.3g} m; it had {float(np.linalg.norm(past)) / rest:.3g} of its length a "
+        f"step before, and its ends moved at {engineering(speed, 'm/s')} towards each other, waves in it at "
+        f"{engineering(wave, 'm/s')}: {_cause(stepper, wave)}"
+    )
+
+
+def _cause(stepper, wave: float) -> str:
+    """Impact, load or time integration, and the way out."""
+    model = stepper.model
+    case = model.case
+    fastest = _speed_of_case(case)
+    if fastest >= _STRONG * wave:
+        return (
+            f"at {engineering(fastest, 'm/s')} the impact is too strong for a truss model: take a lower speed, a "
+            "stronger material, or a smaller time step"
+        )
+    others = ["take a smaller time.step"]
+    touch = model.contact.any or model.pairs is not None
+    if touch and case.contact.treatment == "scheme" and not stepper.scheme.explicit:
+        growth = held_growth(stepper.scheme)
+        grows = f", which amplifies the motion of nodes that contact holds by {growth:.3f} a step" * (
+            growth > 1.0 + 1e-9
+        )
+        others.append(f'contact.treatment = "stick" instead of what {case.time.integrator} makes of impact{grows}')
+    if touch and case.contact.treatment != "scheme":
+        others.append(f'another contact.treatment than "{case.contact.treatment}"')
+    ways = ", or ".join(others)
+    if model.external.active or any(s.motion is not None or s.velocity is not None for s in case.support):
+        return f"loads and supports crush it, or the time integration does not follow the motion: {ways}"
+    return (
+        f"nothing in the case is faster than {engineering(fastest, 'm/s')}, which does not crush bars, so the time "
+        f"integration is the likelier cause: {ways}"
+    )
+
+
+def _speed_of_case(case) -> float:
+    """Upper bound on the speed [m/s] at which bodies and walls of a case start towards each other; turning aside."""
+    given = [item.velocity for item in (*case.initial, *case.wall) if item.velocity is not None]
+    found = [float(np.linalg.norm(velocity)) for velocity in given]
+    for wall in case.wall:
+        if wall.motion is not None:
+            rows = np.diff(np.array(wall.motion, dtype=float), axis=0)
+            found.append(float((np.linalg.norm(rows[:, 1:], axis=1) / rows[:, 0]).max(initial=0.0)))
+    return sum(sorted(found)[-2:])

@@ -1,0 +1,55 @@
+"""The alarm of contact: a node beyond a wall ends the run, and what schemes legitimately leave does not."""
+
+import pytest
+
+from pfem_petsc import Case, Simulation
+from pfem_petsc.contact.alarm import TOLERANCE, check_positions
+from pfem_petsc.errors import SimulationFailure
+
+
+def run(comm, folder, *keys):
+    """A finished run of the rod in which its tip is on the wall."""
+    keys = ["output.fields_every=1", "initial.velocity=[0.1, 0, 0]", "time.end=0.7", *keys]
+    simulation = Simulation(Case.load("rod_impact", keys), comm, output=folder / "rod", quiet=True)
+    assert simulation.run() == 0
+    return simulation
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("scheme", ["central_differences", "chung_lee", "newmark", "wilson"])
+def test_a_node_beyond_a_wall_is_an_error(scheme, comm, shared_tmp_path):
+    simulation = run(comm, shared_tmp_path, f"time.integrator={scheme}")
+    stepper = simulation.stepper
+    tip = simulation.model.nodes["tip"]
+    where = stepper.state.position if stepper.scheme.solves_end else stepper.balance.predictor
+    solved = where if stepper.scheme.solves_end else where + stepper.solution.u
+    where[tip, 0] += 1.05 - solved[tip, 0] + 0.5 * TOLERANCE
+    check_positions(stepper)
+    where[tip, 0] += 2e-3
+    with pytest.raises(SimulationFailure) as failure:
+        simulation._snapshot()
+    messages = comm.allgather(str(failure.value))
+    assert messages == [messages[0]] * comm.size and failure.value.exit_status == 3
+    assert messages[0].startswith("step 70, t = 0.7") and "node 20 is 0.002 m beyond wall 'wall' (1 node" in messages[0]
+
+
+@pytest.mark.parallel
+def test_wilson_may_leave_x1_beyond(comm, shared_tmp_path):
+    """x1 is beyond the wall by up to (theta - 1) h v; x_tau, which the step is solved for, is not."""
+    case = Case.load("rod_impact", ["time.integrator=wilson", "output.fields_every=1", "time.end=0.2"])
+    run = Simulation(case, comm, output=shared_tmp_path / "rod", quiet=True)
+    depth = max(step.row["probe/tip/position"][0, 0] for step in run) - 1.05
+    assert 1e-4 < depth < 0.4 * 0.01 * 0.6
+
+
+@pytest.mark.parallel
+def test_what_is_no_concern_of_a_wall_may_be_beyond_it(comm, shared_tmp_path):
+    """Nodes out of its node set, one that a support carries through it, and whoever passed beside a rectangle."""
+    motion = "motion=[[0.0, 0.0, 0.0, 0.0], [0.7, 0.2, 0.0, 0.0]]"
+    run(comm, shared_tmp_path, f'support=[{{node_set="tip", fix="x", {motion}}}]')
+    free = ["initial.velocity=[0.5, 0, 0]", "node_set.base.nearest=[0,0,0]", 'wall.0.node_set="base"']
+    last = run(comm, shared_tmp_path, *free)
+    assert max(comm.allgather(float(last.state.position[:, 0].max(initial=0.0)))) > 1.3
+    rectangle = "along=[0,1,0], size=[0.1,0.1], node_set='tip'"
+    keys = [f'wall=[{{name="wall", type="rectangle", point=[1.05,1,0], normal=[-1,0,0], {rectangle}}}]']
+    run(comm, shared_tmp_path, "initial.velocity=[0.5, 0, 0]", *keys)

@@ -1,0 +1,149 @@
+"""The guard of implicit steps: solutions that have nothing to do with the state before are refused, motions are not."""
+
+import h5py
+import numpy as np
+import pytest
+
+from pfem_petsc import Case, Simulation
+from pfem_petsc.errors import SimulationFailure
+from pfem_petsc.stepping.guard import LARGEST, NOTICEABLE, StepGuard
+from pfem_petsc.stepping.stepper import NotConverged
+
+pytestmark = pytest.mark.parallel
+
+
+def star_dome():
+    """Points [m] and bars of the hexagonal star dome with 24 bars; nodes 7 to 12 are its feet."""
+    inner, outer = np.arange(6) * np.pi / 3.0, np.arange(6) * np.pi / 3.0 + np.pi / 6.0
+    ring = np.column_stack([25.0 * np.cos(inner), 25.0 * np.sin(inner), np.full(6, 6.216)])
+    feet = np.column_stack([50.0 * np.cos(outer), 50.0 * np.sin(outer), np.zeros(6)])
+    bars = [(0, 1 + i) for i in range(6)] + [(1 + i, 1 + (i + 1) % 6) for i in range(6)]
+    bars += [(1 + i, 7 + i) for i in range(6)] + [(1 + (i + 1) % 6, 7 + i) for i in range(6)]
+    return np.vstack([[[0.0, 0.0, 8.216]], ring, feet]) / 100.0, bars
+
+
+def dome(comm, folder, step, end, guard=True, integrator="newmark"):
+    """The dome under its own weight from rest."""
+    points, bars = star_dome()
+    if comm.rank == 0:
+        with h5py.File(folder / "dome.h5", "w") as file:
+            file["points"], file["bars"] = points, np.array(bars)
+    comm.Barrier()
+    case = {
+        "mesh": {"file": str(folder / "dome.h5")},
+        "node_set": {"feet": {"indices": list(range(7, 13))}, "apex": {"indices": [0]}},
+        "material": {"m": {"young_modulus": 3.03e9, "density": 7850.0}},
+        "section": {"s": {"area": 3.17e-4, "material": "m"}},
+        "support": [{"node_set": "feet", "fix": "xyz"}],
+        "gravity": {"acceleration": [0.0, 0.0, -9.81]},
+        "time": {"integrator": integrator, "step": step, "end": end},
+        "output": {"fields_every": 0, "probe": [{"name": "apex", "node_set": "apex"}]},
+        "solver": {"guard": guard, "linear": "mumps"},
+    }
+    return Simulation(Case.from_dict(case), comm, output=folder / "dome", quiet=True)
+
+
+def last_of(simulation):
+    """The last row of a run."""
+    return [step.row for step in simulation][-1]
+
+
+@pytest.mark.parametrize("step", [0.1, 1.0, 10.0])
+def test_a_dome_is_not_turned_inside_out(step, comm, shared_tmp_path):
+    """Its own weight moves the apex by 0.16 mm; one large step turns it inside out otherwise."""
+    small = last_of(dome(comm, shared_tmp_path, 0.01, 0.5))
+    large = dome(comm, shared_tmp_path, step, 3.0 * step)
+    told = []
+    large.start()
+    large.stepper.message = told.append
+    row = last_of(large)
+    assert row["elastic_energy"] == pytest.approx(small["elastic_energy"], rel=1e-5)
+    place = [r["probe/apex/position"][0, 2] for r in (row, small)]
+    assert place[0] == pytest.approx(place[1], abs=1e-8) and 0.0819 < place[0] < 0.0821
+    assert told and "halving the step" in told[0] and "solver.guard = false" in told[0]
+    assert any("energy from nowhere" in text or "too far from the state before" in text for text in told)
+
+
+def test_without_the_guard_the_dome_turns(comm, shared_tmp_path):
+    """What the guard is for: no message, and a state far from the exact one."""
+    row = last_of(dome(comm, shared_tmp_path, 10.0, 10.0, guard=False))
+    assert row["probe/apex/position"][0, 2] < 0.0
+
+
+def test_a_step_that_is_refused_leaves_the_state_as_it_was(comm, shared_tmp_path, monkeypatch):
+    """Halved to the end: status 3 with reason and way out, and nothing of the state has changed."""
+    simulation = dome(comm, shared_tmp_path, 0.01, 1.0)
+    simulation.start()
+    stepper = simulation.stepper
+    for _ in range(3):
+        stepper.step()
+    state = stepper.state
+    before = {name: getattr(state, name).copy() for name in ("x", "v", "a", "f", "external", "contact", "support")}
+    held, ledger = stepper.held.copy(), simulation.ledger.sums.copy()
+    monkeypatch.setattr(StepGuard, "check", lambda self, *rest: "the solution is suspicious")
+    with pytest.raises(NotConverged, match="step 4, .*suspicious.*guard = false.*halved 10 times") as failure:
+        stepper.step()
+    assert isinstance(failure.value, SimulationFailure) and failure.value.exit_status == 3
+    for name, array in before.items():
+        np.testing.assert_array_equal(getattr(state, name), array)
+    np.testing.assert_array_equal(stepper.held, held)
+    np.testing.assert_array_equal(simulation.ledger.sums, ledger)
+    assert state.step == 3 and state.time == pytest.approx(0.03)
+
+
+def lattice(comm, folder):
+    """A guard and the positions (local, 3) of a block of octet cells."""
+    case = {
+        "mesh": {"generator": "lattice", "kind": "octet", "cells": [2, 2, 2], "pitch": 0.01},
+        "material": {"m": {"young_modulus": 210e9, "density": 7850.0}},
+        "section": {"s": {"area": 1e-6, "material": "m"}},
+        "time": {"integrator": "newmark", "step": 1e-3, "end": 1e-2},
+    }
+    model = Simulation(Case.from_dict(case), comm, output=folder / "it", quiet=True, check_only=True).model
+    return StepGuard(model), model.mesh.points.copy(), model.mesh.n_owned
+
+
+def test_mirrored_cells_keep_their_lengths_and_are_found(comm, shared_tmp_path):
+    guard, x, owned = lattice(comm, shared_tmp_path)
+    mirrored = x.copy()
+    mirrored[:, 2] = 0.02 - x[:, 2]
+    text = guard.check(x, mirrored, x[:owned], 1e9)
+    assert text is not None and "turns by 90 degrees" in text
+    assert comm.allgather(text) == [text] * comm.size
+
+
+@pytest.mark.parametrize("angle", [0.1, 0.3, 0.6])
+def test_rotations_pass(angle, comm, shared_tmp_path):
+    """A body that turns rigidly, predicted by its velocity: up to 0.6 rad a step, with the energy of a slow turn."""
+    guard, x, owned = lattice(comm, shared_tmp_path)
+    c, s = np.cos(angle), np.sin(angle)
+    turned = x @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    predicted = x[:owned] + angle * np.column_stack([-x[:owned, 1], x[:owned, 0], np.zeros(owned)])
+    assert 0.5 * angle**2 < LARGEST and (angle < 0.15 or 0.5 * angle**2 > NOTICEABLE)
+    energy = 10.0 * angle**8 / comm.size  # of the step; the parabola is 0.003 angle^4 off a circle
+    assert guard.check(x, turned, predicted, energy) is None
+
+
+@pytest.mark.parametrize("integrator", ["newmark", "generalized_alpha", "energy_momentum", "houbolt"])
+def test_a_snap_that_the_step_resolves_passes(integrator, comm, shared_tmp_path):
+    """Two shallow bars that a growing load turns inside out in a hundred steps: no step is halved."""
+    if comm.rank == 0:
+        with h5py.File(shared_tmp_path / "arch.h5", "w") as file:
+            file["points"] = [[-1.0, 0.0, 0.0], [0.0, 0.0, 0.1], [1.0, 0.0, 0.0]]
+            file["bars"] = [[0, 1], [1, 2]]
+    comm.Barrier()
+    case = {
+        "mesh": {"file": str(shared_tmp_path / "arch.h5")},
+        "node_set": {"feet": {"indices": [0, 2]}, "apex": {"indices": [1]}},
+        "material": {"m": {"young_modulus": 1e6, "density": 1000.0}},
+        "section": {"s": {"area": 1e-3, "material": "m"}},
+        "support": [{"node_set": "feet", "fix": "xyz"}, {"node_set": "apex", "fix": "xy"}],
+        "load": [{"node_set": "apex", "force": [0.0, 0.0, -1.0], "table": [[0.0, 0.0], [2.0, 1.0]]}],
+        "time": {"integrator": integrator, "step": 0.02, "end": 2.0},
+        "output": {"fields_every": 0, "probe": [{"name": "apex", "node_set": "apex"}]},
+    }
+    simulation = Simulation(Case.from_dict(case), comm, output=shared_tmp_path / "arch", quiet=True)
+    rows = [step.row for step in simulation]
+    heights = [row["probe/apex/position"][0, 2] for row in rows]
+    assert heights[0] > 0.09 and min(heights) < -0.1
+    assert all(row["step_size"] == 0.02 for row in rows)

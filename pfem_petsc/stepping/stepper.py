@@ -223,6 +223,9 @@ class Stepper(ABC):
             total += weight * self.model.external.at(time, part)
         return total
 
+    def destroy(self) -> None:  # noqa: B027 - most steppers have nothing to free
+        """Free PETSc objects: the stepper makes no further step. Collective; may be called again."""
+
     def when(self, balance: Balance) -> str:
         """The step that a balance is for, and the time that it holds at, for messages."""
         step = self.state.step + 1

@@ -168,11 +168,12 @@ class Stepper(ABC):
             free.begin(state.time, self.part)
         state.external = self._load(self.balance)
         self.solution = self.solve(self.balance)
+        ties = self.model.contact.ties
         if self.model.contact.any:
             walls = self.solution.walls
             self.model.contact.log.book(walls, self.part, self.model.comm)
-            if self.model.contact.ties.any:
-                self.model.contact.ties.take(walls.nodes, walls.touching, walls.places, self.balance.time)
+            if ties.any:
+                fresh = ties.take(walls.nodes, walls.touching, walls.places, self.balance.time)
         if not self.scheme.leads:
             self.before[:] = state.x
         self.scheme.finish(state, self.balance, self.solution.u, self.part)
@@ -180,6 +181,9 @@ class Stepper(ABC):
             self._take_rates(state.time)
         if free is not None:
             free.finish(self.part)
+        if ties.any and self.scheme.turns_held and self.treatment is None:
+            rates = self.model.contact.motion.rates(self.balance.time)
+            ties.calm(*fresh, state.v, rates, self.part)
 
     def _prescribe(self, balance: Balance) -> None:
         """Put what supports prescribe into a balance, whose increments are zero there: exact position, velocity and

@@ -12,7 +12,7 @@ from ..parallel.agreement import agreed
 from ..registry import lookup
 from .explicit import ExplicitContact
 from .forces import WallForces
-from .frames import NodalFrames, build_frames
+from .frames import MIN_VOLUME, NodalFrames, build_frames
 from .log import ContactLog
 from .motion import WallMotion
 from .search import near_planes
@@ -222,19 +222,26 @@ class Contact:
         )
 
     def frames(
-        self, candidates: np.ndarray, x: np.ndarray, time: float, concerned: np.ndarray, rank: np.ndarray | None = None
+        self,
+        candidates: np.ndarray,
+        x: np.ndarray,
+        time: float,
+        concerned: np.ndarray,
+        rank: np.ndarray | None = None,
+        least: float = MIN_VOLUME,
     ) -> NodalFrames:
         """Coordinates and bounds of candidate nodes from their planes at positions (owned, 3). Collective.
 
         ``concerned`` (m, walls) says which walls can stop a candidate; ``rank`` (m, walls) in which order they are
-        taken where there are more than three; default: nearest first.
+        taken where there are more than three; default: nearest first; ``least`` is for
+        :func:`~pfem_petsc.contact.frames.build_frames`.
         """
         at = x[candidates]
         normals, offsets = self.planes(concerned, at, self.motion.shifts(time))
         if rank is None:
             rank = np.einsum("iwk,ik->iw", normals, at) - offsets
         tolerance = 1e-12 * self.length
-        frames = build_frames(candidates, self.fixed[candidates], normals, offsets, rank, tolerance)
+        frames = build_frames(candidates, self.fixed[candidates], normals, offsets, rank, tolerance, at, least)
         with agreed(self.mesh.comm):
             if frames.contradiction >= 0:
                 node = frames.contradiction
@@ -258,6 +265,9 @@ class Contact:
             sign = frames.signs[:, k]
             safe = np.maximum(row, 0)
             touching = (row >= 0) & (active[every, safe] == -sign)
+            # of walls that share a row and are not quite parallel one is nearer
+            bound = np.where(sign > 0.0, frames.lower[every, safe], frames.upper[every, safe])
+            touching &= sign * (bound - frames.bounds[:, k]) <= 1e-12 * self.length
             strengths[touching, k] = np.abs(left[every[touching], safe[touching]])
             left[every[touching], safe[touching]] = 0.0  # walls that share a bound: the first takes the force
         return strengths

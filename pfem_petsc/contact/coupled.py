@@ -90,7 +90,7 @@ class CoupledPairs:
         data = np.zeros((len(self.numbers), 4 + 4 * walls))
         data[self._mine, :3] = x
         data[self._mine, 3] = stiffness
-        data[self._mine, 4 : 4 + 3 * walls] = planes[0].reshape(len(self.here), -1)
+        data[self._mine, 4 : 4 + 3 * walls] = planes[0].reshape(len(self.here), 3 * walls)
         # a sum cannot take infinities: no concern is written as a bound that no position breaks
         data[self._mine, 4 + 3 * walls :] = np.maximum(planes[1], -1e300)
         self.pairs.sum(data)

@@ -4,7 +4,8 @@ At a node, y = B x with the normals of up to three independent planes as rows of
 coordinate; opposite planes bound the same coordinate from both sides. Rows along the axes stay in their axis's slot,
 so that walls along the axes need no change of coordinates at all. Planes are taken in the order of a rank, nearest
 first; a plane that finds no row, or would take the volume of the rows (the product of the sines of their angles) below
-:data:`MIN_VOLUME`, waits: whether it is kept is verified after the solve.
+:data:`MIN_VOLUME`, waits: whether it is kept is verified after the solve. A plane that is almost parallel to a row
+shares it, with the bound that is right at the place where the node is thought to be; that is verified as well.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from .sliding import Sliding
 __all__ = ["MIN_VOLUME", "NodalFrames", "build_frames"]
 
 MIN_VOLUME = 0.04  # of the rows of B: cond(B) <= 2.6/0.04 = 65; two planes share a node from 2.3 degrees on
-_PARALLEL = 1e-14  # 1 - |cos| of normals that share a row
+_PARALLEL = 1e-14  # 1 - |cos| of normals that share a row, to which the bound is exact at the given place alone
 
 
 class NodalFrames:
@@ -32,6 +33,8 @@ class NodalFrames:
     lower, upper : (m, 3) bounds on y [m], infinite where there is none
     rows : (m, w) int8: the coordinate (0, 1, 2) that wall k bounds at the node, -1 where it does not
     signs : (m, w) +1 for a lower bound, -1 for an upper one
+    shared : (m, w) bool: the coordinate is that of an almost parallel wall, and the bound right at one place alone
+    bounds : (m, w) bounds of the walls on their coordinates [m]
     normals, offsets : (m, w, 3), (m, w) planes that have a row; offset -inf for the others
     oblique : whether any basis is not the identity
     contradiction : index in ``nodes`` of a node whose bounds leave it no room, -1 for none
@@ -47,6 +50,8 @@ class NodalFrames:
         self.upper = np.full((m, 3), np.inf)
         self.rows = np.full((m, walls), -1, dtype=np.int8)
         self.signs = np.ones((m, walls))
+        self.shared = np.zeros((m, walls), dtype=np.bool_)
+        self.bounds = np.zeros((m, walls))
         self.normals = np.zeros((m, walls, 3))
         self.offsets = np.full((m, walls), -np.inf)
         self.oblique = False
@@ -66,6 +71,8 @@ def build_frames(
     offsets: np.ndarray,
     rank: np.ndarray,
     tolerance: float = 0.0,
+    places: np.ndarray | None = None,
+    least: float = MIN_VOLUME,
 ) -> NodalFrames:
     """Frames of nodes from their planes, lowest rank first.
 
@@ -76,6 +83,8 @@ def build_frames(
     normals, offsets : (m, w, 3), (m, w) planes n . x >= d; offset -inf where a wall does not concern a node
     rank : (m, w) order in which planes are taken, commonly the distance [m]
     tolerance : opposite bounds that overlap by no more are met in their middle [m]
+    places : (m, 3) where the nodes are thought to be [m]; default: the origin
+    least : volume of the rows below which a plane waits
     """
     frames = NodalFrames(nodes, offsets.shape[1])
     frames.oblique, frames.contradiction = _build(
@@ -84,12 +93,16 @@ def build_frames(
         offsets,
         rank,
         tolerance,
+        np.zeros((len(nodes), 3)) if places is None else places,
+        least,
         frames.basis,
         frames.inverse,
         frames.lower,
         frames.upper,
         frames.rows,
         frames.signs,
+        frames.shared,
+        frames.bounds,
     )
     frames.normals = normals
     frames.offsets = np.where(frames.rows >= 0, offsets, -np.inf)
@@ -112,7 +125,23 @@ def _rest(vector, spanned, n, out):
 
 
 @kernel
-def _build(fixed, normals, offsets, rank, tolerance, basis, inverse, lower, upper, rows, signs):
+def _build(
+    fixed,
+    normals,
+    offsets,
+    rank,
+    tolerance,
+    places,
+    least,
+    basis,
+    inverse,
+    lower,
+    upper,
+    rows,
+    signs,
+    shares,
+    bounds,
+):
     m, w = offsets.shape
     taken = np.zeros(3, dtype=np.bool_)
     spanned = np.zeros((3, 3))
@@ -158,7 +187,7 @@ def _build(fixed, normals, offsets, rank, tolerance, basis, inverse, lower, uppe
                 if n == 3:
                     continue
                 length = _rest(normal, spanned, n, part)
-                if length * volume < MIN_VOLUME:
+                if length * volume < least:
                     continue
                 volume *= length
                 axis = 0
@@ -182,10 +211,22 @@ def _build(fixed, normals, offsets, rank, tolerance, basis, inverse, lower, uppe
                 taken[slot] = True
             rows[i, wall] = slot
             signs[i, wall] = sign
+            bound = sign * offsets[i, wall]
+            if shared:
+                here, gap, cosine, same = 0.0, -offsets[i, wall], 0.0, True
+                for c in range(3):
+                    here += basis[i, slot, c] * places[i, c]
+                    gap += normal[c] * places[i, c]
+                    cosine += normal[c] * basis[i, slot, c]
+                    same = same and normal[c] == sign * basis[i, slot, c]
+                if not same:
+                    bound = here - gap / cosine
+                    shares[i, wall] = True
+            bounds[i, wall] = bound
             if sign > 0.0:
-                lower[i, slot] = max(lower[i, slot], offsets[i, wall])
+                lower[i, slot] = max(lower[i, slot], bound)
             else:
-                upper[i, slot] = min(upper[i, slot], -offsets[i, wall])
+                upper[i, slot] = min(upper[i, slot], bound)
         for slot in range(3):
             if taken[slot]:
                 continue

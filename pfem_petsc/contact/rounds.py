@@ -15,7 +15,7 @@ from ..integrators.base import Balance, State
 from ..solvers.newton import zero_tolerance
 from ..stepping.stepper import NotConverged
 from .forces import WallForces
-from .frames import NodalFrames
+from .frames import MIN_VOLUME, NodalFrames
 from .implicit_friction import StepFriction
 from .pair_coordinates import PairCoordinates
 from .projection import project
@@ -23,6 +23,8 @@ from .projection import project
 __all__ = ["ContactRounds"]
 
 _ROUNDS = 50  # solves of a step
+_PATIENCE = 5  # of these, before walls that wait take a row of smaller volume
+_SMALL_VOLUME = 1e-3  # of rows: two planes share a node from 0.06 degrees on
 _DESCENTS = 30  # of a guess from which Newton's method went round in circles
 
 
@@ -74,8 +76,19 @@ class ContactRounds:
         if self.model.comm.allreduce(int(near.any()), op=MPI.MAX) == 0:
             return None
         nodes = np.flatnonzero(near)
-        self._concerned = contact.concerned(nodes, (state.position + move)[nodes], self._shifts)
+        self._concerned = self._within_reach(nodes, (state.position + move)[nodes], reach[nodes])
         return nodes
+
+    def _within_reach(self, nodes: np.ndarray, x: np.ndarray, reach: np.ndarray) -> np.ndarray:
+        """(m, walls) bool: walls that nodes (m,) on their way to (m, 3) come within reach (m,) [m] of, or are at."""
+        contact, state = self.contact, self.state
+        concerned = contact.concerned(nodes, x, self._shifts)
+        within = np.zeros_like(concerned)
+        starts = state.position[nodes], contact.motion.shifts(state.time), 1e-9 * self.model.length
+        for place, shifts, distance in ((x, self._shifts, reach[:, None]), starts):
+            normals, offsets = contact.planes(concerned, place, shifts)
+            within |= np.einsum("mwi,mi->mw", normals, place) - offsets < distance
+        return within & concerned
 
     def frames(self, x: np.ndarray) -> NodalFrames | None:
         """Frames of the candidates from the planes at positions (owned, 3). Collective."""
@@ -84,9 +97,16 @@ class ContactRounds:
             concerned = self._concerned
             if self.contact.ties.any:
                 concerned = concerned & ~self.contact.ties.held[self.candidates][:, None]
-            self._frames = self.contact.frames(self.candidates, x, self.balance.time, concerned, self._rank)
+            self._frames = self.contact.frames(
+                self.candidates,
+                x,
+                self.balance.time,
+                concerned,
+                self._rank,
+                MIN_VOLUME if self.round < _PATIENCE else _SMALL_VOLUME,
+            )
             if self.contact.ties.any:
-                self._tied = self.contact.ties.pin(self._frames, self.balance.time)
+                self._tied = self.contact.ties.pin(self._frames, x, self.balance.time)
             if self.friction is not None:
                 self.friction.apply(self._frames, x)
         if self.pairs is not None:
@@ -197,15 +217,15 @@ class ContactRounds:
             self.strengths = self._strengths(w, g, noise)
             self._pull = np.where(contact.fixed[self.candidates], 0.0, g[self.candidates])
         beyond = np.flatnonzero(contact.near(x, self._shifts, np.array([-slack])))
-        unsettled, joined = self._unexpected(beyond, x, slack)
-        left = joined
+        joined, broken = self._unexpected(beyond, x, slack)
+        left, unsettled = joined, False
         if self.friction is not None and self._frames is not None:
             at = self.candidates
             known = self._frames, x[at], self._pull, self.strengths
             self.strengths = self.friction.settle(*known, noise, tolerance)
             left = np.union1d(left, self.friction.unsettled)
-        if not contact.flat.all() and self._frames is not None:
-            unsettled = unsettled or self._off_surface(x, slack)
+        if self._frames is not None:
+            unsettled = self._misaligned() or (not contact.flat.all() and self._off_surface(x, slack))
         unsettled = unsettled or len(left) > 0
         if self.model.comm.allreduce(int(unsettled), op=MPI.MAX) == 0:
             return settled
@@ -217,7 +237,7 @@ class ContactRounds:
                 f"step {self.state.step + 1}, t = {self.balance.time:.6g} s: the nodes that touch walls could not be "
                 f"settled in {_ROUNDS} solves{f' (nodes {shown})' if shown else ''}; take a smaller time step"
             )
-        self._join(joined, x)
+        self._join(joined, broken, x)
         return False
 
     def _press(self, w: np.ndarray, g: np.ndarray, noise: float) -> np.ndarray:
@@ -251,10 +271,8 @@ class ContactRounds:
         active[(w[at] >= upper[at]) & (turned < -noise)] = 1
         return self.contact.strengths(frames, turned, active)
 
-    def _unexpected(self, beyond: np.ndarray, x: np.ndarray, tolerance: float) -> tuple[bool, np.ndarray]:
-        """Whether nodes beyond walls were not held back by a bound on them, and these nodes."""
-        if len(beyond) == 0:
-            return False, beyond
+    def _unexpected(self, beyond: np.ndarray, x: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
+        """Nodes (k,) beyond walls that no bound on them stands for, and which walls these are (k, walls)."""
         contact = self.contact
         concerned = contact.concerned(beyond, x[beyond], self._shifts)
         normals, offsets = contact.planes(concerned, x[beyond], self._shifts)
@@ -264,13 +282,30 @@ class ContactRounds:
             place = np.searchsorted(self.candidates, beyond)
             known = place < len(self.candidates)
             known[known] = self.candidates[place[known]] == beyond[known]
-            # what a bound keeps is kept to rounding of the coordinates; supports decide over walls
-            broken[known] &= self._frames.rows[place[known]] < 0
+            # what a bound of its own keeps is kept to rounding of the coordinates; supports decide over walls
+            place = place[known]
+            broken[known] &= (self._frames.rows[place] < 0) | self._frames.shared[place]
             if contact.ties.any:
                 broken &= ~contact.ties.held[beyond][:, None]
         thin = (np.where(contact.fixed[beyond][:, None, :], 0.0, normals) ** 2).sum(axis=2) <= 1e-12
         broken &= ~thin
-        return bool(broken.any()), beyond[broken.any(axis=1)]
+        met = broken.any(axis=1)
+        return beyond[met], broken[met]
+
+    def _misaligned(self) -> bool:
+        """Whether a wall presses on the row of an almost parallel one that does not: the force is off its normal."""
+        frames, pressing = self._frames, self.strengths > 0.0
+        astray = pressing & frames.shared
+        if not astray.any():
+            return False
+        for node, wall in np.argwhere(astray):
+            own = (frames.rows[node] == frames.rows[node, wall]) & ~frames.shared[node]
+            turn = np.abs(
+                frames.normals[node, wall] - frames.signs[node, wall] * frames.basis[node, frames.rows[node, wall]]
+            )
+            if turn.max() > 1e-12 and not (pressing[node] & own).any():
+                return True
+        return False
 
     def _off_surface(self, x: np.ndarray, tolerance: float) -> bool:
         """Whether a node pressed on a curved wall is off its surface, or was held by the plane of another point."""
@@ -285,13 +320,13 @@ class ContactRounds:
                     return True
         return False
 
-    def _join(self, joined: np.ndarray, x: np.ndarray) -> None:
+    def _join(self, joined: np.ndarray, broken: np.ndarray, x: np.ndarray) -> None:
         """The candidates of the next round and the order of their walls: broken first, then the pressing ones."""
         contact = self.contact
         known = np.empty(0, dtype=np.int64) if self.candidates is None else self.candidates
         nodes = np.union1d(known, joined)
-        concerned = contact.concerned(nodes, x[nodes], self._shifts)
-        rank = np.full((len(nodes), len(contact.walls)), np.inf)
+        concerned = np.zeros((len(nodes), len(contact.walls)), dtype=bool)
+        concerned[np.searchsorted(nodes, joined)] = broken
         if self.candidates is not None:
             place = np.searchsorted(nodes, known)
             concerned[place] |= self._concerned

@@ -2,8 +2,9 @@
 
 In the step in which a node meets such a wall it is stopped as by any wall, along the normal; from then on its position
 relative to the wall is the one of that moment, in all three directions and whatever the sign of the force. Components
-that supports prescribe stay the supports'. What is tied is part of the state: ``tied_to`` (owned,) is the wall's index
-plus one, 0 where there is none, and ``tied_at`` (owned, 3) the place relative to the wall [m].
+that supports prescribe stay the supports'; where these carry a node through its wall the run ends. What is tied is part
+of the state: ``tied_to`` (owned,) is the wall's index plus one, 0 where there is none, and ``tied_at`` (owned, 3) the
+place relative to the wall [m].
 """
 
 from __future__ import annotations
@@ -70,8 +71,10 @@ class Ties:
         self.check(nodes, walls, places, time)
         return nodes, walls, places, stiffness[nodes, None] * (places - x[nodes])
 
-    def pin(self, frames, time: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def pin(self, frames, x: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Hold the tied nodes of an implicit step, of which there are frames. Collective.
+
+        ``x`` (owned, 3) has the prescribed components at ``time`` [m].
 
         Returns
         -------
@@ -84,13 +87,13 @@ class Ties:
         """
         nodes, walls, places = self.targets(time)
         with agreed(self.contact.mesh.comm):
-            self.check(nodes, walls, places, time)
+            self.check(nodes, walls, np.where(self.contact.fixed[nodes], x[nodes], places), time)
         at = np.searchsorted(frames.nodes, nodes)
         frames.pin(at, places, ~self.contact.fixed[nodes])
         return at, walls, places
 
     def check(self, nodes: np.ndarray, walls: np.ndarray, places: np.ndarray, time: float) -> None:
-        """Refuse to carry nodes at (m, 3) through walls other than their own (m,).
+        """Refuse to carry nodes at (m, 3) through walls, their own (m,) among them where supports prescribe components.
 
         Raises
         ------
@@ -98,15 +101,26 @@ class Ties:
             On this rank.
         """
         contact = self.contact
-        if len(nodes) == 0 or len(contact.walls) == 1:
+        partly = contact.fixed[nodes].any(axis=1)
+        if len(contact.walls) == 1 and not partly.any():
+            return
+        if contact.motion.free is not None:
+            partly &= ~np.isin(walls, contact.motion.free.at)  # whose place may be a trial
+        if len(nodes) == 0:
             return
         shifts = contact.motion.shifts(time)
         concerned = contact.concerned(nodes, places, shifts)
-        concerned[np.arange(len(nodes)), walls] = False
+        concerned[np.arange(len(nodes)), walls] = partly
         normals, offsets = contact.planes(concerned, places, shifts)
         gaps = np.einsum("mwi,mi->mw", normals, places) - offsets
         gaps[(np.where(contact.fixed[nodes][:, None, :], 0.0, normals) ** 2).sum(axis=2) <= 1e-12] = np.inf
         node, other = np.unravel_index(np.argmin(gaps), gaps.shape)
+        if gaps[node, other] < -_SLACK * contact.length and other == walls[node]:
+            raise SimulationFailure(
+                f"node {contact.mesh.node_ids[nodes[node]]} is tied to wall {contact.names[other]!r} and its supports "
+                f"carry it {-gaps[node, other]:.3g} m beyond the wall; free these components, move the wall with the "
+                "supports, or do not tie the node"
+            )
         if gaps[node, other] < -_SLACK * contact.length:
             raise SimulationFailure(
                 f"node {contact.mesh.node_ids[nodes[node]]}, tied to wall {contact.names[walls[node]]!r}, is carried "
@@ -114,14 +128,47 @@ class Ties:
                 "apart, or name the nodes that they concern with 'node_set'"
             )
 
-    def take(self, nodes: np.ndarray, touching: np.ndarray, places: np.ndarray, time: float) -> None:
-        """Tie nodes (m,) at (m, 3) that touch (m, walls) walls that tie; of several the first."""
+    def take(
+        self, nodes: np.ndarray, touching: np.ndarray, places: np.ndarray, time: float
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Tie nodes (m,) at (m, 3) that touch (m, walls) walls that tie; of several the first.
+
+        Gives the nodes that are now tied (k,), their walls (k,), and the walls' normals there (k, 3).
+        """
         tied_to, tied_at = self._memory()
         fresh = touching & self.tying & (tied_to[nodes] == 0)[:, None]
         met = fresh.any(axis=1)
         walls = fresh[met].argmax(axis=1)
         tied_to[nodes[met]] = walls + 1
-        tied_at[nodes[met]] = places[met] - self.contact.motion.shifts(time)[walls]
+        own = places[met] - self.contact.motion.shifts(time)[walls]
+        tied_at[nodes[met]] = own
+        normals = np.zeros((len(walls), 3))
+        for k in np.unique(walls):
+            normals[walls == k] = self.contact.walls[k].planes(own[walls == k])[0]
+        return nodes[met], walls, normals
+
+    def calm(
+        self, nodes: np.ndarray, walls: np.ndarray, normals: np.ndarray, v: np.ndarray, rates: np.ndarray, h: float
+    ) -> None:
+        """Tie nodes where they come to rest on their walls, for schemes with x1 - x0 = h (v0 + v1)/2.
+
+        Held at the place of the touch, such a node would have its velocity relative to the wall turned round in every
+        step, for ever. Half a step further on along that velocity it has lost it. A node that still approaches the wall
+        is stopped once more before it is tied.
+
+        Parameters
+        ----------
+        nodes, walls, normals : as :meth:`take` gives them
+        v : (owned, 3) velocities [m/s]; rates : (walls, 3) those of the walls
+        h : step [s]
+        """
+        tied_to, tied_at = self._memory()
+        relative = v[nodes] - rates[walls]
+        away = np.einsum("ki,ki->k", relative, normals)
+        later = away < -1e-9 * np.linalg.norm(relative, axis=1)
+        tied_to[nodes[later]] = 0
+        tied_at[nodes] += 0.5 * h * relative
+        tied_at[nodes[later]] = 0.0
 
     def _memory(self) -> tuple[np.ndarray, np.ndarray]:
         memory, owned = self.contact.state.memory, self.contact.mesh.n_owned

@@ -95,6 +95,8 @@ class Scheme(ABC):
     solves_end : the position solved for is x_{n+1}
     symmetric : whether the Hessian is
     dissipates : whether the scheme takes energy from high frequencies
+    turns_held : x1 - x0 = h (v0 + v1)/2 and nothing else ties velocity to position: a node that is held in place from
+        one step to the next has its velocity turned round
     notice : what users must be told when they choose it; empty for nothing
     """
 
@@ -104,6 +106,7 @@ class Scheme(ABC):
     solves_end = True
     symmetric = True
     dissipates = True
+    turns_held = False
     notice = ""
 
     def __init__(self, parameters: StrictModel) -> None:

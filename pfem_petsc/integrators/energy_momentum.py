@@ -24,6 +24,7 @@ class Scheme(Base):
     at_ends = False
     symmetric = False
     dissipates = False
+    turns_held = True
 
     def balance(self, state: State, h: float) -> Balance:
         return Balance(

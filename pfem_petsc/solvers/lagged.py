@@ -224,6 +224,7 @@ class LaggedPreconditioner:
 
     def destroy(self) -> None:
         """Free the PETSc objects."""
+        self._problem = None
         for thing in (self._inner, self._right, self._left, self.matrix, self.product):
             if thing is not None:
                 thing.destroy()

@@ -6,11 +6,15 @@ quarter of the memory. Contact problems take the restriction of the operator to 
 
 from __future__ import annotations
 
+import atexit
+import weakref
+
 import numpy as np
 from petsc4py import PETSc
 
 from ..mechanics.compiled import kernel
 from ..mechanics.mass import consistent_product
+from .outlive import outlive
 
 __all__ = ["MatrixFreeHessian"]
 
@@ -70,15 +74,23 @@ def _diagonal(bars, stored, blocks):
 
 
 class _Restriction:
-    """H restricted to some of the unknowns of each rank: what is left of a contact problem's inactive set."""
+    """H restricted to some of the unknowns of each rank: what is left of a contact problem's inactive set.
+
+    It does not refer to its PETSc matrix, which refers to it: such a cycle passes through PETSc, where Python's
+    garbage collector does not see it, and would never be freed.
+    """
 
     def __init__(self, whole: MatrixFreeHessian, kept: np.ndarray) -> None:
         self.whole = whole
         self.kept = kept.astype(np.int64)
-        n = len(kept)
-        self.mat = PETSc.Mat().createPython(((n, None), (n, None)), self, comm=whole.mesh.comm)
-        self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
-        self.mat.setUp()
+
+    def matrix(self) -> PETSc.Mat:
+        """A PETSc matrix of it. Collective."""
+        n = len(self.kept)
+        matrix = PETSc.Mat().createPython(((n, None), (n, None)), self, comm=self.whole.mesh.comm)
+        matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+        matrix.setUp()
+        return matrix
 
     def mult(self, mat: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Y = H x with zeros for the unknowns left out; called by PETSc."""
@@ -94,6 +106,26 @@ class _Restriction:
         d.setArray(self.whole.diagonal().reshape(-1)[self.kept])
 
 
+class _Context:
+    """What PETSc calls for an operator that owns its PETSc matrix; it does not keep the operator alive."""
+
+    def __init__(self, operator: _Extension | MatrixFreeHessian) -> None:
+        self.operator = weakref.ref(operator)
+
+    def mult(self, mat: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """Y = H x; called by PETSc."""
+        self.operator().mult(mat, x, y)
+
+    def getDiagonal(self, mat: PETSc.Mat, d: PETSc.Vec) -> None:  # noqa: N802 - PETSc's name
+        """Diagonal of H; called by PETSc."""
+        d.setArray(self.operator().diagonal().ravel())
+
+    def createSubMatrix(self, mat, rows, columns, out=None):  # noqa: ANN001, ANN201, N802 - PETSc's name
+        """The restriction of H to some unknowns; called by PETSc."""
+        whole = self.operator()
+        return _Restriction(whole, rows.getIndices() - 3 * whole.mesh.first_node).matrix()
+
+
 class _Extension:
     """H of all unknowns, where rows and columns of those that walls hold are those of a unit matrix, scaled."""
 
@@ -101,10 +133,12 @@ class _Extension:
         self.whole = whole
         self.kept: np.ndarray | None = None
         local, total = 3 * whole.mesh.n_owned, 3 * whole.mesh.n_nodes
-        self.mat = PETSc.Mat().createPython(((local, total), (local, total)), self, comm=whole.mesh.comm)
+        context = _Context(self)
+        self.mat = PETSc.Mat().createPython(((local, total), (local, total)), context, comm=whole.mesh.comm)
         self.mat.setBlockSize(3)
         self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         self.mat.setUp()
+        atexit.register(outlive, weakref.ref(self.mat))
 
     def mult(self, mat: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Y = H x; called by PETSc."""
@@ -139,9 +173,10 @@ class MatrixFreeHessian:
         mesh = model.mesh
         self.mesh = mesh
         local, total = 3 * mesh.n_owned, 3 * mesh.n_nodes
-        self.mat = PETSc.Mat().createPython(((local, total), (local, total)), self, comm=mesh.comm)
+        self.mat = PETSc.Mat().createPython(((local, total), (local, total)), _Context(self), comm=mesh.comm)
         self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         self.mat.setUp()
+        atexit.register(outlive, weakref.ref(self.mat))
         self.bounded = self.mat
         self.stored = np.zeros((len(mesh.bars), 5))
         self._u = np.zeros((mesh.n_local, 3))
@@ -220,10 +255,6 @@ class MatrixFreeHessian:
         if fixed is not None:
             out[:owned][fixed] = held
 
-    def getDiagonal(self, mat: PETSc.Mat, d: PETSc.Vec) -> None:  # noqa: N802 - PETSc's name
-        """Diagonal of H; called by PETSc."""
-        d.setArray(self.diagonal().ravel())
-
     def diagonal(self) -> np.ndarray:
         """Diagonal of H (owned, 3)."""
         problem, owned = self._problem, self.mesh.n_owned
@@ -262,14 +293,8 @@ class MatrixFreeHessian:
     def couple(self, pairs) -> None:
         """Nothing to prepare: pairs are applied with the bars."""
 
-    def createSubMatrix(self, mat, rows, columns, out=None):  # noqa: ANN001, ANN201, N802 - PETSc's name
-        """The restriction of H to some unknowns; called by PETSc."""
-        return _Restriction(self, rows.getIndices() - 3 * self.mesh.first_node).mat
-
-    def destroy(self, mat: PETSc.Mat | None = None) -> None:
-        """Free the PETSc matrix; PETSc calls it with the matrix when that goes."""
-        if mat is None and self.mat is not None:
-            matrix, self.mat = self.mat, None
-            matrix.destroy()
-            if self._extension is not None:
-                self._extension.mat.destroy()
+    def destroy(self) -> None:
+        """Free the PETSc matrices."""
+        if self._extension is not None:
+            self._extension.mat.destroy()
+        self.mat.destroy()

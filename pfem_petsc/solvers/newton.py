@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import atexit
 import re
+import weakref
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -14,6 +16,7 @@ from .lagged import LaggedPreconditioner, Preconditioning
 from .linear import LinearChoice, configure
 from .matrix import HessianMatrix
 from .matrix_free import MatrixFreeHessian
+from .outlive import outlive
 from .reasons import linear_reason, newton_reason
 
 __all__ = ["NewtonReport", "NewtonSolver", "Problem", "zero_tolerance"]
@@ -147,6 +150,9 @@ class NewtonSolver:
         """Free the PETSc objects."""
         for snes in self._solvers.values():
             snes.destroy()
+        self._solvers.clear()
+        self._ours.clear()
+        self.problem = None
         for vector in (self._u, self._g, self._lower, self._upper):
             vector.destroy()
 
@@ -194,12 +200,14 @@ class NewtonSolver:
         if full_steps:
             PETSc.Options(prefix)["snes_linesearch_type"] = "basic"
         snes.setType("vinewtonrsls" if contact else "newtonls")
-        # looked up at each call: the methods may be covered by log events after this
-        snes.setFunction(lambda *arguments: self._residual(*arguments), self._g)
+        # Methods are looked up at each call: they may be covered by log events after this. PETSc's solver must not keep
+        # this object alive, which owns it: Python's garbage collector does not see such a cycle.
+        this = weakref.ref(self)
+        snes.setFunction(lambda *arguments: this()._residual(*arguments), self._g)
         matrix = self.hessian.bounded if contact else self.hessian.mat
-        snes.setJacobian(lambda *arguments: self._hessian(*arguments), matrix, matrix)
+        snes.setJacobian(lambda *arguments: this()._hessian(*arguments), matrix, matrix)
         snes.setTolerances(rtol=0.0, atol=0.0, stol=0.0, max_it=self.max_newton)
-        snes.setConvergenceTest(self._converged)
+        snes.setConvergenceTest(lambda *arguments: this()._converged(*arguments))
         if contact:
             # PETSc's default 1e-8 is absolute: a node that near its bound would be held there, off it
             options = PETSc.Options(snes.getOptionsPrefix())
@@ -214,6 +222,7 @@ class NewtonSolver:
             # options belong to the process: the next model has a length of its own
             options.delValue("snes_vi_zero_tolerance")
         self._solvers[key] = snes
+        atexit.register(outlive, weakref.ref(snes))
         return snes
 
     def _residual(self, snes: PETSc.SNES, u: PETSc.Vec, g: PETSc.Vec) -> None:

@@ -17,6 +17,7 @@ from ..errors import SimulationFailure
 from ..integrators.base import Balance
 from ..solvers.lagged import LaggedPreconditioner
 from ..solvers.linear import LinearChoice, unsymmetric
+from ..solvers.mass import MassSolver
 from ..solvers.matrix import HessianMatrix
 from ..solvers.matrix_free import MatrixFreeHessian
 from ..solvers.newton import NewtonReport, NewtonSolver
@@ -43,6 +44,7 @@ class ImplicitStepper(Stepper):
 
     def __init__(self, model, scheme, h: float, choice: LinearChoice) -> None:
         super().__init__(model, scheme, h)
+        _free_left_over(model.comm)
         symmetric = scheme.symmetric and not model.contact.rough
         if choice.matrix_free:
             self.hessian = MatrixFreeHessian(model)
@@ -67,6 +69,7 @@ class ImplicitStepper(Stepper):
         self.level = 0  # the next step is made in 2**level parts
         self.message: Callable[[str], None] = lambda text: None
         self.held = np.zeros(model.mesh.n_owned, dtype=bool)  # nodes held by walls in the last step
+        self._mass: MassSolver | None = None
 
     def step(self) -> None:
         """Advance by one step; where it does not converge, in halves of halves, which grow back step by step.
@@ -106,11 +109,10 @@ class ImplicitStepper(Stepper):
         self.smallest = min(self.smallest, part)
 
     def destroy(self) -> None:
-        """Free the PETSc objects."""
         self.newton.destroy()
-        self.hessian.destroy()
-        if self.lagged is not None:
-            self.lagged.destroy()
+        for owner in (self.hessian, self.lagged, self._mass):
+            if owner is not None:
+                owner.destroy()
 
     @property
     def lagged_count(self) -> list[float]:
@@ -152,28 +154,9 @@ class ImplicitStepper(Stepper):
                 a[at] = np.einsum("kij,kj->ki", inertia.redistribution.inverse(inertia.mass, fixed), load[at])
             a[fixed] = 0.0
             return a
-        mass = HessianMatrix(self.model.mesh, fixed, self.model.supports.any)
-        mass.fill(lambda values: self._mass_matrix(mass, values))
-        b, a = mass.mat.createVecs()
-        right = load.copy()
-        right[fixed] = 0.0
-        b.array[:] = right.ravel()
-        ksp = PETSc.KSP().create(self.model.comm)
-        ksp.setType("cg")
-        ksp.getPC().setType("pbjacobi")
-        ksp.setTolerances(rtol=1e-14, max_it=1000)
-        ksp.setOperators(mass.mat)
-        ksp.solve(b, a)
-        result = a.array.reshape(load.shape).copy()
-        for thing in (ksp, a, b):
-            thing.destroy()
-        mass.destroy()
-        return result
-
-    def _mass_matrix(self, matrix: HessianMatrix, values: np.ndarray) -> None:
-        model = self.model
-        model.bars.tangents(self.state.x, 0.0, model.inertia.coefficients(1.0, 0.0), matrix.pattern, values)
-        matrix.constrain(float(model.inertia.mass.max(initial=1.0)), values)
+        if self._mass is None:
+            self._mass = MassSolver(self.model)
+        return self._mass.solve(load)
 
     def solve(self, balance: Balance) -> Solution:
         state, pairs = self.state, self.model.pairs
@@ -317,3 +300,13 @@ class ImplicitStepper(Stepper):
             f"Newton iterations: {report.why}; residual {report.norm:.3g} N, asked {tolerance:.3g} N; worst at "
             f'node {node} ({residual:.3g} N). Take a smaller time.step, or solver.linear = "mumps"'
         )
+
+
+def _free_left_over(comm: MPI.Comm) -> None:
+    """Free what PETSc holds of earlier steppers that nobody has destroyed. Collective.
+
+    Python drops objects whenever it likes, which PETSc, whose objects belong to all ranks, only puts aside.
+    """
+    gc.collect()
+    if hasattr(PETSc, "garbage_cleanup"):
+        PETSc.garbage_cleanup(comm)

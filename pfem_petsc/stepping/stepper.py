@@ -169,11 +169,12 @@ class Stepper(ABC):
             free.begin(state.time, self.part)
         state.external = self._load(self.balance)
         self.solution = self.solve(self.balance)
+        ties = self.model.contact.ties
         if self.model.contact.any:
             walls = self.solution.walls
             self.model.contact.log.book(walls, self.part, self.model.comm)
-            if self.model.contact.ties.any:
-                self.model.contact.ties.take(walls.nodes, walls.touching, walls.places, self.balance.time)
+            if ties.any:
+                fresh = ties.take(walls.nodes, walls.touching, walls.places, self.balance.time)
         if not self.scheme.leads:
             self.before[:] = state.x
         self.scheme.finish(state, self.balance, self.solution.u, self.part)
@@ -181,6 +182,9 @@ class Stepper(ABC):
             self._take_rates(state.time)
         if free is not None:
             free.finish(self.part)
+        if ties.any and self.scheme.turns_held and self.treatment is None:
+            rates = self.model.contact.motion.rates(self.balance.time)
+            ties.calm(*fresh, state.v, rates, self.part)
 
     def _prescribe(self, balance: Balance) -> None:
         """Put what supports prescribe into a balance, whose increments are zero there: exact position, velocity and
@@ -223,6 +227,9 @@ class Stepper(ABC):
         for weight, time in balance.loads:
             total += weight * self.model.external.at(time, part)
         return total
+
+    def destroy(self) -> None:  # noqa: B027 - most steppers have nothing to free
+        """Free PETSc objects: the stepper makes no further step. Collective; may be called again."""
 
     def when(self, balance: Balance) -> str:
         """The step that a balance is for, and the time that it holds at, for messages."""

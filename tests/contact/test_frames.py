@@ -61,3 +61,21 @@ def test_overlapping_bounds():
     met = frames_of(normals, [1.0 + 4e-13, -1.0])
     assert met.contradiction == -1 and met.lower[0, 0] == met.upper[0, 0]
     assert frames_of(normals, [1.1, -1.0]).contradiction == 0
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_almost_parallel_planes_share_a_bound_that_is_exact_at_the_place(sign):
+    """Planes 3e-8 apart in direction, 7 m from the origin: without regard to the place the bound is 2e-7 m off."""
+    angle = 3e-8
+    normals = np.array([[[0.0, 0.0, 1.0], [angle, 0.0, sign]]])
+    place = np.array([[7.0, 2.0, 0.5]])
+    offsets = np.array([[0.1, normals[0, 1] @ place[0] + 0.05]])
+    frames = build_frames(
+        np.array([0]), np.zeros((1, 3), bool), normals, offsets, np.array([[0.0, 1.0]]), 1.0, places=place
+    )
+    assert frames.rows.tolist() == [[2, 2]] and frames.shared.tolist() == [[False, True]]
+    # the node is 0.05 m beyond the second plane: at its bound it is on it
+    moved = place[0] + [0.0, 0.0, frames.bounds[0, 1] - place[0, 2]]
+    assert abs(normals[0, 1] @ moved - offsets[0, 1]) < 1e-15
+    same = build_frames(np.array([0]), np.zeros((1, 3), bool), normals[:, [0, 0]], offsets, np.array([[0.0, 1.0]]))
+    assert not same.shared.any() and same.bounds.tolist() == offsets.tolist()

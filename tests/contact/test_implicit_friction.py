@@ -349,3 +349,39 @@ def test_any_number_of_ranks(name, comm, shared_tmp_path):
         assert np.abs(alone.gather(alone.state.position) - x).max() < 1e-10 * 0.2
         assert row["contact_work"] == pytest.approx(found["one"]["contact_work"], rel=1e-8)
     comm.Barrier()
+
+
+@pytest.mark.parametrize("friction", [0.2, 0.0])
+def test_wall_out_of_reach_changes_nothing(friction, comm, shared_tmp_path):
+    """A plane 100 m above, oblique to the floor, is in no nodal frame: the steps are bitwise the same."""
+    floor = {"type": "plane", "name": "floor", "point": [0, 0, 0], "normal": [0, 0, 1.0], "friction": friction}
+    far = {"type": "plane", "name": "far", "point": [0, 0, 100.0], "normal": [0.1, 0, -1.0]}
+    x = []
+    for name, walls in (("one", [floor]), ("two", [floor, far])):
+        case = lattice_case(
+            walls, cells=(1, 1, 1), integrator="newmark", step=1e-3, end=8e-3, gravity=(3.0, 1.0, -9.81)
+        )
+        case["initial"]["velocity"] = [0.1, 0.0, -0.2]
+        rows, run = rows_of(case, comm, shared_tmp_path, name)
+        assert rows[-1]["wall/floor/contacts"] > 0
+        x.append(run.state.position.copy())
+    np.testing.assert_array_equal(*x)
+
+
+def test_valley_of_almost_parallel_planes(comm, shared_tmp_path):
+    """Nodes that come to rest where two planes one degree apart meet are on both of them."""
+    tilt = np.radians(0.5)
+    valley = planes([[s * np.sin(tilt), 0.0, np.cos(tilt)] for s in (1.0, -1.0)], [0.0, 0.0])
+    for name, wall in zip(("left", "right"), valley, strict=True):
+        wall["name"] = name
+    case = lattice_case(valley, cells=(1, 1, 1), integrator="newmark", step=2e-3, end=0.04, gravity=(0.0, 0.0, -9.81))
+    lowest = "bottom"
+    case["node_set"] = {lowest: {"box": [[-1e-3, -1, -1e-3], [1e-3, 1, 1e-3]]}}
+    for wall in valley:
+        wall["node_set"] = lowest
+    case["support"] = [{"node_set": "rest", "fix": "y"}]
+    case["node_set"]["rest"] = {"box": [[-1, -1e-3, -1], [1, 1e-3, 1]]}
+    rows, run = rows_of(case, comm, shared_tmp_path)
+    gaps = run.model.contact.gaps(run.state.position, run.state.time)
+    assert gaps.min() >= -1e-13
+    assert min(row["wall/left/contacts"] + row["wall/right/contacts"] for row in rows) >= 1

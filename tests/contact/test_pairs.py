@@ -294,3 +294,21 @@ def test_unequal_bodies_keep_momentum(comm, shared_tmp_path):
 def test_refusals(change, message, comm, shared_tmp_path):
     with pytest.raises(InputError, match=message):
         simulation(two_rods("central_differences", **change), comm, shared_tmp_path)
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("walls", [planes([[1.0, 0, 0]], [-0.5]), []])
+def test_ranks_that_own_no_node_of_a_pair(walls, comm, shared_tmp_path):
+    """Two rods of four bars on three ranks: the middle ranks have the pair, and others none of its nodes."""
+    case = two_rods()
+    case["mesh"] |= {"elements": 4, "gap": 0.01}
+    case["node_set"]["second"] = {"box": [[1.005, -1, -1], [3, 1, 1]]}
+    case["wall"] = walls
+    if not walls:  # pairs that share a node
+        shared = {"name": "shared", "first": "left", "second": "right", "direction": DIRECTION}
+        case["contact_pair"].append(shared)
+    case["time"] |= {"end": 1.0}
+    rows = [step.row for step in simulation(case, comm, shared_tmp_path)]
+    assert max(row["pair/faces/force"][0] for row in rows) > 0.05
+    assert max(abs(row["momentum"][0]) for row in rows) < 1e-14
+    assert max(abs(row["energy_imbalance"]) for row in rows) < 1e-14

@@ -1,10 +1,16 @@
 """Models that run after one another in a process do not see each other."""
 
+import gc
+from pathlib import Path
+
 import numpy as np
 import pytest
+from lattices import lattice_case, planes, simulation
 from petsc4py import PETSc
 
 from pfem_petsc import Case, Simulation
+from pfem_petsc.errors import SimulationFailure
+from pfem_petsc.solvers import matrix_free
 
 pytestmark = pytest.mark.parallel
 
@@ -21,3 +27,52 @@ def test_tolerance_on_bounds_is_that_of_the_model(comm, shared_tmp_path):
     assert not PETSc.Options("pfem_contact_").hasName("snes_vi_zero_tolerance")
     force = wall_force(comm, shared_tmp_path / "rod", "rod_impact", "time.end=0.9")
     assert (force[40:] < -0.4).all()
+
+
+def resting(steps, **tables):
+    """A lattice that lies on a floor."""
+    tables = {"integrator": "newmark", "cells": (2, 2, 2), "gravity": (0.0, 0.0, -9.81), **tables}
+    return lattice_case(planes([[0.0, 0.0, 1.0]], [0.0]), step=1e-3, end=1e-3 * steps, **tables)
+
+
+def test_restrictions_to_inactive_unknowns_are_freed(comm, shared_tmp_path):
+    """Every Newton iteration in contact makes a matrix of the inactive unknowns: PETSc keeps the last one alone."""
+    run = simulation(resting(25, solver={"operator": "matrix_free", "linear": "cg"}), comm, shared_tmp_path)
+    iterations = sum(step.row["newton_iterations"] for step in run)
+    assert iterations >= 25
+    gc.collect()
+    left = sum(isinstance(thing, matrix_free._Restriction) for thing in gc.get_objects())
+    assert left <= 2
+    run.stepper.destroy()
+    run.stepper.destroy()
+    assert not any(isinstance(thing, matrix_free._Restriction) for thing in gc.get_objects())
+
+
+@pytest.mark.parametrize("linear, destroyed", [("mumps", True), ("mumps", False), ("gamg", True)])
+def test_one_simulation_after_the_other_takes_no_more_memory(linear, destroyed, comm, shared_tmp_path):
+    def resident():
+        return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
+
+    for count in range(16):
+        run = simulation(resting(1, cells=(1, 1, 1), solver={"linear": linear}), comm, shared_tmp_path)
+        for _ in run:
+            pass
+        if destroyed:
+            run.stepper.destroy()
+        if count == 5:
+            before = resident()
+    assert resident() - before < 10 * 1e5  # bytes; what each leaves behind, if nothing is freed, is 2e5 to 4e5
+
+
+def test_consistent_mass_is_inverted_by_a_solver_with_options_and_a_check(comm, shared_tmp_path):
+    case = resting(1, gravity=(1.0, 0.5, -9.81))
+    case["time"]["mass"] = "consistent"
+    for step in simulation(case, comm, shared_tmp_path):
+        assert step.row["time"] >= 0.0
+    options = PETSc.Options("pfem_mass_")
+    options["ksp_max_it"] = 1
+    try:
+        with pytest.raises(SimulationFailure, match="consistent mass matrix: the limit of linear iterations"):
+            list(simulation(case, comm, shared_tmp_path))
+    finally:
+        options.delValue("ksp_max_it")

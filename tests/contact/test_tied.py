@@ -172,6 +172,44 @@ def test_wall_with_mass(integrator, comm, shared_tmp_path):
     assert rows[-1]["wall/glue/contacts"] >= 1 and rows[-1]["wall/glue/releases"] == 0
 
 
+@pytest.mark.parametrize("mass", [0.5, None])
+def test_energy_momentum_comes_to_rest_on_its_wall(mass, comm, shared_tmp_path):
+    """Velocity of a tied node is that of the wall, with mass or without, not 0.5 and 1.5 of it in turns for ever."""
+    speed, keys = 0.05, {} if mass is None else {"mass": mass}
+    case = rod("energy_momentum", {}, speed=speed, elements=5, step=0.02, end=0.8, gap=0.0513, **keys)
+    case["contact"]["treatment"] = "scheme"
+    case["initial"]["velocity"] = [speed, 0.01, 0.0]
+    run = simulation(case, comm, shared_tmp_path)
+    apart, rows = [], []
+    for step in run:
+        nodes, walls, places = run.model.contact.ties.targets(run.state.time)
+        rows.append(step.row)
+        if len(nodes):
+            apart.append(np.abs(run.state.v[nodes] - run.model.contact.motion.rates(run.state.time)[walls]).max())
+            gap = run.model.contact.gaps(run.state.position, run.state.time)[nodes, walls]
+            assert -1e-12 <= gap.min() <= gap.max() <= 0.5 * 0.02 * speed
+    assert len(apart) > 30 and apart[0] > 0.1 * speed
+    assert max(apart[1:]) < 1e-9 * speed
+    assert max(abs(row["energy_imbalance"]) for row in rows) < 1e-9 * rows[0]["kinetic_energy"]
+    if mass:
+        total = np.array([row["momentum"] + mass * row["wall/glue/velocity"] for row in rows])
+        np.testing.assert_allclose(total, total[:1].repeat(len(rows), axis=0), atol=1e-12)
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("integrator", ["central_differences", "newmark"])
+def test_supports_carry_a_node_through_its_own_wall(integrator, comm, shared_tmp_path):
+    """A component that a support moves is the support's: where it takes the node beyond the wall, that is told."""
+    case = rod(integrator, {}, end=1.0, elements=5, step=0.02, speed=0.0, gap=0.0)
+    normal = np.array([-1.0, 0.0, 1.0]) / np.sqrt(2.0)
+    case["wall"] = planes([normal], [normal @ [1.0, 0.0, 0.0]], node_set="tip", tied=True, name="glue")
+    case["gravity"] = {"acceleration": [0.0, 0.0, -1.0]}
+    table = [[0.0, 0.0, 0.0, 0.0], [0.4, 0.0, 0.0, 0.0], [1.0, 0.1, 0.0, 0.0]]
+    case["support"] = [{"node_set": "tip", "fix": "x", "motion": table}]
+    with pytest.raises(SimulationFailure, match=r"node 5 is tied to wall 'glue' and its supports carry it .* beyond"):
+        simulation(case, comm, shared_tmp_path).run()
+
+
 @pytest.mark.parametrize("integrator", ["central_differences", "newmark"])
 def test_carried_through_another_wall(integrator, comm, shared_tmp_path):
     case = rod(integrator, {}, end=1.0, elements=5, velocity=[0.0, 0.0, -1.0])

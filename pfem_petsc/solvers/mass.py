@@ -1,0 +1,71 @@
+"""Accelerations from forces with consistent mass: M a = f by conjugate gradients."""
+
+from __future__ import annotations
+
+import numpy as np
+from petsc4py import PETSc
+
+from ..errors import SimulationFailure
+from .matrix import HessianMatrix
+from .reasons import linear_reason
+
+__all__ = ["MassSolver"]
+
+_PREFIX = "pfem_mass_"
+
+
+class MassSolver:
+    """The consistent mass matrix, which does not change in a run, and its solver. Construction is collective.
+
+    Options: prefix ``pfem_mass_``.
+
+    Parameters
+    ----------
+    model : Model
+        With consistent mass.
+    """
+
+    def __init__(self, model) -> None:
+        self._fixed = model.supports.fixed
+        self._matrix = matrix = HessianMatrix(model.mesh, self._fixed, model.supports.any)
+
+        def add(values: np.ndarray) -> None:
+            coefficients = model.inertia.coefficients(1.0, 0.0)
+            model.bars.tangents(model.mesh.points, 0.0, coefficients, matrix.pattern, values)
+            matrix.constrain(float(model.inertia.mass.max(initial=1.0)), values)
+
+        matrix.fill(add)
+        self._right, self._left = matrix.mat.createVecs()
+        self._ksp = PETSc.KSP().create(model.comm)
+        self._ksp.setOptionsPrefix(_PREFIX)
+        self._ksp.setType("cg")
+        self._ksp.getPC().setType("pbjacobi")
+        self._ksp.setTolerances(rtol=1e-14, max_it=1000)
+        self._ksp.setOperators(matrix.mat)
+        self._ksp.setFromOptions()
+
+    def solve(self, load: np.ndarray) -> np.ndarray:
+        """Accelerations (owned, 3) [m/s2] for forces (owned, 3) [N], zero on prescribed components. Collective.
+
+        Raises
+        ------
+        SimulationFailure
+            On all ranks, where the solver does not converge.
+        """
+        right = load.copy()
+        right[self._fixed] = 0.0
+        self._right.array[:] = right.ravel()
+        self._ksp.solve(self._right, self._left)
+        reason = self._ksp.getConvergedReason()
+        if reason < 0:
+            raise SimulationFailure(
+                f"the initial acceleration: no convergence after {self._ksp.getIterationNumber()} iterations with the "
+                f"consistent mass matrix: {linear_reason(reason)}; check options -{_PREFIX}..., the densities and areas"
+            )
+        return self._left.array.reshape(load.shape).copy()
+
+    def destroy(self) -> None:
+        """Free the PETSc objects."""
+        for thing in (self._ksp, self._right, self._left):
+            thing.destroy()
+        self._matrix.destroy()

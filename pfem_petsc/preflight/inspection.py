@@ -7,6 +7,7 @@ from .forecast import memory_warning
 from .motions import jumping_motions
 from .overlaps import nodes_on_bars, overlapping_bars
 from .parts import count_parts
+from .reach import bars_larger_than_walls
 from .rigidity import global_rigidity, model_directions, unbraced_nodes
 from .sanity import odd_numbers
 from .walls import wall_gaps
@@ -17,7 +18,7 @@ __all__ = ["inspect", "warnings_before"]
 def warnings_before(case, model, plan) -> list[str]:
     """What looks wrong and is cheap to find: for every start. Collective."""
     texts = odd_numbers(case, model) + memory_warning(case, model, plan) + wall_gaps(model)[1]
-    texts += jumping_motions(case, plan)
+    texts += jumping_motions(case, plan) + bars_larger_than_walls(case, model)
     count, nodes, first = count_parts(model.mesh)
     if count > 1 and model.pairs is None:  # pairs are between bodies
         texts.append(

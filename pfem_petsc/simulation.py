@@ -11,6 +11,7 @@ import numpy as np
 from mpi4py import MPI
 
 from .contact.alarm import check_positions
+from .contact.piercing import Piercing
 from .errors import EarlyStop, InputError, PfemError, SimulationFailure
 from .mechanics.compiled import Compilation
 from .output.lock import FolderLock
@@ -235,6 +236,7 @@ class Simulation:
             self.stepper.message = self._progress.warning
         self.recorder = Recorder(self.stepper, self.ledger)
         self.blow_up = BlowUp(self.model)
+        self._piercing = Piercing(self.model)
         lay_over(self)
         continues = False
         if self.restart is not None:
@@ -286,6 +288,7 @@ class Simulation:
                 self._stop_early(self._asked)
             # where a run that was killed after its last checkpoint had not got to it
             self._complete()
+            self._tell_walls()
             self._finish("done")
         except (GeneratorExit, EarlyStop):
             self._finish("stopped")
@@ -420,6 +423,20 @@ class Simulation:
             state.time, state.step, state.position, fields.at_nodes(state), fields.at_bars(state)
         )
         self._last_snapshot = state.step
+        for text in self._piercing.look(state.x, state.time):
+            self._progress.warning(text)
+
+    def _tell_walls(self) -> None:
+        """What became of the walls, where it may not be what was meant. Collective."""
+        contact = self.model.contact
+        times = contact.log.times(self.comm)
+        touched = np.array(times["sum"]) > 0.0
+        for flags in times["flags"]:
+            touched |= np.array(flags, dtype=bool)
+        for name in np.array(contact.names, dtype=object)[~touched]:
+            self._progress.message(f"wall {name!r} was never touched by a node")
+        for text in self._piercing.summary():
+            self._progress.message(text)
 
     def _finish(self, outcome: str) -> None:
         """Close the results and let go of the folder. Collective."""

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from .chains import chain_nodes, chain_warning
 from .forecast import memory_warning
 from .motions import jumping_motions
 from .overlaps import nodes_on_bars, overlapping_bars
 from .parts import count_parts
+from .reach import bars_larger_than_walls
 from .rigidity import global_rigidity, model_directions, unbraced_nodes
 from .sanity import odd_numbers
 from .walls import wall_gaps
@@ -16,7 +18,7 @@ __all__ = ["inspect", "warnings_before"]
 def warnings_before(case, model, plan) -> list[str]:
     """What looks wrong and is cheap to find: for every start. Collective."""
     texts = odd_numbers(case, model) + memory_warning(case, model, plan) + wall_gaps(model)[1]
-    texts += jumping_motions(case, plan)
+    texts += jumping_motions(case, plan) + bars_larger_than_walls(case, model)
     count, nodes, first = count_parts(model.mesh)
     if count > 1 and model.pairs is None:  # pairs are between bodies
         texts.append(
@@ -30,8 +32,12 @@ def warnings_before(case, model, plan) -> list[str]:
             f"{pairs} pair{'s' if pairs > 1 else ''} of bars lie{'' if pairs > 1 else 's'} along each other, from a "
             f"common node on: {_list(pairs, shown)}; where a node is meant to divide the longer one, take that bar out"
         )
+    # what is generated is of members in one piece
+    chained, first_chained = chain_nodes(model) if case.mesh.generator is None else (0, -1)
+    if chained:
+        texts.append(chain_warning(chained, first_chained))
     loose, first = unbraced_nodes(model)
-    if loose:
+    if loose > chained:
         texts.append(
             f"{loose} node{'s' if loose > 1 else ''} can move freely, to first order: bars and supports hold too few "
             f"directions there; the first is node {first}"

@@ -1,0 +1,113 @@
+"""Bars that lie across walls: contact is of nodes only, so a bar can pass through a wall between its nodes.
+
+Planes and the inside of spheres and cylinders are convex: a bar whose ends keep them keeps them. Across a sphere or a
+cylinder from outside a bar whose ends touch it is a chord, which is no defect of the run; what is told is a bar that
+gets deeper than a quarter of the radius. A rectangle is crossed by a bar whose ends are on its two sides.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from mpi4py import MPI
+
+__all__ = ["DEEP", "Piercing", "distances", "small_walls"]
+
+DEEP = 0.25
+"""Part of the radius from which on a bar inside a curved wall counts as piercing it."""
+
+
+def small_walls(walls) -> list[int]:
+    """Indices of the walls that a bar can pierce while its nodes keep them."""
+    return [k for k, wall in enumerate(walls) if wall.partial or getattr(wall, "sign", -1.0) > 0.0]
+
+
+def distances(starts: np.ndarray, ends: np.ndarray, point: np.ndarray, axis: np.ndarray | None) -> np.ndarray:
+    """Distances (m,) [m] of segments (m, 3) from a point, or from the line through it along a unit ``axis``."""
+    first, way = starts - point, ends - starts
+    if axis is not None:
+        first, way = first - np.outer(first @ axis, axis), way - np.outer(way @ axis, axis)
+    squares = np.einsum("ij,ij->i", way, way)
+    part = -np.einsum("ij,ij->i", first, way) / np.maximum(squares, np.finfo(float).tiny)
+    return np.linalg.norm(first + np.clip(part, 0.0, 1.0)[:, None] * way, axis=1)
+
+
+def _crossing(wall, starts: np.ndarray, ends: np.ndarray, slack: float) -> np.ndarray:
+    """(m,) bool: segments that cross a rectangle, relative to where it is at rest."""
+    first, second = starts @ wall.normal - wall.offset, ends @ wall.normal - wall.offset
+    across = np.minimum(first, second) < -slack
+    across &= np.maximum(first, second) > slack
+    part = np.where(across, first / np.where(across, first - second, 1.0), 0.0)
+    point = starts + part[:, None] * (ends - starts) - wall.centre
+    return across & (np.abs(point @ wall.first) < wall.half[0]) & (np.abs(point @ wall.second) < wall.half[1])
+
+
+class Piercing:
+    """Looks for bars across walls, snapshot by snapshot. Construction is collective.
+
+    Attributes
+    ----------
+    walls : indices of the walls looked at
+    first : wall to the time [s] when a bar was first seen across it
+    seen : wall to the number of snapshots with bars across it
+    looks : snapshots looked at
+    """
+
+    def __init__(self, model) -> None:
+        self._model = model
+        self.walls = small_walls(model.contact.walls)
+        self.first: dict[int, float] = {}
+        self.seen = dict.fromkeys(self.walls, 0)
+        self.looks = 0
+        if not self.walls:
+            return
+        mesh = model.mesh
+        members = np.zeros((mesh.n_local, len(self.walls)))
+        members[: mesh.n_owned] = model.contact.members[:, self.walls]
+        mesh.update_ghosts(members)
+        self._bars = mesh.bars[mesh.counted]
+        self._concerned = (members[self._bars[:, 0]] > 0.0) & (members[self._bars[:, 1]] > 0.0)
+
+    def look(self, x: np.ndarray, time: float) -> list[str]:
+        """What to tell of bars at positions (local, 3), ghosts included, that is new. Collective."""
+        if not self.walls:
+            return []
+        self.looks += 1
+        shifts = self._model.contact.motion.shifts(time)
+        found = np.array([self._across(i, k, x, shifts[k]) for i, k in enumerate(self.walls)])
+        counts, lowest = found[:, 0].copy(), found[:, 1].copy()
+        comm = self._model.comm
+        comm.Allreduce(MPI.IN_PLACE, counts, op=MPI.SUM)
+        comm.Allreduce(MPI.IN_PLACE, lowest, op=MPI.MIN)
+        told = []
+        for count, bar, k in zip(counts.tolist(), lowest.tolist(), self.walls, strict=True):
+            self.seen[k] += count > 0
+            if count and k not in self.first:
+                self.first[k] = time
+                bars = f"bar {bar} lies" if count == 1 else f"{count} bars, bar {bar} among them, lie"
+                told.append(
+                    f"t = {time:.6g} s: {bars} across wall {self._model.contact.names[k]!r}: only nodes touch walls; "
+                    "take shorter bars or a larger wall"
+                )
+        return told
+
+    def _across(self, i: int, k: int, x: np.ndarray, shift: np.ndarray) -> tuple[int, int]:
+        """Number of this rank's bars across wall ``k``, and the lowest of their numbers in the mesh."""
+        mesh, wall = self._model.mesh, self._model.contact.walls[k]
+        rows = np.flatnonzero(self._concerned[:, i])
+        starts, ends = x[self._bars[rows, 0]] - shift, x[self._bars[rows, 1]] - shift
+        if wall.partial:
+            across = _crossing(wall, starts, ends, 1e-6 * self._model.length)
+        else:
+            across = distances(starts, ends, wall.centre, getattr(wall, "axis", None)) < (1.0 - DEEP) * wall.radius
+        ids = mesh.bar_ids[mesh.counted][rows[across]]
+        return len(ids), int(ids.min(initial=np.iinfo(np.int64).max))
+
+    def summary(self) -> list[str]:
+        """What to tell at the end of the run."""
+        names = self._model.contact.names
+        return [
+            f"bars lay across wall {names[k]!r} in {self.seen[k]} of {self.looks} snapshots, first at t = "
+            f"{self.first[k]:.6g} s: only nodes touch walls"
+            for k in self.walls
+            if k in self.first
+        ]

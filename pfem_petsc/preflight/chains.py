@@ -1,0 +1,42 @@
+"""Chains of collinear bars: what a mesh generator makes of a truss whose lines it divides."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .rigidity import model_directions
+
+__all__ = ["chain_nodes", "chain_warning"]
+
+_STRAIGHT = 1e-4  # angle between two bars that count as collinear [rad]
+
+
+def chain_nodes(model) -> tuple[int, int]:
+    """How many nodes no support holds and only two collinear bars meet at; and the first of them. Collective.
+
+    A straight rod has such nodes and is meant: of a truss on one line there are none.
+    """
+    mesh, owned = model.mesh, model.mesh.n_owned
+    if len(model_directions(model)) < 2:
+        return 0, mesh.n_nodes
+    way = mesh.points[mesh.bars[:, 1]] - mesh.points[mesh.bars[:, 0]]
+    way /= np.linalg.norm(way, axis=1)[:, None]
+    degree = np.bincount(mesh.bars.ravel(), minlength=mesh.n_local)[:owned]
+    leaving = np.zeros((mesh.n_local, 3))
+    np.add.at(leaving, mesh.bars[:, 0], way)
+    np.subtract.at(leaving, mesh.bars[:, 1], way)
+    found = (degree == 2) & (np.linalg.norm(leaving[:owned], axis=1) < _STRAIGHT)
+    found &= ~model.supports.fixed.any(axis=1)
+    ids = mesh.node_ids[:owned][found]
+    first = min(model.comm.allgather(min(ids.tolist(), default=mesh.n_nodes)))
+    return model.comm.allreduce(len(ids)), first
+
+
+def chain_warning(count: int, first: int) -> str:
+    """What to tell about nodes of :func:`chain_nodes`."""
+    nodes = "1 node is" if count == 1 else f"{count} nodes are"
+    return (
+        f"{nodes} only connected to two collinear bars, and nothing holds them across; the first is node {first}: was "
+        "the mesh subdivided? Each member of a truss is one bar: in Gmsh `Transfinite Curve {:} = 2;` (a chain of bars "
+        "that is meant, like a cable, needs tension to be stiff)"
+    )

@@ -320,7 +320,11 @@ class Simulation:
             return
         state, fields = self.state, self.fields
         self._writer.write_snapshot(
-            state.time, state.step, state.position, fields.at_nodes(state), fields.at_bars(state)
+            state.time,
+            state.step,
+            state.position,
+            fields.at_nodes(state, self.stepper.acceleration),
+            fields.at_bars(state),
         )
         self._last_snapshot = state.step
 

@@ -94,6 +94,7 @@ class Scheme(ABC):
         balance work over the whole step
     solves_end : the position solved for is x_{n+1}
     symmetric : whether the Hessian is
+    remembers : names of what it keeps of nodes in the state's memory, linear in motions
     notice : what users must be told when they choose it; empty for nothing
     """
 
@@ -102,6 +103,7 @@ class Scheme(ABC):
     at_ends = True
     solves_end = True
     symmetric = True
+    remembers: tuple[str, ...] = ()
     notice = ""
 
     def __init__(self, parameters: StrictModel) -> None:

@@ -41,6 +41,7 @@ class Scheme(ExplicitScheme):
     """Central differences (explicit)."""
 
     leads = True
+    remembers = ("half_velocity",)
 
     def limit(self, damping_ratio: float = 0.0) -> float:
         """2 for any damping ratio: damping is centred."""

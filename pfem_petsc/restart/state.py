@@ -22,7 +22,7 @@ from ..parallel.natural import NaturalOrder
 
 __all__ = ["STATE_VERSION", "RunState"]
 
-STATE_VERSION = 2
+STATE_VERSION = 3
 """Changed with the meaning of what is saved."""
 
 _MEMORY = "memory."
@@ -65,7 +65,7 @@ class RunState:
         """The numbers; the last history row, and the step of the last snapshot. Collective."""
         stepper, energy, walls = self.stepper, self.stepper.energy, self.stepper.solution.walls
         mine = {
-            "work": ledger.work.tolist(),
+            "ledger": ledger.kept(),
             "energy": list(energy[:3]),
             "walls": {name: getattr(walls, name).tolist() for name in walls.sums},
             "contact_log": self.model.contact.log.share(),
@@ -81,6 +81,7 @@ class RunState:
             "free_walls": free.kept() if (free := self.model.contact.motion.free) is not None else None,
             "contact_times": self.model.contact.log.times(self.comm),
             "row": {name: float(row[name]) for name in ("energy_imbalance", "active_contacts", "step")},
+            "closed_pairs": ledger.impacts.closed_pairs.tolist(),
             "snapshot": snapshot,
             "node_arrays": sorted(set().union(*self.comm.allgather(set(self._node_arrays())))),
             "memories": memories,
@@ -132,7 +133,8 @@ class RunState:
     def put_back_sums(self, checkpoint: Checkpoint, ledger, recorder) -> dict[str, Any]:
         """Set ledger and recorder, both made after :meth:`put_back`; gives what is known of the last row."""
         scalars = checkpoint.scalars
-        ledger.work[:] = self._share(scalars["ranks"])["work"]
+        ledger.put_back(self._share(scalars["ranks"])["ledger"])
+        ledger.impacts.closed_pairs[:] = scalars["closed_pairs"]
         recorder.iterations = [int(n) for n in scalars["iterations"]]
         recorder.start_energy = scalars["start_energy"]
         return dict(scalars["row"])

@@ -56,13 +56,18 @@ class Stepper(ABC):
     treatment : of impact, None for the scheme's own formulas
     booking : called after each part of a step
     before : (local, 3) positions at the start of the last part, with ghosts [m]
+    closed : (owned, walls) bool, nodes that have met a wall and not left it since
+    step_changed : whether the scheme was told to forget what holds for another step, since the last booking
+    totals_at_start, totals_solved : (3, 3) this rank's sums of support, external and damping force [N] at the start, and
+        of the balance that was solved there by a scheme that leads; None after a restart
+    walls_at_start, pairs_at_start : (walls, 3), (pairs, 3) forces at the start [N]
     renews_forces : each evaluation of the state fills another array ``state.f``, so that the last one is kept
     kept_numbers, kept_arrays, kept_bars : names of attributes that, with the state, determine what comes: numbers,
         arrays with a row for each owned node, and for each local bar
     """
 
     kept_numbers: tuple[str, ...] = ("part", "smallest")
-    kept_arrays: tuple[str, ...] = ("touching",)
+    kept_arrays: tuple[str, ...] = ("touching", "closed")
     kept_bars: tuple[str, ...] = ()
     renews_forces = False
 
@@ -90,6 +95,12 @@ class Stepper(ABC):
         self.before = mesh.points.copy()
         model.contact.state = self.state
         self.touching = model.contact.log.touching
+        self.closed = np.zeros_like(self.touching)
+        self.step_changed = False
+        self.totals_at_start: np.ndarray | None = None
+        self.totals_solved: np.ndarray | None = None
+        self.walls_at_start = np.zeros((len(model.contact.names), 3))
+        self.pairs_at_start = np.zeros((0, 3))
         self.solution = Solution(self.zero, self.state.f, model.contact.nothing)
 
     def start(self) -> None:
@@ -118,12 +129,51 @@ class Stepper(ABC):
                 self.solution.walls, self.solution.contacts = walls, len(held)
         if supports.any:
             state.support = np.zeros_like(state.v)
-            state.support[supports.fixed] = -(load + state.contact)[supports.fixed]
+            missing = load + state.contact
+            if model.inertia.products:  # free nodes pull at fixed ones
+                missing -= model.inertia.mass_times(state.a, np.empty_like(load))
+            state.support[supports.fixed] = -missing[supports.fixed]
+        self.totals_at_start = self._totals()
+        self.walls_at_start = self.solution.walls.force
+        if model.pairs is not None:
+            self.pairs_at_start = np.array(list(model.pairs.totals().values()))
         self.scheme.start(state, self.h)
-        if model.contact.motion.free is not None:
-            model.contact.motion.free.start(self.h)
+        free = model.contact.motion.free
+        if free is not None:
+            free.start(self.h)
         if self.scheme.leads:
+            v, speeds = state.v, free.state.v if free is not None else None
             self._solve_and_finish()
+            self.totals_solved = self._totals()
+            # what is on a wall has not lost its velocity yet; the scheme goes on from its own memory
+            state.v = v
+            if free is not None:
+                free.state.v = speeds
+
+    def acceleration(self) -> np.ndarray:
+        """Acceleration (owned, 3) to record [m/s2]; collective where the mass is consistent.
+
+        Where the balance holds at the ends of steps it is the scheme's. For the others that is of first order, or holds
+        at another time: nodes that nothing holds have the one of the forces at the end of the step.
+        """
+        state, model, scheme = self.state, self.model, self.scheme
+        if scheme.at_ends or state.step == 0:
+            return state.a
+        load = -state.f[: len(state.a)]
+        if model.external.active:
+            load += model.external.at(state.time, np.empty_like(load))
+        if model.inertia.damped:
+            load -= model.inertia.damping_times(state.v, np.empty_like(load))
+        held = model.supports.fixed | (state.contact != 0.0).any(axis=1)[:, None]
+        if model.inertia.consistent:
+            known = np.where(held, state.a, 0.0)
+            load += state.contact - model.inertia.mass_times(known, np.empty_like(load))
+        return np.where(held, state.a, self.accelerate(load))
+
+    def _totals(self) -> np.ndarray:
+        state, inertia = self.state, self.model.inertia
+        damping = -inertia.damping_times(state.v, np.empty_like(state.v))
+        return np.array([state.support.sum(axis=0), state.external.sum(axis=0), damping.sum(axis=0)])
 
     def step(self) -> None:
         """Advance from t_n to t_{n+1}; the state is complete at both. Collective where the solve is."""

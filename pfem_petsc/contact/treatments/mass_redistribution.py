@@ -13,6 +13,7 @@ import numpy as np
 
 from ...errors import InputError
 from ...parallel.agreement import agreed
+from .base import Jump
 from .base import Treatment as Base
 
 __all__ = ["Redistribution", "Treatment", "redistribute"]
@@ -94,6 +95,8 @@ def redistribute(model) -> Redistribution:
 class Treatment(Base):
     """No mass on contact nodes along the walls' normals."""
 
+    elastic = True
+
     def before(self) -> None:
         """Keep where nodes start."""
         self._start = self.stepper.state.position.copy()
@@ -105,6 +108,8 @@ class Treatment(Base):
             return
         moved = stepper.model.inertia.redistribution
         nodes, n = moved.nodes, moved.normals
+        # no momentum jumps along the normals, but the scheme's memory is made anew
+        self.jump = Jump(nodes, state.v[nodes], state.a[nodes], 0.0, self.remembered(nodes))
         secant = (state.position[nodes] - self._start[nodes]) / stepper.part
         state.v, state.a = state.v.copy(), state.a.copy()
         state.v[nodes] += np.einsum("mi,mi->m", secant - state.v[nodes], n)[:, None] * n

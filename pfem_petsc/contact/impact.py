@@ -166,40 +166,52 @@ class Impacts:
         self.counted = np.ones(len(contact.names), dtype=bool)
         if free is not None:
             self.counted[free.at] = False
+        self._free_rates = free.state.v if free is not None else None  # at the start of the step
         self.slack = _SLACK * self.model.length
         treatment = stepper.treatment
         # nothing is lost where nodes have no mass along the normal, or where a treatment takes the work back
         self.elastic = treatment is not None and treatment.elastic
 
-    def step(self, x: np.ndarray, v: np.ndarray, load: np.ndarray | None, time: float, shifts: np.ndarray) -> float:
+    def step(
+        self,
+        x: np.ndarray,
+        motion: tuple[np.ndarray, np.ndarray],
+        load: np.ndarray | None,
+        time: float,
+        shifts: np.ndarray,
+    ) -> float:
         """Energy [J] of this rank's closing contacts in the step just solved. Collective with pairs or free walls.
 
         Parameters
         ----------
-        x, v : (owned, 3) at the start of the step of closure; for schemes that solve in advance, as they are
+        x, motion : (owned, 3) at the start of the step of closure, velocity and acceleration there; for schemes that
+            solve in advance, those of the balance
         load : (owned, 3) all forces there but those of contact and damping [N]; None where the scheme solves in advance
         time, shifts : of the walls there
         """
         if not self.active:
             return 0.0
-        loss = self._on_walls(x, v, load, time, shifts) if self.model.contact.any else 0.0
+        loss = self._on_walls(x, motion, load, time, shifts) if self.model.contact.any else 0.0
         if self.model.pairs is not None:
-            loss += self._of_pairs(x, v, load)
+            loss += self._of_pairs(x, motion, load)
         return 0.0 if self.elastic else loss
 
-    def _free(self, nodes: np.ndarray, v: np.ndarray, load: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    def _free(self, nodes: np.ndarray, motion: tuple[np.ndarray, np.ndarray], load: np.ndarray | None) -> tuple:
         """Velocities and accelerations (m, 3) without contact at the start of the step."""
         inertia, state = self.model.inertia, self.stepper.state
+        v, a = motion
+        if load is None and inertia.products:
+            return v[nodes], a[nodes]
         if load is None:
             balance = self.stepper.balance
             damping = inertia.damping if inertia.damped else np.empty(0)
-            return unpressed(nodes, v, state.a, state.contact, inertia.mass, damping, balance.alpha, balance.eta)
+            return unpressed(nodes, v, a, state.contact, inertia.mass, damping, balance.alpha, balance.eta)
         v, load = v[nodes], load[nodes]
         if inertia.damped:
             load = load - inertia.damping[nodes, None] * v
         return v, load / inertia.mass[nodes, None]
 
-    def _on_walls(self, x, v, load, time: float, shifts: np.ndarray) -> float:
+    def _on_walls(self, x, motion, load, time: float, shifts: np.ndarray) -> float:
         contact, log = self.model.contact, self.model.contact.log
         free = contact.motion.free
         if len(self.met) == 0 and len(log.last) == 0 and free is None:
@@ -210,8 +222,15 @@ class Impacts:
         else:
             normals, offsets = contact.planes(np.ones((len(nodes), len(contact.names)), dtype=bool), x[nodes], shifts)
             gaps = np.einsum("mwi,mi->mw", normals, x[nodes]) - offsets
-        free_v, free_a = self._free(nodes, v, load)
+        free_v, free_a = self._free(nodes, motion, load)
         rates, speeds = contact.motion.rates(time, ahead=True), np.empty(gaps.shape)
+        if free is not None:
+            rates[free.at] = self._free_rates
+            if load is None:  # as they would be if nothing pushed them
+                balance = self.stepper.balance
+                free_fall = free.weight / free.mass[:, None]
+                rates[free.at] = free.state.v + balance.eta / balance.alpha * (free_fall - free.balanced)
+            self._free_rates = free.state.v
         loss, self.met = stop_nodes(
             nodes,
             log.touching,
@@ -261,14 +280,14 @@ class Impacts:
         given = 0.5 * (sums[:, 2:] ** 2).sum(axis=1) / (free.mass + sums[:, 1])
         return float((keeps * (sums[:, 0] - given)).sum())
 
-    def _of_pairs(self, x, v, load) -> float:
+    def _of_pairs(self, x, motion, load) -> float:
         """The same of pairs that meet, whose reduced mass counts. Collective."""
         pairs = self.model.pairs
         pressing = pairs.force > 0.0
         fresh, parted = pressing & ~self.closed_pairs, self.closed_pairs & ~pressing
         if not fresh.any() and not parted.any():
             return 0.0
-        free_v, free_a = self._free(np.arange(len(v)), v, load)
+        free_v, free_a = self._free(np.arange(len(x)), motion, load)
         ends = pairs.gather(np.concatenate([x, free_v, free_a], axis=1))
         distance = pairs.distances(ends[:, :, :3]) - pairs.gaps
         self.closed_pairs = pressing | (parted & (distance <= self.slack))

@@ -41,11 +41,12 @@ class Moment:
 
     Where the mass is lumped, ``momentum``, ``a`` and ``v`` are velocity, acceleration and velocity; where it is
     consistent, M v [kg m/s], M a and C v [N].
-    ``velocity`` is that in any case.
+    ``velocity`` and ``acceleration`` are these in any case.
     """
 
     momentum: np.ndarray
     velocity: np.ndarray
+    acceleration: np.ndarray
     a: np.ndarray
     v: np.ndarray
     internal: np.ndarray
@@ -138,11 +139,27 @@ class Ledger:
         stepper, state = self.stepper, self.stepper.state
         if stepper.scheme.leads:
             shifts = self.model.contact.motion.shifts(state.time)
-            return self.impacts.step(state.position, state.v, None, state.time, shifts)
+            free = self._before_contact(before) if self.impacts.active else (state.v, state.a)
+            return self.impacts.step(state.position, free, None, state.time, shifts)
         load = before.external - before.internal if self.impacts.active else None
         return self.impacts.step(
-            stepper.before[: len(state.v)], before.velocity, load, state.time - stepper.part, self._shifts
+            stepper.before[: len(state.v)], (before.velocity, before.acceleration), load, state.time - stepper.part, self._shifts
         )
+
+    def _before_contact(self, before: Moment) -> tuple[np.ndarray, np.ndarray]:
+        """Velocity and acceleration (owned, 3) of a balance solved in advance, less what a treatment made of them;
+        where a force changes more than its own node's, they go on as before."""
+        state, balance, jump = self.stepper.state, self.stepper.balance, None
+        if self.stepper.treatment is not None:
+            jump = self.stepper.treatment.jump
+        v, a = state.v, state.a
+        if jump is not None:
+            v, a = v.copy(), a.copy()
+            v[jump.nodes], a[jump.nodes] = jump.v, jump.a
+        if self.model.inertia.products:
+            earlier = before.acceleration
+            return v + (balance.eta / balance.alpha) * (earlier - a), earlier
+        return v, a
 
     def _walls_before(self) -> None:
         """Keep what the next step must know of walls that move."""
@@ -277,6 +294,7 @@ class Ledger:
         return Moment(
             momentum=momentum,
             velocity=state.v,
+            acceleration=state.a,
             a=a,
             v=v,
             internal=internal if self.stepper.renews_forces else internal.copy(),
@@ -303,7 +321,7 @@ class Ledger:
             internal = stepper.solution.internal[:owned]
         elif balance.weight:
             internal = (1.0 - balance.weight) * internal + balance.weight * stepper.solution.internal[:owned]
-        return Moment(before.momentum, before.velocity, a, v, internal, state.external, state.support, state.contact)
+        return Moment(before.momentum, before.velocity, before.acceleration, a, v, internal, state.external, state.support, state.contact)
 
     def _thermal_before(self) -> None:
         if self.model.temperatures.varying:

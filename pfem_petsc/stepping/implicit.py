@@ -147,10 +147,8 @@ class ImplicitStepper(Stepper):
         if not inertia.consistent:
             a = load / inertia.mass[:, None]
             if inertia.redistribution is not None:
-                at, tensors = inertia.redistribution.touched, inertia.redistribution.tensors
-                matrices = inertia.mass[at, None, None] * np.eye(3) + tensors
-                inverse = np.linalg.pinv(matrices, rcond=1e-10, hermitian=True)
-                a[at] = np.einsum("kij,kj->ki", inverse, load[at])
+                at = inertia.redistribution.touched
+                a[at] = np.einsum("kij,kj->ki", inertia.redistribution.inverse(inertia.mass, fixed), load[at])
             a[fixed] = 0.0
             return a
         mass = HessianMatrix(self.model.mesh, fixed, self.model.supports.any)

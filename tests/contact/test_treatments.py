@@ -41,6 +41,41 @@ def test_no_mass_no_spike_explicit(step, comm, shared_tmp_path):
     assert rows[-1]["wall/wall/releases"] == 1
 
 
+@pytest.mark.parallel
+@pytest.mark.parametrize("integrator", ["central_differences", "newmark"])
+@pytest.mark.parametrize("fix, normal", [("z", [-1.0, 0.0, 0.0]), ("yz", [-1.0, 0.0, 0.0]), ("z", [-0.8, 0.0, 0.6])])
+def test_no_mass_where_supports_hold_other_directions(integrator, fix, normal, comm, shared_tmp_path):
+    """A node that cannot move in some directions is stopped along the free part of the wall's normal."""
+    keys = [
+        f"time.integrator={integrator}",
+        'contact.treatment="mass_redistribution"',
+        "output.fields_every=0",
+        "initial.velocity=[0.1, 0, 0]",
+        "time.end=2.6",
+    ]
+    held = ["node_set.all.all=true", f'support=[{{node_set="all", fix="{fix}"}}]', f"wall.0.normal={normal}"]
+    runs = []
+    for more in ([], held):
+        run = Simulation(Case.load("rod_impact", keys + more), comm, output=shared_tmp_path / "rod", quiet=True)
+        runs.append([step.row for step in run])
+    for free, fixed in zip(*runs, strict=True):
+        assert fixed["probe/tip/position"][0, 0] == pytest.approx(free["probe/tip/position"][0, 0], abs=1e-11)
+        assert fixed["wall/wall/force"][0] == pytest.approx(free["wall/wall/force"][0], abs=1e-9)
+        across = normal[2] / normal[0] * fixed["wall/wall/force"][0]
+        assert fixed["wall/wall/force"][2] == pytest.approx(across, abs=1e-12)
+    assert max(row["probe/tip/position"][0, 0] for row in runs[1]) < 1.05 + 1e-12
+    assert min(row["wall/wall/force"][0] for row in runs[1]) < -FORCE
+
+
+@pytest.mark.parallel
+def test_no_mass_where_supports_hold_the_normal(comm, shared_tmp_path):
+    """A wall is no concern of a node that supports hold along its normal; the node keeps its mass."""
+    keys = ['contact.treatment="mass_redistribution"', 'support=[{node_set="tip", fix="xyz"}]', "time.end=0.05"]
+    run = Simulation(Case.load("rod_impact", keys), comm, output=shared_tmp_path / "rod", quiet=True)
+    run.run()
+    assert comm.allreduce(len(run.model.inertia.redistribution.nodes)) == 0
+
+
 @pytest.mark.parametrize("step", [0.01, 0.05])
 @pytest.mark.parametrize("integrator, parameters", [("newmark", TRAPEZOID), ("energy_momentum", {})])
 def test_no_mass_no_spike_implicit(integrator, parameters, step, comm, shared_tmp_path):

@@ -5,6 +5,9 @@ from the wall: the mass of a node becomes a matrix, m I - m n n^T at the contact
 neighbours, with the total kept. A contact node then follows its neighbours by equilibrium along n: its force is
 continuous in time, no spike grows as 1/h, and impact loses no energy. Needs plane walls
 with a node set, each node in one wall only.
+
+Supports decide over walls: where they prescribe components of a contact node, n is the free part of the wall's normal,
+scaled to a unit vector, and the wall is no concern of a node that it cannot move.
 """
 
 from __future__ import annotations
@@ -18,22 +21,47 @@ from .base import Treatment as Base
 
 __all__ = ["Redistribution", "Treatment", "redistribute"]
 
+_THIN = 1e-12  # squared length of a normal's free part below which supports alone decide
+
 
 class Redistribution:
     """The masses moved, on this rank.
 
     Attributes
     ----------
-    nodes, normals : (m,), (m, 3) owned contact nodes and their walls' unit normals
+    nodes : (m,) owned contact nodes that can move along their walls' normals
+    walls : (m,) wall of each
+    normals : (m, 3) unit vectors along the free parts of these walls' normals
+    across : (m,) size of these parts: a node that moves by d along its vector moves by ``across`` d off the wall
     touched : (k,) owned nodes whose mass is a matrix, ascending
     tensors : (k, 3, 3) what the matrix is beyond mass times identity [kg]
     """
 
-    def __init__(self, nodes: np.ndarray, normals: np.ndarray, touched: np.ndarray, tensors: np.ndarray) -> None:
+    def __init__(
+        self,
+        nodes: np.ndarray,
+        walls: np.ndarray,
+        normals: np.ndarray,
+        across: np.ndarray,
+        touched: np.ndarray,
+        tensors: np.ndarray,
+    ) -> None:
         self.nodes = nodes
+        self.walls = walls
         self.normals = normals
+        self.across = across
         self.touched = touched
         self.tensors = tensors
+
+    def inverse(self, mass: np.ndarray, fixed: np.ndarray) -> np.ndarray:
+        """Inverse (k, 3, 3) of the mass matrices of the touched nodes on their free components, zero elsewhere [1/kg].
+
+        ``mass`` (owned,) [kg], ``fixed`` (owned, 3) bool. Directions without mass have none.
+        """
+        free = ~fixed[self.touched]
+        matrices = mass[self.touched, None, None] * np.eye(3) + self.tensors
+        matrices *= free[:, :, None] & free[:, None, :]
+        return np.linalg.pinv(matrices, rcond=1e-10, hermitian=True)
 
 
 def redistribute(model) -> Redistribution:
@@ -60,8 +88,8 @@ def redistribute(model) -> Redistribution:
             raise InputError(f"{key}: node {mesh.node_ids[several[0]]} belongs to several walls; give it one")
     # normal, mass and sum of weights of contact nodes, known to all ranks that see them
     info = np.zeros((mesh.n_local, 5))
-    nodes = np.flatnonzero(members.any(axis=1))
-    info[nodes, :3] = contact.normals[members[nodes].argmax(axis=1)]
+    nodes, walls, free, across = _movable(contact)
+    info[nodes, :3] = free
     info[nodes, 3] = inertia.mass[nodes]
     mesh.update_ghosts(info)
     is_contact = info[:, 3] > 0.0
@@ -89,7 +117,20 @@ def redistribute(model) -> Redistribution:
         n = normals[here[give]]
         np.add.at(tensors, there[give], share[:, None, None] * n[:, :, None] * n[:, None, :])
     touched = np.flatnonzero(np.abs(tensors).max(axis=(1, 2), initial=0.0) > 0.0)
-    return Redistribution(nodes, normals[nodes].copy(), touched, tensors[touched])
+    return Redistribution(nodes, walls, free, across, touched, tensors[touched])
+
+
+def _movable(contact) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Owned wall nodes (m,) that can move off their walls (m,), along which unit vectors (m, 3), how far (m,)."""
+    nodes = np.flatnonzero(contact.members.any(axis=1))
+    walls = contact.members[nodes].argmax(axis=1)
+    normals = contact.normals[walls]
+    free = np.where(contact.fixed[nodes], 0.0, normals)
+    # the whole normal as it is: its last digits decide nothing, but results stay what they were
+    free = np.where(contact.fixed[nodes].any(axis=1)[:, None], free, normals)
+    across = np.sqrt((free * free).sum(axis=1))
+    can = across**2 > _THIN
+    return nodes[can], walls[can], free[can] / across[can, None], across[can]
 
 
 class Treatment(Base):

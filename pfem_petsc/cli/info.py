@@ -18,7 +18,6 @@ example:
   {PROGRAM} info results/rod_impact"""
 
 
-
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the verb."""
     add_result(parser)

@@ -153,7 +153,9 @@ class ExplicitContact:
         force = strength[:, :, None] * normals
         friction = 0.0
         if self.contact.rough:
-            moved, force, friction = self._rub(nodes, free, shifts, (normals, offsets), stiffness[nodes], moved, strength, time)
+            moved, force, friction = self._rub(
+                nodes, free, shifts, (normals, offsets), stiffness[nodes], moved, strength, time
+            )
         if booked and self.contact.rebounds:
             self._remember_approach(nodes, free, shifts, normals, strength)
         return nodes, moved, force, np.einsum("mwi,mwi->mw", force, normals) > 0.0, friction
@@ -180,7 +182,9 @@ class ExplicitContact:
         rebound[:] = 0.0
         rebound[nodes] = np.where(fresh, self.contact.restitution * np.maximum(approach, 0.0), 0.0)
 
-    def _rub(self, nodes, free, shifts, planes, stiffness, moved, strength, time) -> tuple[np.ndarray, np.ndarray, float]:
+    def _rub(
+        self, nodes, free, shifts, planes, stiffness, moved, strength, time
+    ) -> tuple[np.ndarray, np.ndarray, float]:
         """Positions and forces (m, w, 3) with friction, from those without, and the energy that it takes [J]; curved walls by planes at the result."""
         contact, state = self.contact, self.contact.state
         way = shifts - self.contact.motion.shifts(state.time)

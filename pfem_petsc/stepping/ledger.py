@@ -143,7 +143,11 @@ class Ledger:
             return self.impacts.step(state.position, free, None, state.time, shifts)
         load = before.external - before.internal if self.impacts.active else None
         return self.impacts.step(
-            stepper.before[: len(state.v)], (before.velocity, before.acceleration), load, state.time - stepper.part, self._shifts
+            stepper.before[: len(state.v)],
+            (before.velocity, before.acceleration),
+            load,
+            state.time - stepper.part,
+            self._shifts,
         )
 
     def _before_contact(self, before: Moment) -> tuple[np.ndarray, np.ndarray]:
@@ -321,7 +325,17 @@ class Ledger:
             internal = stepper.solution.internal[:owned]
         elif balance.weight:
             internal = (1.0 - balance.weight) * internal + balance.weight * stepper.solution.internal[:owned]
-        return Moment(before.momentum, before.velocity, before.acceleration, a, v, internal, state.external, state.support, state.contact)
+        return Moment(
+            before.momentum,
+            before.velocity,
+            before.acceleration,
+            a,
+            v,
+            internal,
+            state.external,
+            state.support,
+            state.contact,
+        )
 
     def _thermal_before(self) -> None:
         if self.model.temperatures.varying:

@@ -131,7 +131,9 @@ def make_march(forces: Callable) -> Callable:
     """
 
     @kernel
-    def march(count, h, x, before, half, bars, nodes, walls, probes, buffers, touched, met, ledger, impulses, energies, sums):
+    def march(
+        count, h, x, before, half, bars, nodes, walls, probes, buffers, touched, met, ledger, impulses, energies, sums
+    ):
         n = len(x)
         n_walls = len(walls.offsets)
         f, f1, a, a1, v, v1, support, support1, contact, contact1 = buffers
@@ -265,7 +267,13 @@ def make_march(forces: Callable) -> Callable:
                 for c in range(3):
                     push_u[k, c] = pushes[k, c] / alpha
             kick(
-                push_u.reshape(-1), alpha, eta, h, impulses.half.reshape(-1), impulses.a.reshape(-1), impulses.v.reshape(-1)
+                push_u.reshape(-1),
+                alpha,
+                eta,
+                h,
+                impulses.half.reshape(-1),
+                impulses.a.reshape(-1),
+                impulses.v.reshape(-1),
             )
             stored = kinetic1 - kinetic + (elastic1 + heat1 + hardening1) - (elastic + heat + hardening)
             kinetic, elastic, heat, hardening = kinetic1, elastic1, heat1, hardening1

@@ -18,7 +18,9 @@ __all__ = ["Recorder"]
 _ELASTIC, _HEAT, _HARDENING = (HEAD.first(name) for name in ("elastic_energy", "plastic_heat", "hardening_energy"))
 _SUMMED = [energy for energy in ENERGIES if energy.source != "derived"]
 _ENERGIES = [HEAD.first(energy.name) for energy in _SUMMED]
-_SIGNS = np.array([-1.0 if energy.side == "supplied" else 1.0 for energy in _SUMMED])  # parts of derived ones count here
+_SIGNS = np.array(
+    [-1.0 if energy.side == "supplied" else 1.0 for energy in _SUMMED]
+)  # parts of derived ones count here
 _PROBED = ("position", "velocity", "acceleration", "reaction")
 
 

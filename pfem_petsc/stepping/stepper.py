@@ -13,6 +13,7 @@ from ..contact.resting import start_at_rest
 from ..errors import SimulationFailure
 from ..integrators.base import Balance, Scheme, State
 from ..mechanics.bars import StrainEnergy
+from .massless import MasslessNodes
 
 __all__ = ["NotConverged", "Solution", "Stepper"]
 
@@ -56,6 +57,7 @@ class Stepper(ABC):
     treatment : of impact, None for the scheme's own formulas
     booking : called after each part of a step
     before : (local, 3) positions at the start of the last part, with ghosts [m]
+    massless : MasslessNodes where contact nodes have no mass along their walls' normals, else None
     closed : (owned, walls) bool, nodes that have met a wall and not left it since
     step_changed : whether the scheme was told to forget what holds for another step, since the last booking
     totals_at_start, totals_solved : (3, 3) this rank's sums of support, external and damping force [N] at the start, and
@@ -95,6 +97,7 @@ class Stepper(ABC):
         self.before = mesh.points.copy()
         model.contact.state = self.state
         self.touching = model.contact.log.touching
+        self.massless = MasslessNodes(model) if model.inertia.redistribution is not None else None
         self.closed = np.zeros_like(self.touching)
         self.step_changed = False
         self.totals_at_start: np.ndarray | None = None
@@ -113,6 +116,10 @@ class Stepper(ABC):
             tick = 1e-3 * self.h
             rate = (supports.positions(tick) - supports.positions(0.0)) / tick
             state.v[supports.nodes, supports.components] = rate
+        if self.massless is not None and self.massless.settle(state.x, 0.0, 0.0) > 1e-9 * model.length:
+            self.fault = SimulationFailure(
+                "step 0, t = 0 s: contact nodes without mass found no equilibrium; take another contact.treatment"
+            )
         self.evaluate(commit=True)
         if model.external.active:
             state.external = model.external.at(0.0, np.empty_like(state.v))
@@ -127,6 +134,9 @@ class Stepper(ABC):
                 if model.pairs is not None:
                     held = np.union1d(held, model.pairs.pressed()[0])
                 self.solution.walls, self.solution.contacts = walls, len(held)
+        if self.massless is not None:
+            state.contact, self.solution.walls = self.massless.press(state.position, load, 0.0)
+            self.solution.contacts = int(self.solution.walls.touching.sum())
         if supports.any:
             state.support = np.zeros_like(state.v)
             missing = load + state.contact

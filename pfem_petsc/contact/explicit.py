@@ -117,8 +117,8 @@ class ExplicitContact:
         return nodes, correction, force.sum(axis=1), contact.sums(nodes, force, moved, touching, friction)
 
     def _press(self, x: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float, booked: bool) -> tuple:
-        """Nodes (m,) near walls that do not hold them for good, places (m, 3), forces (m, w, 3), touching (m, w), and the
-        energy that friction takes [J]."""
+        """Nodes (m,) near walls that do not hold them for good, places (m, 3), forces (m, w, 3), touching (m, w), and
+        the energy that friction takes [J]."""
         shifts = self.contact.motion.shifts(time)
         near = self.contact.near(x, shifts)
         if self.contact.rebounds:
@@ -185,7 +185,10 @@ class ExplicitContact:
     def _rub(
         self, nodes, free, shifts, planes, stiffness, moved, strength, time
     ) -> tuple[np.ndarray, np.ndarray, float]:
-        """Positions and forces (m, w, 3) with friction, from those without, and the energy that it takes [J]; curved walls by planes at the result."""
+        """Positions and forces (m, w, 3) with friction, from those without, and the energy that it takes [J].
+
+        Curved walls are taken by their planes at the result.
+        """
         contact, state = self.contact, self.contact.state
         way = shifts - self.contact.motion.shifts(state.time)
         before, fixed = state.position[nodes], self.contact.fixed[nodes]

@@ -29,7 +29,8 @@ class ContactColumns:
 
     Attributes
     ----------
-    size : numbers of this rank's share: the changes of the active set, and a :data:`~pfem_petsc.output.sums.WALL` for each wall
+    size : numbers of this rank's share: the changes of the active set, and the ``WALL`` of
+        :mod:`~pfem_petsc.output.sums` for each wall
     width : numbers of the columns
     """
 

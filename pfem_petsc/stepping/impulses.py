@@ -24,8 +24,8 @@ from ..output.sums import HEAD, PAIR, WALL
 __all__ = ["DAMPING", "EXTERNAL", "SUPPORT", "WALLS", "Impulses", "wall_shares"]
 
 SUPPORT, EXTERNAL, DAMPING, WALLS = 0, 1, 2, 3
-"""Rows of the particles: three in the order of the totals of :mod:`~pfem_petsc.stepping.node_loops`, then walls and pairs,
-then the jumps of walls and pairs."""
+"""Rows of the particles: three in the order of the totals of :mod:`~pfem_petsc.stepping.node_loops`, then walls and
+pairs, then the jumps of walls and pairs."""
 
 
 def wall_shares(stepper, nodes: np.ndarray, jumps: np.ndarray) -> np.ndarray:

@@ -90,7 +90,7 @@ class Ledger:
             self.impulses.start(stepper.totals_at_start)
             if stepper.scheme.leads:
                 self.impulses.step(stepper.totals_solved)
-                self._pending = [self._impact(self._before), stepper.solution.walls.friction]
+                self._pending = [self._impact(self._before, started=True), stepper.solution.walls.friction]
 
     def update(self) -> None:
         """Book the step just made."""
@@ -134,21 +134,17 @@ class Ledger:
         pending, self._pending = self._pending, [0.0, friction]
         return impact + pending[0], pending[1]
 
-    def _impact(self, before: Moment) -> float:
+    def _impact(self, before: Moment, started: bool = False) -> float:
         """What closing contacts take [J], those of the next step where the scheme has solved it in advance."""
         stepper, state = self.stepper, self.stepper.state
-        if stepper.scheme.leads:
+        if stepper.scheme.leads and not started:
             shifts = self.model.contact.motion.shifts(state.time)
             free = self._before_contact(before) if self.impacts.active else (state.v, state.a)
             return self.impacts.step(state.position, free, None, state.time, shifts)
         load = before.external - before.internal if self.impacts.active else None
-        return self.impacts.step(
-            stepper.before[: len(state.v)],
-            (before.velocity, before.acceleration),
-            load,
-            state.time - stepper.part,
-            self._shifts,
-        )
+        x, time = (state.x, state.time) if started else (stepper.before, state.time - stepper.part)
+        motion = (before.velocity, before.acceleration)
+        return self.impacts.step(x[: len(state.v)], motion, load, time, self._shifts)
 
     def _before_contact(self, before: Moment) -> tuple[np.ndarray, np.ndarray]:
         """Velocity and acceleration (owned, 3) of a balance solved in advance, less what a treatment made of them;

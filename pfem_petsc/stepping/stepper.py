@@ -60,8 +60,8 @@ class Stepper(ABC):
     massless : MasslessNodes where contact nodes have no mass along their walls' normals, else None
     closed : (owned, walls) bool, nodes that have met a wall and not left it since
     step_changed : whether the scheme was told to forget what holds for another step, since the last booking
-    totals_at_start, totals_solved : (3, 3) this rank's sums of support, external and damping force [N] at the start, and
-        of the balance that was solved there by a scheme that leads; None after a restart
+    totals_at_start, totals_solved : (3, 3) this rank's sums of support, external and damping force [N] at the start,
+        and of the balance that was solved there by a scheme that leads; None after a restart
     walls_at_start, pairs_at_start : (walls, 3), (pairs, 3) forces at the start [N]
     renews_forces : each evaluation of the state fills another array ``state.f``, so that the last one is kept
     kept_numbers, kept_arrays, kept_bars : names of attributes that, with the state, determine what comes: numbers,

@@ -90,6 +90,7 @@ class Ledger:
             self.impulses.start(stepper.totals_at_start)
             if stepper.scheme.leads:
                 self.impulses.step(stepper.totals_solved)
+                self.impulses.state.v[:] = 0.0  # as the velocities of nodes, which have not jumped yet
                 self._pending = [self._impact(self._before, started=True), stepper.solution.walls.friction]
 
     def update(self) -> None:

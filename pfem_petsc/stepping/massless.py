@@ -22,10 +22,10 @@ class MasslessNodes:
         self._force = np.zeros((model.mesh.n_local, 3))
 
     def settle(self, x: np.ndarray, time: float, now: float) -> float:
-        """Move nodes of ``x`` (local, 3), in place, along their normals until they are in equilibrium or on the wall.
+        """Move nodes of ``x`` (local, 3), in place, along their normals into equilibrium or onto the wall.
 
-        Forces, walls and temperatures are those of ``time``; temperatures are then as they were at ``now`` [s]. Gives the
-        last and largest move, which is rounding of the model's length unless they have found no equilibrium.
+        Forces, walls and temperatures are those of ``time``; temperatures are then as they were at ``now`` [s]. Gives
+        the last and largest move, which is rounding of the model's length unless they have found no equilibrium.
         Collective.
         """
         model, moved = self.model, self.moved
@@ -63,7 +63,7 @@ class MasslessNodes:
         return gaps[np.arange(len(gaps)), self.moved.walls] / self.moved.across
 
     def press(self, x: np.ndarray, load: np.ndarray, time: float) -> tuple[np.ndarray, WallForces]:
-        """Forces (owned, 3) of the walls that keep nodes at x (owned, 3) in equilibrium with a load [N], and their sums.
+        """Forces (owned, 3) of the walls that keep nodes at x (owned, 3) in equilibrium with a load, and their sums.
 
         A node without mass that is in equilibrium feels its wall alone.
         """

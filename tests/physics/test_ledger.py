@@ -280,7 +280,7 @@ def test_recorded_accelerations_are_of_second_order(integrator, mass, shared_tmp
                 mass=mass,
                 node_set={"root": {"nearest": [0.0, 0.0, 0.0]}, "end": {"nearest": [1.0, 0.0, 0.0]}},
                 support=[{"node_set": "root", "fix": "xyz"}],
-                initial=[{"node_set": "end", "velocity": [1.0, 0.0, 0.0]}],
+                initial={"on": [{"node_set": "end", "velocity": [1.0, 0.0, 0.0]}]},
                 output={"fields_every": 0, "probe": [{"name": "end", "node_set": "end"}]},
             ),
             shared_tmp_path / str(steps),
@@ -311,7 +311,7 @@ def test_pairs_meet(integrator, treatment, shared_tmp_path):
                 "left": {"box": [[-1, -1, -1], [1.001, 1, 1]]},
             },
             contact_pair=[{"name": "faces", "first": "first", "second": "second", "direction": [1.0, 0.0, 0.0]}],
-            initial=[{"node_set": "left", "velocity": [1.0, 0.0, 0.0]}],
+            initial={"on": [{"node_set": "left", "velocity": [1.0, 0.0, 0.0]}]},
         ),
         shared_tmp_path,
     )

@@ -1,8 +1,12 @@
 """``python -m pfem_petsc``."""
 
-import sys
-
-from .cli.main import main
-
 if __name__ == "__main__":
+    from .signals import watch_early
+
+    watch_early()  # before the imports, which take a second
+
+    import sys
+
+    from .cli.main import main
+
     sys.exit(main())

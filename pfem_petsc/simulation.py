@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import weakref
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from mpi4py import MPI
 
 from .errors import EarlyStop, InputError, PfemError, SimulationFailure
 from .mechanics.compiled import Compilation
+from .output.lock import FolderLock
 from .output.opening import open_progress, open_result_file
 from .output.progress import Progress
 from .output.row import Row
 from .output.units import engineering
 from .output.vtkhdf import ResultWriter
+from .parallel.agreement import on_root
 from .parallel.petsc_log import lay_over, staged
 from .preflight.forecast import forecast
 from .preflight.inspection import inspect, warnings_before
@@ -45,7 +48,10 @@ class Step(NamedTuple):
 
 
 class Simulation:
-    """A case on a communicator.
+    """A case on a communicator; a context manager, which closes it.
+
+    One run at a time writes into an output folder: from :meth:`start` to the end of the iteration, or to
+    :meth:`close`, the folder is locked.
 
     Parameters
     ----------
@@ -59,7 +65,8 @@ class Simulation:
     quiet : bool
         Print nothing on stdout.
     wall_time : float, optional
-        Stop with a checkpoint after so many seconds; SIGTERM, SIGINT and SIGUSR1 do so at any time during the run.
+        Stop with a checkpoint after so many seconds, but not before the first step; SIGTERM, SIGINT, SIGUSR1 and SIGHUP
+        do so at any time during the run.
     check_only : bool
         Set the model up and write nothing.
 
@@ -87,6 +94,13 @@ class Simulation:
         self.comm = comm if comm is not None else MPI.COMM_WORLD
         self.folder = Path(output) if output is not None else Path("results") / case.name
         self.quiet = quiet
+        self.on_steps: list[tuple[Callable[[Step], object], int]] = []
+        self._closed = False
+        self._lock = FolderLock(self.folder)
+        weakref.finalize(self, _let_go, self._stop, self._lock)
+        if not check_only:
+            # a large model takes minutes to set up
+            on_root(self.comm, self._lock.check)
         found = find_restart(case, self.comm, self.folder, None if check_only else restart)
         self.restart = found if isinstance(found, Restart) else None
         self.notes = [found] if isinstance(found, str) else []
@@ -97,9 +111,9 @@ class Simulation:
         case = self.case
         self.model = Model(case, self.comm)
         self.plan = make_plan(self.model, self.restart.attributes["plan"] if self.restart is not None else None)
-        self.finished = False
+        self._reached: float | None = None
         if self.restart is not None and self.restart.continues or self.notes:
-            self.finished = finished(case, self.comm, self.folder, self.plan.step * self.plan.steps)
+            self._reached = finished(case, self.comm, self.folder, self.plan.step * self.plan.steps)
         self.model.contact.check_start(self.model.mesh.points[: self.model.mesh.n_owned], self.model.length)
         self.stepper = make_stepper(self.model, self.plan)
         self.fields = Fields(self.model)
@@ -110,6 +124,44 @@ class Simulation:
         self._writer: ResultWriter | None = None
         minutes = case.output.checkpoint_minutes
         self.meetings = Meetings(self.comm, self._stop, 60.0 * minutes if minutes else None)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
+        # an unforeseen error may have come on this rank alone: closing together would wait for ever
+        if kind is None or self.comm.size == 1 or issubclass(kind, PfemError):
+            self.close()
+        else:
+            self._closed = True
+            self._leave("failed")
+
+    def close(self) -> None:
+        """Close the results, free PETSc's objects, give signals back and unlock the folder; again: nothing. Collective.
+
+        State, last row and mesh can still be looked at; everything else is refused. A run that was not at its end can
+        be continued from its last checkpoint.
+        """
+        if self._closed:
+            return
+        self._closed = True
+        try:
+            self._finish("stopped")
+        finally:
+            destroy = getattr(self.stepper, "destroy", None)
+            if destroy is not None:
+                destroy()
+
+    def _usable(self) -> None:
+        if self._closed:
+            raise InputError(
+                f"{self.folder}: this simulation was closed; go on with a new Simulation with restart=True"
+            )
+
+    @property
+    def finished(self) -> bool:
+        """Whether a restart was asked for and the output folder holds results up to the end already."""
+        return self._reached is not None
 
     @property
     def state(self):  # noqa: ANN201
@@ -123,27 +175,55 @@ class Simulation:
 
     def summary(self) -> dict[str, str]:
         """Label and text of what a user checks before a run. Collective."""
+        self._usable()
         return summarise(self.case, self.model, self.plan)
 
     def inspect(self) -> tuple[dict[str, str], list[str]]:
         """Label and text of a closer look at the truss and a forecast of the run; and what looks wrong. Collective."""
+        self._usable()
         recorder = Recorder(self.stepper, None)
         entries, warnings = inspect(self.case, self.model)
         entries |= forecast(self.case, self.model, self.plan, self.fields, recorder.columns, recorder.types)
         return entries, self.model.warnings + warnings_before(self.case, self.model, self.plan) + warnings
 
+    def on_step(self, function: Callable[[Step], object], every: int = 1) -> None:
+        """Have a function called on all ranks after each step whose number is a multiple of ``every``.
+
+        It gets the finished :class:`Step` and may look at :attr:`state` and call what is collective; what it gives is
+        not looked at. With ``every`` large, :meth:`run` still makes the steps between by one compiled call. Functions
+        are called in the order in which they were given.
+
+        Raises
+        ------
+        InputError
+            ``every`` is not a positive whole number.
+        """
+        self._usable()
+        if not isinstance(every, int | np.integer) or isinstance(every, bool) or every < 1:
+            raise InputError(f"on_step: every = {every!r}: give a positive whole number of steps")
+        self.on_steps.append((function, int(every)))
+
     @staged
     def start(self) -> None:
         """Complete the state at the start and open the output. Collective; called by :meth:`run` and iteration."""
+        self._usable()
         if self._started:
             return
         self._started = True
-        self._stop.watch()
+        try:
+            on_root(self.comm, self._lock.take)
+            self._stop.watch()
+            self._begin()
+        except PfemError:
+            self._finish("failed")
+            raise
+
+    def _begin(self) -> None:
         self._checkpoints = Checkpoints(self.case, self.stepper, self.plan, self.folder)
         if self.restart is not None:
             # before anything in the folder changes: it may be refused
             checkpoint = self._checkpoints.take_back(self.restart)
-        aside = prepare_folder(self.comm, self.folder, self.restart)
+        aside = prepare_folder(self.comm, self.folder, self.restart, self.plan)
         self._progress = open_progress(self, aside)
         if self.restart is None:
             self.stepper.start()
@@ -158,7 +238,7 @@ class Simulation:
         continues = False
         if self.restart is not None:
             continues = self.restart.continues
-            self.row = self._checkpoints.state.put_back_sums(checkpoint, self.ledger, self.recorder)
+            self.row = self._checkpoints.state.put_back_sums(checkpoint, self.ledger, self.recorder, self.blow_up)
             self._last_snapshot = self.restart.last[0]
             changes = f"; changed: {'; '.join(self.restart.changed)}" if self.restart.changed else ""
             self._progress.message(
@@ -172,6 +252,7 @@ class Simulation:
 
     def __iter__(self) -> Iterator[Step]:
         """Run step by step; the output is closed when the iteration ends."""
+        self._usable()
         if self.finished:
             return
         with self._compilation:
@@ -182,6 +263,7 @@ class Simulation:
 
         ``worth``: steps of a run for which that call is compiled, which takes some seconds when it is first met.
         """
+        self._usable()
         if self.finished:
             return
         with self._compilation:
@@ -212,11 +294,11 @@ class Simulation:
             raise
         except BaseException:
             # one rank alone may be here: nothing collective is safe
-            if self._progress is not None:
-                self._progress.close("failed")
+            if self.comm.size == 1:
+                self._finish("failed")
+            else:
+                self._leave("failed")
             raise
-        finally:
-            self._stop.release()
 
     def run(self) -> int:
         """Run to the end and give the exit status. Collective.
@@ -229,14 +311,18 @@ class Simulation:
             On all ranks; what was recorded before is in the result file.
         """
         if self.finished and self.comm.rank == 0 and not self.quiet:
-            print(f"{self.folder}: finished already: the results have t = {engineering(self.case.time.end, 's')}")
+            end = self.plan.step * self.plan.steps
+            beyond = f", beyond time.end = {engineering(end, 's')}" if self._reached > end * (1.0 + 1e-9) else ""
+            print(f"{self.folder}: finished already: the results have t = {engineering(self._reached, 's')}{beyond}")
         for _ in self.batches():
             pass
         return 0
 
     def _advance(self) -> Step:
+        self._usable()
         stepper, output = self.stepper, self.case.output
         stepper.step()
+        self._stop.stepped = True
         solution = stepper.solution
         step = self.state.step
         last = step == self.plan.steps
@@ -260,7 +346,11 @@ class Simulation:
         self._progress.update(
             step, self.state.time, stepper.h, solution.newton, solution.linear, self.row["active_contacts"], drift
         )
-        return Step(step, self.state.time, solution.newton, solution.linear, row)
+        made = Step(step, self.state.time, solution.newton, solution.linear, row)
+        for function, every in self.on_steps:
+            if step % every == 0:
+                function(made)
+        return made
 
     def _book(self) -> None:
         """Energies and iterations of a step, or of each part of a halved one."""
@@ -297,12 +387,17 @@ class Simulation:
 
     def meet(self) -> int:
         """All ranks agree on faults, which are raised on all, and on a request to stop: its code, or zero."""
-        return self.meetings.meet(self.state.step, self.stepper.fault)
+        fault = self.stepper.fault
+        try:
+            self._lock.renew()
+        except SimulationFailure as lost:
+            fault = fault or lost
+        return self.meetings.meet(self.state.step, fault)
 
     def _checkpoint(self) -> None:
         """Results first: what the checkpoint goes on from must be in them."""
         self._writer.flush_history()
-        self._checkpoints.write(self.ledger, self.recorder, self.row, self._last_snapshot)
+        self._checkpoints.write(self.ledger, self.recorder, self.blow_up, self.row, self._last_snapshot)
         self.meetings.checkpoint_written()
 
     def _stop_early(self, code: int) -> None:
@@ -329,16 +424,26 @@ class Simulation:
         self._last_snapshot = state.step
 
     def _finish(self, outcome: str) -> None:
+        """Close the results and let go of the folder. Collective."""
         writer, self._writer = self._writer, None
-        if writer is not None:
-            try:
+        try:
+            if writer is not None:
                 writer.close()
-            except SimulationFailure:
-                # after a failure, that one is told
-                if outcome == "done":
-                    raise
+        except SimulationFailure:
+            # after a failure, that one is told
+            if outcome == "done":
+                raise
+        finally:
+            self._leave(outcome)
+            self._lock.release()
+
+    def _leave(self, outcome: str) -> None:
+        """What this rank can do alone; the folder stays locked until its process ends: others may be writing."""
         if self._progress is not None:
             self._progress.close(outcome)
+        if self.restart is not None:
+            self.restart.file.close()
+        self._stop.release()
 
     def _tell_compilation(self) -> None:
         text = "compiling loops for this machine, once"
@@ -353,5 +458,12 @@ class Simulation:
 
     def gather(self, values: np.ndarray) -> np.ndarray | None:
         """An owned array (owned, ...) as a whole in mesh numbering on rank 0, None elsewhere. Collective."""
+        self._usable()
         parts = self.comm.gather(self.mesh.node_order.to_slab(values))
         return np.concatenate(parts) if parts is not None else None
+
+
+def _let_go(stop: StopRequest, lock: FolderLock) -> None:
+    """Of a simulation that nobody has closed, and nobody has any more."""
+    stop.release()
+    lock.release()

@@ -1,7 +1,7 @@
 """Reproduce the paper's examples: run, measure, draw docs/images/paper, write docs/paper.md.
 
 usage: python scripts/paper.py [--workers 2] [--results results/paper] [--redraw]
-Runs take about two minutes on two cores; they are kept, and run again only when the case or the program changes.
+Runs take about six minutes on two cores; they are kept, and run again only when the case or the program changes.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from paper_reproduction.document import write_document
 from paper_reproduction.figures import draw_rods
 from paper_reproduction.figures_ring import draw_ring
 from paper_reproduction.running import read, run_all
+from paper_reproduction.schemes import READINGS
 from paper_reproduction.studies import all_studies
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -31,11 +32,12 @@ def main() -> None:
     if not arguments.redraw:
         run_all(all_studies(), arguments.results, arguments.workers)
     runs = {study.key: read(study.key, arguments.results) for study in all_studies()}
+    readings = [measure_all(runs, reading) for reading in READINGS]
     images = ROOT / "docs" / "images" / "paper"
-    for file in (*draw_rods(runs, images), *draw_ring(runs, images)):
+    for file in (*draw_rods(runs, readings, images), *draw_ring(runs, images)):
         print(f"{file.relative_to(ROOT)}  {file.stat().st_size / 1000:.0f} kB")
-    verdicts = write_document(measure_all(runs), ROOT / "docs" / "paper.md")
-    print("docs/paper.md  " + ", ".join(f"{n} {verdict}" for verdict, n in verdicts.most_common()))
+    for name, counts in write_document(readings, ROOT / "docs" / "paper.md").items():
+        print(f"docs/paper.md  {name}: " + ", ".join(f"{n} {verdict}" for verdict, n in counts.most_common()))
 
 
 if __name__ == "__main__":

@@ -30,7 +30,7 @@ AGREEMENT = WORLD.Dup() if WORLD.size > 1 else None
 PASSED, SKIPPED, FAILED = range(3)
 OUTCOME = {"passed": PASSED, "skipped": SKIPPED, "failed": FAILED}
 # Seconds that a rank waits for the others after a phase that passed, and after one that failed.
-PATIENCE = {PASSED: 280.0, SKIPPED: 60.0, FAILED: 30.0}
+PATIENCE = {PASSED: 1200.0, SKIPPED: 300.0, FAILED: 120.0}
 
 # The same examples on every rank and in every run; compiled kernels make the first example slow.
 settings.register_profile("ranks", derandomize=True, deadline=None, database=None)
@@ -176,7 +176,7 @@ def on_ranks() -> Callable[..., subprocess.CompletedProcess]:
     The result has ``returncode``, ``stdout`` and ``stderr``; ``timeout`` [s] ends all ranks with an exception.
     """
 
-    def run(ranks: int, *arguments: str | Path, timeout: float = 120.0, **options) -> subprocess.CompletedProcess:
+    def run(ranks: int, *arguments: str | Path, timeout: float = 400.0, **options) -> subprocess.CompletedProcess:
         # This process may have started MPI: what that left in the environment would confuse another launch.
         left = ("PMIX_", "PMI_", "OMPI_COMM_", "OMPI_MCA_orte_", "OMPI_MCA_ess_", "OMPI_UNIVERSE_", "OPAL_", "ORTE_")
         environment = {name: value for name, value in os.environ.items() if not name.startswith(left)}

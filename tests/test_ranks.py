@@ -15,10 +15,10 @@ def outcome(tmp_path, on_ranks):
     """Run the lines of a test on 2 ranks: exit status and output."""
 
     def run(*lines: str) -> tuple[int, str]:
-        (tmp_path / "conftest.py").write_text(CONFTEST.read_text().replace("FAILED: 30.0", "FAILED: 1.0"))
+        (tmp_path / "conftest.py").write_text(CONFTEST.read_text().replace("FAILED: 120.0", "FAILED: 1.0"))
         (tmp_path / "pytest.ini").write_text("[pytest]\nmarkers = parallel\n")
         (tmp_path / "test_it.py").write_text(HEADER + "\n".join(lines) + "\n")
-        done = on_ranks(2, "-m", "pytest", "--color=no", "-p", "no:cacheprovider", cwd=tmp_path, timeout=60)
+        done = on_ranks(2, "-m", "pytest", "--color=no", "-p", "no:cacheprovider", cwd=tmp_path, timeout=300)
         return done.returncode, done.stdout + done.stderr
 
     return run

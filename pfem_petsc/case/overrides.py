@@ -9,7 +9,7 @@ from typing import Any
 
 from ..errors import InputError
 
-__all__ = ["apply_overrides"]
+__all__ = ["apply_overrides", "split_key"]
 
 LISTS = {
     ("load",),
@@ -46,7 +46,7 @@ def apply_overrides(data: dict[str, Any], overrides: Iterable[str]) -> list[tupl
     paths = []
     for text in overrides:
         key, equals, value = text.partition("=")
-        parts = _split(key.strip())
+        parts = split_key(key.strip())
         if not equals or parts is None:
             raise InputError(f"--set {text}: expected KEY=VALUE, like time.step=1e-5 or wall.0.point=[1.0, 0.0, 0.0]")
         if not value.strip():
@@ -64,7 +64,7 @@ def _value(text: str) -> Any:
     return read["value"] if len(read) == 1 else text
 
 
-def _split(key: str) -> list[str] | None:
+def split_key(key: str) -> list[str] | None:
     """Parts of a dotted path, indices in brackets included; None where it is malformed."""
     parts, position = [], 0
     while position < len(key):

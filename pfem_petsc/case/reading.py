@@ -14,6 +14,7 @@ from . import tables as t
 from .base import StrictModel
 from .problems import Path as KeyPath
 from .problems import Problems
+from .record import read_record
 
 __all__ = ["KEYS", "parse_toml", "read_tables"]
 
@@ -72,7 +73,7 @@ def read_tables(data: Mapping[str, Any], folder: Path, problems: Problems) -> di
         "material": _named(t.Material, data, "material", problems),
         "section": _named(t.Section, data, "section", problems),
         "initial": _initial(data, problems),
-        "support": _listed(t.Support, data.get("support"), ("support",), problems),
+        "support": _supports(data.get("support"), folder, problems),
         "load": _listed(t.Load, data.get("load"), ("load",), problems),
         "gravity": problems.read(t.Gravity, data["gravity"], ("gravity",)) if "gravity" in data else None,
         "temperature": _listed(t.Temperature, data.get("temperature"), ("temperature",), problems),
@@ -200,6 +201,27 @@ def _walls(data: Any, problems: Problems) -> list[StrictModel]:
             taker = f"a wall of type {row['type']}"
             walls.append(problems.read(model, named, path, taker=taker, siblings=lambda: _siblings(WALLS)))
     return [wall for wall in walls if wall is not None]
+
+
+def _supports(data: Any, folder: Path, problems: Problems) -> list[t.Support]:
+    """Supports; the rows of an ``acceleration_file`` take its place, so that a resolved case holds all it needs."""
+    supports = []
+    for i, row in enumerate(_rows(data, ("support",), problems)):
+        path: KeyPath = ("support", i)
+        name = row.get("acceleration_file") if isinstance(row, Mapping) else None
+        if isinstance(name, str) and name:
+            taken = [key for key in ("motion", "velocity", "acceleration") if key in row]
+            if taken:
+                problems.add(path, f"expected at most one of the keys acceleration_file, {', '.join(taken)}")
+                continue
+            try:
+                rows = read_record(folder / name)
+            except InputError as error:
+                problems.add((*path, "acceleration_file"), str(error), name)
+                continue
+            row = {key: value for key, value in row.items() if key != "acceleration_file"} | {"acceleration": rows}
+        supports.append(problems.read(t.Support, row, path))
+    return [support for support in supports if support is not None]
 
 
 def _pairs(data: Any, problems: Problems) -> list[t.ContactPair]:

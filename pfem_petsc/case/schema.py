@@ -30,6 +30,7 @@ class Case:
     name : stem of the case file, or name of the built-in case
     source : file of the case as given, for messages
     folder : what the case's relative file names start from
+    overrides : texts that were set over its values
     mesh : :class:`~pfem_petsc.case.tables.Mesh`: generator with parameters, or file
     node_set, material, section : tables by name, in the file's order
     initial, support, load, temperature, wall, contact_pair : lists of tables
@@ -44,7 +45,7 @@ class Case:
     def __init__(self, attributes: Mapping[str, Any], *, name: str, source: str, folder: Path) -> None:
         for key in KEYS:
             self.__dict__[key] = attributes[key]
-        self.__dict__.update(name=name, source=source, folder=Path(folder))
+        self.__dict__.update(name=name, source=source, folder=Path(folder), overrides=())
 
     def __setattr__(self, key: str, value: Any) -> None:
         raise AttributeError(f"a case is not changed after it was checked; give {key} to Case.load as an override")
@@ -99,14 +100,16 @@ class Case:
         overrides: Iterable[str] = (),
     ) -> Case:
         """Check a case given as nested tables with the keys of the case file; see :meth:`load`."""
-        data = copy.deepcopy(dict(data))
+        data, overrides = copy.deepcopy(dict(data)), tuple(overrides)
         problems = Problems(source, apply_overrides(data, overrides))
         attributes = read_tables(data, Path(folder), problems)
         check_names(attributes, data, problems)
         problems.raise_if_any()
         name = Path(source).stem if name is None else name
         attributes["title"] = name if attributes["title"] is None else attributes["title"]
-        return cls(attributes, name=name, source=source, folder=Path(folder))
+        case = cls(attributes, name=name, source=source, folder=Path(folder))
+        case.__dict__["overrides"] = overrides
+        return case
 
     def to_dict(self) -> dict[str, Any]:
         """The case as nested tables with the keys of the case file, every default explicit, absent ones left out."""

@@ -181,9 +181,15 @@ class Support(StrictModel):
     fix: str
     """the fixed components: any of x, y, z"""
     motion: Table4 | None = None
-    """rows [t, dx, dy, dz]: displacement from the start [s, m], linear between rows, constant outside"""
+    """rows [t, dx, dy, dz]: displacement from the mesh's place [s, m], at rest before the first and after the last"""
     velocity: Vector3 | None = None
     """constant velocity of the fixed components [m/s]"""
+    acceleration: Table4 | None = None
+    """rows [t, ax, ay, az] [s, m/s2]: linear between rows, zero outside; the fixed components start from rest"""
+    acceleration_file: Annotated[str, Field(min_length=1)] | None = None
+    """the same as a CSV file with columns t, ax, ay, az, relative to the case file"""
+    interpolation: Literal["smooth", "linear"] = "smooth"
+    """of ``motion`` between its rows: a cubic spline, or straight lines, whose velocity jumps at rows"""
 
     @field_validator("fix")
     @classmethod
@@ -192,18 +198,23 @@ class Support(StrictModel):
             raise ValueError('expected any of the components x, y, z, each once, like "xz"')
         return fix
 
-    @field_validator("motion")
+    @field_validator("motion", "acceleration")
     @classmethod
-    def _motion_times(cls, motion: tuple[Any, ...] | None) -> tuple[Any, ...] | None:
-        _increasing(motion)
-        return motion
+    def _motion_times(cls, rows: tuple[Any, ...] | None) -> tuple[Any, ...] | None:
+        _increasing(rows)
+        return rows
 
     @model_validator(mode="after")
     def _moves_what_it_fixes(self) -> Support:
-        if self.motion is not None and self.velocity is not None:
-            raise ValueError("expected at most one of the keys motion, velocity")
+        keys = [key for key in ("motion", "velocity", "acceleration") if getattr(self, key) is not None]
+        if len(keys) > 1:
+            raise ValueError(
+                f"expected at most one of the keys motion, velocity, acceleration, acceleration_file; got {keys}"
+            )
+        if self.interpolation == "linear" and self.motion is None:
+            raise ValueError('interpolation = "linear" goes with motion: accelerations are linear between rows anyway')
         for k, axis in enumerate("xyz"):
-            rows = self.motion or ()
+            rows = self.motion or self.acceleration or ()
             moves = any(row[1 + k] != 0.0 for row in rows) or (self.velocity is not None and self.velocity[k] != 0.0)
             if moves and axis not in self.fix:
                 raise ValueError(f'{axis} is given a motion, but fix = "{self.fix}" leaves it free')

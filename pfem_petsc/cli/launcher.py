@@ -115,8 +115,14 @@ def _print(error: BaseException, debug: bool, who: str = "") -> int:
     status, text = _message(error)
     if debug:
         text = "".join(traceback.format_exception(error)) + text
-    sys.stdout.flush()
-    print(f"{who}{text}", file=sys.stderr, flush=True)
+    try:
+        sys.stdout.flush()
+        print(f"{who}{text}", file=sys.stderr, flush=True)
+    except OSError:
+        # the terminal has gone; the interpreter must not flush into it at its end
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        for stream in (sys.stdout, sys.stderr):
+            os.dup2(nowhere, stream.fileno())
     return status
 
 

@@ -11,11 +11,16 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
+from typing import TYPE_CHECKING
 
 from ..case.builtin import built_in_cases
 from ..errors import InputError
+from ..signals import give_back_early
 from .launcher import collectively, launched_rank, on_first_rank, refuse
 from .parser import PROGRAM, Parser, add_debug
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
 
 __all__ = ["main"]
 
@@ -54,9 +59,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     except SystemExit as done:  # --help and --version
         return int(done.code or 0)
     arguments.petsc_options = petsc_options
+
+    def run_verb(*comm: MPI.Comm) -> int:
+        if arguments.verb != "run":
+            give_back_early()
+        return verb.run(arguments, *comm)
+
     if verb.RANKS == "all":
-        return collectively(lambda comm: verb.run(arguments, comm), debug)
-    return on_first_rank(lambda: verb.run(arguments), debug, uses_mpi=verb.RANKS == "one")
+        return collectively(run_verb, debug)
+    return on_first_rank(run_verb, debug, uses_mpi=verb.RANKS == "one")
 
 
 def _parse(words: list[str]) -> tuple[argparse.Namespace, ModuleType]:

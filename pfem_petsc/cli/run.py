@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import os
+import shlex
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..errors import EarlyStop, SimulationFailure
 from .parser import PROGRAM, add_case, seconds
 
 if TYPE_CHECKING:
@@ -34,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         nargs="?",
         const=True,
-        help="go on from a checkpoint; default: the newest of the output folder",
+        help="go on from a checkpoint; default: the newest of the output folder; what --set set then stays",
     )
     parser.add_argument("--quiet", action="store_true", help="no progress on the screen")
     parser.add_argument(
@@ -47,27 +50,64 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace, comm: MPI.Comm) -> int:
     """Simulate, and give the exit status. Collective."""
+    restart = arguments.restart if arguments.restart in (None, True) else Path(arguments.restart)
     case = load_case(arguments, comm)
+    output = arguments.output or Path("results", case.name)
     from ..simulation import Simulation
 
-    restart = arguments.restart if arguments.restart in (None, True) else Path(arguments.restart)
-    simulation = Simulation(
-        case,
-        comm,
-        output=arguments.output or Path("results", case.name),
-        restart=restart,
-        quiet=arguments.quiet,
-        wall_time=arguments.wall_time,
-    )
-    return simulation.run() or 0
+    command = _command(arguments, case, comm.size)
+    try:
+        with Simulation(
+            case, comm, output=output, restart=restart, quiet=arguments.quiet, wall_time=arguments.wall_time
+        ) as simulation:
+            kept = [text for text in case.overrides if text not in arguments.overrides]
+            if kept:
+                simulation.notes.append(f"as in the run that is continued: --set {shlex.join(kept)}")
+            return simulation.run() or 0
+    except (EarlyStop, SimulationFailure) as error:
+        if "continue with --restart" in str(error):
+            raise type(error)(f"{error}\n  {command}") from error
+        raise
 
 
 def load_case(arguments: argparse.Namespace, comm: MPI.Comm):  # noqa: ANN201 - the type would import the schema
-    """The case of the command line, read by rank 0; PETSc is started with its options. Collective."""
+    """The case of the command line, read by rank 0; PETSc is started with its options. Collective.
+
+    A restart goes on with the values that the run it continues was given by ``--set``, and those given now over them.
+    """
     import petsc4py
 
     petsc4py.init([PROGRAM, *arguments.petsc_options])
-    from ..case.schema import Case
     from ..parallel.agreement import on_root
 
-    return on_root(comm, Case.load, arguments.case, arguments.overrides)
+    return on_root(comm, _load, arguments)
+
+
+def _load(arguments: argparse.Namespace):  # noqa: ANN202
+    from ..case.builtin import built_in_path
+    from ..case.schema import Case
+
+    overrides = arguments.overrides
+    restart = getattr(arguments, "restart", None)
+    if restart is not None:
+        from ..restart.overrides import joined_overrides, kept_overrides
+
+        name = (built_in_path(arguments.case) or Path(arguments.case)).stem
+        kept = kept_overrides(name, arguments.output or Path("results", name), restart)
+        overrides = joined_overrides(kept, overrides)
+    return Case.load(arguments.case, overrides)
+
+
+def _command(arguments: argparse.Namespace, case, ranks: int) -> str:  # noqa: ANN001
+    """The command line that continues this run, to be pasted into a shell."""
+    launcher = []
+    if ranks > 1:
+        launcher = ["srun" if "SLURM_STEP_NUM_TASKS" in os.environ else "mpirun", "-n", str(ranks)]
+    words = [*launcher, *PROGRAM.split(), str(arguments.case)]
+    words += ["-o", str(arguments.output)] if arguments.output is not None else []
+    words += ["--quiet"] if arguments.quiet else []
+    words += ["--wall-time", f"{arguments.wall_time:g}"] if arguments.wall_time is not None else []
+    words += ["--set", *case.overrides] if case.overrides else []
+    words += ["--restart"]
+    words += ["--", *arguments.petsc_options] if arguments.petsc_options else []
+    return shlex.join(words)

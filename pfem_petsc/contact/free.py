@@ -138,6 +138,7 @@ class FreeWalls:
             "a": state.a.tolist(),
             "time": state.time,
             "memory": memory,
+            "increment": self._u.tolist(),
         }
 
     def put_back(self, kept: dict[str, Any]) -> None:
@@ -146,5 +147,6 @@ class FreeWalls:
         for name in ("x", "v", "a"):
             setattr(self.state, name, np.array(kept[name], dtype=float).reshape(shape))
         self.state.time = kept["time"]
+        self._u = np.array(kept["increment"], dtype=float).reshape(shape)
         for name, array in kept["memory"].items():
             self.state.memory[name] = np.array(array, dtype=float).reshape(shape)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..mechanics.loads import Table
+from ..mechanics.motion import motion_of
 
 __all__ = ["WallMotion"]
 
@@ -19,10 +19,7 @@ class WallMotion:
     """
 
     def __init__(self, walls) -> None:
-        self._tables = [Table(wall.motion) if wall.motion is not None else None for wall in walls]
-        self._velocities = np.array(
-            [wall.velocity if wall.velocity is not None else (0.0, 0.0, 0.0) for wall in walls], dtype=np.float64
-        ).reshape(-1, 3)
+        self._motions = [motion_of(wall) for wall in walls]
         self.free = None
         self.moving = np.array(
             [wall.velocity is not None or wall.motion is not None or wall.mass is not None for wall in walls],
@@ -31,23 +28,26 @@ class WallMotion:
 
     def shifts(self, time: float) -> np.ndarray:
         """Displacements (w, 3) [m] at a time [s]."""
-        shifts = self._velocities * time
-        for k, table in enumerate(self._tables):
-            if table is not None:
-                shifts[k] = table(time)
+        shifts = np.zeros((len(self._motions), 3))
+        for k, motion in enumerate(self._motions):
+            if motion is not None:
+                shifts[k] = motion.at(time)[0]
         if self.free is not None:
             shifts[self.free.at] = self.free.displacements(time)
         return shifts
 
     def rates(self, time: float, ahead: bool = False) -> np.ndarray:
-        """Velocities (w, 3) [m/s] at a time [s]; in a table's kinks that before, or that ahead."""
-        rates = self._velocities.copy()
-        for k, table in enumerate(self._tables):
-            if table is not None:
-                row = np.searchsorted(table.times, time, side="right" if ahead else "left") - 1
-                inside = 0 <= row < len(table.times) - 1
-                if inside:
-                    rates[k] = np.diff(table.values[row : row + 2], axis=0)[0] / np.diff(table.times[row : row + 2])
+        """Velocities (w, 3) [m/s] at a time [s]; in the kinks of a linear table that before, or that ahead."""
+        rates = np.zeros((len(self._motions), 3))
+        for k, motion in enumerate(self._motions):
+            if motion is not None:
+                rates[k] = motion.at(time, ahead=ahead)[1]
         if self.free is not None:
             rates[self.free.at] = self.free.state.v
         return rates
+
+    def accelerations(self, time: float) -> np.ndarray:
+        """Accelerations (w, 3) [m/s2] at a time [s] of walls whose motion is given; zero for those with mass."""
+        nothing = np.zeros((3, 3))
+        moved = [nothing if motion is None else motion.at(time) for motion in self._motions]
+        return np.array([each[2] for each in moved]).reshape(-1, 3)

@@ -1,8 +1,9 @@
 """Nodes that rest on walls or on each other at the start: their acceleration and the forces that hold them.
 
-A node that touches a wall and does not move along its normal is not accelerated into it: with the walls' forces r,
+A node that touches a wall and does not move along its normal is not accelerated into it: with the walls' forces r and
+accelerations a_w,
 
-    M a = f + r,   0 <= n . a  complementary to  the strength of r,
+    M a = f + r,   0 <= n . (a - a_w)  complementary to  the strength of r,
 
 and likewise with n . (a_2 - a_1) of closed pairs. r includes friction: against the velocity of a node that slides, else
 what keeps it from sliding, if the wall can give that much. An acceleration without r starts a truss at rest on a floor
@@ -57,7 +58,8 @@ def start_at_rest(model, state, accelerate: Callable[[np.ndarray], np.ndarray], 
         resting[:, contact.motion.free.at] = False  # these give way
     kept = resting.any(axis=1)
     nodes, normals, resting = nodes[kept], normals[kept], resting[kept]
-    planes = np.where(resting, 0.0, -np.inf)
+    accelerations = contact.motion.accelerations(state.time)
+    planes = np.where(resting, np.einsum("mwi,wi->mw", normals, accelerations), -np.inf)
     fixed = model.supports.fixed[nodes]
     share = 0.5 if model.inertia.consistent else 1.0
     weight = share * mass[nodes]
@@ -83,7 +85,7 @@ def start_at_rest(model, state, accelerate: Callable[[np.ndarray], np.ndarray], 
         if contact.rough:
             slack = _SLACK * model.wave_speed
             strengths *= weight[:, None]
-            _rub(contact, nodes, v, rates, slack, weight, moved, normals, planes, strengths, drag)
+            _rub(contact, nodes, v, rates, accelerations, slack, weight, moved, normals, planes, strengths, drag)
             strengths /= weight[:, None]
         before, hold = hold, weight[:, None] * (moved - free)
         sizes = [np.abs(part).max(initial=0.0) for part in (hold - before, between - earlier, hold, between)]
@@ -104,11 +106,11 @@ def start_at_rest(model, state, accelerate: Callable[[np.ndarray], np.ndarray], 
     return contact.sums(nodes, force, x[nodes], strengths > 0.0)
 
 
-def _rub(contact, nodes, v, rates, slack, weight, a, normals, planes, pressing, drag) -> None:
+def _rub(contact, nodes, v, rates, accelerations, slack, weight, a, normals, planes, pressing, drag) -> None:
     """Friction at the start: accelerations (m, 3), pressing (m, w) and drag (m, w, 3) forces, in place.
 
     Nodes that slide have a slip in which their velocity outweighs any acceleration; that of the others is their
-    acceleration.
+    acceleration, relative to that of the wall.
     """
     away = v[nodes][:, None, :] - rates
     away -= np.einsum("mwi,mwi->mw", away, normals)[:, :, None] * normals
@@ -122,7 +124,7 @@ def _rub(contact, nodes, v, rates, slack, weight, a, normals, planes, pressing, 
         add_friction(
             moved,
             -factor * v[nodes[part]],
-            factor * rates,
+            factor * rates if factor else accelerations,
             contact.fixed[nodes[part]],
             normals[part],
             planes[part],

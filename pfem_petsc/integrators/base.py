@@ -95,6 +95,7 @@ class Scheme(ABC):
     solves_end : the position solved for is x_{n+1}
     symmetric : whether the Hessian is
     remembers : names of what it keeps of nodes in the state's memory, linear in motions
+    dissipates : whether the scheme takes energy from high frequencies
     notice : what users must be told when they choose it; empty for nothing
     """
 
@@ -104,6 +105,7 @@ class Scheme(ABC):
     solves_end = True
     symmetric = True
     remembers: tuple[str, ...] = ()
+    dissipates = True
     notice = ""
 
     def __init__(self, parameters: StrictModel) -> None:
@@ -116,8 +118,11 @@ class Scheme(ABC):
     def start(self, state: State, h: float) -> None:
         """Set memory up from the complete state at the start (x, v, a); nothing by default."""
 
-    def restart(self, state: State, nodes: np.ndarray, h: float) -> None:
-        """Make what is remembered of some owned nodes agree with v and a, which contact changed; nothing by default."""
+    def restart(self, state: State, nodes: np.ndarray | tuple[np.ndarray, np.ndarray], h: float) -> None:
+        """Make what is remembered of some owned nodes agree with v and a, which contact or supports changed.
+
+        ``nodes`` : (m,), or (nodes, components), both (m,). Nothing by default.
+        """
 
     def step_changed(self, state: State) -> None:
         """Forget what holds for the old step only; the state (x, v, a) is complete. Nothing by default."""

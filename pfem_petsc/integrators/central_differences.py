@@ -42,6 +42,7 @@ class Scheme(ExplicitScheme):
 
     leads = True
     remembers = ("half_velocity",)
+    dissipates = False
 
     def limit(self, damping_ratio: float = 0.0) -> float:
         """2 for any damping ratio: damping is centred."""

@@ -23,6 +23,7 @@ class Scheme(Base):
 
     at_ends = False
     symmetric = False
+    dissipates = False
 
     def balance(self, state: State, h: float) -> Balance:
         return Balance(

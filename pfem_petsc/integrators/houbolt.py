@@ -27,7 +27,7 @@ class Scheme(Base):
         state.memory.pop("d0", None)
         state.memory.pop("d1", None)
 
-    def restart(self, state: State, nodes: np.ndarray, h: float) -> None:
+    def restart(self, state: State, nodes: np.ndarray | tuple[np.ndarray, np.ndarray], h: float) -> None:
         if "d0" in state.memory:
             v, a = state.v[nodes], state.a[nodes]
             state.memory["d0"][nodes] = h * v - (0.5 * h * h) * a

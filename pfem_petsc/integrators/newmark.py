@@ -28,6 +28,10 @@ class Parameters(StrictModel):
 class Scheme(Base):
     """Newmark's method (implicit)."""
 
+    def __init__(self, parameters: StrictModel) -> None:
+        super().__init__(parameters)
+        self.dissipates = parameters.gamma > 0.5
+
     def limit(self, damping_ratio: float = 0.0) -> float:
         """Unconditionally stable for 2 beta >= gamma >= 1/2; else Omega^2 (gamma/2 - beta) = 1 (undamped)."""
         beta, gamma = self.parameters.beta, self.parameters.gamma

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..errors import InputError
-from .loads import Table
+from .motion import Motion, motion_of
 
 __all__ = ["Supports"]
 
@@ -16,22 +16,18 @@ class Supports:
     Attributes
     ----------
     fixed : (owned, 3) bool
-    any : whether any component of the whole model is prescribed; moving : whether any of this rank moves
+    any : whether any component of the whole model is prescribed; moving : whether any of them moves
+    at : (nodes, components), an index of arrays (owned, 3)
     nodes, components : (k,) indices of the prescribed components, in order of the nodes
     """
 
     def __init__(self, case, nodes: dict[str, np.ndarray], mesh) -> None:
         self.fixed = np.zeros((mesh.n_owned, 3), dtype=bool)
-        motions: list[tuple[np.ndarray, list[int], object]] = []
+        motions: list[tuple[np.ndarray, list[int], Motion]] = []
         for index, support in enumerate(case.support):
             members = nodes[support.node_set]
             axes = ["xyz".index(letter) for letter in support.fix]
-            motion = None
-            if getattr(support, "motion", None):
-                motion = Table(support.motion)
-            elif getattr(support, "velocity", None):
-                velocity = np.array(support.velocity)
-                motion = lambda time, velocity=velocity: velocity * time  # noqa: E731
+            motion = motion_of(support)
             for axis in axes:
                 if motion is not None and self.fixed[members, axis].any():
                     node = mesh.node_ids[members[self.fixed[members, axis]][0]]
@@ -43,8 +39,9 @@ class Supports:
             if motion is not None:
                 motions.append((members, axes, motion))
         self.nodes, self.components = np.nonzero(self.fixed)
+        self.at = (self.nodes, self.components)
         self._start = mesh.points[: mesh.n_owned][self.fixed]
-        self._moved = np.zeros((mesh.n_owned, 3))
+        self._moved = np.zeros((3, mesh.n_owned, 3))  # displacements, velocities, accelerations
         self._motions = motions
         self.moving = bool(motions)
         self.any = bool(case.support)
@@ -53,8 +50,19 @@ class Supports:
         """Prescribed positions (k,) [m] at a time [s], in the order of :attr:`nodes` and :attr:`components`."""
         if not self._motions:
             return self._start
+        return self._start + self._at(time, 0.0)[0]
+
+    def rates(self, time: float, span: float) -> tuple[np.ndarray, np.ndarray]:
+        """Prescribed velocities (k,) [m/s] and accelerations (k,) [m/s2] at a time [s], the exact derivatives.
+
+        Where velocities jump (linear interpolation) the acceleration is the mean over the ``span`` [s] before.
+        """
+        _, v, a = self._at(time, span)
+        return v, a
+
+    def _at(self, time: float, span: float) -> np.ndarray:
         for members, axes, motion in self._motions:
-            displacement = motion(time)
+            moved = motion.at(time, span)
             for axis in axes:
-                self._moved[members, axis] = displacement[axis]
-        return self._start + self._moved[self.nodes, self.components]
+                self._moved[:, members, axis] = moved[:, axis, None]
+        return self._moved[:, self.nodes, self.components]

@@ -5,12 +5,13 @@ from __future__ import annotations
 import errno
 import json
 import os
+import time
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import h5py
 import numpy as np
@@ -34,9 +35,18 @@ from .hdf5 import (
 )
 from .integrity import check_seal, checksum, seal, seal_size, way_out
 
-__all__ = ["Checkpoint", "newest_checkpoint", "read_checkpoint", "read_checkpoint_header", "write_checkpoint"]
+__all__ = [
+    "Checkpoint",
+    "OpenCheckpoint",
+    "newest_checkpoint",
+    "read_checkpoint",
+    "read_checkpoint_header",
+    "write_checkpoint",
+]
 
 NAME, PREVIOUS = "checkpoint.h5", "checkpoint-previous.h5"
+
+_ATTEMPTS = 20  # to catch a file between two replacements
 
 
 @dataclass(frozen=True)
@@ -123,50 +133,116 @@ def write_checkpoint(
             _put_in_place(temporary, path)
 
 
-def read_checkpoint(path: Path | str, comm: MPI.Comm, orders: Mapping[str, NaturalOrder]) -> Checkpoint:
-    """Read a checkpoint on any number of ranks. Collective.
+class OpenCheckpoint:
+    """A checkpoint opened for reading: the same file on all ranks, and the same from its header to its last array.
+
+    Every rank opens the file once and reads it through that descriptor, whatever takes its name meanwhile, as when the
+    run that writes it goes on. Construction is collective.
 
     Parameters
     ----------
     path : Path or str
     comm : MPI.Comm
-    orders : mapping of array name to how this run's ranks own its rows
-        The arrays wanted; others in the file are left alone.
+
+    Attributes
+    ----------
+    scalars, attributes : dicts, as they were written
+    digest : of everything but the values of the arrays, whose checksums are part of it
 
     Raises
     ------
     InputError
-        On all ranks: file missing, damaged, of another version, without one of the arrays, or with another number of
-        rows.
+        On all ranks: missing, damaged, of another version.
     """
-    path = Path(path)
-    scalars, attributes = read_checkpoint_header(path, comm)
-    slabs: dict[str, np.ndarray] = {}
-    expected: dict[str, int] = {}
-    # Reading needs no agreement on each transfer: every rank reads its slab for itself.
-    with agreed(comm), _sound(path), h5py.File(path, "r", locking=False) as file:
-        for name, order in orders.items():
-            if name not in file["arrays"]:
-                known = ", ".join(sorted(file["arrays"])) or "none"
-                raise InputError(f"{path}: has no array {name!r} (it has {known}): it belongs to another kind of run")
-            dataset = file["arrays"][name]
-            if len(dataset) != order.n_global:
-                raise InputError(
-                    f"{path}: {name} has {len(dataset)} rows, the case needs {order.n_global}: it belongs to another "
-                    "mesh; restart the case it was written by"
-                )
-            slabs[name] = dataset[order.first : order.first + order.count]
-            expected[name] = int(dataset.attrs["checksum"])
-    for name, slab in slabs.items():
-        if checksum(comm, slab, orders[name].first) != expected[name]:
-            raise InputError(f"{path}: damaged: the values of {name} do not match their checksum; {way_out(path)}")
-    arrays = {name: orders[name].from_slab(slab) for name, slab in slabs.items()}
-    return Checkpoint(path, arrays, scalars, attributes)
+
+    def __init__(self, path: Path | str, comm: MPI.Comm) -> None:
+        self.path, self.comm = Path(path), comm
+        self._raw: BinaryIO | None = None
+        for attempt in range(_ATTEMPTS):
+            with agreed(comm):
+                self._raw = _open(self.path)
+                mine = check_seal(self.path, self._raw)
+            digests = comm.allgather(mine)
+            if len(set(digests)) == 1:
+                break
+            # it was replaced while the ranks opened it
+            self.close()
+            time.sleep(0.05 * (1 + attempt))
+        else:
+            raise InputError(
+                f"{self.path}: is replaced all the time, or not the same file on all machines: wait until the run that "
+                "writes it has ended"
+            )
+        self.digest = digests[0]
+        self.scalars, self.attributes = on_root(comm, self._header)
+
+    def close(self) -> None:
+        """Close the file; again: nothing."""
+        raw, self._raw = self._raw, None
+        if raw is not None:
+            raw.close()
+
+    def _header(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        with _sound(self.path), h5py.File(self._raw, "r") as file:
+            state = file["state"][()]
+            if zlib.crc32(state) != file["state"].attrs["checksum"]:
+                raise InputError(f"{self.path}: damaged: its state does not match the checksum; {way_out(self.path)}")
+        state = json.loads(state)
+        return state["scalars"], state["attributes"]
+
+    def read(self, orders: Mapping[str, NaturalOrder]) -> Checkpoint:
+        """Read arrays, on any number of ranks. Collective.
+
+        Parameters
+        ----------
+        orders : mapping of array name to how this run's ranks own its rows
+            The arrays wanted; others in the file are left alone.
+
+        Raises
+        ------
+        InputError
+            On all ranks: damaged, without one of the arrays, or with another number of rows.
+        """
+        path = self.path
+        slabs: dict[str, np.ndarray] = {}
+        expected: dict[str, int] = {}
+        # Reading needs no agreement on each transfer: every rank reads its slab for itself.
+        with agreed(self.comm), _sound(path), h5py.File(self._raw, "r") as file:
+            for name, order in orders.items():
+                if name not in file["arrays"]:
+                    known = ", ".join(sorted(file["arrays"])) or "none"
+                    raise InputError(
+                        f"{path}: has no array {name!r} (it has {known}): it belongs to another kind of run"
+                    )
+                dataset = file["arrays"][name]
+                if len(dataset) != order.n_global:
+                    raise InputError(
+                        f"{path}: {name} has {len(dataset)} rows, the case needs {order.n_global}: it belongs to "
+                        "another mesh; restart the case it was written by"
+                    )
+                slabs[name] = dataset[order.first : order.first + order.count]
+                expected[name] = int(dataset.attrs["checksum"])
+        for name, slab in slabs.items():
+            if checksum(self.comm, slab, orders[name].first) != expected[name]:
+                raise InputError(f"{path}: damaged: the values of {name} do not match their checksum; {way_out(path)}")
+        arrays = {name: orders[name].from_slab(slab) for name, slab in slabs.items()}
+        return Checkpoint(path, arrays, self.scalars, self.attributes)
+
+
+def read_checkpoint(path: Path | str, comm: MPI.Comm, orders: Mapping[str, NaturalOrder]) -> Checkpoint:
+    """Open, read and close a checkpoint, see :class:`OpenCheckpoint`. Collective."""
+    file = OpenCheckpoint(path, comm)
+    try:
+        return file.read(orders)
+    finally:
+        file.close()
 
 
 def read_checkpoint_header(path: Path | str, comm: MPI.Comm) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Scalars and attributes of a checkpoint, on all ranks. Collective; raises as :func:`read_checkpoint`."""
-    return on_root(comm, _read_header, Path(path))
+    """Scalars and attributes of a checkpoint, on all ranks; raises as :class:`OpenCheckpoint`. Collective."""
+    file = OpenCheckpoint(path, comm)
+    file.close()
+    return file.scalars, file.attributes
 
 
 def newest_checkpoint(folder: Path | str) -> Path | None:
@@ -197,16 +273,18 @@ def _put_in_place(temporary: Path, path: Path) -> None:
             raise
 
 
-def _read_header(path: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    if not path.is_file():
-        raise InputError(f"{path}: there is no such checkpoint; name an existing one, or start without --restart")
-    check_seal(path)
-    with _sound(path), h5py.File(path, "r", locking=False) as file:
-        state = file["state"][()]
-        if zlib.crc32(state) != file["state"].attrs["checksum"]:
-            raise InputError(f"{path}: damaged: its state does not match the checksum; {way_out(path)}")
-    state = json.loads(state)
-    return state["scalars"], state["attributes"]
+def _open(path: Path) -> BinaryIO:
+    for _ in range(_ATTEMPTS):
+        try:
+            return open(path, "rb")  # noqa: SIM115 - it stays open
+        except FileNotFoundError:
+            # between the two renamings of a run that writes the next one
+            if not path.with_name(PREVIOUS).exists() or path.name != NAME:
+                break
+            time.sleep(0.02)
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read: {error.strerror}; {way_out(path)}") from error
+    raise InputError(f"{path}: there is no such checkpoint; name an existing one, or start without --restart")
 
 
 @contextmanager

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import h5py
 import numpy as np
@@ -65,7 +66,8 @@ def seal(path: Path) -> None:
         found = [(dataset.id.get_offset(), dataset.id.get_storage_size()) for dataset in file["arrays"].values()]
     arrays = sorted([offset, length] for offset, length in found if length)
     content = {"size": path.stat().st_size, "seal_size": size, "arrays": arrays}
-    text = json.dumps({**content, "digest": _digest(path, content)})
+    with open(path, "rb") as raw:
+        text = json.dumps({**content, "digest": _digest(raw, content)})
     line = f"{FORMAT} {VERSION}\n{text}\n".encode()
     if len(line) > size:
         raise ValueError(f"{path}: seal of {len(line)} bytes for {size}")
@@ -73,8 +75,13 @@ def seal(path: Path) -> None:
         raw.write(line.ljust(size))
 
 
-def check_seal(path: Path) -> None:
-    """Compare a file with its seal, all but the values of its arrays. One process.
+def check_seal(path: Path, raw: BinaryIO | None = None) -> str:
+    """Compare a file with its seal, all but the values of its arrays; give the digest. One process.
+
+    Parameters
+    ----------
+    path : Path
+    raw : the file opened for reading, whatever ``path`` has become since; default: opened here
 
     Raises
     ------
@@ -82,30 +89,39 @@ def check_seal(path: Path) -> None:
         When the file is not a checkpoint, of another version, cut, or damaged.
     """
     try:
-        with open(path, "rb") as raw:
-            head = raw.read(LARGEST_SEAL).split(b"\n", 2)
-        first = head[0].decode(errors="replace")
-        name, _, version = first.rpartition(" ")
-        if name != FORMAT:
-            raise InputError(f"{path}: not a checkpoint of pfem_petsc, or damaged at its beginning; {way_out(path)}")
-        if version != str(VERSION):
-            raise InputError(
-                f"{path}: has version {version} of the checkpoint format, this program reads {VERSION}: restart with "
-                f"the version of pfem_petsc that wrote it, or {way_out(path)}"
-            )
-        try:
-            content: dict[str, Any] = json.loads(head[1])
-            size, digest = int(content["size"]), content.pop("digest")
-            actual = path.stat().st_size
-            if actual != size:
-                raise InputError(f"{path}: damaged: has {actual} bytes of {size}; {way_out(path)}")
-            sound = _digest(path, content) == digest
-        except (ValueError, KeyError, TypeError, IndexError, OverflowError):
-            sound = False
-        if not sound:
-            raise InputError(f"{path}: damaged: what describes its content does not match the digest; {way_out(path)}")
+        if raw is None:
+            with open(path, "rb") as raw:
+                return _checked(path, raw)
+        return _checked(path, raw)
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}; {way_out(path)}") from error
+
+
+def _checked(path: Path, raw: BinaryIO) -> str:
+    raw.seek(0)
+    head = raw.read(LARGEST_SEAL).split(b"\n", 2)
+    first = head[0].decode(errors="replace")
+    name, _, version = first.rpartition(" ")
+    if name != FORMAT:
+        raise InputError(f"{path}: not a checkpoint of pfem_petsc, or damaged at its beginning; {way_out(path)}")
+    if version != str(VERSION):
+        raise InputError(
+            f"{path}: has version {version} of the checkpoint format, this program reads {VERSION}: restart with "
+            f"the version of pfem_petsc that wrote it, or {way_out(path)}"
+        )
+    digest = None
+    try:
+        content: dict[str, Any] = json.loads(head[1])
+        size, digest = int(content["size"]), content.pop("digest")
+        actual = os.fstat(raw.fileno()).st_size
+        if actual != size:
+            raise InputError(f"{path}: damaged: has {actual} bytes of {size}; {way_out(path)}")
+        sound = _digest(raw, content) == digest
+    except (ValueError, KeyError, TypeError, IndexError, OverflowError, AttributeError):
+        sound = False
+    if not sound:
+        raise InputError(f"{path}: damaged: what describes its content does not match the digest; {way_out(path)}")
+    return str(digest)
 
 
 def way_out(path: Path) -> str:
@@ -116,18 +132,17 @@ def way_out(path: Path) -> str:
     return "start without --restart"
 
 
-def _digest(path: Path, content: dict[str, Any]) -> str:
+def _digest(raw: BinaryIO, content: dict[str, Any]) -> str:
     """Digest of the seal's content and of all bytes after the user block that are not values of arrays."""
     digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode())
     position = int(content["seal_size"])
-    with open(path, "rb") as raw:
-        for offset, length in [*content["arrays"], [int(content["size"]), 0]]:
-            raw.seek(position)
-            while position < offset:
-                block = raw.read(min(BLOCK, offset - position))
-                if not block:
-                    raise ValueError("the file ends early")
-                digest.update(block)
-                position += len(block)
-            position = offset + length
+    for offset, length in [*content["arrays"], [int(content["size"]), 0]]:
+        raw.seek(position)
+        while position < offset:
+            block = raw.read(min(BLOCK, offset - position))
+            if not block:
+                raise ValueError("the file ends early")
+            digest.update(block)
+            position += len(block)
+        position = offset + length
     return digest.hexdigest()

@@ -65,6 +65,7 @@ def _attributes(simulation) -> dict[str, Any]:
     attributes: dict[str, Any] = {
         "name": case.name,
         "folder": str(case.folder.resolve()),
+        "overrides": list(case.overrides),
         "time_step": plan.step,
         "steps": plan.steps,
         "linear_solver": plan.linear.why if plan.linear is not None else "none",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
 from collections.abc import Callable
@@ -155,10 +156,11 @@ class Progress:
         if not self._root:
             return
         self._log_line(text, "WARNING")
-        if self._bar is not None:
-            self._bar.console.print(f"warning: {text}", style="yellow", markup=False, highlight=False)
-        else:
-            print(f"warning: {text}", file=sys.stderr, flush=True)
+        with contextlib.suppress(OSError):  # it is in the log
+            if self._bar is not None:
+                self._bar.console.print(f"warning: {text}", style="yellow", markup=False, highlight=False)
+            else:
+                print(f"warning: {text}", file=sys.stderr, flush=True)
 
     def close(self, outcome: str = "done") -> None:
         """Print the state at the end, the wall time and the speed; a second call does nothing."""
@@ -169,8 +171,12 @@ class Progress:
         step, time, *_ = self._last
         if self._bar is not None:
             self._draw_bar()
-            self._bar.stop()
-            self._bar = None
+        if self._bar is not None:
+            try:
+                self._bar.stop()
+                self._bar = None
+            except OSError:
+                self._let_go_of_stdout()
         if step > self._marked[1]:
             self._write(self._line(now))
         wall, steps = now - self._begin, step - self._start[0]
@@ -266,8 +272,11 @@ class Progress:
         total = f"/{self._n_steps}" if self._n_steps is not None else ""
         # must fit into 80 columns; the lines of the log have the rest
         state = f"{step}{total}  t = {engineering(time, 's')}" + (f"  contacts {contacts:,}" if contacts else "")
-        self._bar.update(self._bar_task, completed=self._done(), state=state)
-        self._bar.refresh()
+        try:
+            self._bar.update(self._bar_task, completed=self._done(), state=state)
+            self._bar.refresh()
+        except OSError:
+            self._let_go_of_stdout()
 
     def _write(self, text: str, level: str = "INFO") -> None:
         """A line on stdout (above the bar, where there is one) and in the log."""
@@ -279,12 +288,16 @@ class Progress:
                 self._bar.console.print(text, markup=False, highlight=False)
             else:
                 print(text, file=self._stream, flush=True)
-        except BrokenPipeError:
-            if self._stream is sys.stdout:
-                # what Python itself flushes at exit must find an open end
-                os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            self._stream = None
-            self._log_line("nobody reads stdout any more: the run goes on and reports here only", "WARNING")
+        except OSError:
+            self._let_go_of_stdout()
+
+    def _let_go_of_stdout(self) -> None:
+        """The reader, or the terminal, has gone, or the disk behind is full."""
+        if self._stream is sys.stdout:
+            # what Python itself flushes at exit must find an open end
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        self._stream = self._bar = None
+        self._log_line("nobody reads stdout any more: the run goes on and reports here only", "WARNING")
 
     def _log_line(self, text: str, level: str) -> None:
         if self._log is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from .forecast import memory_warning
+from .motions import jumping_motions
 from .overlaps import nodes_on_bars, overlapping_bars
 from .parts import count_parts
 from .rigidity import global_rigidity, model_directions, unbraced_nodes
@@ -15,6 +16,7 @@ __all__ = ["inspect", "warnings_before"]
 def warnings_before(case, model, plan) -> list[str]:
     """What looks wrong and is cheap to find: for every start. Collective."""
     texts = odd_numbers(case, model) + memory_warning(case, model, plan) + wall_gaps(model)[1]
+    texts += jumping_motions(case, plan)
     count, nodes, first = count_parts(model.mesh)
     if count > 1 and model.pairs is None:  # pairs are between bodies
         texts.append(

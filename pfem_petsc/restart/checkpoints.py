@@ -6,7 +6,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from ..output.checkpoint import NAME, read_checkpoint, write_checkpoint
+from ..output.checkpoint import NAME, write_checkpoint
 from .compare import check_mesh_is_the_same, mesh_mark
 from .folder import Restart
 from .state import STATE_VERSION, RunState
@@ -43,7 +43,7 @@ class Checkpoints:
         every = self.case.output.checkpoint_every
         return bool(every) and step % every == 0
 
-    def write(self, ledger, recorder, row: dict[str, Any], snapshot: int) -> None:
+    def write(self, ledger, recorder, blow_up, row: dict[str, Any], snapshot: int) -> None:
         """Write one, with the last history row and the step of the last snapshot. It becomes the newest. Collective.
 
         Raises
@@ -51,12 +51,14 @@ class Checkpoints:
         SimulationFailure
             On all ranks; those before stay.
         """
-        scalars = self.state.scalars(ledger, recorder, row, snapshot)
+        scalars = self.state.scalars(ledger, recorder, blow_up, row, snapshot)
         if scalars["step"] == self.last_step:
             return
         attributes = {
             "state_version": STATE_VERSION,
             "pfem_petsc": _version(),
+            "name": self.case.name,
+            "overrides": list(self.case.overrides),
             "case": self.case.to_dict(),
             "plan": self.plan.record(),
             "mesh_mark": self._mark,
@@ -73,7 +75,8 @@ class Checkpoints:
             On all ranks: damaged, or of another mesh.
         """
         check_mesh_is_the_same(restart.path, self._mark, restart.attributes, self.case.source)
-        checkpoint = read_checkpoint(restart.path, self.comm, self.state.orders(restart.scalars))
+        checkpoint = restart.file.read(self.state.orders(restart.scalars))
+        restart.file.close()
         self.state.put_back(checkpoint)
         if restart.continues:
             self.last_step = restart.step

@@ -11,7 +11,9 @@ from mpi4py import MPI
 
 from ..errors import InputError
 from ..output import result as results
-from ..output.checkpoint import NAME, PREVIOUS, newest_checkpoint, read_checkpoint_header
+from ..output.checkpoint import NAME, PREVIOUS, OpenCheckpoint, newest_checkpoint
+from ..output.integrity import check_seal
+from ..output.units import engineering
 from ..parallel.agreement import on_root
 from .compare import changed_keys, check_version
 
@@ -28,16 +30,25 @@ class Restart:
     Attributes
     ----------
     path : the checkpoint
-    scalars, attributes : its header
+    file : the same, open
     changed : keys of the case that differ, as lines
     continues : whether the results in the output folder are continued; else they are moved aside and new ones begin
     """
 
     path: Path
-    scalars: dict[str, Any]
-    attributes: dict[str, Any]
+    file: OpenCheckpoint
     changed: list[str]
     continues: bool
+
+    @property
+    def scalars(self) -> dict[str, Any]:
+        """The numbers of the checkpoint."""
+        return self.file.scalars
+
+    @property
+    def attributes(self) -> dict[str, Any]:
+        """What it says about the run that wrote it."""
+        return self.file.attributes
 
     @property
     def step(self) -> int:
@@ -67,39 +78,39 @@ def find_restart(case, comm: MPI.Comm, folder: Path, asked: bool | Path | None) 
     path = on_root(comm, newest_checkpoint, folder) if asked is True else Path(asked)
     if path is None:
         return f"{folder}: no checkpoint there to restart from: starting from zero"
-    scalars, attributes = read_checkpoint_header(path, comm)
-    check_version(path, attributes)
-    changed = changed_keys(path, attributes["case"], case.to_dict(), case.source)
+    file = OpenCheckpoint(path, comm)
+    check_version(path, file.attributes)
+    changed = changed_keys(path, file.attributes["case"], case.to_dict(), case.source)
     continues = on_root(comm, _continues, folder, path)
-    return Restart(path, scalars, attributes, changed, continues)
+    return Restart(path, file, changed, continues)
 
 
-def finished(case, comm: MPI.Comm, folder: Path, end: float) -> bool:
-    """Whether the output folder holds results of this case up to its end [s]. Collective."""
+def finished(case, comm: MPI.Comm, folder: Path, end: float) -> float | None:
+    """Up to when the output folder holds results of this case [s], None where not up to its end. Collective."""
     return on_root(comm, _finished, case, folder / RESULT, end)
 
 
-def _finished(case, path: Path, end: float) -> bool:
+def _finished(case, path: Path, end: float) -> float | None:
     if not path.is_file():
-        return False
+        return None
     try:
         with results.open_result(path) as result:
-            reached = min(
-                (float(times[-1]) for times in (result.history["time"], result.times) if len(times)), default=-1.0
-            )
+            reached = [float(times[-1]) for times in (result.history["time"], result.times) if len(times)]
             changed_keys(path, result.case.to_dict(), case.to_dict(), case.source)
     except InputError:
         # of another case, or not readable: it is moved aside
-        return False
-    return reached >= end * (1.0 - 1e-9)
+        return None
+    return max(reached) if reached and min(reached) >= end * (1.0 - 1e-9) else None
 
 
 def _continues(folder: Path, path: Path) -> bool:
     return (folder / RESULT).is_file() and path.resolve().parent == folder.resolve()
 
 
-def prepare_folder(comm: MPI.Comm, folder: Path, restart: Restart | None) -> Path | None:
+def prepare_folder(comm: MPI.Comm, folder: Path, restart: Restart | None, plan) -> Path | None:
     """Make the output folder; what it holds is moved aside to a numbered name, unless a restart continues it.
+
+    The caller has the folder's lock. ``plan`` says how far the run goes: results beyond that are not cut.
 
     Returns
     -------
@@ -108,9 +119,34 @@ def prepare_folder(comm: MPI.Comm, folder: Path, restart: Restart | None) -> Pat
     Raises
     ------
     InputError
-        On all ranks, where the folder cannot be written.
+        On all ranks, where the folder cannot be written, or a restart would lose what it holds.
     """
-    return on_root(comm, _prepare, folder, restart)
+    return on_root(comm, _prepare, folder, restart, plan)
+
+
+def _refuse_other(restart: Restart) -> None:
+    """The checkpoint was read before the lock was taken: another run may have written one since, and results."""
+    if check_seal(restart.path) != restart.file.digest:
+        raise InputError(
+            f"{restart.path}: another run has written this checkpoint anew while this one was set up: nothing is "
+            "changed; start again with --restart"
+        )
+
+
+def _refuse_loss(path: Path, plan) -> None:
+    """Results beyond the end of the run would be cut off."""
+    with results.open_result(path) as result:
+        steps, times = result.history["step"], result.history["time"]
+        snapshots = int((result.steps > plan.steps).sum())
+    rows = int((steps > plan.steps).sum())
+    if rows or snapshots:
+        reached = max([*times[-1:], *result.times[-1:]])
+        raise InputError(
+            f"{path}: the results reach t = {engineering(reached, 's')}, beyond time.end = "
+            f"{engineering(plan.step * plan.steps, 's')}: to go on from the checkpoint up to there would cut off "
+            f"{rows} rows of the history and {snapshots} snapshots; take a later end (--set time.end={reached:.6g} or "
+            "more), another folder (-o), or start without --restart, which moves the results aside"
+        )
 
 
 def _refuse_gap(path: Path, restart: Restart) -> None:
@@ -125,11 +161,13 @@ def _refuse_gap(path: Path, restart: Restart) -> None:
         )
 
 
-def _prepare(folder: Path, restart: Restart | None) -> Path | None:
+def _prepare(folder: Path, restart: Restart | None, plan) -> Path | None:
     aside = None
     try:
         if restart is not None and restart.continues:
+            _refuse_other(restart)
             _refuse_gap(folder / RESULT, restart)
+            _refuse_loss(folder / RESULT, plan)
             if restart.path.name == PREVIOUS and (folder / NAME).exists():
                 # A later one than the results will reach back to must not be taken for the newest.
                 os.replace(folder / NAME, folder / ASIDE)

@@ -61,7 +61,7 @@ class RunState:
         bars = {name: (self.bar_order, array[self.counted]) for name, array in self._bar_arrays().items()}
         return {**nodes, **bars}
 
-    def scalars(self, ledger, recorder, row: dict[str, Any], snapshot: int) -> dict[str, Any]:
+    def scalars(self, ledger, recorder, blow_up, row: dict[str, Any], snapshot: int) -> dict[str, Any]:
         """The numbers; the last history row, and the step of the last snapshot. Collective."""
         stepper, energy, walls = self.stepper, self.stepper.energy, self.stepper.solution.walls
         mine = {
@@ -78,6 +78,9 @@ class RunState:
             "stepper": {name: getattr(stepper, name) for name in stepper.kept_numbers},
             "iterations": list(recorder.iterations),
             "start_energy": recorder.start_energy,
+            "energy_scale": recorder.energy_scale,
+            "blow_up": blow_up.kept(),
+            "pairs": pairs.force.tolist() if (pairs := self.model.pairs) is not None else None,
             "free_walls": free.kept() if (free := self.model.contact.motion.free) is not None else None,
             "contact_times": self.model.contact.log.times(self.comm),
             "row": {name: float(row[name]) for name in ("energy_imbalance", "active_contacts", "step")},
@@ -128,15 +131,19 @@ class RunState:
         stepper.solution.contacts = int(mine["contacts"])
         if scalars["free_walls"] is not None:
             self.model.contact.motion.free.put_back(scalars["free_walls"])
+        if scalars["pairs"] is not None:
+            self.model.pairs.force = np.array(scalars["pairs"], dtype=float)
         self.model.contact.log.put_back(mine["contact_log"], scalars["contact_times"], stepper.touching)
 
-    def put_back_sums(self, checkpoint: Checkpoint, ledger, recorder) -> dict[str, Any]:
-        """Set ledger and recorder, both made after :meth:`put_back`; gives what is known of the last row."""
+    def put_back_sums(self, checkpoint: Checkpoint, ledger, recorder, blow_up) -> dict[str, Any]:
+        """Set ledger, recorder and watch, made after :meth:`put_back`; gives what is known of the last row."""
         scalars = checkpoint.scalars
         ledger.put_back(self._share(scalars["ranks"])["ledger"])
         ledger.impacts.closed_pairs[:] = scalars["closed_pairs"]
         recorder.iterations = [int(n) for n in scalars["iterations"]]
         recorder.start_energy = scalars["start_energy"]
+        recorder.energy_scale = scalars["energy_scale"]
+        blow_up.put_back(scalars["blow_up"])
         return dict(scalars["row"])
 
     def _share(self, ranks: list[dict[str, Any]]) -> dict[str, Any]:

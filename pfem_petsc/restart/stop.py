@@ -3,56 +3,51 @@
 from __future__ import annotations
 
 import signal
-import threading
 import time
-from types import FrameType
 
 import numpy as np
 from mpi4py import MPI
 
 from ..errors import PfemError
 from ..output.units import duration
+from ..signals import SignalNotes, early
 
 __all__ = ["Meetings", "StopRequest"]
-
-SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGUSR1)
 
 _INTERVAL = 0.2  # seconds between meetings
 _MOST = 100  # steps between meetings, so that a fault is known to all within a bounded number of steps
 _WALL_TIME = 1000  # code of the wall time, beyond all signals
 
 
-class StopRequest:
-    """Takes note of signals, so that the run can end at the end of a step; a second SIGINT ends the process at once.
+class StopRequest(SignalNotes):
+    """Asks a run to end at the end of a step: because of a signal, or of the wall time, but not before its first step.
 
     Parameters
     ----------
     wall_time : [s], from now on; None for no limit
+
+    Attributes
+    ----------
+    stepped : whether the run has made a step
     """
 
     def __init__(self, wall_time: float | None = None) -> None:
+        super().__init__()
         self.wall_time = wall_time
+        self.stepped = False
         self._begin = time.monotonic()
-        self._signal = 0
-        self._before: dict[int, object] = {}
 
     def watch(self) -> None:
-        """Take the signals over. Nothing outside of the main thread, where Python cannot."""
-        if threading.current_thread() is threading.main_thread() and not self._before:
-            self._before = {number: signal.signal(number, self._note) for number in SIGNALS}
-
-    def release(self) -> None:
-        """Give the signals back to who had them."""
-        before, self._before = self._before, {}
-        for number, handler in before.items():
-            signal.signal(number, handler if handler is not None else signal.SIG_DFL)
+        """Take the signals over, those included that came since the program began."""
+        super().watch()
+        self.adopt(early())
 
     @property
     def code(self) -> int:
         """Zero while the run may go on."""
         if self._signal:
             return self._signal
-        if self.wall_time is not None and time.monotonic() - self._begin >= self.wall_time:
+        if self.wall_time is not None and self.stepped and time.monotonic() - self._begin >= self.wall_time:
             return _WALL_TIME
         return 0
 
@@ -61,12 +56,6 @@ class StopRequest:
         if code == _WALL_TIME:
             return f"the wall time of {duration(self.wall_time or 0.0)} is over"
         return f"{signal.Signals(code).name} received"
-
-    def _note(self, number: int, frame: FrameType | None) -> None:
-        self._signal = self._signal or number
-        if number == signal.SIGINT:
-            # The next one must work also inside of compiled code.
-            signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 class Meetings:

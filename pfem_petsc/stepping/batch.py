@@ -168,7 +168,8 @@ class Batches:
         case, stepper, state = simulation.case, simulation.stepper, simulation.state
         output, begin, end = case.output, state.step, simulation.plan.steps
         left = [simulation.meetings.steps_left(begin), end - begin]
-        left += [every - begin % every for every in (output.fields_every, output.checkpoint_every) if every]
+        called = (every for _, every in simulation.on_steps)
+        left += [every - begin % every for every in (output.fields_every, output.checkpoint_every, *called) if every]
         count = min(*left, MOST + 1) - 1
         if self._refused or count < _FEWEST or end < self._worth:
             return

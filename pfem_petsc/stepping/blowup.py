@@ -25,6 +25,14 @@ class BlowUp:
         self._strange = 0
         self._most = model.total_mass * (_ROUNDING * model.wave_speed) ** 2  # [J]
 
+    def kept(self) -> dict[str, Any]:
+        """What a checkpoint must hold: rows so far, how many of the last were strange, and the most put in [J]."""
+        return {"rows": self._rows, "strange": self._strange, "most": self._most}
+
+    def put_back(self, kept: dict[str, Any]) -> None:
+        """Go on as the run that is continued would have."""
+        self._rows, self._strange, self._most = int(kept["rows"]), int(kept["strange"]), float(kept["most"])
+
     def check(self, row: dict[str, Any], state) -> None:
         """Look at a row.
 

@@ -9,7 +9,7 @@ to rounding with any scheme, whatever it remembers, and with steps that are halv
 what is known of nodes (velocity, acceleration, the scheme's memory), the same changes, times the nodes' masses, are
 made to a particle that no force pushes: its velocity is the impulse of the jumps. The forces of contact pairs cancel in
 the sum; their impulse is that on the second nodes. What a jump of a pair takes from a node that a support holds goes to
-the support.
+the support, and so does what a prescribed motion puts in place of the scheme's own velocities.
 """
 
 from __future__ import annotations
@@ -93,6 +93,12 @@ class Impulses:
         load = self.forces(totals, walls, pairs)
         u = (load if balance.a_hat is None else load - balance.a_hat) / balance.alpha
         stepper.scheme.finish(state, balance, u, stepper.part)
+        inertia, at = stepper.model.inertia, stepper.model.supports.at if stepper.support_change else None
+        for name, change in stepper.support_change.items():
+            every = np.zeros((len(inertia.mass), 3))
+            every[at] = change
+            particles = getattr(state, name) if name in ("v", "a") else state.memory[name]
+            particles[SUPPORT] += inertia.mass_times(every, np.empty_like(every)).sum(axis=0)
 
     def jump(self) -> None:
         """Add what the treatment has changed in this step."""

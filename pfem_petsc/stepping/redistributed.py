@@ -49,7 +49,8 @@ class RedistributedStepper(Stepper):
         self._equilibrium(balance, u)
         state.support = np.zeros_like(u)
         if supports.any:
-            inertia = model.inertia.mass_times(balance.alpha * u, np.empty_like(u))
+            a = balance.alpha * u if balance.a_hat is None else balance.alpha * u + balance.a_hat
+            inertia = model.inertia.mass_times(a, np.empty_like(u))
             state.support[at] = (inertia - load - state.contact)[at]
         return Solution(u, state.f, walls, contacts=int(walls.touching.sum()))
 

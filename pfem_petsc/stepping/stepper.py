@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -59,6 +59,8 @@ class Stepper(ABC):
     before : (local, 3) positions at the start of the last part, with ghosts [m]
     massless : MasslessNodes where contact nodes have no mass along their walls' normals, else None
     closed : (owned, walls) bool, nodes that have met a wall and not left it since
+    support_change : what motions of supports have put in place of the scheme's velocity, acceleration and memory of
+        their components (k,) in the last step, by name; empty without such motions
     step_changed : whether the scheme was told to forget what holds for another step, since the last booking
     totals_at_start, totals_solved : (3, 3) this rank's sums of support, external and damping force [N] at the start,
         and of the balance that was solved there by a scheme that leads; None after a restart
@@ -100,6 +102,7 @@ class Stepper(ABC):
         self.massless = MasslessNodes(model) if model.inertia.redistribution is not None else None
         self.closed = np.zeros_like(self.touching)
         self.step_changed = False
+        self.support_change: dict[str, np.ndarray] = {}
         self.totals_at_start: np.ndarray | None = None
         self.totals_solved: np.ndarray | None = None
         self.walls_at_start = np.zeros((len(model.contact.names), 3))
@@ -112,10 +115,8 @@ class Stepper(ABC):
         state.v = model.initial_velocity()
         supports = model.supports
         if supports.any:
-            # nodes that are moved start with the velocity of their motion
-            tick = 1e-3 * self.h
-            rate = (supports.positions(tick) - supports.positions(0.0)) / tick
-            state.v[supports.nodes, supports.components] = rate
+            state.position[supports.at] = supports.positions(0.0)
+            state.v[supports.at] = supports.rates(0.0, 0.0)[0]
         if self.massless is not None and self.massless.settle(state.x, 0.0, 0.0) > 1e-9 * model.length:
             self.fault = SimulationFailure(
                 "step 0, t = 0 s: contact nodes without mass found no equilibrium; take another contact.treatment"
@@ -126,9 +127,9 @@ class Stepper(ABC):
         load = state.external - state.f[: model.mesh.n_owned]
         if model.inertia.damped:
             load -= model.inertia.damping_times(state.v, np.zeros_like(load))
-        state.a = self.accelerate(load)
+        state.a = self._acceleration(load)
         if (model.contact.any or model.pairs is not None) and model.inertia.redistribution is None:
-            walls = start_at_rest(model, state, self.accelerate, load)
+            walls = start_at_rest(model, state, self._acceleration, load)
             if walls is not None:
                 held = walls.nodes[walls.touching.any(axis=1)]
                 if model.pairs is not None:
@@ -138,11 +139,9 @@ class Stepper(ABC):
             state.contact, self.solution.walls = self.massless.press(state.position, load, 0.0)
             self.solution.contacts = int(self.solution.walls.touching.sum())
         if supports.any:
+            inertial = model.inertia.mass_times(state.a, np.empty_like(state.a))
             state.support = np.zeros_like(state.v)
-            missing = load + state.contact
-            if model.inertia.products:  # free nodes pull at fixed ones
-                missing -= model.inertia.mass_times(state.a, np.empty_like(load))
-            state.support[supports.fixed] = -missing[supports.fixed]
+            state.support[supports.fixed] = (inertial - load - state.contact)[supports.fixed]
         self.totals_at_start = self._totals()
         self.walls_at_start = self.solution.walls.force
         if model.pairs is not None:
@@ -199,10 +198,15 @@ class Stepper(ABC):
         if self.scheme.leads:
             self.before[:] = self.state.x
             self.scheme.advance(self.state, self.part)
+            if self.model.supports.moving:
+                self.state.position[self.model.supports.at] = self.model.supports.positions(end)
             self._arrive(end)
             self._solve_and_finish()
         else:
             self._solve_and_finish()
+            if self.model.supports.moving:
+                self.state.position[self.model.supports.at] = self.model.supports.positions(end)
+                self._take_rates(end)
             self._arrive(end)
         if self.treatment is not None:
             self.treatment.after()
@@ -217,6 +221,8 @@ class Stepper(ABC):
     def _solve_and_finish(self) -> None:
         state = self.state
         self.balance = self.scheme.balance(state, self.part)
+        if self.model.supports.moving:
+            self._prescribe(self.balance)
         free = self.model.contact.motion.free
         if free is not None:
             free.begin(state.time, self.part)
@@ -230,8 +236,66 @@ class Stepper(ABC):
         if not self.scheme.leads:
             self.before[:] = state.x
         self.scheme.finish(state, self.balance, self.solution.u, self.part)
+        if self.scheme.leads and self.model.supports.moving:
+            self._take_rates(state.time)
         if free is not None:
             free.finish(self.part)
+
+    def _prescribe(self, balance: Balance) -> None:
+        """Put what supports prescribe into a balance, whose increments are zero there: exact position, velocity and
+        acceleration, where the scheme's formulas would make velocity and acceleration of positions, and ring."""
+        supports = self.model.supports
+        forces_hold = sum(weight * time for weight, time in balance.loads)
+        v, a = supports.rates(forces_hold, self.part)
+        self._ruled = self._by_rule(balance, a)
+        balance.predictor = balance.predictor.copy()
+        balance.predictor[supports.at] = supports.positions(balance.time)
+        balance.v_hat = np.zeros_like(self.state.v) if balance.v_hat is None else balance.v_hat.copy()
+        balance.v_hat[supports.at] = v
+        balance.a_hat = np.zeros_like(self.state.v) if balance.a_hat is None else balance.a_hat.copy()
+        balance.a_hat[supports.at] = a
+
+    def _by_rule(self, balance: Balance, a: np.ndarray) -> State:
+        """What the scheme would make of prescribed components (k, 1) by the acceleration (k,) of their balance.
+
+        That is the rule by which forces become impulses.
+        """
+        supports, state = self.model.supports, self.state
+
+        def pick(array: np.ndarray | None) -> np.ndarray | None:
+            return None if array is None else array[supports.at][:, None]
+
+        memory = {name: pick(state.memory[name]) for name in self.scheme.remembers if name in state.memory}
+        fields = (pick(array) for array in (state.position, state.v, state.a))
+        ruled = State(*fields, *(np.zeros((len(a), 1)) for _ in range(4)), memory=memory)
+        known = {name: pick(getattr(balance, name)) for name in ("predictor", "v_hat", "a_hat")}
+        own = replace(balance, **known)
+        u = (a[:, None] if own.a_hat is None else a[:, None] - own.a_hat) / own.alpha
+        self.scheme.finish(ruled, own, u, self.part)
+        return ruled
+
+    def _take_rates(self, time: float) -> None:
+        """Velocity and acceleration of prescribed components at a time, and what the scheme remembers of them."""
+        supports, state = self.model.supports, self.state
+        state.v[supports.at], state.a[supports.at] = supports.rates(time, self.part)
+        self.scheme.restart(state, supports.at, self.part)
+        if self.scheme.leads:
+            way = supports.positions(self.balance.time) - state.position[supports.at]
+            state.memory["half_velocity"][supports.at] = way / self.part
+        ruled, given = self._ruled, {"v": state.v, "a": state.a, **state.memory}
+        made = {"v": ruled.v, "a": ruled.a, **ruled.memory}
+        self.support_change = {name: given[name][supports.at] - array[:, 0] for name, array in made.items()}
+
+    def _acceleration(self, load: np.ndarray) -> np.ndarray:
+        """Acceleration (owned, 3) with M a = load [N] on free components, on others as prescribed. Collective."""
+        supports = self.model.supports
+        if not supports.moving:
+            return self.accelerate(load)
+        carried = np.zeros_like(load)
+        carried[supports.at] = supports.rates(self.state.time, 0.0)[1]
+        a = self.accelerate(load - self.model.inertia.mass_times(carried, np.empty_like(load)))
+        a[supports.at] = carried[supports.at]
+        return a
 
     def _load(self, balance: Balance) -> np.ndarray:
         if not self.model.external.active:

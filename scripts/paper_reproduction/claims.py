@@ -3,30 +3,37 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
+
+import numpy as np
 
 from .exact import BAR, PLASTIC_BAR, ROD
 from .measures import RingImpact, RodImpact, measure_ring, measure_rod
 from .running import Run
-from .schemes import SCHEMES
+from .schemes import PAPER, SCHEMES, Reading
 from .studies import (
     BAR_ELEMENTS,
     BAR_STEPS,
     OTHER_RINGS,
     OTHER_SCHEMES,
+    PHASE_SPEED,
+    PHASES,
     REFINED,
-    REFINED_SCHEMES,
     RING_STEPS,
+    ROD_STEP,
     bar_key,
     other_ring_key,
+    phase_key,
     refined_key,
     ring_key,
+    ring_twin_key,
     rod_key,
 )
 
 __all__ = [
     "EXPLICIT",
+    "FITTED",
     "NOT",
     "OPEN",
     "PARTLY",
@@ -42,6 +49,7 @@ __all__ = [
 ]
 
 REPRODUCED, PARTLY, NOT, OPEN = "reproduced", "partly", "not reproduced", "not checkable"
+FITTED = "fitted"  # what a missing datum was chosen for cannot count as reproduced
 SHORT = {
     "central_differences": "CD",
     "newmark": "Newmark",
@@ -50,7 +58,7 @@ SHORT = {
     "houbolt": "Houbolt",
     "wilson": "Wilson",
 }
-EXPLICIT = ("central_differences", "chung_lee", "souza_moura")
+EXPLICIT = ("central_differences", "chung_lee", "souza_moura")  # of the paper
 SMOOTH = ("central_differences", "newmark", "chung_lee")  # that the paper recommends, less the one we do not know
 ROUGH = ("houbolt", "wilson")  # that it finds unsatisfactory
 
@@ -66,40 +74,68 @@ class Claim(NamedTuple):
 
 @dataclass
 class Measures:
-    """All runs and their measures: rods by scheme, bars by (scheme, step, plastic), rings by (scheme, step)."""
+    """All runs under a reading, and their measures.
+
+    Rods by scheme, bars by (scheme, step, plastic), rings by (scheme, step); of the study of phases a list over the
+    phases by scheme, None for a run that did not reach its end.
+
+    Attributes
+    ----------
+    chaotic : schemes whose ring at the large step parts from one with a speed that differs in the tenth digit
+    """
 
     runs: dict[str, Run]
+    reading: Reading
     rod: dict[str, RodImpact] = field(default_factory=dict)
+    phases: dict[str, list[RodImpact | None]] = field(default_factory=dict)
     bars: dict[tuple[str, str, bool], RodImpact] = field(default_factory=dict)
     ring: dict[tuple[str, str], RingImpact] = field(default_factory=dict)
+    chaotic: set[str] = field(default_factory=set)
     other_ring: dict[tuple[str, str], RingImpact] = field(default_factory=dict)
     refined_rod: dict[tuple[str, int], RodImpact] = field(default_factory=dict)
     refined_bar: dict[tuple[bool, int], RodImpact] = field(default_factory=dict)
 
 
-def measure_all(runs: dict[str, Run]) -> Measures:
+def measure_all(runs: dict[str, Run], reading: Reading) -> Measures:
     """Measure every run that has a history."""
-    found = Measures(runs)
+    found = Measures(runs, reading)
     for scheme in SCHEMES:
-        found.rod[scheme] = measure_rod(runs[rod_key(scheme)], ROD)
+        found.rod[scheme] = measure_rod(runs[rod_key(scheme, reading)], ROD)
         for step in BAR_STEPS:
             for plastic in (False, True):
-                run = runs[bar_key(scheme, step, plastic)]
+                run = runs[bar_key(scheme, reading, step, plastic)]
                 if run.history:
                     found.bars[scheme, step, plastic] = measure_rod(run, PLASTIC_BAR if plastic else BAR)
         for step in RING_STEPS:
-            found.ring[scheme, step] = measure_ring(runs[ring_key(scheme, step)])
+            found.ring[scheme, step] = measure_ring(runs[ring_key(scheme, reading, step)])
+        if _parts(runs[ring_key(scheme, reading, "0.5")], runs[ring_twin_key(scheme, reading)]):
+            found.chaotic.add(scheme)
+        if phase_key(scheme, reading, 0) in runs:
+            found.phases[scheme] = [_phase(runs, scheme, reading, phase) for phase in range(PHASES)]
     for ring in OTHER_RINGS:
         for scheme in OTHER_SCHEMES:
-            found.other_ring[ring, scheme] = measure_ring(runs[other_ring_key(ring, scheme)])
-    for scheme in REFINED_SCHEMES:
-        for n in REFINED:
-            found.refined_rod[scheme, n] = measure_rod(runs[refined_key("rod", scheme, n)], ROD)
+            found.other_ring[ring, scheme] = measure_ring(runs[other_ring_key(ring, scheme, reading)])
+    for n in REFINED:
+        for scheme in PAPER:
+            found.refined_rod[scheme, n] = measure_rod(runs[refined_key("rod", scheme, reading, n)], ROD)
     for n in BAR_ELEMENTS:
         for plastic, case in ((False, "bar_collision"), (True, "bar_collision_plastic")):
-            run = runs[refined_key(case, "central_differences", n)]
+            run = runs[refined_key(case, "central_differences", reading, n)]
             found.refined_bar[plastic, n] = measure_rod(run, PLASTIC_BAR if plastic else BAR)
     return found
+
+
+def _phase(runs: dict[str, Run], scheme: str, reading: Reading, phase: int) -> RodImpact | None:
+    run = runs[phase_key(scheme, reading, phase)]
+    gap = ROD.gap + phase / PHASES * PHASE_SPEED * ROD_STEP
+    return None if run.failure else measure_rod(run, replace(ROD, speed=PHASE_SPEED, gap=gap))
+
+
+def _parts(run: Run, twin: Run) -> bool:
+    """Whether node 1 of two rings is ever more than a millimetre apart."""
+    first, second = (part.history["probe/impact/position"][:, 0, 0] for part in (run, twin))
+    rows = min(len(first), len(second))
+    return bool(np.abs(first[:rows] - second[:rows]).max() > 1e-3)
 
 
 def listed(values: dict[str, float], form: str = ".2f", unit: str = "") -> str:

@@ -6,10 +6,10 @@ from collections import Counter
 from pathlib import Path
 from string import Template
 
-from .claims import Claim, Measures
+from .claims import FITTED, NOT, OPEN, PARTLY, REPRODUCED, Claim, Measures
 from .claims_bars import bar_claims
 from .claims_ring import conclusion_claims, phases_text, ring_claims
-from .claims_rod import rod_claims
+from .claims_rod import phase_rows, rod_claims
 from .exact import BAR, PLASTIC_BAR, ROD, Rod
 from .measures import RodImpact
 from .schemes import IN_TABLES, SCHEMES
@@ -30,22 +30,25 @@ def all_claims(m: Measures) -> dict[str, list[Claim]]:
     }
 
 
-def write_document(m: Measures, file: Path) -> Counter:
-    """Write the document; gives how many statements have which verdict."""
-    claims = all_claims(m)
-    verdicts = Counter(claim.verdict for section in claims.values() for claim in section)
-    count = sum(verdicts.values())
-    values = {section: _claims_table(found) for section, found in claims.items()}
-    values["summary"] = f"Of {count} statements: " + ", ".join(
-        f"{n} {verdict}" for verdict, n in verdicts.most_common()
-    )
-    values["rod_table"] = _rod_table(m)
+def write_document(readings: list[Measures], file: Path) -> dict[str, Counter]:
+    """Write the document from the measures under all readings, the most likely first; verdicts by reading."""
+    m = readings[0]
+    judged = [all_claims(measures) for measures in readings]
+    verdicts = {
+        measures.reading.name: Counter(claim.verdict for section in claims.values() for claim in section)
+        for measures, claims in zip(readings, judged, strict=True)
+    }
+    names = [measures.reading.name for measures in readings]
+    values = {section: _claims_table([claims[section] for claims in judged], names) for section in judged[0]}
+    values["summary"] = _summary(verdicts)
+    values["phases"] = _phases_table(readings)
+    values["rod_table"] = _rod_table(readings)
     for plastic in (False, True):
         for step in BAR_STEPS:
             kind = "plastic" if plastic else "elastic"
-            values[f"{kind}_{step.replace('.', '')}"] = _bar_table(m, step, plastic)
+            values[f"{kind}_{step.replace('.', '')}"] = _bar_table(readings, step, plastic)
     for step in RING_STEPS:
-        values[f"ring_{step.replace('.', '')}"] = _ring_table(m, step)
+        values[f"ring_{step.replace('.', '')}"] = _ring_table(readings, step)
     values["other_rings"] = _other_rings(m)
     values["elastic_force"] = f"{BAR.force / 1e3:.2f}"
     values["plastic_force"] = f"{PLASTIC_BAR.force / 1e3:.2f}"
@@ -55,14 +58,41 @@ def write_document(m: Measures, file: Path) -> Counter:
     return verdicts
 
 
+def _summary(verdicts: dict[str, Counter]) -> str:
+    order = (REPRODUCED, PARTLY, NOT, FITTED, OPEN)
+    rows = [[name, *(str(counts[verdict]) for verdict in order)] for name, counts in verdicts.items()]
+    return _table(["reading", *order], rows)
+
+
+def _lines(readings: list[Measures]) -> list[tuple[str, Measures, str]]:
+    """Label, measures and scheme of the lines of a table: explicit schemes once, implicit ones with each mass."""
+    lines = []
+    for scheme in IN_TABLES:
+        for measures in readings:
+            mass = measures.reading.mass(scheme)
+            if measures is readings[0] or mass != readings[0].reading.mass(scheme):
+                lines.append((f"{SCHEMES[scheme].name}, {mass}", measures, scheme))
+    return lines
+
+
 def _table(head: list[str], rows: list[list[str]]) -> str:
     lines = [head, ["---"] * len(head), *rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
-def _claims_table(claims: list[Claim]) -> str:
-    rows = [[c.where, c.statement, c.measured, f"**{c.verdict}**"] for c in claims]
-    return _table(["Where", "The paper", "Measured here", "Verdict"], rows)
+def _claims_table(claims: list[list[Claim]], names: list[str]) -> str:
+    rows = []
+    for readings in zip(*claims, strict=True):
+        first = readings[0]
+        rows.append([first.where, first.statement, first.measured, *(f"**{claim.verdict}**" for claim in readings)])
+    return _table(["Where", "The paper", f"Measured here ({names[0]})", "Verdict", *names[1:]], rows)
+
+
+def _phases_table(readings: list[Measures]) -> str:
+    rows = [row for measures in readings for row in phase_rows(measures)]
+    distinct = list(dict.fromkeys(map(tuple, rows)))
+    head = ["scheme", "mass", "variation beyond the jump", "F max", "contacts", "energy left", "not finished"]
+    return _table(head, [list(row) for row in distinct])
 
 
 def impact_row(name: str, bar: RodImpact, exact: Rod) -> list[str]:
@@ -83,26 +113,25 @@ def impact_row(name: str, bar: RodImpact, exact: Rod) -> list[str]:
 _HEAD = ["scheme", "contact end", "contacts", "F max", "F median", "undershoot", "rebound", "energy left"]
 
 
-def _rod_table(m: Measures) -> str:
+def _rod_table(readings: list[Measures]) -> str:
     rows = []
-    for scheme in IN_TABLES:
-        row, run = impact_row(SCHEMES[scheme].name, m.rod[scheme], ROD), m.runs[rod_key(scheme)]
+    for name, m, scheme in _lines(readings):
+        row, run = impact_row(name, m.rod[scheme], ROD), m.runs[rod_key(scheme, m.reading)]
         if run.failure:
             row[1], row[4], row[6:] = f"ended at t = {run.time[-1]:.2f}", "", ["", ""]
         rows.append(row)
     return _table(_HEAD, [["exact", "1", "1", "1", "1", "0", "1", "1"], *rows])
 
 
-def _bar_table(m: Measures, step: str, plastic: bool) -> str:
+def _bar_table(readings: list[Measures], step: str, plastic: bool) -> str:
     exact = PLASTIC_BAR if plastic else BAR
     rows = []
-    for scheme in IN_TABLES:
-        entry = SCHEMES[scheme]
+    for name, m, scheme in _lines(readings):
         if (scheme, step, plastic) in m.bars:
-            rows.append(impact_row(entry.name, m.bars[scheme, step, plastic], exact))
+            rows.append(impact_row(name, m.bars[scheme, step, plastic], exact))
         else:
-            reason = m.runs[bar_key(scheme, step, plastic)].failure
-            rows.append([entry.name, "refused: " + _limit(reason), *[""] * 6])
+            reason = m.runs[bar_key(scheme, m.reading, step, plastic)].failure
+            rows.append([name, "refused: " + _limit(reason), *[""] * 6])
     return _table(_HEAD, rows)
 
 
@@ -113,20 +142,13 @@ def _limit(reason: str) -> str:
     return f"unstable beyond Δt = {float(limit) * 1e6:.3f} µs"
 
 
-def _ring_table(m: Measures, step: str) -> str:
+def _ring_table(readings: list[Measures], step: str) -> str:
     rows = []
-    for scheme in IN_TABLES:
-        entry, ring = SCHEMES[scheme], m.ring[scheme, step]
-        rows.append(
-            [
-                entry.name,
-                phases_text(ring),
-                f"{ring.strain:.3f}",
-                f"{ring.left:.3f}",
-                f"{ring.dissipated:.3f}",
-                f"{ring.kept:.3f}",
-            ]
-        )
+    for name, m, scheme in _lines(readings):
+        ring, chaotic = m.ring[scheme, step], scheme in m.chaotic
+        values = (ring.strain, ring.left, ring.dissipated, ring.kept)
+        shown = [f"about {value:.1g}" if chaotic else f"{value:.3f}" for value in values]
+        rows.append([name, phases_text(ring, chaotic), *shown])
     return _table(["scheme", "contact [ms]", "largest strain", "plastic strain left", "plastic work", "energy"], rows)
 
 
@@ -134,7 +156,8 @@ def _other_rings(m: Measures) -> str:
     rows = []
     for ring, (outer, inner, *_) in OTHER_RINGS.items():
         for scheme in OTHER_SCHEMES:
-            found = m.other_ring[ring, scheme]
+            found, rough = m.other_ring[ring, scheme], scheme in m.chaotic
             name = f"{ring}, radii {outer:g} and {inner:g} m"
-            rows.append([name, SCHEMES[scheme].name, phases_text(found), f"{found.strain:.3f}", f"{found.kept:.3f}"])
-    return _table(["ring", "scheme", "contact [ms]", "largest strain", "energy"], rows)
+            strain = f"about {found.strain:.1g}" if rough else f"{found.strain:.3f}"
+            rows.append([name, SCHEMES[scheme].name, phases_text(found, rough), strain])
+    return _table(["ring", "scheme", "contact [ms]", "largest strain"], rows)

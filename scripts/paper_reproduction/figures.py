@@ -13,13 +13,14 @@ from matplotlib.lines import Line2D
 
 from pfem_petsc.post.chart import STYLE
 
+from .claims import Measures
 from .exact import BAR, PLASTIC_BAR, ROD, Rod
 from .measures import tip_velocity, wall_force
 from .running import Run
-from .schemes import PAPER, SCHEMES
+from .schemes import LIKELY, PAPER, SCHEMES
 from .studies import BAR_STEPS, bar_key, refined_key, rod_key
 
-__all__ = ["draw_bars", "draw_rod", "draw_rods", "legend", "new_figure", "save", "styled"]
+__all__ = ["draw_bars", "draw_phases", "draw_rod", "draw_rods", "legend", "new_figure", "save", "styled"]
 
 EXACT = {"color": "#111418", "linewidth": 2.2, "alpha": 0.55, "linestyle": "-"}
 FINE = {"color": "#6b7280", "linewidth": 1.8, "alpha": 0.8, "linestyle": (0, (4, 1.5))}
@@ -84,7 +85,7 @@ def draw_rod(runs: dict[str, Run], file: Path, force: bool) -> None:
     """Figure 3 or 4: the whole history, and the first moments of contact."""
     figure = new_figure(9.4, 4.3)
     wide, close = figure.subplots(1, 2, width_ratios=[1.7, 1.0])
-    keys = {scheme: rod_key(scheme) for scheme in PAPER}
+    keys = {scheme: rod_key(scheme, LIKELY) for scheme in PAPER}
     for axes in (wide, close):
         corners = ROD.contact_force(5.0) if force else ROD.tip_velocity(5.0)
         axes.plot(*corners, **EXACT)
@@ -115,7 +116,7 @@ def draw_bars(runs: dict[str, Run], file: Path, number: int, plastic: bool, forc
     scale = (1e6, 1e-3 if force else 1.0)
     values = wall_force if force else tip_velocity
     extra = [("exact", EXACT)]
-    fine = runs[refined_key("bar_collision_plastic", "central_differences", 320)]
+    fine = runs[refined_key("bar_collision_plastic", "central_differences", LIKELY, 320)]
     if plastic:
         extra = [("exact, to the end of the plateau", EXACT), ("320 bars, 31 ns", FINE)]
     end = 190.0 if force and plastic else 130.0 if force else 250.0
@@ -125,7 +126,7 @@ def draw_bars(runs: dict[str, Run], file: Path, number: int, plastic: bool, forc
             axes.plot(*_smoothed(fine.time * 1e6, values(fine) * scale[1], 2.0), **FINE)
         corners = exact.contact_force(2.5e-4) if force else exact.tip_velocity(2.5e-4)
         axes.plot(corners[0] * scale[0], corners[1] * scale[1], **EXACT)
-        keys = {scheme: bar_key(scheme, name, plastic) for scheme in PAPER}
+        keys = {scheme: bar_key(scheme, LIKELY, name, plastic) for scheme in PAPER}
         _curves(axes, runs, keys, values, scale)
         axes.set_title(f"({letter}) Δt = {name} µs")
         axes.set_ylabel("contact force [kN]" if force else "velocity of the impacted node [m/s]", fontsize=9)
@@ -146,8 +147,30 @@ def _smoothed(time: np.ndarray, values: np.ndarray, width: float) -> tuple[np.nd
     return time[rows - 1 :] - 0.5 * width, np.convolve(values, kernel, mode="valid")
 
 
-def draw_rods(runs: dict[str, Run], folder: Path) -> list[Path]:
-    """Draw figures 3, 4 and 7 to 10."""
+@styled
+def draw_phases(readings: list[Measures], file: Path) -> None:
+    """Variation of the tip's velocity, and energy left, over where in the time step the impact falls."""
+    figure = new_figure(9.4, 6.4)
+    panels = figure.subplots(2, len(readings), sharex=True, sharey="row", squeeze=False)
+    for column, measures in enumerate(readings):
+        for scheme in (scheme for scheme in SCHEMES if scheme in PAPER):
+            entry, rods = SCHEMES[scheme], measures.phases[scheme]
+            style = {"color": entry.colour, "linestyle": entry.dash, "linewidth": entry.width}
+            x = [phase / len(rods) for phase, rod in enumerate(rods) if rod is not None]
+            ended = [rod for rod in rods if rod is not None]
+            panels[0, column].plot(x, [rod.excess for rod in ended], marker="o", markersize=3, **style)
+            panels[1, column].plot(x, [rod.energy for rod in ended], marker="o", markersize=3, **style)
+        panels[0, column].set_title(measures.reading.name)
+        panels[1, column].set_xlabel("impact within the step")
+    panels[0, 0].set_ylabel("variation beyond the jump [v₀]")
+    panels[1, 0].set_ylabel("energy left")
+    figure.suptitle("Rod: what depends on the phase of the impact", x=0.01, ha="left", fontsize=12, fontweight="bold")
+    legend(figure, [])
+    save(figure, file)
+
+
+def draw_rods(runs: dict[str, Run], readings: list[Measures], folder: Path) -> list[Path]:
+    """Draw figures 3, 4, 7 to 10, and that of the study of phases."""
     assert set(BAR_STEPS) == {"0.5", "2"}
     files = [folder / f"figure_{n:02d}.png" for n in (3, 4, 7, 8, 9, 10)]
     draw_rod(runs, files[0], False)
@@ -156,4 +179,6 @@ def draw_rods(runs: dict[str, Run], folder: Path) -> list[Path]:
     draw_bars(runs, files[3], 8, True, False)
     draw_bars(runs, files[4], 9, False, True)
     draw_bars(runs, files[5], 10, True, True)
+    files.append(folder / "phases.png")
+    draw_phases(readings, files[-1])
     return files

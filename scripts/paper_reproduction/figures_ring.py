@@ -10,7 +10,7 @@ from matplotlib.colors import LinearSegmentedColormap
 
 from .figures import legend, new_figure, save, styled
 from .running import Run
-from .schemes import PAPER, SCHEMES
+from .schemes import LIKELY, PAPER, SCHEMES
 from .studies import INSTANTS, RING_STEPS, ring_key
 
 __all__ = ["draw_ring"]
@@ -26,7 +26,7 @@ def _displacement(runs: dict[str, Run], file: Path, number: int, step: str) -> N
     nodes = (("impact", "(a) node 1, the vertex that hits"), ("opposite", "(b) node 2, the opposite vertex"))
     for axes, (probe, title) in zip(panels, nodes):
         for scheme in [scheme for scheme in SCHEMES if scheme in PAPER]:
-            run, entry = runs[ring_key(scheme, step)], SCHEMES[scheme]
+            run, entry = runs[ring_key(scheme, LIKELY, step)], SCHEMES[scheme]
             x = run.history[f"probe/{probe}/position"][:, 0, 0]
             axes.plot(run.time * 1e3, x - x[0], color=entry.colour, linestyle=entry.dash, linewidth=entry.width)
         axes.set_title(title)
@@ -45,7 +45,7 @@ def _displacement(runs: dict[str, Run], file: Path, number: int, step: str) -> N
 def _shapes(runs: dict[str, Run], file: Path) -> None:
     figure = new_figure(9.4, 6.6)
     panels = figure.subplots(2, 3, sharex=True, sharey=True)
-    run = runs[ring_key("central_differences", "0.05")]
+    run = runs[ring_key("central_differences", LIKELY, "0.05")]
     start = runs["ring/first_step"].result
     rest, bars = start.positions(0)[:, :2], start.bars
     colours = None

@@ -20,7 +20,7 @@ from pfem_petsc.errors import PfemError
 
 from .studies import Study
 
-__all__ = ["Run", "read", "run_all"]
+__all__ = ["Run", "read", "run_all", "run_study"]
 
 # What decides the numbers: results of older versions of these are not used again.
 SOURCES = ("contact", "integrators", "mechanics", "mesh/generators", "solvers", "stepping", "simulation.py")
@@ -67,7 +67,7 @@ def _digest(study: Study) -> str:
     return digest.hexdigest()
 
 
-def _run(study: Study, folder: Path) -> tuple[str, str, float]:
+def run_study(study: Study, folder: Path) -> tuple[str, str, float]:
     """Run one study into its folder: its key, why it failed (or nothing), and seconds."""
     digest, started = _digest(study), time.perf_counter()
     if folder.exists():
@@ -97,7 +97,7 @@ def run_all(studies: Iterable[Study], root: Path, workers: int) -> None:
         return
     # MPI does not survive a fork: each worker is a process of its own from the start
     with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
-        runs = [pool.submit(_run, study, root / study.key) for study in missing]
+        runs = [pool.submit(run_study, study, root / study.key) for study in missing]
         for number, run in enumerate(as_completed(runs), 1):
             key, failure, seconds = run.result()
             print(f"{number:3d}/{len(missing)}  {key:45s} {seconds:6.1f} s  {failure[:100]}", flush=True)

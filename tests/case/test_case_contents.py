@@ -244,3 +244,35 @@ def test_default_title_is_the_name():
     case = Case.load("rod_impact")
     assert case.title == "Elastic rod against a rigid wall"
     assert case.folder.samefile(Path(case.source).parent)
+
+
+@pytest.mark.parametrize("separator", [",", ", ", ";", "\t", " "])
+def test_acceleration_record(case_text, tmp_path, separator):
+    """A record is read relative to the case file, and the resolved case has its rows."""
+    lines = ["# station 7", separator.join(["t", "ax", "ay", "az"]), ""]
+    rows = ((0.0, 0.5, 0.0, -1e-3), (0.02, 1.0, 2.0, 3.0))
+    lines += [separator.join(map(str, row)) for row in rows]
+    (tmp_path / "record.csv").write_text("\n".join(lines))
+    override = 'support=[{node_set="tip", fix="xyz", acceleration_file="record.csv"}]'
+    case = Case.from_toml(case_text, tmp_path, overrides=[override])
+    assert case.support[0].acceleration == rows
+    assert Case.from_toml(case.to_toml(), "/nowhere") == case
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("0,1,2\n", "line 1: expected four finite numbers"),
+        ("t,ax,ay,az\n0,1,2,3\n1,nan,0,0\n", "line 3: expected four finite numbers"),
+        ("0,1,2,3\nt,ax,ay,az\n", "line 2: expected numbers"),
+        ("t,ax,ay,az\nt,ax,ay,az\n", "line 2: expected numbers"),
+        ("0,1,2,3\n0,1,2,3\n", "line 2: times must increase"),
+        ("t,ax,ay,az\n", "this file has no rows"),
+        (b"\xff\xfe\x00", "this is not a text file"),
+    ],
+)
+def test_damaged_acceleration_records(case_text, tmp_path, text, told):
+    (tmp_path / "record.csv").write_bytes(text if isinstance(text, bytes) else text.encode())
+    override = 'support=[{node_set="tip", fix="xyz", acceleration_file="record.csv"}]'
+    with pytest.raises(InputError, match=r'support\[0\].acceleration_file = "record.csv".*: ' + told):
+        Case.from_toml(case_text, tmp_path, overrides=[override])

@@ -128,6 +128,27 @@ REFUSED = {
         ["support.0.velocity=[0.0, 1.0, 0.0]", "support.0.motion=[[0.0, 0.0, 1.0, 0.0]]"],
         ["support[0]", "at most one of the keys motion, velocity"],
     ),
+    "moved and shaken": (
+        ["support.0.velocity=[0.0, 1.0, 0.0]", "support.0.acceleration=[[0.0, 0.0, 1.0, 0.0]]"],
+        ["support[0]", "at most one of the keys motion, velocity, acceleration"],
+    ),
+    "moved and shaken from a file": (
+        ["support.0.velocity=[0.0, 1.0, 0.0]", "support.0.acceleration_file=a.csv"],
+        ["support[0]", "at most one of the keys acceleration_file, velocity"],
+    ),
+    "shaken but free": (
+        ["support.0.acceleration=[[0.0, 1.0, 0.0, 0.0]]"],
+        ["support[0]", 'x is given a motion, but fix = "yz"'],
+    ),
+    "record that is not there": (
+        ["support.0.acceleration_file=none.csv"],
+        ['support[0].acceleration_file = "none.csv"', "cannot be read"],
+    ),
+    "unknown interpolation": (["support.0.interpolation=smoth"], ["support[0].interpolation", "'smooth'?"]),
+    "lines of accelerations": (
+        ["support.0.acceleration=[[0.0, 0.0, 1.0, 0.0]]", "support.0.interpolation=linear"],
+        ["support[0]", "goes with motion"],
+    ),
     "two choices of nodes": (["node_set.tip.all=true"], ["node_set.tip", "exactly one", "got nearest and all"]),
     "no choice of nodes": (["node_set.tip={}"], ["node_set.tip", "exactly one", "got none"]),
     "not all nodes": (["node_set.tip={all = false}"], ["node_set.tip.all = false", "true"]),

@@ -140,7 +140,7 @@ def test_rods_in_a_pile_stay_there(scheme, comm, shared_tmp_path):
 BELTS = {
     "velocity": [{"velocity": [1.0, 0.0, 0.0]}, 1.0],
     "backwards": [{"velocity": [-1.0, 0.0, 0.0]}, -1.0],
-    "table": [{"motion": [[0.0, 0.0, 0.0, 0.0], [1.0, 1.0, 0.0, 0.0]]}, 1.0],
+    "table": [{"motion": [[0.0, 0.0, 0.0, 0.0], [1.0, 1.0, 0.0, 0.0]], "interpolation": "linear"}, 1.0],
 }
 
 
@@ -166,3 +166,31 @@ def test_a_block_on_a_belt_is_dragged_along_from_the_start(scheme, belt, comm, s
     assert first["wall/belt/force"] == pytest.approx([direction * 0.3 * GRAVITY, 0.0, GRAVITY], rel=1e-9, abs=1e-9)
     last = [step.row for step in run][-1]
     assert last["momentum"][0] == pytest.approx(direction * 0.3 * GRAVITY * 0.1, rel=1e-2)
+
+
+@pytest.mark.parametrize("axis", [0, 2])
+@pytest.mark.parametrize("scheme", ["central_differences", "newmark", "energy_momentum"])
+def test_a_block_on_a_floor_that_starts_to_move(scheme, axis, comm, shared_tmp_path):
+    """Two rows are an S, whose first acceleration is 6 d/T^2: the block goes along with it from the first row."""
+    moved = [0.0, 0.0, 0.0]
+    moved[axis] = 0.05
+    floor = {"name": "floor", "type": "plane", "point": [0, 0, 0], "normal": [0.0, 0.0, 1.0], "friction": 0.3}
+    data = {
+        "mesh": {"generator": "rod", "length": 0.1, "elements": 2},
+        "material": {"it": {"young_modulus": 1e6, "density": 1000.0}},
+        "section": {"it": {"area": 1e-2, "material": "it"}},
+        "gravity": {"acceleration": [0.0, 0.0, -GRAVITY]},
+        "wall": [floor | {"motion": [[0.0, 0.0, 0.0, 0.0], [1.0, *moved]]}],
+        "time": {"integrator": scheme, "step": 1e-3, "end": 0.1},
+        "output": {"fields_every": 0},
+        "solver": {"rtol": 1e-12},
+    }
+    run = Simulation(Case.from_dict(data), comm, output=shared_tmp_path / "it", quiet=True)
+    run.start()
+    expected = np.array([0.0, 0.0, GRAVITY])
+    expected[axis] += 0.3
+    # that of central differences brings the nodes to where the floor is one step later
+    error = 2e-4 if scheme == "central_differences" else 1e-9
+    assert run.row["wall/floor/force"] == pytest.approx(expected, abs=error)
+    last = [step.row for step in run][-1]
+    assert last["momentum"][axis] == pytest.approx(0.05 * 6.0 * 0.1 * 0.9, rel=0.03)

@@ -112,7 +112,7 @@ def test_galilean_equivalence(kind, integrator, comm, shared_tmp_path):
         walls = [{"type": "sphere", "point": [0.1, 0.05, -0.32], "radius": 0.31, "name": "w"}]
     moving = [dict(wall, velocity=(-speed).tolist()) for wall in walls]
     if kind == "motion":
-        moving = [dict(wall, motion=[[0.0, 0, 0, 0], [0.1, *(-0.1 * speed)]]) for wall in walls]
+        moving = [dict(wall, motion=[[0.0, 0, 0, 0], [0.1, *(-0.1 * speed)]], interpolation="linear") for wall in walls]
     common = {"integrator": integrator, "step": 2e-4, "end": 0.02, "solver": {"rtol": 1e-13}}
     rows, x, run = run_of(lattice_case(walls, velocity=speed.tolist(), **common), comm, shared_tmp_path, "a")
     others, y, _ = run_of(lattice_case(moving, **common), comm, shared_tmp_path, "b")

@@ -1,8 +1,7 @@
-"""Failures provoked on the way, on two ranks: all end within seconds, with status 3, one message, readable results."""
+"""Failures provoked on the way, on two ranks: all end, with status 3, one message, readable results."""
 
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -36,7 +35,7 @@ def watched(step):
     def wrapper(self):
         if self.state.step == {at}:
             if rank == 0:
-                print("provoked", time.time(), flush=True)
+                print("provoked", flush=True)
             provoke(self)
         step(self)
     return wrapper
@@ -47,19 +46,16 @@ sys.exit(main(sys.argv[1:]))
 """
 
 ROD = ["rod_impact", "--quiet", "--set", "time.end=1000", "mesh.elements=40"]
-LIMIT = 10.0  # seconds from the fault to the end of the last rank
 
 
 def fail(on_ranks, tmp_path, body, *words, at=57, folder=None, before=""):
-    """Run with a fault before step ``at`` + 1; gives the finished process and the seconds it took from there."""
+    """Run with a fault before step ``at`` + 1; gives the finished process. One that hangs ends in a time-out."""
     script, folder = tmp_path / "fault.py", folder or tmp_path / "out"
     lines = "\n".join(f"    {line}" for line in body.splitlines())
     script.write_text(SCRIPT.format(body=lines, at=at, before=before))
-    done = on_ranks(2, script, *words, "-o", folder, timeout=150.0, cwd=tmp_path)
-    end = time.time()
-    provoked = [line for line in done.stdout.splitlines() if line.startswith("provoked")]
-    assert provoked, done.stderr
-    return done, end - float(provoked[0].split()[1])
+    done = on_ranks(2, script, *words, "-o", folder, timeout=300.0, cwd=tmp_path)
+    assert "provoked" in done.stdout, done.stderr
+    return done
 
 
 def run_on_ranks(ranks, *arguments, timeout, cwd):
@@ -68,14 +64,13 @@ def run_on_ranks(ranks, *arguments, timeout, cwd):
     return subprocess.run(line, env=environment(), capture_output=True, text=True, timeout=timeout, cwd=cwd)
 
 
-def assert_told(done, seconds, *texts, status=3):
+def assert_told(done, *texts, status=3):
     assert done.returncode == status, done.stderr
     said = [line for line in done.stderr.splitlines() if "error: " in line]
     assert len(said) == 1, done.stderr
     for text in texts:
         assert text in said[0]
     assert "Traceback" not in done.stderr
-    assert seconds < LIMIT
 
 
 def assert_results(folder, last):
@@ -94,8 +89,8 @@ def assert_results(folder, last):
 def test_exception_on_one_rank(on_ranks, tmp_path, failing):
     """The other rank waits in an exchange of ghosts that never ends."""
     body = f"if rank == {failing}: raise ZeroDivisionError('surprise')"
-    done, seconds = fail(on_ranks, tmp_path, body, *ROD)
-    assert_told(done, seconds, f"rank {failing}: ", "ZeroDivisionError: surprise")
+    done = fail(on_ranks, tmp_path, body, *ROD)
+    assert_told(done, f"rank {failing}: ", "ZeroDivisionError: surprise")
     with open_result(tmp_path / "out") as result:
         assert result.times[-1] == pytest.approx(0.5)
 
@@ -103,9 +98,8 @@ def test_exception_on_one_rank(on_ranks, tmp_path, failing):
 def test_killed_rank(tmp_path):
     """The launcher ends the others; the status is its own."""
     body = "if rank == 1: os.kill(os.getpid(), signal.SIGKILL)"
-    done, seconds = fail(run_on_ranks, tmp_path, body, *ROD)
+    done = fail(run_on_ranks, tmp_path, body, *ROD)
     assert done.returncode not in (0, 2, 4)
-    assert seconds < LIMIT
     with open_result(tmp_path / "out") as result:
         assert result.times[-1] == pytest.approx(0.5)
 
@@ -115,8 +109,8 @@ def test_positions_that_are_no_numbers(on_ranks, tmp_path, every):
     """Found also where no history row is written, and told with the bar."""
     body = "if rank == 1: state.memory['half_velocity'][0] = np.nan"
     words = (f"output.history_every={every}", "output.fields_every=0")
-    done, seconds = fail(on_ranks, tmp_path, body, *ROD, *words)
-    assert_told(done, seconds, "blew up", "bar ", "nodes ", "take a smaller time step", "step ")
+    done = fail(on_ranks, tmp_path, body, *ROD, *words)
+    assert_told(done, "blew up", "bar ", "nodes ", "take a smaller time step", "step ")
     said = done.stderr.partition("step ")[2]
     assert 57 <= int(said.partition(",")[0]) <= 57 + 101
     with open_result(tmp_path / "out") as result:
@@ -128,8 +122,8 @@ def test_positions_that_are_no_numbers(on_ranks, tmp_path, every):
 def test_velocities_that_are_no_numbers_in_an_implicit_step(on_ranks, tmp_path):
     """No halving of the step mends it; nothing of it gets into the results."""
     body = "if rank == 1: state.v[0] = np.nan"
-    done, seconds = fail(on_ranks, tmp_path, body, *ROD, "time.integrator=newmark", "output.fields_every=1")
-    assert_told(done, seconds, "step 58")
+    done = fail(on_ranks, tmp_path, body, *ROD, "time.integrator=newmark", "output.fields_every=1")
+    assert_told(done, "step 58")
     assert_results(tmp_path / "out", 57)
 
 
@@ -139,8 +133,8 @@ def test_unstable_step(on_ranks, tmp_path):
     halved += "*(0.5 * frequency for frequency in found(*given)))\n"
     # two per cent above the limit, so that it takes some steps; stiff, so that the bar is far from zero length then
     words = ["pendulum", "--quiet", "--set", "material.default.young_modulus=1e10", "time.step=4.56e-4"]
-    done, seconds = fail(on_ranks, tmp_path, "pass", *words, at=1, before=halved)
-    assert_told(done, seconds, "the integration has created", "the motion is unstable", "at node", "smaller time.step")
+    done = fail(on_ranks, tmp_path, "pass", *words, at=1, before=halved)
+    assert_told(done, "the integration has created", "the motion is unstable", "at node", "smaller time.step")
     with open_result(tmp_path / "out") as result:
         kinetic = result.history["kinetic_energy"]
         assert np.isfinite(kinetic).all()
@@ -151,8 +145,8 @@ def test_unstable_step(on_ranks, tmp_path):
 def test_collapsed_bar(on_ranks, tmp_path, integrator):
     """The rod hits the wall at five times its wave speed."""
     words = ("initial.velocity=[5,0,0]", "time.step=0.002", f"time.integrator={integrator}", "time.end=1")
-    done, seconds = fail(on_ranks, tmp_path, "pass", *ROD, *words, at=3)
-    assert_told(done, seconds, "step ", "bar 39 between nodes 39 and 40", "the impact is too strong")
+    done = fail(on_ranks, tmp_path, "pass", *ROD, *words, at=3)
+    assert_told(done, "step ", "bar 39 between nodes 39 and 40", "the impact is too strong")
     with open_result(tmp_path / "out") as result:
         assert np.isfinite(result.positions(-1)).all()
 
@@ -160,14 +154,14 @@ def test_collapsed_bar(on_ranks, tmp_path, integrator):
 def test_singular_system(on_ranks, tmp_path):
     """Neither stiffness nor mass: no step, however small, has a solution."""
     body = "stepper.hessian.fill = lambda write: (stepper.hessian.mat.zeroEntries(), stepper.hessian.mat.assemble())"
-    done, seconds = fail(on_ranks, tmp_path, body, *ROD, "time.integrator=newmark", "time.end=2")
-    assert_told(done, seconds, "step 58", "no convergence", "halved 10 times")
+    done = fail(on_ranks, tmp_path, body, *ROD, "time.integrator=newmark", "time.end=2")
+    assert_told(done, "step 58", "no convergence", "halved 10 times")
     assert_results(tmp_path / "out", 57)
 
 
 def test_folder_that_vanishes(on_ranks, tmp_path):
-    done, seconds = fail(on_ranks, tmp_path, "if rank == 0: os.rename(folder, folder + '-gone')", *ROD)
-    assert_told(done, seconds, "result.vtkhdf: gone or unreachable during the run")
+    done = fail(on_ranks, tmp_path, "if rank == 0: os.rename(folder, folder + '-gone')", *ROD)
+    assert_told(done, "result.vtkhdf: gone or unreachable during the run")
     assert_results(tmp_path / "out-gone", 57)
 
 
@@ -197,8 +191,8 @@ def filled(leave):
 def test_full_disk(on_ranks, tmp_path, small, words):
     """All that was flushed before is whole, and the run goes on from it once there is room."""
     words = (*words, "output.checkpoint_every=50", "time.end=8")
-    done, seconds = fail(on_ranks, tmp_path, filled(100_000), *ROD, *words, folder=small / "out")
-    assert_told(done, seconds, "disk full", "make room and continue with --restart")
+    done = fail(on_ranks, tmp_path, filled(100_000), *ROD, *words, folder=small / "out")
+    assert_told(done, "disk full", "make room and continue with --restart")
     (small / "out" / "filler").unlink()
     with open_result(small / "out") as result:
         steps = result.history["step"]
@@ -209,16 +203,16 @@ def test_full_disk(on_ranks, tmp_path, small, words):
             np.testing.assert_array_equal(result.steps, range(len(result.times)))
             assert len(result.times) > 50
     again = ("-m", "pfem_petsc", *ROD, *words, "time.end=2", "-o", small / "out", "--restart")
-    done = on_ranks(2, *again, timeout=120.0)
+    done = on_ranks(2, *again, timeout=300.0)
     assert done.returncode == 0, done.stderr
 
 
 def test_full_disk_at_a_checkpoint(on_ranks, tmp_path, small):
     """The results are whole, and the checkpoint before stays."""
     words = ("output.fields_every=0", "output.history_every=100000", "output.checkpoint_every=50")
-    done, seconds = fail(on_ranks, tmp_path, filled(700_000), *ROD, *words, folder=small / "out")
-    assert_told(done, seconds, "checkpoint", "disk full")
+    done = fail(on_ranks, tmp_path, filled(700_000), *ROD, *words, folder=small / "out")
+    assert_told(done, "checkpoint", "disk full")
     (small / "out" / "filler").unlink()
     again = ("-m", "pfem_petsc", *ROD, *words, "time.end=2", "-o", small / "out", "--restart")
-    done = on_ranks(2, *again, timeout=120.0)
+    done = on_ranks(2, *again, timeout=300.0)
     assert done.returncode == 0, done.stderr

@@ -2,39 +2,28 @@
 
 import numpy as np
 import pytest
-from mpi4py import MPI
 from oscillator import roots, wilson
 
-from pfem_petsc import Case
-from pfem_petsc.stepping.model import Model
-from pfem_petsc.stepping.prepare import make_plan, make_stepper
+from pfem_petsc.integrators.base import State
+from pfem_petsc.registry import lookup
 
 SPEED, STEP, MOVING = 0.1, 0.01, 8  # the node moves for so many steps, then it is held
 
 
 def held(integrator, parameters, steps):
     """Velocity over SPEED and acceleration times STEP over SPEED after the stop, step by step."""
-    stop = MOVING * STEP
-    rows = [[0.0, 0.0, 0.0, 0.0], [stop, SPEED * stop, 0.0, 0.0], [10.0, SPEED * stop, 0.0, 0.0]]
-    case = Case.from_dict(
-        {
-            "mesh": {"generator": "rod", "length": 1.0, "elements": 1},
-            "node_set": {"held": {"nearest": [1.0, 0.0, 0.0]}, "all": {"all": True}},
-            "material": {"soft": {"young_modulus": 1e-9, "density": 1.0}},
-            "section": {"it": {"area": 1.0, "material": "soft"}},
-            "initial": {"velocity": [SPEED, 0.0, 0.0]},
-            "support": [{"node_set": "held", "fix": "x", "motion": rows}],
-            "time": {"integrator": integrator, "step": STEP, "end": 1.0, **parameters},
-        }
-    )
-    model = Model(case, MPI.COMM_SELF)
-    it = make_stepper(model, make_plan(model))
-    it.start()
-    node = int(np.flatnonzero(model.mesh.node_ids == 1)[0])
+    module = lookup("pfem_petsc.integrators", integrator, "test")
+    scheme = module.Scheme(module.Parameters(**parameters))
+    start = np.zeros((1, 3))
+    state = State(start.copy(), start + [SPEED, 0.0, 0.0], *(start.copy() for _ in range(5)))
+    scheme.start(state, STEP)
     found = []
-    for _ in range(MOVING + steps):
-        it.step()
-        found.append((it.state.v[node, 0] / SPEED, it.state.a[node, 0] * STEP / SPEED))
+    for step in range(MOVING + steps):
+        balance = scheme.balance(state, STEP)
+        place = start + [SPEED * min(balance.time, MOVING * STEP), 0.0, 0.0]
+        scheme.finish(state, balance, place - balance.predictor, STEP)
+        state.time = (step + 1) * STEP
+        found.append((state.v[0, 0] / SPEED, state.a[0, 0] * STEP / SPEED))
     return np.array(found[MOVING:]).T
 
 

@@ -81,7 +81,7 @@ def test_killed_at_any_moment_the_file_is_readable_and_can_be_continued(tmp_path
         capture_output=True,
         text=True,
         env=alone(),
-        timeout=120,
+        timeout=300,
     )
     assert done.returncode == 0, done.stderr
     for path, n_vtk in zip(paths, map(int, done.stdout.split()), strict=True):

@@ -14,7 +14,7 @@ EXPLICIT = set(EVENTS) - {"pfemResidual", "pfemHessian", "pfemPreconditioner"}
 
 def log_of(folder, *settings):
     command = [sys.executable, "-m", "pfem_petsc", "rod_impact", "-o", str(folder), "--quiet", "--set", *settings]
-    done = subprocess.run([*command, "--", "-log_view"], capture_output=True, text=True, timeout=120)
+    done = subprocess.run([*command, "--", "-log_view"], capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     return done.stdout
 

@@ -31,13 +31,20 @@ def test_impulse_of_a_load(integrator, shared_tmp_path, comm):
     assert np.abs(history["energy_imbalance"]).max() < 1e-9 * history["kinetic_energy"].max()
 
 
+PULLS = {
+    "velocity": {"velocity": [0.005, 0.0, 0.0]},
+    "linear": {"motion": [[0.0, 0.0, 0.0, 0.0], [5.0, 0.025, 0.0, 0.0]], "interpolation": "linear"},
+}
+
+
+@pytest.mark.parametrize("pull", PULLS.values(), ids=PULLS)
 @pytest.mark.parametrize("integrator", ["central_differences", "newmark", "chung_lee"])
-def test_moved_support(integrator, shared_tmp_path, comm):
+def test_moved_support(integrator, pull, shared_tmp_path, comm):
     """A support pulled at constant speed: the end follows exactly, and its work is what the rod has gained."""
     supports = [
         {"node_set": "all", "fix": "yz"},
         {"node_set": "start", "fix": "x"},
-        {"node_set": "end", "fix": "x", "motion": [[0.0, 0.0, 0.0, 0.0], [4.0, 0.02, 0.0, 0.0]]},
+        {"node_set": "end", "fix": "x", **pull},
     ]
     history = run(rod(integrator, support=supports), shared_tmp_path)
     assert history["probe/end/position"][:, 0, 0] == pytest.approx(1.0 + 0.005 * history["time"], abs=1e-14)

@@ -151,6 +151,28 @@ def test_impulses_with_damping_and_halved_steps(shared_tmp_path, comm, monkeypat
     assert unexplained(history) < 1e-12
 
 
+@pytest.mark.parametrize("mass", ["lumped", "consistent"])
+@pytest.mark.parametrize("integrator", SCHEMES)
+def test_impulses_of_supports_that_move(integrator, mass, shared_tmp_path):
+    """Velocities that a motion prescribes are not the scheme's: the difference is an impulse of the support."""
+    motion = [[0.0, 0.0, 0.0, 0.0], [0.01, 0.005, 0.001, 0.0], [0.02, 0.006, -0.002, 0.0], [0.03, 0.0, 0.0, 0.0]]
+    history = run(
+        case(
+            integrator,
+            step=1e-3,
+            steps=40,
+            mass=mass,
+            mesh={"generator": "rod", "length": 1.0, "elements": 3},
+            node_set={"root": {"nearest": [0.0, 0.0, 0.0]}},
+            support=[{"node_set": "root", "fix": "xyz", "motion": motion}],
+        ),
+        shared_tmp_path,
+    )
+    assert np.abs(history["support_impulse"]).max() > 0.1
+    assert unexplained(history) < 1e-9
+    assert np.abs(history["energy_imbalance"]).max() < 1e-9 * history["kinetic_energy"].max()
+
+
 @pytest.mark.parametrize("integrator", SCHEMES)
 def test_friction_takes_the_energy_of_sliding(integrator, shared_tmp_path):
     """A rod that slides on a rough floor until it stands: friction has its kinetic energy, and impact nothing."""

@@ -283,3 +283,29 @@ def test_files_are_as_large_as_forecast(comm, shared_tmp_path, name, overrides):
     assert (shared_tmp_path / "out" / "result.vtkhdf").stat().st_size == pytest.approx(forecast, rel=0.25)
     held = (shared_tmp_path / "out" / "checkpoint.h5").stat().st_size
     assert held == pytest.approx(checkpoint_bytes(simulation.model), rel=0.5)
+
+
+@pytest.mark.parametrize(
+    ("scheme", "warns"),
+    [
+        ("newmark', beta=0.25, gamma=0.5", True),
+        ("newmark'", False),
+        ("energy_momentum'", True),
+        ("generalized_alpha', rho_inf=1.0", True),
+        ("generalized_alpha'", False),
+        ("central_differences'", True),
+        ("chung_lee', beta=1.0", True),
+        ("hulbert_chung'", False),
+        ("houbolt'", False),
+    ],
+)
+def test_jumps_of_velocity_are_warned_of_where_they_stay(comm, scheme, warns):
+    time = f"time={{integrator='{scheme}, step=1e-3, end=0.1}}"
+    for interpolation in ("linear", "smooth"):
+        moved = (
+            f"support=[{{node_set='hinge', fix='xyz', motion=[[0,0,0,0],[1,1,0,0]], interpolation='{interpolation}'}}]"
+        )
+        simulation = Simulation(Case.load("pendulum", [time, moved]), comm, check_only=True)
+        told = warnings_before(simulation.case, simulation.model, simulation.plan)
+        found = [line for line in told if "velocity jumps at each of the 2 rows" in line]
+        assert len(found) == (warns and interpolation == "linear")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import random
 import signal
@@ -16,7 +17,7 @@ import numpy as np
 
 from pfem_petsc.output.result import open_result
 
-PATIENCE = 300.0  # seconds that any single run may take, on a machine with other work
+PATIENCE = 600.0  # seconds that any single run may take, on a machine with other work
 
 
 class Kind(NamedTuple):
@@ -128,9 +129,12 @@ def killed(
             os.kill(pid, signal.SIGKILL)
         how = f"killed {process_time:.3f} s after {'the first words' if steps_only else 'the start'} ({started:.2f} s)"
         try:
-            process.wait(timeout=30.0)
+            process.wait(timeout=60.0)
         except subprocess.TimeoutExpired:
             how += LEFT_OVER
+            for pid in pids:  # those that it has left have the folder's lock
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGKILL)
         return how
     finally:
         if process.poll() is None:

@@ -18,6 +18,8 @@ TWO_RODS = (
     "contact_pair=[{name='faces', first='tip', second='other', direction=[1.0, 0.0, 0.0]}]",
 )
 LAGGED = ("mesh.cells=[4,4,4]", "time.end=5e-5", "time.step=1e-6")
+ROWS = "[[0, 0, 0, 0], [0.02, 1e-3, 0, 0], [0.06, 0, 0, 2e-3], [0.1, 0, 0, 0]]"
+MOVED = f"support=[{{node_set='hinge', fix='xyz', motion={ROWS}}}]"
 CASES = {
     "central differences": ("rod_impact", SHORT),
     "consistent mass": ("rod_impact", (*SHORT, "time.mass=consistent")),
@@ -46,11 +48,19 @@ CASES = {
     "mass redistribution": ("rod_impact", (*SHORT, "contact.treatment=mass_redistribution")),
     "pairs": ("rod_impact", (*SHORT, *TWO_RODS)),
     "pairs, implicit": ("rod_impact", (*SHORT, *TWO_RODS, "time.integrator=generalized_alpha")),
+    "wall with mass": ("rod_impact", (*SHORT, "wall.0.mass=0.5", "wall.0.velocity=[-0.1,0,0]")),
+    "wall with mass, implicit": (
+        "rod_impact",
+        (*SHORT, "wall.0.mass=0.5", "wall.0.velocity=[-0.1,0,0]", "time.integrator=generalized_alpha"),
+    ),
     "sparse history": ("rod_impact", (*SHORT, "output.history_every=9")),
     "plastic, explicit": ("bar_collision_plastic", ("time.end=8e-5",)),
     "plastic, implicit": ("bar_collision_plastic", ("time.end=8e-5", "time.integrator=newmark")),
     "plastic lattice": ("lattice_drop", LATTICE),
     "supported, multistep": ("pendulum", ("time.end=0.15", "time.integrator=houbolt")),
+    "moved, explicit": ("pendulum", ("time.end=0.15", MOVED)),
+    "moved, multistep": ("pendulum", ("time.end=0.15", MOVED, "time.integrator=houbolt")),
+    "moved, beyond the step": ("pendulum", ("time.end=0.15", MOVED, "time.integrator=wilson", "time.theta=1.6")),
     "heated": (
         "pendulum",
         ("time.end=0.15", "material.default.thermal_expansion=1e-5")
@@ -100,6 +110,47 @@ def test_restart_on_as_many_ranks_is_bitwise(comm, shared_tmp_path, name):
     assert simulate(case, overrides, folders[1], comm, stop_after=stopped + 5, restart=True) > stopped
     simulate(case, overrides, folders[1], comm, restart=True)
     assert everywhere(comm, differences, *(folder / "result.vtkhdf" for folder in folders)) == {}
+
+
+ROD = {
+    "mesh": {"generator": "rod", "length": 1.0, "elements": 4},
+    "material": {"m": {"young_modulus": 1e6, "density": 1000.0, "damping": 1e4}},
+    "section": {"s": {"area": 1.0, "material": "m"}},
+    "initial": {"velocity": [0.1, 0.0, 0.0]},
+    "time": {"integrator": "newmark", "step": 0.04, "end": 4.0},
+}
+
+
+def test_motion_that_has_come_to_rest_is_not_taken_for_unstable_after_a_restart(tmp_path):
+    """What energies are compared with is that of the start; nothing of it is left."""
+    folders = tmp_path / "whole", tmp_path / "stopped"
+    for folder, ends in zip(folders, ((4.0,), (2.0, 4.0)), strict=True):
+        for end in ends:
+            data = {**ROD, "time": {**ROD["time"], "end": end}, "output": {"checkpoint_every": 10}}
+            run = Simulation(Case.from_dict(data), output=folder, quiet=True, restart=end != ends[0])
+            assert run.run() == 0
+    assert differences(*(folder / "result.vtkhdf" for folder in folders)) == {}
+
+
+@pytest.mark.parallel
+def test_all_that_is_looked_at_in_later_steps_is_put_back(comm, shared_tmp_path):
+    """Also what only messages and rows show: the watch, the largest energy, the forces of pairs."""
+    overrides = (*SHORT, *TWO_RODS, "output.checkpoint_every=10")
+    found = []
+    for end in (0.3, 0.6):
+        case = Case.load("rod_impact", [*overrides, f"time.end={end}"])
+        simulation = Simulation(case, comm, output=shared_tmp_path / "out", quiet=True, restart=end > 0.3)
+        simulation.start()
+        found.append((simulation.blow_up.kept(), simulation.recorder.energy_scale, simulation.model.pairs.force.copy()))
+        while simulation.state.step < simulation.plan.steps:
+            simulation._advance()
+        found.append((simulation.blow_up.kept(), simulation.recorder.energy_scale, simulation.model.pairs.force.copy()))
+        simulation.close()
+    (_, before, after, _) = found
+    assert before[:2] == after[:2]
+    assert before[0]["rows"] == 31
+    np.testing.assert_array_equal(before[2], after[2])
+    assert before[2].any()
 
 
 EXTENDED = {

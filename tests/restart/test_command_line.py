@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -15,7 +16,9 @@ import pytest
 from kills import KINDS, command, differences, environment, processes_of
 
 from pfem_petsc.cli.main import main
+from pfem_petsc.errors import InputError
 from pfem_petsc.output.result import open_result
+from pfem_petsc.restart.overrides import kept_overrides
 
 ROD = ["rod_impact", "--quiet", "--set", "output.checkpoint_every=20"]
 
@@ -162,24 +165,119 @@ def test_another_folder_gets_results_from_the_checkpoint_on(copy, tmp_path):
 def test_wall_time(tmp_path, capsys):
     folder = tmp_path / "slow"
     words = ["rod_impact", "-o", str(folder), "--quiet", "--set", "time.end=1000"]
-    begin = time.monotonic()
     assert main([*words, "--wall-time", "0.5"]) == 4
-    assert time.monotonic() - begin < 10.0
     said = capsys.readouterr().err
     assert said.startswith("stopped: the wall time of 0.50 s is over")
     assert "continue with --restart" in said
     reached = steps(folder)[0][-1]
     assert 0 < reached < 100_000
-    assert main([*words, "--restart", "--wall-time", "0.2"]) == 4
+    # over before the first step, which is made nevertheless
+    assert main([*words, "--restart", "--wall-time", "1e-9"]) == 4
     rows = steps(folder)[0]
     assert rows[-1] > reached
     np.testing.assert_array_equal(rows, range(rows[-1] + 1))
 
 
+def test_message_has_the_command_that_continues(tmp_path, capsys):
+    """Run as it stands, but for the wall time; a value with blanks and quotes comes back whole."""
+    folder = tmp_path / "a folder"
+    title = 'title="It\'s  two"'
+    words = ["rod_impact", "-o", str(folder), "--quiet", "--set", title, "time.end=0.6", "output.fields_every=3"]
+    assert main([*words, "--wall-time", "1e-9"]) == 4
+    line = capsys.readouterr().err.strip().splitlines()[-1]
+    pasted = shlex.split(line)
+    assert pasted[:3] == ["python", "-m", "pfem_petsc"]
+    at = pasted.index("--wall-time")
+    del pasted[at : at + 2]
+    assert main(pasted[3:]) == 0
+    rows, snapshots = steps(folder)
+    np.testing.assert_array_equal(rows, range(61))
+    np.testing.assert_array_equal(snapshots, range(0, 61, 3))
+    with open_result(folder) as result:
+        assert result.case.title == "It's  two"
+
+
+def test_values_of_set_are_kept_by_a_restart(tmp_path, capsys):
+    """But for those given anew; the case file may lack what was given then."""
+    (tmp_path / "case.toml").write_text(
+        '[mesh]\ngenerator = "rod"\nlength = 1.0\nelements = 4\n[material.m]\nyoung_modulus = 1.0\ndensity = 1.0\n'
+        '[section.s]\narea = 1.0\nmaterial = "m"\n[time]\nintegrator = "newmark"\nend = 0.4\n'
+    )
+    words = [str(tmp_path / "case.toml"), "-o", str(tmp_path / "out")]
+    assert main([*words, "--quiet", "--set", "time.step=0.1", "time.end=1.0", "output.checkpoint_every=5"]) == 0
+    assert main([*words, "--restart"]) == 0
+    assert "finished already: the results have t = 1.000 s\n" in capsys.readouterr().out
+    assert main([*words, "--restart", "--set", "time.end=2.0"]) == 0
+    said = capsys.readouterr().out
+    assert "as in the run that is continued: --set time.step=0.1 output.checkpoint_every=5" in said
+    assert "changed: time.end: 1.0 -> 2.0" in said
+    with open_result(tmp_path / "out") as result:
+        assert result.attributes["overrides"] == ["time.step=0.1", "output.checkpoint_every=5", "time.end=2.0"]
+        np.testing.assert_array_equal(result.history["step"], range(21))
+    # another model is refused as ever
+    assert main([*words, "--restart", "--set", "time.step=0.2"]) == 2
+    assert "time.step: 0.1 -> 0.2" in capsys.readouterr().err
+    # what the file says is told, and what was set stays
+    text = (tmp_path / "case.toml").read_text()
+    (tmp_path / "case.toml").write_text(text.replace("end = 0.4", "end = 0.5") + "[solver]\nrtol = 1e-8\n")
+    assert main([*words, "--restart", "--set", "time.end=2.5"]) == 0
+    assert "changed: time.end: 2.0 -> 2.5; solver.rtol: 1e-09 -> 1e-08" in capsys.readouterr().out
+
+
+def test_values_of_another_case_are_not_kept(copy):
+    assert kept_overrides("rod_impact", copy, True) == ["output.checkpoint_every=20", "time.end=0.5"]
+    assert kept_overrides("pendulum", copy, True) == []
+    for path in copy.glob("*.h5"):
+        path.unlink()
+    assert kept_overrides("rod_impact", copy, True) == ["output.checkpoint_every=20", "time.end=0.5"]
+    assert kept_overrides("pendulum", copy, True) == []
+
+
+@pytest.mark.parametrize("fields_every", [10, 0])
+def test_results_beyond_an_earlier_end_are_never_cut(tmp_path, capsys, fields_every):
+    folder = tmp_path / "rod"
+    more = f"--set=output.fields_every={fields_every}"
+    assert main(rod(folder, more)) == 0
+    # results and checkpoint of a run that was killed on its way
+    with h5py.File(folder / "result.vtkhdf", "r+") as file:
+        del file["case/text"]
+        file["case/text"] = "not a case"
+    before = {path.name: path.read_bytes() for path in folder.iterdir() if path.suffix in (".h5", ".vtkhdf")}
+    assert main(rod(folder, "--restart", str(folder / "checkpoint-previous.h5"), more, end=0.45)) == 2
+    said = capsys.readouterr().err
+    assert "the results reach t = 500.0 ms, beyond time.end = 450.0 ms" in said
+    assert "5 rows of the history and 1 snapshots" in said
+    assert "--set time.end=0.5" in said
+    assert {name: (folder / name).read_bytes() for name in before} == before
+    assert [path.name for path in tmp_path.iterdir()] == ["rod"]
+
+
+def test_earlier_end_of_a_finished_run_says_what_there_is(copy, capsys):
+    words = rod(copy, "--restart", end=0.3)
+    words.remove("--quiet")
+    assert main(words) == 0
+    assert "the results have t = 500.0 ms, beyond time.end = 300.0 ms" in capsys.readouterr().out
+    assert len(steps(copy)[0]) == 51
+
+
+def test_checkpoint_written_anew_between_set_up_and_start(copy):
+    """Another run has continued the folder meanwhile: its rows would be cut."""
+    from pfem_petsc import Case, Simulation
+
+    late = Simulation(Case.load("rod_impact", ["time.end=0.9"]), output=copy, restart=True, quiet=True)
+    assert main(rod(copy, "--restart", end=0.8)) == 0
+    with pytest.raises(InputError, match="another run has written this checkpoint anew"):
+        late.run()
+    np.testing.assert_array_equal(steps(copy)[0], range(81))
+
+
 def test_checkpoints_by_the_clock(tmp_path):
+    """Due whenever the ranks meet: after the first step, and at the end."""
     folder = tmp_path / "minutes"
-    words = ["rod_impact", "-o", str(folder), "--quiet", "--set", "time.end=1000", "output.checkpoint_minutes=0.002"]
-    assert main([*words, "--wall-time", "1.0"]) == 4
+    assert (
+        main(["rod_impact", "-o", str(folder), "--quiet", "--set", "time.end=0.1", "output.checkpoint_minutes=1e-9"])
+        == 0
+    )
     assert (folder / "checkpoint-previous.h5").is_file()
 
 
@@ -193,7 +291,7 @@ def undisturbed(tmp_path_factory):
     folder = tmp_path_factory.mktemp("undisturbed")
     for ranks in (1, 2):
         line = command(ranks, *STOPPED_WORDS, folder / str(ranks))
-        done = subprocess.run(line, env=environment(), capture_output=True, text=True, timeout=120)
+        done = subprocess.run(line, env=environment(), capture_output=True, text=True, timeout=300)
         assert done.returncode == 0, done.stderr
     return folder
 
@@ -218,7 +316,7 @@ def test_signal_stops_with_a_checkpoint_and_the_restart_is_bitwise(tmp_path, und
     assert status == 4, said
     assert f"stopped: {signal.Signals(number).name} received" in said
     assert said.count("stopped: ") == 1
-    done = subprocess.run([*line, "--restart"], env=environment(), capture_output=True, text=True, timeout=120)
+    done = subprocess.run([*line, "--restart"], env=environment(), capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     assert differences(folder / "result.vtkhdf", undisturbed / str(ranks) / "result.vtkhdf") == {}
 
@@ -234,7 +332,7 @@ def test_launcher_that_ends_its_ranks_leaves_them_time_for_a_checkpoint(tmp_path
     assert said.count("stopped: SIGTERM received") == 1
     reached = int(re.search(r"step (\d+) is finished", said).group(1))
     line.append(f"--set=time.end={(reached + 50) * 5e-7}")
-    done = subprocess.run([*line, "--restart"], env=environment(), capture_output=True, text=True, timeout=120)
+    done = subprocess.run([*line, "--restart"], env=environment(), capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     np.testing.assert_array_equal(steps(folder)[0], range(reached + 51))
 
@@ -247,12 +345,12 @@ def signalled(line, ranks, folder, number, whom):
     pids = processes_of(process, ranks)
     for pid in {"last rank": pids[-1:], "all ranks": pids, "launcher": [process.pid]}[whom]:
         os.kill(pid, number)
-    said = process.communicate(timeout=60)[1]
+    said = process.communicate(timeout=300)[1]
     return process.returncode, said
 
 
-def test_second_interrupt_ends_at_once(tmp_path):
-    """Also where the first one is not looked at any more: here in a step that never ends."""
+def test_third_interrupt_ends_at_once(tmp_path):
+    """Also where the others are not looked at any more: here in a step that never ends."""
     script = tmp_path / "stuck.py"
     script.write_text(
         "import ctypes, sys\n"
@@ -269,13 +367,12 @@ def test_second_interrupt_ends_at_once(tmp_path):
         [sys.executable, str(script)], env=environment(), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
     )
     assert process.stdout.readline() == "stuck\n"
+    for _ in range(2):
+        process.send_signal(signal.SIGINT)
+        time.sleep(0.3)
+        assert process.poll() is None
     process.send_signal(signal.SIGINT)
-    time.sleep(0.3)
-    assert process.poll() is None
-    begin = time.monotonic()
-    process.send_signal(signal.SIGINT)
-    assert process.wait(timeout=20) == -signal.SIGINT
-    assert time.monotonic() - begin < 5.0
+    assert process.wait(timeout=100) == -signal.SIGINT
     process.stdout.close()
 
 

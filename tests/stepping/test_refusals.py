@@ -55,7 +55,7 @@ def test_steps_at_the_limit_are_taken(comm, shared_tmp_path):
 def test_status_of_the_command_line(what, ranks, tmp_path, on_ranks):
     overrides, parts = REFUSED[what]
     keys = [word for key in overrides for word in ("--set", key)]
-    done = on_ranks(ranks, "-m", "pfem_petsc", "rod_impact", "-o", tmp_path / "out", "--quiet", *keys, timeout=60)
+    done = on_ranks(ranks, "-m", "pfem_petsc", "rod_impact", "-o", tmp_path / "out", "--quiet", *keys, timeout=300)
     assert done.returncode == 2
     message = [line for line in done.stderr.splitlines() if line.startswith("error: ")]
     assert len(message) == 1
@@ -67,7 +67,7 @@ def test_status_of_the_command_line(what, ranks, tmp_path, on_ranks):
 def test_status_of_a_failing_run(tmp_path, on_ranks):
     """A bar driven through zero length: status 3."""
     keys = ["--set", "initial.velocity=[3.0, 0.0, 0.0]"]
-    done = on_ranks(2, "-m", "pfem_petsc", "rod_impact", "-o", tmp_path / "out", "--quiet", *keys, timeout=60)
+    done = on_ranks(2, "-m", "pfem_petsc", "rod_impact", "-o", tmp_path / "out", "--quiet", *keys, timeout=300)
     assert done.returncode == 3
     assert done.stderr.count("error: ") == 1
     assert "gone through zero length" in done.stderr

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field, field_validator, model_validator
@@ -25,7 +25,9 @@ class WallKeys(WallParameters):
     gravity: bool = False
     """true: gravity acts on a wall with mass as it does on the truss"""
     motion: Annotated[tuple[Row4, ...], listed] | None = None
-    """rows [t, dx, dy, dz]: displacement of the wall [s, m], linear between rows, constant outside"""
+    """rows [t, dx, dy, dz]: displacement of the wall [s, m], at rest before the first and after the last"""
+    interpolation: Literal["smooth", "linear"] = "smooth"
+    """of ``motion`` between its rows: a cubic spline, or straight lines, whose velocity jumps at rows"""
     adjust: bool = False
     """true: nodes that start beyond the wall are moved onto it, unstressed bars included"""
 
@@ -54,6 +56,8 @@ class WallKeys(WallParameters):
     def _moves_one_way(self) -> WallKeys:
         if self.velocity is not None and self.motion is not None:
             raise ValueError("expected at most one of the keys velocity, motion")
+        if self.interpolation == "linear" and self.motion is None:
+            raise ValueError('interpolation = "linear" goes with motion')
         if self.gravity and self.mass is None:
             raise ValueError("gravity = true needs the wall's mass [kg]")
         if self.mass is not None and self.motion is not None:

@@ -1,0 +1,154 @@
+"""Prescribed motion over time: position, velocity and acceleration of supports and walls, piecewise cubic.
+
+Rows of displacements are interpolated by a clamped cubic spline: twice continuously differentiable between the first
+row and the last one, so that velocities and accelerations of a sampled record are right to second order. Monotone
+interpolants jump in acceleration at every row, and flatten the crests of a record, where its acceleration is largest.
+The motion is constant outside the rows, so it starts from rest and comes to rest: the end slopes are zero.
+
+A spline would swing beyond rows that stand still. Two equal values one after the other are therefore a rest: nothing
+moves between them, and the spline ends there with slope zero. The crest of a wave sampled at equal intervals, whose two
+highest samples may be equal, is no rest: there the values turn back and the slopes fall off towards the crest.
+
+Accelerations are linear between their rows and zero outside, and are integrated exactly from rest.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+__all__ = ["Motion", "motion_of"]
+
+_ROUNDING = 1e-14  # relative, of times: a row that a step reaches but for rounding is reached
+
+
+class Motion:
+    """Cubics in time, one after the other; displacement zero velocity before the first.
+
+    Parameters
+    ----------
+    times : (n,) when each cubic begins [s]
+    coefficients : (n, 4, 3) of 1, s, s^2, s^3, where s is the time since it began [m, m/s, m/s2, m/s3]
+    jumps : whether the velocity jumps from one cubic to the next
+
+    Attributes
+    ----------
+    jumps : as given; accelerations are then means over the step that ends at the time asked for
+    """
+
+    def __init__(self, times: np.ndarray, coefficients: np.ndarray, jumps: bool = False) -> None:
+        self._times = times
+        self._coefficients = coefficients
+        self.jumps = jumps
+
+    def at(self, time: float, span: float = 0.0, ahead: bool = True) -> np.ndarray:
+        """Displacement [m], velocity [m/s] and acceleration [m/s2] at a time [s], (3, 3).
+
+        Parameters
+        ----------
+        time : [s]
+        span : length of the step [s]; a jump of velocity within it, after t = 0, counts as acceleration over the step
+        ahead : at the very time of a row, what comes after it, else what came before
+        """
+        slack = _ROUNDING * abs(time)
+        row = int(np.searchsorted(self._times, time + slack if ahead else time - slack, "right" if ahead else "left"))
+        if row == 0:
+            return np.stack([self._coefficients[0, 0], np.zeros(3), np.zeros(3)])
+        s = time - self._times[row - 1]
+        c0, c1, c2, c3 = self._coefficients[row - 1]
+        moved = np.stack(
+            [c0 + s * (c1 + s * (c2 + s * c3)), c1 + s * (2.0 * c2 + 3.0 * s * c3), 2.0 * c2 + 6.0 * s * c3]
+        )
+        if self.jumps and span > 0.0:
+            moved[2] = (moved[1] - self.at(max(time - span, 0.0))[1]) / span if time > 0.0 else 0.0
+        return moved
+
+
+def motion_of(entry) -> Motion | None:
+    """The motion that a support or a wall of a case is given; None for none.
+
+    Parameters
+    ----------
+    entry : with ``motion`` and ``velocity``, and where it takes them ``interpolation`` and ``acceleration``
+    """
+    if getattr(entry, "acceleration", None) is not None:
+        return _accelerated(np.array(entry.acceleration, dtype=np.float64))
+    if entry.motion is not None:
+        rows = np.array(entry.motion, dtype=np.float64)
+        if getattr(entry, "interpolation", "smooth") == "linear":
+            return _linear(rows[:, 0], rows[:, 1:])
+        return _smooth(rows[:, 0], rows[:, 1:])
+    if entry.velocity is not None and any(entry.velocity):
+        coefficients = np.zeros((1, 4, 3))
+        coefficients[0, 1] = entry.velocity
+        return Motion(np.zeros(1), coefficients)
+    return None
+
+
+def _linear(times: np.ndarray, values: np.ndarray) -> Motion:
+    coefficients = np.zeros((len(times), 4, 3))
+    coefficients[:, 0] = values
+    coefficients[:-1, 1] = np.diff(values, axis=0) / np.diff(times)[:, None]
+    return Motion(times, coefficients, jumps=True)
+
+
+def _smooth(times: np.ndarray, values: np.ndarray) -> Motion:
+    coefficients = np.zeros((len(times), 4, 3))
+    coefficients[:, 0] = values
+    width = np.diff(times)[:, None]
+    if len(times) > 1:
+        slopes = np.column_stack([_slopes(times, column) for column in values.T])
+        rate = np.diff(values, axis=0) / width
+        coefficients[:-1, 1] = slopes[:-1]
+        coefficients[:-1, 2] = (3.0 * rate - 2.0 * slopes[:-1] - slopes[1:]) / width
+        coefficients[:-1, 3] = (slopes[:-1] + slopes[1:] - 2.0 * rate) / width**2
+    return Motion(times, coefficients)
+
+
+def _slopes(times: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Slopes (n,) of the cubic spline through values (n,): zero at both ends and at rests."""
+    width = np.diff(times)
+    rate = np.diff(values) / width
+    still = np.zeros(len(times), dtype=bool)
+    still[[0, -1]] = True
+    rests = _rests(width, rate)
+    still[:-1] |= rests
+    still[1:] |= rests
+    # continuity of the second derivative at row i:
+    # m[i-1]/w[i-1] + 2 m[i] (1/w[i-1] + 1/w[i]) + m[i+1]/w[i] = 3 (rate[i-1]/w[i-1] + rate[i]/w[i])
+    inverse = (1.0 / width).tolist()
+    right = (3.0 * rate / width).tolist()
+    fixed = still.tolist()
+    slopes, factors = [0.0] * len(times), [0.0] * len(times)
+    for i in range(1, len(times) - 1):
+        if not fixed[i]:
+            pivot = 2.0 * (inverse[i - 1] + inverse[i]) - inverse[i - 1] * factors[i - 1]
+            factors[i] = inverse[i] / pivot
+            slopes[i] = (right[i - 1] + right[i] - inverse[i - 1] * slopes[i - 1]) / pivot
+    for i in range(len(times) - 2, 0, -1):
+        slopes[i] -= factors[i] * slopes[i + 1]
+    return np.array(slopes)
+
+
+def _rests(width: np.ndarray, rate: np.ndarray) -> np.ndarray:
+    """(n - 1,) bool: intervals of equal values in which nothing moves; crests of sampled waves are none."""
+    rests = rate == 0.0
+    for k in np.flatnonzero(rests[2:-2]) + 2:
+        before, after = rate[k - 1], rate[k + 1]
+        turns = before * after < 0.0
+        fades = abs(before) <= 0.8 * abs(rate[k - 2]) and abs(after) <= 0.8 * abs(rate[k + 2])
+        even = np.ptp(width[k - 1 : k + 2]) <= 0.01 * width[k]
+        onward = before * rate[k - 2] > 0.0 and after * rate[k + 2] > 0.0
+        rests[k] = not (turns and fades and even and onward)
+    return rests
+
+
+def _accelerated(rows: np.ndarray) -> Motion:
+    times, values = rows[:, 0], rows[:, 1:]
+    width = np.diff(times)[:, None]
+    coefficients = np.zeros((len(times), 4, 3))
+    coefficients[:-1, 2] = 0.5 * values[:-1]
+    coefficients[:-1, 3] = np.diff(values, axis=0) / (6.0 * width)
+    coefficients[1:, 1] = np.cumsum(0.5 * width * (values[:-1] + values[1:]), axis=0)
+    moved = width * coefficients[:-1, 1] + width**2 * (coefficients[:-1, 2] + width * coefficients[:-1, 3])
+    coefficients[1:, 0] = np.cumsum(moved, axis=0)
+    return Motion(times, coefficients)

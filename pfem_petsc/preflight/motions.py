@@ -1,0 +1,20 @@
+"""Motions of supports and walls whose velocity jumps."""
+
+from __future__ import annotations
+
+__all__ = ["jumping_motions"]
+
+
+def jumping_motions(case, plan) -> list[str]:
+    """Warn of linear interpolation with a scheme that keeps the vibrations that its jumps of velocity cause."""
+    if plan.scheme.dissipates:
+        return []
+    moved = [(f"support[{k}]", entry) for k, entry in enumerate(case.support)]
+    moved += [(f"wall {entry.name!r}", entry) for entry in case.wall]
+    return [
+        f'{name}: with interpolation = "linear" the velocity jumps at each of the {len(entry.motion)} rows of motion, '
+        f"and {case.time.integrator} with these parameters keeps the vibrations that this causes; take "
+        'interpolation = "smooth", or a scheme with numerical dissipation'
+        for name, entry in moved
+        if entry.interpolation == "linear"
+    ]

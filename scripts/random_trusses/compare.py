@@ -1,0 +1,84 @@
+"""Results of two runs of a case: equal bit for bit, or how far they are apart."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+
+from pfem_petsc import open_result
+
+from .oracle import energy_scale
+
+__all__ = ["bitwise", "distance", "paths_distance"]
+
+
+def bitwise(one: Path, other: Path) -> dict[str, float]:
+    """Datasets of two folders' results that are not equal bit for bit, with the largest difference over the largest
+    value (inf: of another shape)."""
+    found: dict[str, float] = {}
+    with (
+        h5py.File(one / "result.vtkhdf", "r", locking=False) as a,
+        h5py.File(other / "result.vtkhdf", "r", locking=False) as b,
+    ):
+        names: set[str] = set()
+        for file in (a, b):
+            file.visititems(lambda name, item: names.add(name) if isinstance(item, h5py.Dataset) else None)
+        for name in sorted(names - {"case/text"}):
+            if name not in a or name not in b or a[name].shape != b[name].shape:
+                found[name] = np.inf
+                continue
+            x, y = a[name][()], b[name][()]
+            if x.tobytes() != y.tobytes():
+                largest = max(float(np.abs(x).max()), np.finfo(float).tiny)
+                found[name] = float(np.abs(x - y).max()) / largest
+    return found
+
+
+def distance(one: Path, other: Path) -> tuple[float, str]:
+    """How far two results are apart: the largest relative difference, and where it is.
+
+    Positions are over the truss's size, energies over the largest energy, momenta over the largest momentum (or that of
+    the centre's way, where they cancel), forces of walls over the largest force.
+    """
+    a, b = open_result(one), open_result(other)
+    worst = paths_distance(one, other)
+    history = {name: np.asarray(a.history[name], dtype=float) for name in a._columns}
+    energy = max(energy_scale(history), 1e-300)
+    speed = np.abs(history["momentum"]).max()
+    size = max(float(np.ptp(a.positions(0), axis=0).max()), 1e-300) if len(a.times) else 1.0
+    scales = {"momentum": speed, "angular_momentum": speed * size, "centre_of_mass": size}
+    other_history = b.history
+    for name, x in history.items():
+        if name.endswith(("_iterations", "releases", "changes", "contact_time", "active_contacts", "contacts")):
+            continue
+        y = np.asarray(other_history[name], dtype=float)
+        if x.shape != y.shape:
+            return np.inf, f"{name}: {x.shape} and {y.shape}"
+        if name.endswith(("_energy", "_work", "_dissipation", "_heat", "_imbalance")):
+            scale = energy
+        elif name in scales:
+            scale = max(scales[name], 1e-300)
+        elif name in ("time", "step", "step_size") or name.endswith("/position"):
+            scale = max(np.abs(x).max(), size)
+        else:
+            continue
+        apart = float(np.abs(x - y).max()) / scale
+        if apart > worst[0]:
+            worst = apart, name
+    return worst
+
+
+def paths_distance(one: Path, other: Path) -> tuple[float, str]:
+    """Largest distance of a node in one result from itself in the other, over the truss's size."""
+    a, b = open_result(one), open_result(other)
+    if len(a.times) != len(b.times):
+        return np.inf, f"{len(a.times)} and {len(b.times)} snapshots"
+    worst = 0.0, "nothing"
+    for i in range(len(a.times)):
+        x, y = a.positions(i), b.positions(i)
+        apart = float(np.abs(x - y).max() / max(np.ptp(a.positions(0), axis=0).max(), 1e-300))
+        if apart > worst[0]:
+            worst = apart, f"positions in snapshot {i} of {len(a.times)}"
+    return worst

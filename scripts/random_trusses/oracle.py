@@ -1,0 +1,222 @@
+"""What must hold of the results of any valid case that ended with status 0.
+
+Each check gives faults, (cause, detail). Tolerances:
+
+- positions against walls: 1e-9 of the truss's size (1e-6 with float32); `wilson` keeps walls at t + theta h and not at
+  the end of the step, so that a node may be as far beyond as it moves in (theta - 1) h, twice at most
+- balance of energy: 1e-7 of the largest energy; above 1e-9 it is counted apart
+- gain of energy from contact and the scheme without a warning, in the mean over the last quarter of the run: 0.05 of
+  what was put in (energy at the start, works of loads and temperature; with walls that move, the largest energy)
+- dissipations: 1e-9 of the largest energy below zero
+- contact work at walls at rest: with `stick` 1e-3 of what was put in, else 0.05 of it in the last quarter
+- momentum: 1e-9 of the largest momentum or impulse
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from pfem_petsc import open_result
+from pfem_petsc.case.schema import Case
+from pfem_petsc.output.result import Result
+
+__all__ = ["check_result", "energy_scale"]
+
+Faults = list[tuple[str, str]]
+_ENDS = ("_energy", "_dissipation", "_work")
+LOSSES = ("numerical_dissipation", "impact_dissipation", "friction_dissipation")
+
+
+def check_result(folder: Path, warned: list[str]) -> Faults:
+    """All checks of a result that is complete."""
+    result = open_result(folder)
+    case = result.case
+    history = {name: np.asarray(result.history[name]) for name in result._columns}
+    faults = _finite(result, history)
+    if faults:
+        return faults
+    faults += _walls(result, case, history)
+    size = float(np.ptp(result.positions(0), axis=0).max()) if len(result.times) else 1.0
+    faults += _energy(case, history, warned, size)
+    faults += _momentum(case, history)
+    return faults
+
+
+def energy_scale(history: dict[str, np.ndarray]) -> float:
+    """The largest of all energies, works and dissipations of a run [J]."""
+    return max(float(np.abs(column).max()) for name, column in history.items() if name.endswith(_ENDS))
+
+
+def _finite(result: Result, history: dict[str, np.ndarray]) -> Faults:
+    for name, column in history.items():
+        if not np.isfinite(column).all():
+            return [("not finite", name)]
+    for i in range(len(result.times)):
+        fields = [result.positions(i), *(result.field(n, i) for n in (*result.point_fields, *result.cell_fields))]
+        if not all(np.isfinite(values).all() for values in fields):
+            return [("not finite", f"snapshot {i}")]
+    return []
+
+
+def _walls(result: Result, case: Case, history: dict[str, np.ndarray]) -> Faults:
+    """No node is beyond a wall in a snapshot."""
+    faults: Faults = []
+    if not len(result.times) or not case.wall:
+        return faults
+    start = result.positions(0)
+    size = float(np.ptp(start, axis=0).max())
+    tolerance = (1e-6 if case.output.precision == "float32" else 1e-9) * max(size, float(np.abs(start).max()))
+    rows = {int(step): row for row, step in enumerate(history["step"])}
+    for wall in case.wall:
+        members = _members(case, wall.node_set, result)
+        moved = history.get(f"wall/{wall.name}/position")
+        worst = (0.0, "")
+        for i, step in enumerate(result.steps):
+            row = rows.get(int(step))
+            if moved is not None and row is None:
+                continue
+            shift = np.zeros(3) if moved is None else moved[row] - moved[0]
+            at = result.positions(i)[members] - shift
+            depth = -_distances(wall, at)
+            if wall.type == "rectangle":
+                depth[~_before_rectangle(wall, result, i, members, at, moved, rows)] = 0.0
+            if len(depth) and depth.max() > worst[0]:
+                worst = (float(depth.max()), f"snapshot {i} of {len(result.times)}, node {members[depth.argmax()]}")
+        if worst[0] > tolerance + _wilson(case, history, result):
+            faults.append(("node beyond a wall", f"{wall.name} ({wall.type}) by {worst[0]:.3g} m in {worst[1]}"))
+    return faults
+
+
+def _members(case: Case, name: str | None, result: Result) -> np.ndarray:
+    """Mesh numbers of the nodes that a wall stops; groups are read from the mesh."""
+    everyone = np.arange(result.n_nodes)
+    if name is None or case.node_set[name].all:
+        return everyone
+    table, points = case.node_set[name], result.positions(0)
+    if table.indices is not None:
+        return np.array(table.indices)
+    if table.group is not None:
+        import importlib
+
+        module = importlib.import_module(f"pfem_petsc.mesh.generators.{case.mesh.generator}")
+        return module.generate(case.mesh.parameters, 0, 1).node_groups[table.group]
+    if table.nearest is not None:
+        return np.array([np.linalg.norm(points - table.nearest, axis=1).argmin()])
+    low, high = np.array(table.box)
+    slack = 1e-6 * np.ptp(points, axis=0).max()
+    return np.flatnonzero(((points >= low + slack) & (points <= high - slack)).all(axis=1))
+
+
+def _distances(wall, x: np.ndarray) -> np.ndarray:
+    """Distance (m,) of points from the surface, negative beyond it."""
+    arm = x - np.array(wall.point)
+    if wall.type in ("plane", "rectangle"):
+        return arm @ np.array(wall.normal) / np.linalg.norm(wall.normal)
+    if wall.type == "cylinder":
+        axis = np.array(wall.axis) / np.linalg.norm(wall.axis)
+        arm = arm - np.multiply.outer(arm @ axis, axis)
+    length = np.linalg.norm(arm, axis=1)
+    return length - wall.radius if wall.side == "outside" else wall.radius - length
+
+
+def _before_rectangle(wall, result: Result, i: int, members, at: np.ndarray, moved, rows) -> np.ndarray:
+    """Nodes that were before the rectangle in the last snapshot and well inside of its edges then and now."""
+    if i == 0 or result.steps[i] - result.steps[i - 1] > 1:
+        return np.zeros(len(at), dtype=bool)
+    row = rows.get(int(result.steps[i - 1]))
+    if moved is not None and row is None:
+        return np.zeros(len(at), dtype=bool)
+    before = result.positions(i - 1)[members] - (0.0 if moved is None else moved[row] - moved[0])
+    normal = np.array(wall.normal) / np.linalg.norm(wall.normal)
+    along = np.array(wall.along) - (np.array(wall.along) @ normal) * normal
+    along /= np.linalg.norm(along)
+    across = np.cross(normal, along)
+    inside = _distances(wall, before) >= 0.0
+    for x in (before, at):
+        arm = x - np.array(wall.point)
+        inside &= (np.abs(arm @ along) < 0.45 * wall.size[0]) & (np.abs(arm @ across) < 0.45 * wall.size[1])
+    return inside
+
+
+def _wilson(case: Case, history: dict[str, np.ndarray], result: Result) -> float:
+    if case.time.integrator != "wilson":
+        return 0.0
+    if "velocity" not in result.point_fields:
+        return np.inf
+    fastest = max(float(np.abs(result.field("velocity", i)).max()) for i in range(len(result.times)))
+    walls = [np.abs(c).max() for n, c in history.items() if n.startswith("wall/") and n.endswith("/velocity")]
+    return 2.0 * (case.time.scheme.theta - 1.0) * float(history["step_size"].max()) * (fastest + sum(walls))
+
+
+def _energy(case: Case, history: dict[str, np.ndarray], warned: list[str], size: float) -> Faults:
+    scale = energy_scale(history)
+    # below: a truss at rest, whose energies are squares of rounding errors
+    strongest = max(m.young_modulus for m in case.material.values()) * max(s.area for s in case.section.values())
+    if not scale > 1e-24 * strongest * size:
+        return []
+    faults: Faults = []
+    imbalance = np.abs(history["energy_imbalance"])
+    if imbalance.max() > 1e-9 * scale:
+        at = int(history["step"][np.argmax(imbalance > 1e-9 * scale)])
+        cause = "energy balance open" if imbalance.max() > 1e-7 * scale else "energy balance above 1e-9"
+        faults.append((cause, f"{imbalance.max() / scale:.3g} of the largest energy, first at step {at}"))
+    heat = history["plastic_heat"]
+    if (np.diff(heat) < -1e-9 * scale).any() or heat.min() < -1e-9 * scale:
+        faults.append(("plastic heat falls", f"{np.diff(heat).min() / scale:.3g} of the largest energy"))
+    for name in ("damping_dissipation", "friction_dissipation", "impact_dissipation"):
+        if name in history and history[name].min() < -1e-9 * scale:
+            faults.append((f"{name} negative", f"{history[name].min() / scale:.3g} of the largest energy"))
+    return faults + _gains(case, history, warned, scale)
+
+
+def _gains(case: Case, history: dict[str, np.ndarray], warned: list[str], scale: float) -> Faults:
+    """What contact and the scheme give, beyond what was put in, and is still there in the last quarter of the run.
+
+    A peak that passes is none: velocities of held nodes are those of the scheme's formulas, and overshoot.
+    """
+    if any("energy" in text or "amplifies" in text for text in warned):
+        return []
+    faults: Faults = []
+    moving = any(wall.velocity or wall.motion or wall.mass for wall in case.wall)
+    put_in = history["kinetic_energy"][0] + history["elastic_energy"][0]
+    put_in += np.abs(history["external_work"]).max() + np.abs(history["thermal_work"]).max()
+    reference = scale if moving else min(scale, float(put_in))
+    lost = sum(history[name] for name in LOSSES if name in history)
+    work = history["contact_work"] - (lost - history["numerical_dissipation"])
+    last = slice(-max(len(work) // 4, 1), None)
+    if not moving:
+        treatment = case.contact.treatment
+        most = work.max() if treatment == "stick" else work[last].mean()
+        if most > (1e-3 if treatment == "stick" else 0.05) * reference:
+            faults.append(("contact work positive", f"{treatment}: {most / reference:.3g} of the energy put in"))
+    stays = float((-lost if moving else history["contact_work"] - lost)[last].mean())
+    if stays > 0.05 * reference:
+        cause = "energy grows without a warning"
+        faults.append((cause, f"by {stays / reference:.3g} of {'the largest energy' if moving else 'what was put in'}"))
+    return faults
+
+
+def _momentum(case: Case, history: dict[str, np.ndarray]) -> Faults:
+    """Momentum is that at the start and all recorded impulses, where the history has them."""
+    if "external_impulse" not in history:
+        return []
+    parts = {"external": history["external_impulse"], "supports": history["support_impulse"]}
+    parts["damping"] = history["damping_impulse"]
+    for wall in case.wall:
+        for what in ("impulse", "jump_impulse"):
+            if f"wall/{wall.name}/{what}" in history:
+                parts[f"{wall.name} {what}"] = history[f"wall/{wall.name}/{what}"]
+    change = history["momentum"] - history["momentum"][0]
+    open_part = np.abs(change - sum(part - part[0] for part in parts.values())).max()
+    mass = _speed_scale(history)
+    scale = max(mass, *(float(np.abs(part).max()) for part in parts.values()))
+    if scale > 0.0 and open_part > 1e-9 * scale:
+        return [("momentum is not that of the impulses", f"{open_part / scale:.3g} of the largest")]
+    return []
+
+
+def _speed_scale(history: dict[str, np.ndarray]) -> float:
+    """Largest momentum of the truss [kg m/s]."""
+    return float(np.linalg.norm(history["momentum"], axis=1).max())

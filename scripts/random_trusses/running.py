@@ -1,0 +1,197 @@
+"""Run cases in this process, one after the other, on the ranks of a communicator."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import io
+import os
+import re
+import shutil
+import signal
+import time
+import traceback
+import warnings
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+
+from pfem_petsc import Case, Simulation
+from pfem_petsc.case.toml import table_text
+from pfem_petsc.errors import EarlyStop, InputError, SimulationFailure
+
+__all__ = ["Outcome", "case_text", "run_case", "run_in_two_parts"]
+
+GRACE = 20.0
+"""Seconds in which all ranks must come to the end of a case."""
+STATUS = {InputError: 2, SimulationFailure: 3}
+_PLACE = re.compile(r"\bstep \d|\bt = ")
+
+
+@dataclass
+class Outcome:
+    """How a run ended.
+
+    Attributes
+    ----------
+    status : as of the command line; 1 for an exception that is no message
+    message : of the failure
+    warnings : that the run gave
+    faults : what is wrong with the way in which it ended: (cause, detail)
+    stopped : step at which it was asked to stop, -1 where it was not
+    """
+
+    status: int = 0
+    message: str = ""
+    warnings: list[str] = field(default_factory=list)
+    faults: list[tuple[str, str]] = field(default_factory=list)
+    stopped: int = -1
+    seconds: float = 0.0
+
+
+def case_text(table: dict[str, Any]) -> str:
+    """The case file."""
+    return table_text(table)
+
+
+def run_case(
+    text: str,
+    comm: MPI.Comm,
+    folder: Path,
+    *,
+    source: str = "random.toml",
+    restart: bool = False,
+    stop_after: int | None = None,
+    jiggle: int = 0,
+) -> Outcome:
+    """Run the text of a case. Collective.
+
+    Parameters
+    ----------
+    folder : of the results, the same on all ranks
+    restart : continue what is there
+    stop_after : the last rank receives SIGTERM after this step
+    jiggle : number of a random change of the initial positions by 1e-13 of the truss's size; 0: none
+    """
+    outcome, screen = Outcome(), io.StringIO()
+    begin = time.monotonic()
+    with contextlib.redirect_stderr(screen), warnings.catch_warnings(record=True) as numeric:
+        warnings.simplefilter("always")
+        try:
+            simulation = Simulation(
+                Case.from_toml(text, source=source, name=Path(source).stem), comm, folder, restart or None, quiet=True
+            )
+            if jiggle:
+                _jiggle(simulation, jiggle)
+            if stop_after is None:
+                simulation.run()
+            else:
+                outcome.stopped = _run_to(simulation, comm, stop_after)
+        except EarlyStop as stop:
+            outcome.status, outcome.message = 4, str(stop)
+        except (InputError, SimulationFailure) as error:
+            outcome.status, outcome.message = STATUS[type(error) if type(error) in STATUS else _kind(error)], str(error)
+            outcome.faults += _unclear(outcome, source)
+        except Exception as error:  # noqa: BLE001 - this is what is looked for
+            outcome.status, outcome.message = 1, f"{type(error).__name__}: {error}"
+            place = traceback.extract_tb(error.__traceback__)[-1]
+            where = f"{Path(place.filename).name}:{place.lineno}"
+            outcome.faults.append(("internal error", f"{outcome.message} ({where})"))
+        _meet(comm, outcome)
+    outcome.warnings = [line for line in screen.getvalue().splitlines() if line]
+    for warning in numeric:
+        if issubclass(warning.category, RuntimeWarning):
+            place = f"{Path(warning.filename).name}:{warning.lineno}"
+            outcome.faults.append(("numerical warning", f"{warning.message} ({place})"))
+            break
+    if "Traceback" in screen.getvalue():
+        outcome.faults.append(("traceback on stderr", screen.getvalue()[-500:]))
+    outcome.seconds = time.monotonic() - begin
+    simulation = None
+    return outcome
+
+
+def run_in_two_parts(text: str, comm: MPI.Comm, folder: Path, middle: int, source: str = "random.toml") -> Outcome:
+    """Run to a step, stop there on a signal, and go on from the checkpoint. Collective.
+
+    The outcome is that of the second part, with the step at which the first one ended.
+    """
+    first = run_case(text, comm, folder, source=source, stop_after=middle)
+    if first.status != 4:
+        return first
+    second = run_case(text, comm, folder, source=source, restart=True)
+    second.stopped = first.stopped
+    second.warnings = first.warnings + second.warnings
+    return second
+
+
+def _run_to(simulation: Simulation, comm: MPI.Comm, last: int) -> int:
+    step = 0
+    try:
+        for made in simulation:
+            step = made.step
+            if step == last and comm.rank == comm.size - 1:
+                os.kill(os.getpid(), signal.SIGTERM)
+    except EarlyStop:
+        step = simulation.state.step
+        raise
+    finally:
+        simulation = None
+    return step
+
+
+def _jiggle(simulation: Simulation, number: int) -> None:
+    """Move the nodes by 1e-13 of the truss's size; bars keep the lengths at which they are free of stress."""
+    state = simulation.stepper.state
+    size = float(np.ptp(state.x, axis=0).max())
+    change = 1e-13 * size * np.random.default_rng(number).uniform(-1.0, 1.0, state.x.shape)
+    fixed = simulation.model.supports
+    if fixed.any:
+        change[fixed.nodes, fixed.components] = 0.0
+    state.x += change
+    simulation.stepper.before += change
+
+
+def _kind(error: Exception) -> type:
+    return InputError if isinstance(error, InputError) else SimulationFailure
+
+
+def _unclear(outcome: Outcome, source: str) -> list[tuple[str, str]]:
+    """A refusal names the file, a failure the step or the time."""
+    if outcome.status == 2 and source not in outcome.message:
+        return [("refusal does not name the file", outcome.message[:200])]
+    if outcome.status == 3 and not _PLACE.search(outcome.message):
+        return [("failure does not name the step", outcome.message[:200])]
+    return []
+
+
+def _meet(comm: MPI.Comm, outcome: Outcome) -> None:
+    """All ranks come here with the same status, or the process ends: the case is then at fault."""
+    if comm.size == 1:
+        return
+    request = comm.Ibarrier()
+    deadline = time.monotonic() + GRACE
+    while not request.Test():
+        if time.monotonic() > deadline:
+            print(f"alone {comm.rank} {outcome.status} {outcome.message[:300]}", flush=True)
+            comm.Abort(1)
+        time.sleep(0.002)
+    statuses = comm.allgather(outcome.status)
+    if len(set(statuses)) > 1:
+        outcome.faults.append(("ranks end differently", f"{statuses}: {outcome.message[:200]}"))
+
+
+def clear(comm: MPI.Comm, *folders: Path) -> None:
+    """Remove folders, and what PETSc and Python hold of earlier cases. Collective."""
+    gc.collect()
+    from petsc4py import PETSc
+
+    if hasattr(PETSc, "garbage_cleanup"):
+        PETSc.garbage_cleanup()
+    comm.Barrier()
+    if comm.rank == 0:
+        for folder in folders:
+            shutil.rmtree(folder, ignore_errors=True)

@@ -1,0 +1,51 @@
+"""Start several runs into one folder at once, round after round: three starts, then two restarts.
+
+    .venv/bin/python scripts/together.py --rounds 20
+
+Of each round one run must work, the others must be refused with status 2 and say why, and what is in the folders must
+be whole and equal to the results of a run that nobody disturbed, bit for bit. Status 0 when all rounds were so.
+"""
+
+from __future__ import annotations
+
+import argparse
+import random
+import sys
+import tempfile
+from collections import Counter
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "restart"))
+
+from together import LATER, play, words  # noqa: E402
+
+from pfem_petsc.cli.main import main as program  # noqa: E402
+
+
+def main() -> int:
+    """Play as often as asked."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rounds", type=int, default=20, metavar="N", help="how many (default: %(default)s)")
+    parser.add_argument("--seed", type=int, default=None, help="of the moments of the starts")
+    parser.add_argument("--folder", type=Path, default=None, help="where to work; default: a temporary folder")
+    arguments = parser.parse_args()
+    chance = random.Random(arguments.seed)
+    folder = arguments.folder or Path(tempfile.mkdtemp(prefix="together-"))
+    starts, restarts, failed = Counter(), Counter(), 0
+    program(words(folder / "alone", LATER))
+    for number in range(arguments.rounds):
+        try:
+            found = play(folder / f"round{number}", folder / "alone" / "result.vtkhdf", chance)
+        except AssertionError as error:
+            failed += 1
+            print(f"round {number}: {error}", flush=True)
+            continue
+        starts.update(found[0])
+        restarts.update(found[1])
+        print(f"round {number}: starts {dict(found[0])}, restarts {dict(found[1])}", flush=True)
+    print(f"{arguments.rounds} rounds: starts {dict(starts)}, restarts {dict(restarts)}, failed {failed}")
+    return 1 if failed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

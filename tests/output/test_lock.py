@@ -1,0 +1,168 @@
+"""The lock of an output folder: one owner, left behind by kills, and recognised as that."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from pfem_petsc.errors import InputError, SimulationFailure
+from pfem_petsc.output import lock as module
+from pfem_petsc.output.lock import FolderLock
+
+TAKE = """
+import os, sys
+from pathlib import Path
+from pfem_petsc.output.lock import FolderLock
+lock = FolderLock(Path(sys.argv[1]))
+lock.take()
+print("taken", flush=True)
+sys.stdin.read()
+"""
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return tmp_path / "results" / "case"
+
+
+def owner(folder, **changes):
+    """A lock file as another process would have made it."""
+    path = FolderLock(folder).path
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps({**module._identity(), **changes}))
+    return path
+
+
+def test_one_owner_at_a_time(folder):
+    first, second = FolderLock(folder), FolderLock(folder)
+    first.check()
+    first.take()
+    first.take()
+    assert first.held
+    for refused in (second.take, second.check):
+        with pytest.raises(InputError, match=rf"another run is writing.*process {os.getpid()} on .*wait.*-o"):
+            refused()
+    second.release()
+    assert first.path.exists()
+    first.release()
+    first.release()
+    second.take()
+    second.release()
+    assert list(folder.parent.iterdir()) == []
+
+
+def test_left_behind_by_a_kill(folder):
+    """Taken over while the killed process is not even reaped yet."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", TAKE, str(folder)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdout.readline() == "taken\n"
+    with pytest.raises(InputError, match=f"process {process.pid} on"):
+        FolderLock(folder).take()
+    process.send_signal(signal.SIGKILL)
+    os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT)
+    lock = FolderLock(folder)
+    lock.check()
+    lock.take()
+    process.communicate()
+    lock.release()
+
+
+def test_number_of_a_process_that_another_has_now(folder):
+    owner(folder, start="1")
+    FolderLock(folder).take()
+
+
+@pytest.mark.parametrize("change", [{"host": "node17"}, {"machine": "another boot"}])
+def test_another_machine(folder, change):
+    """Nothing is known of its processes: the file is renewed, or not."""
+    path = owner(folder, pid=1, start="1", **change)
+    os.utime(path, (time.time() - 300,) * 2)
+    with pytest.raises(InputError, match=rf"shown itself 5:0\d ago: if it is dead, remove {path}"):
+        FolderLock(folder).take()
+    os.utime(path, (time.time() - 2 * module.ABANDONED,) * 2)
+    FolderLock(folder).take()
+
+
+def test_owner_renews_it_and_notices_its_loss(folder, monkeypatch):
+    monkeypatch.setattr(module, "RENEWAL", 0.0)
+    lock = FolderLock(folder)
+    lock.take()
+    os.utime(lock.path, (0.0, 0.0))
+    lock.renew()
+    assert time.time() - lock.path.stat().st_mtime < 60.0
+    owner(folder, token="other")
+    with pytest.raises(SimulationFailure, match="removed or taken over"):
+        lock.renew()
+    lock.release()
+    assert lock.path.exists()
+
+
+def test_file_without_content(folder):
+    """Its maker was killed at the wrong moment, or is about to write."""
+    path = owner(folder)
+    path.write_text("")
+    with pytest.raises(InputError, match="another run"):
+        FolderLock(folder).take()
+    os.utime(path, (time.time() - 60,) * 2)
+    FolderLock(folder).take()
+
+
+def test_file_system_without_hard_links(folder, monkeypatch):
+    def refused(*_):
+        raise PermissionError(1, "Operation not permitted")
+
+    monkeypatch.setattr(os, "link", refused)
+    first = FolderLock(folder)
+    first.take()
+    with pytest.raises(InputError, match="another run"):
+        FolderLock(folder).take()
+    first.release()
+
+
+RACE = """
+import os, random, sys, time
+from pathlib import Path
+from pfem_petsc.errors import InputError
+from pfem_petsc.output.lock import FolderLock
+folder, log = Path(sys.argv[1]), sys.argv[2]
+chance = random.Random(int(sys.argv[3]))
+end = time.monotonic() + 1.0
+while time.monotonic() < end:
+    if os.fork() == 0:
+        lock = FolderLock(folder)
+        try:
+            lock.take()
+        except InputError:
+            os._exit(0)
+        alone = os.open(log, os.O_CREAT | os.O_EXCL | os.O_WRONLY)
+        time.sleep(0.002 * chance.random())
+        os.unlink(log)
+        if chance.random() < 0.5:
+            lock.release()
+        os._exit(7)
+    status = os.waitstatus_to_exitcode(os.wait()[1])
+    assert status in (0, 7), status
+    chance.random()
+    print(status)
+"""
+
+
+def test_many_processes_that_leave_it_behind_are_never_two_at_once(folder, tmp_path):
+    """Half of the owners end without giving it back; whoever is second finds the marker of the first and fails."""
+    processes = [
+        subprocess.Popen(
+            [sys.executable, "-c", RACE, str(folder), str(tmp_path / "alone"), str(seed)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for seed in range(4)
+    ]
+    said = [process.communicate() for process in processes]
+    assert [process.returncode for process in processes] == [0] * 4, said
+    assert sum(out.split().count("7") for out, _ in said) > 20

@@ -1,0 +1,190 @@
+"""Supports that move: a ground record against exact integration, no ringing, reactions, restarts."""
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+from runs import run
+
+from pfem_petsc import Case
+from pfem_petsc.stepping.model import Model
+
+pytestmark = pytest.mark.parallel
+
+SECOND_ORDER = {
+    "trapezoid": ("newmark", {"beta": 0.25, "gamma": 0.5}),
+    "energy_momentum": ("energy_momentum", {}),
+    "generalized_alpha": ("generalized_alpha", {}),
+    "houbolt": ("houbolt", {}),
+    "wilson": ("wilson", {}),
+    "central_differences": ("central_differences", {}),
+    "chung_lee": ("chung_lee", {}),
+    "hulbert_chung": ("hulbert_chung", {}),
+}
+ALL = SECOND_ORDER | {"newmark": ("newmark", {})}
+OMEGA = 4.0 * np.pi  # of the oscillator [rad/s]
+STEP = 1e-3
+TIMES = 0.02 * np.arange(76)
+
+
+def ground(t):
+    """Displacement, velocity and acceleration of the ground: a product of slow sines, at rest at the start."""
+    a, b = 2.0 * np.pi / 3.0, 2.0 * np.pi * 3.0
+    s, c, p, q = np.sin(a * t), np.cos(a * t), np.sin(b * t), np.cos(b * t)
+    e, e1, e2 = s**2, 2 * a * s * c, 2 * a * a * (c**2 - s**2)
+    return 0.02 * e * p, 0.02 * (e1 * p + e * b * q), 0.02 * (e2 * p + 2 * e1 * b * q - e * b * b * p)
+
+
+def oscillator(scheme, support, end=0.75, damping=0.0, mass="lumped"):
+    """One bar along x, whose free end has the circular frequency OMEGA relative to the base."""
+    integrator, parameters = ALL[scheme]
+    young = OMEGA**2 / (2.0 if mass == "lumped" else 3.0)
+    return Case.from_dict(
+        {
+            "mesh": {"generator": "rod", "length": 1.0, "elements": 1},
+            "node_set": {"base": {"indices": [0]}, "mass": {"indices": [1]}, "all": {"all": True}},
+            "material": {"m": {"young_modulus": young, "density": 1.0, "damping": damping}},
+            "section": {"s": {"area": 1.0, "material": "m"}},
+            "support": [{"node_set": "all", "fix": "yz"}, {"node_set": "base", "fix": "x", **support}],
+            "time": {"integrator": integrator, "step": STEP, "end": end, "mass": mass, **parameters},
+            "output": {
+                "fields_every": 0,
+                "probe": [{"name": "base", "node_set": "base"}, {"name": "mass", "node_set": "mass"}],
+            },
+            "solver": {"rtol": 1e-13},
+        }
+    )
+
+
+def response(times, values, at, w=OMEGA):
+    """Relative displacement of an oscillator under accelerations of its base, linear between rows: exact pieces."""
+    found = np.zeros(len(at))
+    y, v = 0.0, 0.0
+    for t0, t1, a0, a1 in zip(times[:-1], times[1:], -values[:-1], -values[1:]):
+        k = (a1 - a0) / (t1 - t0)
+        # a particular solution (a0 + k s)/w^2, and what is left as free vibration
+        p, q = y - a0 / w**2, (v - k / w**2) / w
+        inside = (at >= t0 - 1e-9) & (at <= t1 + 1e-9)
+        s = np.append(at[inside] - t0, t1 - t0)
+        moved = (a0 + k * s) / w**2 + p * np.cos(w * s) + q * np.sin(w * s)
+        found[inside], y = moved[:-1], moved[-1]
+        v = k / w**2 + w * (q * np.cos(w * s[-1]) - p * np.sin(w * s[-1]))
+    return found
+
+
+def rows(values):
+    return [[float(t), float(x), 0.0, 0.0] for t, x in zip(TIMES, values)]
+
+
+def relative(history):
+    return history["probe/mass/position"][:, 0, 0] - history["probe/base/position"][:, 0, 0] - 1.0
+
+
+@pytest.mark.parametrize("scheme", SECOND_ORDER)
+def test_acceleration_record_against_exact_integration(scheme, comm, shared_tmp_path):
+    """Relative displacement to 1e-3 of its peak; the base has the record's acceleration, and its exact integrals."""
+    values = ground(TIMES)[2]
+    history = run(oscillator(scheme, {"acceleration": rows(values)}), shared_tmp_path)
+    time = history["time"]
+    exact = response(TIMES, values, time)
+    assert np.abs(relative(history) - exact).max() <= 1e-3 * np.abs(exact).max()
+    assert history["probe/base/acceleration"][:, 0, 0] == pytest.approx(np.interp(time, TIMES, values), abs=1e-9)
+    # linear pieces between rows of a smooth function: integrals right to (omega 20 ms)^2/12
+    assert history["probe/base/position"][:, 0, 0] == pytest.approx(ground(time)[0], abs=0.03 * 0.02)
+    assert np.abs(history["energy_imbalance"]).max() < 1e-9 * history["kinetic_energy"].max()
+
+
+@pytest.mark.parametrize("scheme", ["trapezoid", "central_differences", "hulbert_chung"])
+def test_displacement_record(scheme, comm, shared_tmp_path):
+    """Rows of displacements every 20 ms: the floor's acceleration is the ground's, not that of kinks at the rows."""
+    x, _, a = ground(TIMES)
+    history = run(oscillator(scheme, {"motion": rows(x)}), shared_tmp_path)
+    time = history["time"]
+    _, _, smooth = ground(time)
+    floor = history["probe/base/acceleration"][:, 0, 0]
+    assert np.abs(floor - smooth)[40:].max() < 0.02 * np.abs(smooth).max()
+    exact = response(TIMES, a, time)
+    # the record's own resolution: its accelerations by the spline differ by (omega 20 ms)^2/12 from the ground's
+    assert np.abs(relative(history) - exact).max() < 0.03 * np.abs(exact).max()
+
+
+RAMP = [[0.0, 0.0, 0.0, 0.0], [0.1, 0.02, 0.0, 0.0], [0.2, 0.02, 0.0, 0.0]]
+
+
+@pytest.mark.parametrize("interpolation", ["smooth", "linear"])
+@pytest.mark.parametrize("scheme", ALL)
+def test_nothing_rings_after_the_stop(scheme, interpolation, comm, shared_tmp_path):
+    """A support that has stopped is at rest, exactly, and its reaction is the bar's force, which does not alternate."""
+    support = {"motion": RAMP, "interpolation": interpolation}
+    history = run(oscillator(scheme, support, end=0.3), shared_tmp_path)
+    after = history["time"] > 0.2 + 2.5 * STEP
+    assert (history["probe/base/velocity"][after] == 0.0).all()
+    assert (history["probe/base/acceleration"][after] == 0.0).all()
+    assert (history["probe/base/position"][after, 0, 0] == 0.02).all()
+    reaction = history["probe/base/reaction"][after, 0, 0]
+    jagged = np.abs(np.diff(reaction, 2)).max()
+    assert jagged < 2.0 * (OMEGA * STEP) ** 2 * np.abs(reaction).max()
+
+
+@pytest.mark.parametrize("mass", ["lumped", "consistent"])
+@pytest.mark.parametrize("scheme", [name for name in ALL if name not in ("wilson",)])
+def test_reactions_of_a_body_carried_along(scheme, mass, comm, shared_tmp_path):
+    """All nodes prescribed: reactions are mass times acceleration (and damping times velocity), node by node."""
+    values = ground(TIMES)[2]
+    case = oscillator(scheme, {"acceleration": rows(values)}, end=0.2, damping=3.0, mass=mass).to_dict()
+    case["support"][1]["node_set"] = "all"
+    history = run(Case.from_dict(case), shared_tmp_path)
+    half = {"energy_momentum": 0.5, "generalized_alpha": 4.0 / 9.0}.get(scheme, 0.0)
+    lag = {"chung_lee": 1.0, "hulbert_chung": 1.0}.get(scheme, half)
+    time = history["time"][1:] - lag * STEP  # the balance's time, at which forces are recorded
+    expected = 1.0 * np.interp(time, TIMES, values)
+    record = np.concatenate([[0.0], np.cumsum(0.01 * (values[1:] + values[:-1]))])
+    row = np.clip(np.searchsorted(TIMES, time, "right") - 1, 0, len(TIMES) - 2)
+    s = time - TIMES[row]
+    speed = record[row] + s * values[row] + 0.5 * s * s * np.diff(values)[row] / 0.02
+    total = history["support_force"][1:, 0]
+    assert total == pytest.approx(expected + 3.0 * speed, abs=1e-9 * np.abs(values).max())
+
+
+@pytest.mark.parametrize("scheme", ["trapezoid", "central_differences"])
+def test_tower_against_its_modes(scheme, comm, shared_tmp_path):
+    """A braced tower on shaken ground: the top moves on it by the sum of its modes' exact responses."""
+    integrator, parameters = ALL[scheme]
+    values = 1e-3 * ground(TIMES)[2]  # so small that the tower stays linear
+    data = {
+        "mesh": {"generator": "lattice", "kind": "octet", "cells": [1, 1, 3], "pitch": 1.0},
+        "node_set": {"base": {"group": "bottom"}, "top": {"group": "top"}},
+        "material": {"m": {"young_modulus": 2e5, "density": 100.0}},
+        "section": {"s": {"area": 1e-2, "material": "m"}},
+        "support": [{"node_set": "base", "fix": "xyz", "acceleration": rows(values)}],
+        "time": {"integrator": integrator, "step": STEP, "end": 0.6, **parameters},
+        "output": {
+            "fields_every": 0,
+            "history_every": 10,
+            "probe": [{"name": "top", "node_set": "top"}, {"name": "base", "node_set": "base"}],
+        },
+        "solver": {"rtol": 1e-11, "linear": "mumps"},
+    }
+    case = Case.from_dict(data)
+    history = run(case, shared_tmp_path)
+    model = Model(case, MPI.COMM_SELF)
+    points, bars, mass = model.mesh.points, model.mesh.bars, model.inertia.mass
+    stiffness = np.zeros((3 * len(points), 3 * len(points)))
+    for a, b in bars:
+        way = points[b] - points[a]
+        length = np.linalg.norm(way)
+        block = 2e5 * 1e-2 / length**3 * np.outer(way, way)
+        for i, j, sign in ((a, a, 1), (b, b, 1), (a, b, -1), (b, a, -1)):
+            stiffness[3 * i : 3 * i + 3, 3 * j : 3 * j + 3] += sign * block
+    free = np.flatnonzero(~model.supports.fixed.ravel())
+    root = np.sqrt(np.repeat(mass, 3))[free]
+    squares, shapes = np.linalg.eigh(stiffness[np.ix_(free, free)] / np.outer(root, root))
+    time = history["time"]
+    push = root * (free % 3 == 0)
+    shaken = [response(TIMES, values, time, np.sqrt(square)) for square in squares]
+    moved = np.zeros((len(time), 3 * len(points)))
+    moved[:, free] = ((shapes.T @ push)[:, None] * np.array(shaken)).T @ shapes.T / root
+    exact = moved.reshape(len(time), -1, 3)[:, model.nodes["top"], 0]
+    ground_moved = history["probe/base/position"][:, :1, 0] - history["probe/base/position"][0, 0, 0]
+    found = history["probe/top/position"][:, :, 0] - history["probe/top/position"][0, :, 0] - ground_moved
+    assert np.sqrt(squares[0]) * STEP < 0.1
+    assert np.abs(found - exact).max() <= 1e-3 * np.abs(exact).max()

@@ -1,0 +1,160 @@
+"""Random valid cases of the generator in scripts/random_cases.py: what must hold of any result holds of theirs.
+
+A case that fails: ``python scripts/random_cases.py --seeds SEED --keep DIR`` runs it again and keeps its file.
+"""
+
+import sys
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
+
+from random_trusses.draw import draw_case  # noqa: E402
+from random_trusses.oracle import check_result  # noqa: E402
+from random_trusses.running import case_text, run_case  # noqa: E402
+from random_trusses.work import check_case, judge_ranks  # noqa: E402
+
+from pfem_petsc import Case, Simulation  # noqa: E402
+
+COUNTED = ("energy balance above 1e-9", "chaotic: ")
+"""What is no fault: rounding, and motions that part whatever is done."""
+SEEDS = range(240)
+CONTINUED = 6
+"""Every so many are stopped in the middle and continued as well."""
+SHARED = range(40)
+"""Seeds that several ranks run."""
+
+
+def faults_of(seed, comm, folder, restart):
+    told = check_case(case_text(draw_case(seed)), comm, folder, f"random-{seed}.toml", restart)
+    return told, [fault for fault in told["faults"] if not fault[0].startswith(COUNTED)]
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_any_case_holds_what_all_must(seed, tmp_path):
+    told, faults = faults_of(seed, MPI.COMM_SELF, tmp_path, seed % CONTINUED == 0)
+    assert told["status"] in (0, 2, 3), f"seed {seed}: {told['message']}"
+    assert not faults, f"seed {seed}: {faults}"
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("part", range(3))
+def test_ranks_do_as_one(comm, shared_tmp_path, part):
+    """The same end and, where it is the end of the run, the same results to 1e-9; each case continued on all ranks."""
+    found = {}
+    for seed in SHARED[part::3]:
+        folder = shared_tmp_path / str(seed)
+        told, faults = faults_of(seed, comm, folder / "n", seed % 2 == 0)
+        if comm.rank == 0 and comm.size > 1:
+            faults += _against_one_rank(seed, told, folder)
+        if faults:
+            found[seed] = faults
+    assert not comm.bcast(found), f"{comm.size} ranks: faults by seed"
+
+
+def _against_one_rank(seed, told, folder):
+    table, source = draw_case(seed), f"random-{seed}.toml"
+    alone = run_case(case_text(table), MPI.COMM_SELF, folder / "1" / "whole", source=source)
+    if alone.status != told["status"]:
+        return [("status", f"{alone.status} ({alone.message}) on one rank, {told['status']} ({told['message']})")]
+    if alone.status:
+        return []
+    found = judge_ranks(case_text(table), table, folder / "1" / "whole", folder / "n" / "whole", folder, source)
+    return [fault for fault in found if not fault[0].startswith(COUNTED)]
+
+
+def test_cases_are_files_that_run_as_they_are():
+    for seed in range(100):
+        text = case_text(draw_case(seed))
+        assert tomllib.loads(text) == draw_case(seed)
+        Case.from_toml(text)
+
+
+def test_generator_draws_all_of_what_is_documented():
+    tables = [draw_case(seed) for seed in range(400)]
+    walls = [wall for table in tables for wall in table.get("wall", ())]
+    assert {wall["type"] for wall in walls} == {"plane", "rectangle", "sphere", "cylinder"}
+    keys = {key for wall in walls for key in wall}
+    assert keys >= {"velocity", "motion", "mass", "gravity", "adjust", "tied"}
+    assert keys >= {"friction", "static_friction", "restitution"}
+    times = [table["time"] for table in tables]
+    assert len({time["integrator"] for time in times}) == 9
+    assert {key for time in times for key in time} >= {"mass", "beta", "gamma", "theta", "rho_b", "rho_inf", "safety"}
+    assert {table.get("contact", {}).get("treatment") for table in tables} >= {
+        "scheme", "stick", "conserving", "mass_redistribution",
+    }  # fmt: skip
+    materials = {key for table in tables for material in table["material"].values() for key in material}
+    assert materials >= {"yield_stress", "isotropic_hardening", "kinematic_hardening", "thermal_expansion", "damping"}
+    assert {key for table in tables for key in table} >= {
+        "support", "load", "gravity", "temperature", "contact_pair", "initial", "solver", "output",
+    }  # fmt: skip
+    assert {key for table in tables for key in table["mesh"]} >= {"generator", "bracing", "kind", "gap"}
+
+
+FALLING = """
+[mesh]
+generator = "rod"
+length = 1.0
+elements = 4
+[material.m]
+young_modulus = 1e5
+density = 1000.0
+[section.s]
+area = 1e-3
+material = "m"
+[initial]
+velocity = [1.0, 0.0, 0.0]
+[[wall]]
+name = "w"
+type = "plane"
+point = [1.05, 0.0, 0.0]
+normal = [-1.0, 0.0, 0.0]
+[time]
+integrator = "central_differences"
+step = 0.01
+end = 0.3
+[output]
+fields_every = 1
+"""
+
+
+@pytest.fixture
+def sound(tmp_path):
+    outcome = run_case(FALLING, MPI.COMM_SELF, tmp_path)
+    assert outcome.status == 0
+    assert check_result(tmp_path, []) == []
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "cause"),
+    [
+        ("VTKHDF/Points", lambda x: x + [0.01, 0.0, 0.0], "node beyond a wall"),
+        ("history/energy_imbalance", lambda x: x + 1e-3, "energy balance open"),
+        ("history/numerical_dissipation", lambda x: x - 1.0, "energy grows without a warning"),
+        ("history/plastic_heat", lambda x: x - np.arange(len(x)), "plastic heat falls"),
+        ("history/damping_dissipation", lambda x: x - 1e-3, "damping_dissipation negative"),
+        ("history/momentum", lambda x: x * np.nan, "not finite"),
+    ],
+)
+def test_the_checks_see_what_they_are_there_for(sound, name, change, cause):
+    """A sound result with one column changed: that fault, by name."""
+    import h5py
+
+    with h5py.File(sound / "result.vtkhdf", "a", locking=False) as file:
+        file[name][...] = change(file[name][...])
+    assert cause in [found for found, _ in check_result(sound, [])]
+
+
+def test_an_exception_is_found_and_told(monkeypatch, tmp_path):
+    def fails(self):
+        raise KeyError("lost")
+
+    monkeypatch.setattr(Simulation, "_snapshot", fails)
+    outcome = run_case(FALLING, MPI.COMM_SELF, tmp_path)
+    assert outcome.status == 1
+    assert outcome.faults[0][0] == "internal error"

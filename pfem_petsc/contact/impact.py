@@ -73,7 +73,9 @@ def unpressed(nodes, v, a, contact, mass, damping, alpha, eta):
 
 
 @kernel
-def stop_nodes(nodes, touching, closed, normals, gaps, v, a, rates, mass, fixed, restitution, counted, slack, speeds):
+def stop_nodes(
+    nodes, touching, closed, normals, gaps, v, a, rates, pulls, mass, fixed, restitution, counted, slack, speeds
+):
     """Energy [J] that walls take from nodes (m,) that close on them, and the nodes that are on walls then.
 
     Parameters
@@ -81,7 +83,7 @@ def stop_nodes(nodes, touching, closed, normals, gaps, v, a, rates, mass, fixed,
     touching : (owned, w) bool, who touches what in this step
     closed : (owned, w) bool, who has met a wall and not left it yet; brought up to date
     normals, gaps : (m, w, 3), (m, w) at the start of the step [m]
-    v, a : (m, 3) there, without contact; rates (w, 3) of the walls
+    v, a : (m, 3) there, without contact; rates, pulls (w, 3) velocities and accelerations of the walls
     mass, fixed : (owned,), (owned, 3)
     restitution, counted : (w,); only walls that count take energy here
     slack : distance at which a node has left [m]
@@ -106,7 +108,7 @@ def stop_nodes(nodes, touching, closed, normals, gaps, v, a, rates, mass, fixed,
                     speed, towards = 0.0, 0.0
                     for c in range(3):
                         speed += normals[j, k, c] * (v[j, c] - rates[k, c])
-                        towards -= normals[j, k, c] * a[j, c]
+                        towards -= normals[j, k, c] * (a[j, c] - pulls[k, c])
                     if speed < 0.0:
                         square = speed * speed + 2.0 * towards * max(gaps[j, k], 0.0)
                         speeds[j, k] = np.sqrt(max(square, 0.0))
@@ -224,11 +226,12 @@ class Impacts:
             gaps = np.einsum("mwi,mi->mw", normals, x[nodes]) - offsets
         free_v, free_a = self._free(nodes, motion, load)
         rates, speeds = contact.motion.rates(time, ahead=True), np.empty(gaps.shape)
+        pulls = np.zeros(rates.shape)
         if free is not None:
-            rates[free.at] = self._free_rates
+            free_fall = free.weight / free.mass[:, None]
+            rates[free.at], pulls[free.at] = self._free_rates, free_fall
             if load is None:  # as they would be if nothing pushed them
                 balance = self.stepper.balance
-                free_fall = free.weight / free.mass[:, None]
                 rates[free.at] = free.state.v + balance.eta / balance.alpha * (free_fall - free.balanced)
             self._free_rates = free.state.v
         loss, self.met = stop_nodes(
@@ -240,6 +243,7 @@ class Impacts:
             free_v,
             free_a,
             rates,
+            pulls,
             self.model.inertia.mass,
             contact.fixed,
             contact.restitution,

@@ -147,7 +147,7 @@ def make_march(forces: Callable) -> Callable:
         load = np.empty(len(nodes.support_nodes))
         works, totals = np.empty(len(WORKS)), np.empty((6, 3))
         pushes, push_u = np.zeros(impulses.v.shape), np.empty(impulses.v.shape)
-        counted, rates_of_walls = np.ones(n_walls, dtype=np.bool_), np.zeros((n_walls, 3))
+        counted, still = np.ones(n_walls, dtype=np.bool_), np.zeros((n_walls, 3))
         supported = len(nodes.support_nodes) > 0
         rates = half if len(nodes.damping) > 0 else nothing
         near = np.empty(0, dtype=np.int64)
@@ -252,7 +252,8 @@ def make_march(forces: Callable) -> Callable:
                     gaps,
                     free_v,
                     free_a,
-                    rates_of_walls,
+                    still,
+                    still,
                     nodes.mass,
                     walls.fixed,
                     walls.restitution,

@@ -216,7 +216,15 @@ def test_walls_with_mass_are_in_the_balance(integrator, shared_tmp_path):
             integrator,
             step=1e-3,
             steps=20,
-            walls=[floor(normal=[0.0, 0.0, -1.0], point=[0.0, 0.0, drop], mass=heavy, velocity=[0.0, 0.0, -speed])],
+            walls=[
+                floor(
+                    normal=[0.0, 0.0, -1.0],
+                    point=[0.0, 0.0, drop],
+                    mass=heavy,
+                    gravity=True,
+                    velocity=[0.0, 0.0, -speed],
+                )
+            ],
             gravity={"acceleration": [0.0, 0.0, -GRAVITY]},
         ),
         shared_tmp_path,

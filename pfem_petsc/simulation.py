@@ -420,7 +420,11 @@ class Simulation:
         check_positions(self.stepper)
         state, fields = self.state, self.fields
         self._writer.write_snapshot(
-            state.time, state.step, state.position, fields.at_nodes(state), fields.at_bars(state)
+            state.time,
+            state.step,
+            state.position,
+            fields.at_nodes(state, self.stepper.acceleration),
+            fields.at_bars(state),
         )
         self._last_snapshot = state.step
         for text in self._piercing.look(state.x, state.time):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
+from ..output.energies import LOST, STORED, SUPPLIED
 from .parser import PROGRAM, add_result
 
 if TYPE_CHECKING:
@@ -15,10 +16,6 @@ RANKS = "one"
 EXAMPLE = f"""\
 example:
   {PROGRAM} info results/rod_impact"""
-
-STORED = ("kinetic_energy", "elastic_energy")
-LOST = ("plastic_dissipation", "damping_dissipation", "numerical_dissipation")
-SUPPLIED = ("external_work", "contact_work", "thermal_work")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -208,10 +208,12 @@ class Contact:
         """
         return self._explicit.press(predictor, u, stiffness, time, tolerance)
 
-    def sums(self, nodes: np.ndarray, force: np.ndarray, x: np.ndarray, touching: np.ndarray) -> WallForces:
-        """Sums of forces (m, w, 3) on nodes at (m, 3)."""
+    def sums(
+        self, nodes: np.ndarray, force: np.ndarray, x: np.ndarray, touching: np.ndarray, friction: float = 0.0
+    ) -> WallForces:
+        """Sums of forces (m, w, 3) on nodes at (m, 3); ``friction``: energy that it takes in the step [J]."""
         moment = np.cross(x[:, None, :], force).sum(axis=0)
-        return WallForces(force.sum(axis=0), touching.sum(axis=0), moment, nodes, touching, x)
+        return WallForces(force.sum(axis=0), touching.sum(axis=0), moment, nodes, touching, x, friction)
 
     def no_room(self, node: int, offsets: np.ndarray) -> str:
         """What to tell about a node (owned index) whose planes contradict each other."""

@@ -101,7 +101,7 @@ class ExplicitContact:
         Gives the nodes (m,), their corrections (m, 3) [m], the forces (m, 3) [N] on them, and the walls' sums.
         """
         contact, ties = self.contact, self.contact.ties
-        nodes, moved, force, touching = self._press(x, stiffness, time, tolerance, booked)
+        nodes, moved, force, touching, friction = self._press(x, stiffness, time, tolerance, booked)
         if ties.any:
             tied, walls, places, pull = ties.hold(x, stiffness, time)
             every = np.zeros((len(tied), len(contact.walls), 3))
@@ -114,10 +114,11 @@ class ExplicitContact:
             return nodes, moved, np.empty((0, 3)), contact.nothing
         correction = moved - x[nodes]
         x[nodes] = moved
-        return nodes, correction, force.sum(axis=1), contact.sums(nodes, force, moved, touching)
+        return nodes, correction, force.sum(axis=1), contact.sums(nodes, force, moved, touching, friction)
 
     def _press(self, x: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float, booked: bool) -> tuple:
-        """Nodes (m,) near walls that do not hold them for good, places (m, 3), forces (m, w, 3), touching (m, w)."""
+        """Nodes (m,) near walls that do not hold them for good, places (m, 3), forces (m, w, 3), touching (m, w), and
+        the energy that friction takes [J]."""
         shifts = self.contact.motion.shifts(time)
         near = self.contact.near(x, shifts)
         if self.contact.rebounds:
@@ -127,7 +128,7 @@ class ExplicitContact:
         nodes = np.flatnonzero(near)
         if len(nodes) == 0:
             walls = len(self.contact.walls)
-            return nodes, np.empty((0, 3)), np.empty((0, walls, 3)), np.empty((0, walls), dtype=bool)
+            return nodes, np.empty((0, 3)), np.empty((0, walls, 3)), np.empty((0, walls), dtype=bool), 0.0
         free = x[nodes]
         concerned = self.contact.concerned(nodes, free, shifts)
         at = free
@@ -150,11 +151,14 @@ class ExplicitContact:
             )
         strength = multipliers * stiffness[nodes][:, None]
         force = strength[:, :, None] * normals
+        friction = 0.0
         if self.contact.rough:
-            moved, force = self._rub(nodes, free, shifts, (normals, offsets), stiffness[nodes], moved, strength, time)
+            moved, force, friction = self._rub(
+                nodes, free, shifts, (normals, offsets), stiffness[nodes], moved, strength, time
+            )
         if booked and self.contact.rebounds:
             self._remember_approach(nodes, free, shifts, normals, strength)
-        return nodes, moved, force, np.einsum("mwi,mwi->mw", force, normals) > 0.0
+        return nodes, moved, force, np.einsum("mwi,mwi->mw", force, normals) > 0.0, friction
 
     def _returning(self) -> np.ndarray:
         """(owned,) bool: nodes that hit a wall with restitution in the last step."""
@@ -178,8 +182,13 @@ class ExplicitContact:
         rebound[:] = 0.0
         rebound[nodes] = np.where(fresh, self.contact.restitution * np.maximum(approach, 0.0), 0.0)
 
-    def _rub(self, nodes, free, shifts, planes, stiffness, moved, strength, time) -> tuple[np.ndarray, np.ndarray]:
-        """Positions and forces (m, w, 3) with friction, from those without; curved walls by planes at the result."""
+    def _rub(
+        self, nodes, free, shifts, planes, stiffness, moved, strength, time
+    ) -> tuple[np.ndarray, np.ndarray, float]:
+        """Positions and forces (m, w, 3) with friction, from those without, and the energy that it takes [J].
+
+        Curved walls are taken by their planes at the result.
+        """
         contact, state = self.contact, self.contact.state
         way = shifts - self.contact.motion.shifts(state.time)
         before, fixed = state.position[nodes], self.contact.fixed[nodes]
@@ -215,4 +224,5 @@ class ExplicitContact:
             moved, multipliers = free.copy(), np.zeros(offsets.shape)
             project(moved, fixed, normals, offsets, tolerance, multipliers)
             strength = multipliers * stiffness[:, None]
-        return at, pressing[:, :, None] * normals + drag
+        friction = -float((drag * (at[:, None, :] - before[:, None, :] - way)).sum())
+        return at, pressing[:, :, None] * normals + drag, friction

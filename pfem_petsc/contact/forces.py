@@ -22,6 +22,7 @@ class WallForces:
     nodes : (m,) owned nodes near walls
     touching : (m, walls) bool, what they touch
     places : (m, 3) where they are [m]
+    friction : energy that friction on these nodes takes in the step solved for [J]
     sums : names of those that are sums
     """
 
@@ -33,3 +34,4 @@ class WallForces:
     nodes: np.ndarray
     touching: np.ndarray
     places: np.ndarray
+    friction: float = 0.0

@@ -64,6 +64,17 @@ class FreeWalls:
         if not self.scheme.leads:
             self.state.time = self._balance.time if self.scheme.solves_end else self.state.time + h
 
+    @property
+    def kinetic(self) -> float:
+        """Kinetic energy of the walls [J]."""
+        return 0.5 * float((self.mass[:, None] * self.state.v**2).sum())
+
+    @property
+    def balanced(self) -> np.ndarray:
+        """Accelerations (f, 3) of the last balance [m/s2]."""
+        known = 0.0 if self._balance.a_hat is None else self._balance.a_hat
+        return self._balance.alpha * self._u + known
+
     def displacements(self, time: float) -> np.ndarray:
         """Displacements (f, 3) [m] at the state's time, or at the end of the step that is being solved."""
         if self._balance is None or time == self.state.time:

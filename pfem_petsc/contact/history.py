@@ -4,20 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..output.sums import WALL
 from .contact import Contact
 from .forces import WallForces
 
 __all__ = ["ContactColumns", "contact_columns"]
 
-_SUMMED = (("force", (3,), float), ("moment", (3,), float), ("impulse", (3,), float), ("contacts", (), np.int64))
-_SUMMED += (("contact_time", (), float), ("releases", (), np.int64))
+_COUNTS = ("contacts", "releases")
+_WALL = [(name, (3,) if size == 3 else (), np.int64 if name in _COUNTS else float) for name, size in WALL.sizes.items()]
 
 
 def contact_columns(contact: Contact) -> list[tuple[str, tuple[int, ...], type]]:
     """Name, shape and type of the columns of a case's walls."""
     columns: list[tuple[str, tuple[int, ...], type]] = [("active_set_changes", (), np.int64)] if contact.any else []
     for k, name in enumerate(contact.names):
-        columns += [(f"wall/{name}/{what}", shape, kind) for what, shape, kind in _SUMMED]
+        columns += [(f"wall/{name}/{what}", shape, kind) for what, shape, kind in _WALL]
         if contact.moving[k]:
             columns += [(f"wall/{name}/{what}", (3,), float) for what in ("position", "velocity")]
     return columns
@@ -28,41 +29,42 @@ class ContactColumns:
 
     Attributes
     ----------
-    size : numbers of this rank's share: the changes of the active set, and 12 a wall
+    size : numbers of this rank's share: the changes of the active set, and the ``WALL`` of
+        :mod:`~pfem_petsc.output.sums` for each wall
     width : numbers of the columns
     """
 
     def __init__(self, contact: Contact) -> None:
         self.contact = contact
         walls = len(contact.names)
-        self.size = 1 + 12 * walls if contact.any else 0
-        starts = 1 + np.cumsum([0, *(12 + 6 * contact.moving)]).astype(np.int64)
+        self.size = 1 + WALL.width * walls if contact.any else 0
+        starts = 1 + np.cumsum([0, *(WALL.width + 6 * contact.moving)]).astype(np.int64)
         self.width = int(starts[-1]) if contact.any else 0
-        self._at = starts[:-1, None] + np.arange(12)
+        self._at = starts[:-1, None] + np.arange(WALL.width)
         self._moving = np.flatnonzero(contact.moving)
-        self._motion_at = starts[self._moving, None] + np.arange(12, 18)
+        self._motion_at = starts[self._moving, None] + np.arange(WALL.width, WALL.width + 6)
 
-    def fill(self, sums: np.ndarray, walls: WallForces) -> None:
+    def fill(self, sums: np.ndarray, walls: WallForces, impulses) -> None:  # noqa: ANN001
         """Put this rank's share into ``sums`` (size,)."""
         log = self.contact.log
         sums[0] = log.changes
-        share = sums[1:].reshape(-1, 12)
-        share[:, 0:3] = walls.force
-        share[:, 3:6] = walls.moment
-        share[:, 6:9] = log.impulse
-        share[:, 9] = walls.contacts
-        share[:, 11] = log.releases
+        share = sums[1:].reshape(-1, WALL.width)
+        share[:, WALL["force"]] = walls.force
+        share[:, WALL["moment"]] = walls.moment
+        share[:, WALL.first("contacts")] = walls.contacts
+        share[:, WALL.first("releases")] = log.releases
+        impulses.fill_walls(share)
 
     def contacts(self, sums: np.ndarray) -> np.ndarray | None:
         """Nodes (walls,) that touch each wall, from the sums over the ranks; None without walls."""
-        return sums[1 : self.size].reshape(-1, 12)[:, 9] if self.size else None
+        return sums[1 : self.size].reshape(-1, WALL.width)[:, WALL.first("contacts")] if self.size else None
 
     def put(self, sums: np.ndarray, time: float, values: np.ndarray) -> None:
         """Fill the columns ``values`` (width,) of a time [s] from the sums over the ranks; the count of changes starts
         anew."""
         contact = self.contact
-        total = sums[1:].reshape(-1, 12)
-        total[:, 10] = contact.log.time
+        total = sums[1:].reshape(-1, WALL.width)
+        total[:, WALL.first("contact_time")] = contact.log.time
         values[0] = sums[0]
         values[self._at] = total
         if len(self._moving):

@@ -61,6 +61,11 @@ class StepFriction:
         self.drag = np.zeros((0, walls, 3))
         self.unsettled = np.empty(0, dtype=np.int64)
 
+    def dissipated(self, nodes: np.ndarray, x: np.ndarray) -> float:
+        """Energy [J] that the drag takes from nodes (m,) on their way to positions (m, 3)."""
+        slip = (x - self.state.position[nodes])[:, None, :] - self._way
+        return -float((self.drag * slip).sum())
+
     def apply(self, frames, x: np.ndarray) -> None:
         """Hold the sticking nodes of the frames and drag the slipping ones, for a guess of positions (owned, 3)."""
         nodes = frames.nodes

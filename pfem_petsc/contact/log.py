@@ -1,4 +1,4 @@
-"""What contact did so far: impulses, contact times, releases and changes of the active set."""
+"""What contact did so far: contact times, releases and changes of the active set."""
 
 from __future__ import annotations
 
@@ -57,7 +57,6 @@ class ContactLog:
     Attributes
     ----------
     touching : (owned, walls) bool, who touches what after the last step
-    impulse : (walls, 3) of each wall's force on this rank's nodes since the start [N s]
     releases : (walls,) how often nodes of this rank let go of each wall
     changes : nodes and walls of this rank that met or parted since the last row of the history
     last : (m,) nodes that touch any wall after the last step
@@ -67,7 +66,6 @@ class ContactLog:
 
     def __init__(self, n_owned: int, n_walls: int) -> None:
         self.touching = np.zeros((n_owned, n_walls), dtype=bool)
-        self.impulse = np.zeros((n_walls, 3))
         self.releases = np.zeros(n_walls, dtype=np.int64)
         self.changes = 0
         self.time = np.zeros(n_walls)
@@ -82,7 +80,6 @@ class ContactLog:
         self.note(walls.contacts > 0, step, comm)
         if len(walls.nodes) == 0 and len(self.last) == 0:
             return
-        self.impulse += step * walls.force
         changes, self.last = compare_contacts(
             self.touching, self.last, walls.nodes, walls.touching, self.present, self.releases
         )
@@ -113,7 +110,6 @@ class ContactLog:
     def share(self) -> dict[str, Any]:
         """This rank's sums, for a checkpoint."""
         return {
-            "wall_impulse": self.impulse.tolist(),
             "wall_releases": self.releases.tolist(),
             "contact_changes": self.changes,
         }
@@ -129,7 +125,6 @@ class ContactLog:
 
     def put_back(self, share: dict[str, Any], times: dict[str, Any], touching: np.ndarray) -> None:
         """Take this rank's sums, the contact times and who touches what from a checkpoint."""
-        self.impulse[:] = np.array(share["wall_impulse"], dtype=float).reshape(self.impulse.shape)
         self.releases[:] = np.array(share["wall_releases"], dtype=np.int64)
         self.changes = int(share["contact_changes"])
         self.time[:] = times["sum"]

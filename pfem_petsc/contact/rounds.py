@@ -352,14 +352,16 @@ class ContactRounds:
         if self._frames is not None:
             at = self._frames.nodes
             force = self.strengths[:, :, None] * self._frames.normals
+            friction = 0.0
             if self.friction is not None:
                 force += self.friction.drag
+                friction = self.friction.dissipated(at, (self.balance.predictor + u)[at])
             touching = self.strengths > 0.0
             if self._tied is not None:
                 tied, owners, _ = self._tied
                 force[tied, owners] = self._pull[tied]
                 touching[tied, owners] = True
-            walls = self.contact.sums(at, force, (self.balance.predictor + u)[at], touching)
+            walls = self.contact.sums(at, force, (self.balance.predictor + u)[at], touching, friction)
             total[at] += force.sum(axis=1)
             held[at] = touching.any(axis=1)
         return total, walls, held

@@ -94,6 +94,7 @@ class Scheme(ABC):
         balance work over the whole step
     solves_end : the position solved for is x_{n+1}
     symmetric : whether the Hessian is
+    remembers : names of what it keeps of nodes in the state's memory, linear in motions
     dissipates : whether the scheme takes energy from high frequencies
     turns_held : x1 - x0 = h (v0 + v1)/2 and nothing else ties velocity to position: a node that is held in place from
         one step to the next has its velocity turned round
@@ -105,6 +106,7 @@ class Scheme(ABC):
     at_ends = True
     solves_end = True
     symmetric = True
+    remembers: tuple[str, ...] = ()
     dissipates = True
     turns_held = False
     notice = ""

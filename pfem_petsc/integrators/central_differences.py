@@ -41,6 +41,7 @@ class Scheme(ExplicitScheme):
     """Central differences (explicit)."""
 
     leads = True
+    remembers = ("half_velocity",)
     dissipates = False
 
     def limit(self, damping_ratio: float = 0.0) -> float:

@@ -21,6 +21,8 @@ Parameters = NoParameters
 class Scheme(Base):
     """Houbolt's method (implicit)."""
 
+    remembers = ("d0", "d1")
+
     def step_changed(self, state: State) -> None:
         state.memory.pop("d0", None)
         state.memory.pop("d1", None)

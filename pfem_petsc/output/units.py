@@ -25,6 +25,7 @@ _UNITS = {
     "temperature": "K",
     "plastic_heat": "J",
     "energy_imbalance": "J",
+    "impulse": "N s",
     "momentum": "kg m/s",
     "angular_momentum": "kg m²/s",
 }
@@ -33,6 +34,8 @@ _UNITS = {
 def unit_of(name: str) -> str:
     """SI unit of a field or history column (``"wall/floor/force"`` -> ``"N"``); empty for pure numbers."""
     last = name.rsplit("/", 1)[-1]
+    if last.endswith("_impulse"):
+        return "N s"
     return "J" if last.endswith(("_energy", "_dissipation", "_work")) else _UNITS.get(last, "")
 
 

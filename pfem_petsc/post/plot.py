@@ -11,15 +11,13 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
+from ..output.energies import LOST, STORED, SUPPLIED
 from ..output.units import engineering, unit_of
 from ..registry import nearest
 from .chart import COLOURS, STYLE, Chart, window_mean
 
 __all__ = ["plot"]
 
-STORED = ("kinetic_energy", "elastic_energy")
-LOST = ("plastic_dissipation", "damping_dissipation", "numerical_dissipation")
-SUPPLIED = ("external_work", "contact_work", "thermal_work")
 WINDOW = 0.02  # width of the mean that smooths wall forces, as a part of the run
 
 History = Mapping[str, np.ndarray]

@@ -35,6 +35,11 @@ def summarise(case, model, plan) -> dict[str, str]:
         "time step": f"{engineering(plan.step, 's', 6)}, {plan.steps:,} steps to "
         f"{engineering(plan.step * plan.steps, 's')}",
         "linear solver": plan.linear.why if plan.linear is not None else "none: every node on its own",
-        "walls": ", ".join(model.contact.names) or "none",
+        "walls": ", ".join(map(_described, case.wall)) or "none",
         "memory": f"{engineering(peak, 'B', 3)} in use on all ranks",
     }
+
+
+def _described(wall) -> str:  # noqa: ANN001 - any kind of wall
+    """Name of a wall, and the mass of one that has any."""
+    return wall.name if wall.mass is None else f"{wall.name} ({engineering(wall.mass, 'kg')})"

@@ -75,7 +75,7 @@ class RunState:
         """The numbers; the last history row, and the step of the last snapshot. Collective."""
         stepper, energy, walls = self.stepper, self.stepper.energy, self.stepper.solution.walls
         mine = {
-            "work": ledger.work.tolist(),
+            "ledger": ledger.kept(),
             "energy": list(energy[:3]),
             "walls": {name: getattr(walls, name).tolist() for name in walls.sums},
             "contact_log": self.model.contact.log.share(),
@@ -94,6 +94,7 @@ class RunState:
             "free_walls": free.kept() if (free := self.model.contact.motion.free) is not None else None,
             "contact_times": self.model.contact.log.times(self.comm),
             "row": {name: float(row[name]) for name in ("energy_imbalance", "active_contacts", "step")},
+            "closed_pairs": ledger.impacts.closed_pairs.tolist(),
             "snapshot": snapshot,
             "node_arrays": sorted(set().union(*self.comm.allgather(set(self._node_arrays())))),
             "memories": memories,
@@ -147,7 +148,8 @@ class RunState:
     def put_back_sums(self, checkpoint: Checkpoint, ledger, recorder, blow_up) -> dict[str, Any]:
         """Set ledger, recorder and watch, made after :meth:`put_back`; gives what is known of the last row."""
         scalars = checkpoint.scalars
-        ledger.work[:] = self._share(scalars["ranks"])["work"]
+        ledger.put_back(self._share(scalars["ranks"])["ledger"])
+        ledger.impacts.closed_pairs[:] = scalars["closed_pairs"]
         recorder.iterations = [int(n) for n in scalars["iterations"]]
         recorder.start_energy = scalars["start_energy"]
         recorder.energy_scale = scalars["energy_scale"]

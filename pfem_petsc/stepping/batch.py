@@ -8,8 +8,9 @@ from ..contact.forces import WallForces
 from ..errors import SimulationFailure
 from ..integrators.central_differences import Scheme as CentralDifferences
 from ..mechanics.bars import StrainEnergy
+from ..output.sums import HEAD, WALL
 from .explicit import ExplicitStepper
-from .march import BarArrays, Buffers, NodeArrays, ProbeArrays, WallArrays, make_march
+from .march import BarArrays, Buffers, ImpulseArrays, NodeArrays, ProbeArrays, WallArrays, make_march
 from .stepper import Solution
 
 __all__ = ["MOST", "WORTH", "Batch", "Batches"]
@@ -50,8 +51,9 @@ class Batch:
         log = contact.log
         walls = (contact.fixed, contact.normals, contact.plane_offsets(0.0), contact.everyone, contact.members)
         room = np.empty(len(inertia.mass), dtype=np.int64)
-        work = (room, log.touching, log.present, log.releases, log.impulse)
-        self._walls = WallArrays(*walls, 1e-13 * model.length, *work)
+        work = (room, log.touching, log.present, log.releases)
+        impact = (stepper.closed, contact.restitution, ledger.impacts.slack)
+        self._walls = WallArrays(*walls, 1e-13 * model.length, *work, *impact)
         self._probes = ProbeArrays(*recorder.probed())
         self.sums = np.zeros((MOST, recorder.width))
         self._spare = [np.zeros_like(stepper.state.v) for _ in range(4)]
@@ -97,7 +99,10 @@ class Batch:
         )
         energies = (ledger.kinetic, *(float(part) for part in stepper.energy[:3]))
         half = state.memory["half_velocity"]
-        done, failed, turned, stuck, offsets, after, energies, u, touched, log.last = self._march(
+        pushed = ledger.impulses.state
+        impulses = ImpulseArrays(pushed.memory["half_velocity"], pushed.a, pushed.v)
+        ledger.take_pending()
+        done, failed, turned, stuck, offsets, after, energies, u, touched, log.last, met = self._march(
             count,
             stepper.h,
             state.x,
@@ -109,7 +114,9 @@ class Batch:
             self._probes,
             buffers,
             log.last,
+            ledger.impacts.met,
             ledger.sums,
+            impulses,
             energies,
             self.sums,
         )
@@ -130,8 +137,10 @@ class Batch:
             text = self.model.contact.no_room(touched[3][stuck], offsets[stuck])
             stepper.fault = SimulationFailure(f"{stepper.when(stepper.balance)}: {text}")
         state.step += 1
+        ledger.impacts.met = met
         ledger.resume(energies[0])
-        flags = self.sums[:done, 24 : 24 + 12 * walls].reshape(done, walls, 12)[:, :, 9] > 0.0
+        share = self.sums[:done, HEAD.width + 1 : HEAD.width + 1 + WALL.width * walls]
+        flags = share.reshape(done, walls, WALL.width)[:, :, WALL.first("contacts")] > 0.0
         return done, flags
 
 
@@ -177,8 +186,8 @@ class Batches:
             state.step, state.time = begin + k + 1, (begin + k + 1) * stepper.h
             if contact.any:
                 contact.log.note(touched[k], stepper.h, simulation.comm)
-                contact.log.changes += int(sums[23])
-                sums[23] = contact.log.changes
+                contact.log.changes += int(sums[HEAD.width])
+                sums[HEAD.width] = contact.log.changes
             if state.step % output.history_every == 0:
                 simulation.take(simulation.recorder.row_of(sums))
         if failed:

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import SimulationFailure
+from ..output.energies import SUPPLIED
 
 __all__ = ["BlowUp"]
 
@@ -51,9 +52,8 @@ class BlowUp:
             raise SimulationFailure(
                 f"{when}: the energy is not finite: the motion blew up{self._where(state)}; take a smaller time.step"
             )
-        put_in = ("external_work", "contact_work", "thermal_work")
         start = held + row["plastic_dissipation"] if self._rows == 0 else 0.0
-        self._most = max(self._most, abs(start), *(abs(row[name]) for name in put_in))
+        self._most = max(self._most, abs(start), *(abs(row[name]) for name in SUPPLIED))
         self._rows += 1
         created = -row["numerical_dissipation"]
         self._strange = self._strange + 1 if created > _CREATED * self._most else 0

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 __all__ = ["CELL_FIELDS", "POINT_FIELDS", "Fields"]
@@ -26,13 +28,13 @@ class Fields:
             name for name in CELL_FIELDS if (name in wanted if wanted is not None else name != "temperature" or heated)
         ]
 
-    def at_nodes(self, state) -> dict[str, np.ndarray]:
-        """Name to (owned, 3)."""
+    def at_nodes(self, state, acceleration: Callable[[], np.ndarray]) -> dict[str, np.ndarray]:
+        """Name to (owned, 3). Collective where ``acceleration`` is."""
         owned = self.model.mesh.n_owned
         values = {
             "displacement": lambda: state.position - self.model.mesh.points[:owned],
             "velocity": lambda: state.v,
-            "acceleration": lambda: state.a,
+            "acceleration": acceleration,
             "contact_force": lambda: state.contact,
         }
         return {name: values[name]() for name in self.points}

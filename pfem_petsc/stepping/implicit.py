@@ -105,6 +105,9 @@ class ImplicitStepper(Stepper):
     def _set_part(self, part: float) -> None:
         if part != self.part:
             self.scheme.step_changed(self.state)
+            if self.model.contact.motion.free is not None:
+                self.scheme.step_changed(self.model.contact.motion.free.state)
+            self.step_changed = True
             self.part = part
         self.smallest = min(self.smallest, part)
 

@@ -14,13 +14,30 @@ from typing import NamedTuple
 import numpy as np
 
 from ..contact.flat import press_planes
+from ..contact.impact import join_nodes, plane_gaps, stop_nodes, unpressed
 from ..contact.log import compare_contacts
 from ..integrators.central_differences import drift, kick
 from ..mechanics.bars import first_inverted
 from ..mechanics.compiled import kernel
-from .node_loops import book_nodes, explicit_increments, hold, react
+from ..output.sums import HEAD, WALL
+from .impulses import WALLS
+from .node_loops import WORKS, book_nodes, explicit_increments, hold, react
 
-__all__ = ["BarArrays", "Buffers", "NodeArrays", "ProbeArrays", "WallArrays", "make_march"]
+__all__ = ["BarArrays", "Buffers", "ImpulseArrays", "NodeArrays", "ProbeArrays", "WallArrays", "make_march"]
+
+
+# places of sums and works: constants of the machine code
+_HEAD, _WALL = HEAD.width, WALL.width
+_KINETIC, _ELASTIC = HEAD.first("kinetic_energy"), HEAD.first("elastic_energy")
+_HEAT, _HARDENING = HEAD.first("plastic_heat"), HEAD.first("hardening_energy")
+_EXTERNAL, _DAMPING = HEAD.first("external_work"), HEAD.first("damping_dissipation")
+_IMPACT, _NUMERICAL = HEAD.first("impact_dissipation"), HEAD.first("numerical_dissipation")
+_TOTALS, _CONTACTS, _ALARM = HEAD.first("momentum"), HEAD.first("active_contacts"), HEAD.first("alarm")
+_SUPPORT_IMPULSE, _EXTERNAL_IMPULSE = HEAD.first("support_impulse"), HEAD.first("external_impulse")
+_DAMPING_IMPULSE = HEAD.first("damping_impulse")
+_FORCE, _MOMENT, _IMPULSE = WALL.first("force"), WALL.first("moment"), WALL.first("impulse")
+_TOUCHED, _RELEASES = WALL.first("contacts"), WALL.first("releases")
+_BY_EXTERNAL, _BY_CONTACT, _BY_DAMPING, _BY_INERTIA, _BY_BARS = range(len(WORKS))
 
 
 class BarArrays(NamedTuple):
@@ -60,7 +77,17 @@ class WallArrays(NamedTuple):
     touching: np.ndarray
     present: np.ndarray
     releases: np.ndarray
-    impulse: np.ndarray
+    closed: np.ndarray
+    restitution: np.ndarray
+    slack: float
+
+
+class ImpulseArrays(NamedTuple):
+    """Particles (rows, 3) of :mod:`~pfem_petsc.stepping.impulses`: what they remember, and their state."""
+
+    half: np.ndarray
+    a: np.ndarray
+    v: np.ndarray
 
 
 class ProbeArrays(NamedTuple):
@@ -93,17 +120,20 @@ def make_march(forces: Callable) -> Callable:
     """The loop over steps for the bars' loop ``forces`` of a law and strain measure.
 
     Its arguments: most steps; step [s]; positions, those of the step before, velocities at half steps (n, 3); arrays of
-    bars, nodes, walls, probes and buffers; nodes (m,) that touch walls; ledger's sums (17,); kinetic, elastic, heat and
+    bars, nodes, walls, probes and buffers; nodes (m,) that touch walls; nodes (k,) that have met walls; the
+    ledger's sums; its particles; kinetic, elastic, heat and
     hardening energy [J]; and ``sums`` (count, width), which takes what a row of the history sums up, of each step.
 
     It gives the number of steps made; of the last of them the first bar that collapsed and the first that went through
     zero length, or -1, and the node that found no room, or -1, with the offsets of its planes; the buffers; the four
     energies; increments (n, 3); what :func:`~pfem_petsc.contact.flat.press_planes` tells of nodes and walls; and the
-    nodes that touch walls.
+    nodes that touch walls, and that have met them.
     """
 
     @kernel
-    def march(count, h, x, before, half, bars, nodes, walls, probes, buffers, touched, ledger, energies, sums):
+    def march(
+        count, h, x, before, half, bars, nodes, walls, probes, buffers, touched, met, ledger, impulses, energies, sums
+    ):
         n = len(x)
         n_walls = len(walls.offsets)
         f, f1, a, a1, v, v1, support, support1, contact, contact1 = buffers
@@ -115,7 +145,9 @@ def make_march(forces: Callable) -> Callable:
         predictor, u = np.empty((n, 3)), np.empty((n, 3))
         stiffness = np.empty(n)
         load = np.empty(len(nodes.support_nodes))
-        works, totals = np.empty(5), np.empty(12)
+        works, totals = np.empty(len(WORKS)), np.empty((6, 3))
+        pushes, push_u = np.zeros(impulses.v.shape), np.empty(impulses.v.shape)
+        counted, still = np.ones(n_walls, dtype=np.bool_), np.zeros((n_walls, 3))
         supported = len(nodes.support_nodes) > 0
         rates = half if len(nodes.damping) > 0 else nothing
         near = np.empty(0, dtype=np.int64)
@@ -173,9 +205,6 @@ def make_march(forces: Callable) -> Callable:
                     contact[near[j]] = total[j]
                 pressed = near
                 if len(near) > 0 or len(touched) > 0:
-                    for k in range(n_walls):
-                        for c in range(3):
-                            walls.impulse[k, c] += h * force[k, c]
                     changes, touched = compare_contacts(
                         walls.touching, touched, near, touching, walls.present, walls.releases
                     )
@@ -210,26 +239,71 @@ def make_march(forces: Callable) -> Callable:
                 totals,
                 works,
             )
+            impact = 0.0
+            if len(touched) > 0 or len(met) > 0:
+                around = join_nodes(met, touched, walls.present)
+                all_normals, gaps = plane_gaps(around, x, walls.normals, walls.offsets)
+                free_v, free_a = unpressed(around, v, a, contact, nodes.mass, nodes.damping, alpha, eta)
+                impact, met = stop_nodes(
+                    around,
+                    walls.touching,
+                    walls.closed,
+                    all_normals,
+                    gaps,
+                    free_v,
+                    free_a,
+                    still,
+                    still,
+                    nodes.mass,
+                    walls.fixed,
+                    walls.restitution,
+                    counted,
+                    walls.slack,
+                    np.empty(gaps.shape),
+                )
+            pushes[:WALLS] = totals[3:]
+            for k in range(n_walls):
+                pushes[WALLS + k] = force[k]
+            for k in range(len(pushes)):
+                for c in range(3):
+                    push_u[k, c] = pushes[k, c] / alpha
+            kick(
+                push_u.reshape(-1),
+                alpha,
+                eta,
+                h,
+                impulses.half.reshape(-1),
+                impulses.a.reshape(-1),
+                impulses.v.reshape(-1),
+            )
             stored = kinetic1 - kinetic + (elastic1 + heat1 + hardening1) - (elastic + heat + hardening)
             kinetic, elastic, heat, hardening = kinetic1, elastic1, heat1, hardening1
-            for k in range(3):
-                ledger[k] += works[k]
-            ledger[3] += works[3] + works[4] - stored
-            ledger[5:] = totals
+            ledger[_EXTERNAL] += works[_BY_EXTERNAL]
+            ledger[_DAMPING] += works[_BY_DAMPING]
+            ledger[_IMPACT] += impact
+            ledger[_NUMERICAL] += works[_BY_INERTIA] + works[_BY_BARS] - stored - works[_BY_CONTACT] - impact
+            for k in range(4):
+                for c in range(3):
+                    ledger[_TOTALS + 3 * k + c] = totals[k, c]
+            for c in range(3):
+                ledger[_SUPPORT_IMPULSE + c] = impulses.v[0, c]
+                ledger[_EXTERNAL_IMPULSE + c] = impulses.v[1, c]
+                ledger[_DAMPING_IMPULSE + c] = impulses.v[2, c]
+            ledger[_KINETIC] = kinetic
             row = sums[step]
-            row[0], row[1], row[2], row[3] = kinetic, elastic, heat, hardening
-            row[4:21] = ledger
-            row[21], row[22] = len(near), 0.0
-            at = 23
+            row[:_HEAD] = ledger
+            row[_ELASTIC], row[_HEAT], row[_HARDENING] = elastic, heat, hardening
+            row[_CONTACTS], row[_ALARM] = len(near), 0.0
+            at = _HEAD
             if n_walls > 0:
-                row[23] = changes
+                row[at] = changes
+                at += 1
                 for k in range(n_walls):
-                    at = 24 + 12 * k
-                    row[at : at + 3] = force[k]
-                    row[at + 3 : at + 6] = moment[k]
-                    row[at + 6 : at + 9] = walls.impulse[k]
-                    row[at + 9], row[at + 10], row[at + 11] = contacts[k], 0.0, walls.releases[k]
-                at = 24 + 12 * n_walls
+                    row[at + _FORCE : at + _FORCE + 3] = force[k]
+                    row[at + _MOMENT : at + _MOMENT + 3] = moment[k]
+                    row[at + _IMPULSE : at + _IMPULSE + 3] = impulses.v[WALLS + k]
+                    row[at + _TOUCHED], row[at + _RELEASES] = contacts[k], walls.releases[k]
+                    at += _WALL
             for p in range(len(probes.starts) - 1):
                 first, size = probes.starts[p], probes.starts[p + 1] - probes.starts[p]
                 for j in range(size):
@@ -255,6 +329,7 @@ def make_march(forces: Callable) -> Callable:
             u,
             (force, contacts, moment, near, touching, places),
             touched,
+            met,
         )
 
     return march

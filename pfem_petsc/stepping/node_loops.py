@@ -4,7 +4,13 @@ from __future__ import annotations
 
 from ..mechanics.compiled import kernel
 
-__all__ = ["book_nodes", "explicit_increments", "hold", "react"]
+__all__ = ["TOTALS", "WORKS", "book_nodes", "explicit_increments", "hold", "react"]
+
+WORKS = ("external", "contact", "damping", "inertial", "internal")
+"""Works that :func:`book_nodes` gives [J], in this order; the first with supports."""
+
+TOTALS = ("momentum", "angular_momentum", "mass_times_position", "support", "external", "damping")
+"""Vectors that :func:`book_nodes` gives, in this order: the last two are sums of forces."""
 
 
 @kernel
@@ -65,15 +71,15 @@ def book_nodes(
     damping : (owned,), (0,) for none; like ``factor`` it multiplies what ``v0`` and ``v1`` hold
     a0, a1, v0, v1, f0, f1, e0, e1, s0, s1, r0, r1 : acceleration, velocity, internal, external, support and contact
         force at start and end of the works' rule (owned, 3); the last six may be (0, 3) for zero, in pairs
-    totals : (12,) out: momentum, angular momentum, mass times position, support force
-    works : (5,) out [J]: external with supports, contact, damping, inertial, internal
+    totals : (6, 3) out, see :data:`TOTALS`; external and damping force are those at the end of the works' rule
+    works : (5,) out [J], see :data:`WORKS`
     """
     damped = len(damping) > 0
     loaded = len(e0) > 0
     supported = len(s0) > 0
     touched = len(r0) > 0
     kinetic = 0.0
-    px = py = pz = lx = ly = lz = mx = my = mz = sx = sy = sz = 0.0
+    px = py = pz = lx = ly = lz = mx = my = mz = sx = sy = sz = ex = ey = ez = bx = by = bz = 0.0
     external = contact = dissipated = inertial = internal = 0.0
     for i in range(len(x0)):
         q = factor[i]
@@ -96,8 +102,14 @@ def book_nodes(
         if damped:
             w = dx * (v0[i, 0] + v1[i, 0]) + dy * (v0[i, 1] + v1[i, 1]) + dz * (v0[i, 2] + v1[i, 2])
             dissipated += damping[i] * w
+            bx -= damping[i] * v1[i, 0]
+            by -= damping[i] * v1[i, 1]
+            bz -= damping[i] * v1[i, 2]
         if loaded:
             external += dx * (e0[i, 0] + e1[i, 0]) + dy * (e0[i, 1] + e1[i, 1]) + dz * (e0[i, 2] + e1[i, 2])
+            ex += e1[i, 0]
+            ey += e1[i, 1]
+            ez += e1[i, 2]
         if supported:
             external += dx * (s0[i, 0] + s1[i, 0]) + dy * (s0[i, 1] + s1[i, 1]) + dz * (s0[i, 2] + s1[i, 2])
             sx += support[i, 0]
@@ -105,9 +117,11 @@ def book_nodes(
             sz += support[i, 2]
         if touched:
             contact += dx * (r0[i, 0] + r1[i, 0]) + dy * (r0[i, 1] + r1[i, 1]) + dz * (r0[i, 2] + r1[i, 2])
-    totals[0], totals[1], totals[2] = px, py, pz
-    totals[3], totals[4], totals[5] = lx, ly, lz
-    totals[6], totals[7], totals[8] = mx, my, mz
-    totals[9], totals[10], totals[11] = sx, sy, sz
+    totals[0, 0], totals[0, 1], totals[0, 2] = px, py, pz
+    totals[1, 0], totals[1, 1], totals[1, 2] = lx, ly, lz
+    totals[2, 0], totals[2, 1], totals[2, 2] = mx, my, mz
+    totals[3, 0], totals[3, 1], totals[3, 2] = sx, sy, sz
+    totals[4, 0], totals[4, 1], totals[4, 2] = ex, ey, ez
+    totals[5, 0], totals[5, 1], totals[5, 2] = bx, by, bz
     works[0], works[1], works[2], works[3], works[4] = external, contact, dissipated, inertial, internal
     return 0.5 * kinetic

@@ -8,13 +8,19 @@ import numpy as np
 from mpi4py import MPI
 
 from ..contact.history import ContactColumns, contact_columns
+from ..output.energies import ENERGIES
 from ..output.row import Row, RowLayout
+from ..output.sums import HEAD, PAIR
 from .ledger import Ledger
 
 __all__ = ["Recorder"]
 
-_HEAD = 29  # numbers of a row before those of walls, pairs and probes
-_SUMS = 23  # numbers of the sums before those
+_ELASTIC, _HEAT, _HARDENING = (HEAD.first(name) for name in ("elastic_energy", "plastic_heat", "hardening_energy"))
+_SUMMED = [energy for energy in ENERGIES if energy.source != "derived"]
+_ENERGIES = [HEAD.first(energy.name) for energy in _SUMMED]
+_SIGNS = np.array(
+    [-1.0 if energy.side == "supplied" else 1.0 for energy in _SUMMED]
+)  # parts of derived ones count here
 _PROBED = ("position", "velocity", "acceleration", "reaction")
 
 
@@ -42,11 +48,8 @@ class Recorder:
         case, mesh, comm = self.model.case, self.model.mesh, self.model.comm
         self.columns: dict[str, tuple[int, ...]] = {"time": (), "step": (), "step_size": ()}
         self.columns |= {name: () for name in ("newton_iterations", "linear_iterations", "active_contacts")}
-        self.columns |= {name: () for name in ("kinetic_energy", "elastic_energy", "plastic_dissipation")}
-        self.columns |= {name: () for name in ("plastic_heat", "hardening_energy", "damping_dissipation")}
-        self.columns |= {name: () for name in ("external_work", "contact_work", "thermal_work")}
-        self.columns |= {name: () for name in ("numerical_dissipation", "energy_imbalance")}
-        self.columns |= {name: (3,) for name in ("momentum", "angular_momentum", "centre_of_mass", "support_force")}
+        self.columns |= {energy.name: () for energy in ENERGIES} | {"energy_imbalance": ()}
+        self.columns |= {name: (3,) for name, size in HEAD.sizes.items() if size == 3}
         self.types: dict[str, Any] = dict.fromkeys(
             ("step", "newton_iterations", "linear_iterations", "active_contacts"), np.int64
         )
@@ -54,7 +57,8 @@ class Recorder:
         self.types |= {name: kind for name, _, kind in contact_columns(self.model.contact) if kind is not float}
         self._pairs = self.model.pairs
         if self._pairs is not None:
-            self.columns |= {f"pair/{name}/force": (3,) for name in self._pairs.names}
+            for name in self._pairs.names:
+                self.columns |= {f"pair/{name}/{what}": (3,) for what in ("force", *PAIR.sizes)}
         self.probe_nodes: dict[str, np.ndarray] = {}
         self._probes: list[tuple[str, np.ndarray, np.ndarray]] = []
         for probe in case.output.probe:
@@ -67,7 +71,18 @@ class Recorder:
                 self.columns[f"probe/{probe.name}/{quantity}"] = (len(everyone), 3)
         self.layout = RowLayout(self.columns, self.types)
         self._contact = ContactColumns(self.model.contact)
-        self._sums = np.zeros(_SUMS + self._contact.size + sum(12 * len(n) for n in self.probe_nodes.values()))
+        probed = sum(12 * len(nodes) for nodes in self.probe_nodes.values())
+        pairs = 0 if self._pairs is None else PAIR.width * len(self._pairs.names)
+        # where the sums of walls, pairs and probes begin
+        self._starts = np.cumsum([HEAD.width, self._contact.size, pairs, probed])
+        self._sums = np.zeros(self._starts[-1])
+        # where the numbers of the head go in a row, and where walls, pairs and probes begin there
+        self._from = np.array([k for name in HEAD.sizes if name != "alarm" for k in range(HEAD.width)[HEAD[name]]])
+        places = [self.layout.places[name][:2] for name in HEAD.sizes if name != "alarm"]
+        self._to = np.concatenate([np.arange(*place) for place in places])
+        self._at = {name: place[0] for name, place in self.layout.places.items()}
+        head = sum(int(np.prod(shape)) for name, shape in self.columns.items() if "/" not in name)
+        self._begin = head - ("active_set_changes" in self.columns)
 
     @property
     def width(self) -> int:
@@ -99,65 +114,57 @@ class Recorder:
     def row_of(self, sums: np.ndarray) -> Row:
         """The row of the state's step and time from its sums (width,) over all ranks. Collective."""
         model = self.model
-        self.alarmed = sums[22] > 0.0
-        model.contact.log.meet(model.comm, self._contact.contacts(sums[_SUMS:]))
+        self.alarmed = sums[HEAD.first("alarm")] > 0.0
+        model.contact.log.meet(model.comm, self._contact.contacts(sums[HEAD.width :]))
         return Row(self.layout, self._unpack(sums))
 
     def _fill(self, sums: np.ndarray, alarm: bool) -> None:
         """This rank's share of a row."""
         stepper, state, ledger = self.stepper, self.stepper.state, self.ledger
         energy, solution = stepper.energy, stepper.solution
-        sums[:4] = ledger.kinetic, energy.elastic, energy.plastic_heat, energy.hardening
-        sums[4:21] = ledger.sums
-        sums[21:23] = solution.contacts, alarm
-        at = _SUMS + self._contact.size
+        sums[: HEAD.width] = ledger.sums
+        sums[_ELASTIC], sums[_HEAT], sums[_HARDENING] = energy[:3]
+        sums[HEAD.first("active_contacts")], sums[HEAD.first("alarm")] = solution.contacts, alarm
+        walls, pairs, at, _ = self._starts
         if self._contact.size:
-            self._contact.fill(sums[_SUMS:at], solution.walls)
+            self._contact.fill(sums[walls:pairs], solution.walls, ledger.impulses)
+        if at > pairs:
+            ledger.impulses.fill_pairs(sums[pairs:at].reshape(-1, PAIR.width))
+        a = stepper.acceleration() if self._probes else state.a
         for name, local, place in self._probes:
             size = 12 * len(self.probe_nodes[name])
             nodes = sums[at : at + size].reshape(4, -1, 3)
             nodes[:] = 0.0
             reaction = state.support[local] + state.contact[local]
-            nodes[:, place] = state.x[local], state.v[local], state.a[local], reaction
+            nodes[:, place] = state.x[local], state.v[local], a[local], reaction
             at += size
 
     def _unpack(self, sums: np.ndarray) -> np.ndarray:
         """The vector of a row from the sums over the ranks."""
         stepper, state = self.stepper, self.stepper.state
-        energies = sums[:9].tolist()
-        kinetic, elastic, heat, hardening, external, contact, damping, numerical, thermal = energies
-        held = kinetic + elastic + heat + hardening + damping + numerical - external - contact - thermal
+        vector, at = np.empty(self.layout.width), self._at
+        vector[self._to] = sums[self._from]
+        vector[at["time"]], vector[at["step"]], vector[at["step_size"]] = state.time, state.step, stepper.smallest
+        vector[at["newton_iterations"]], vector[at["linear_iterations"]] = self.iterations
+        vector[at["plastic_dissipation"]] = sums[_HEAT] + sums[_HARDENING]
+        total = at["centre_of_mass"]
+        vector[total : total + 3] /= self.model.total_mass
+        energies = sums[_ENERGIES]
+        held = float(_SIGNS @ energies)
         if self.start_energy is None:
             self.start_energy = held
-        self.energy_scale = max(self.energy_scale, *map(abs, energies))
-        vector = np.empty(self.layout.width)
-        vector[:17] = (
-            state.time,
-            state.step,
-            stepper.smallest,
-            *self.iterations,
-            sums[21],
-            kinetic,
-            elastic,
-            heat + hardening,
-            heat,
-            hardening,
-            damping,
-            external,
-            contact,
-            thermal,
-            numerical,
-            held - self.start_energy,
-        )
-        vector[17:_HEAD] = sums[9:21]
-        vector[23:26] /= self.model.total_mass
+        self.energy_scale = max(self.energy_scale, float(np.abs(energies).max()))
+        vector[at["energy_imbalance"]] = held - self.start_energy
         self.iterations = [0, 0]
-        source, at = _SUMS + self._contact.size, _HEAD + self._contact.width
+        walls, pairs, probes, _ = self._starts
+        begin = self._begin
         if self._contact.size:
-            self._contact.put(sums[_SUMS:source], state.time, vector[_HEAD:at])
+            self._contact.put(sums[walls:pairs], state.time, vector[begin : begin + self._contact.width])
+            begin += self._contact.width
         if self._pairs is not None:
-            for force in self._pairs.totals().values():
-                vector[at : at + 3] = force
-                at += 3
-        vector[at:] = sums[source:]
+            columns = vector[begin : begin + (3 + PAIR.width) * len(self._pairs.names)].reshape(-1, 3 + PAIR.width)
+            columns[:, :3] = list(self._pairs.totals().values())
+            columns[:, 3:] = sums[pairs:probes].reshape(-1, PAIR.width)
+            begin += columns.size
+        vector[begin:] = sums[probes:]
         return vector

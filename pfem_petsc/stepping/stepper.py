@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from ..errors import SimulationFailure
 from ..integrators.base import Balance, Scheme, State
 from ..mechanics.bars import StrainEnergy
 from .collapse import tell_collapse
+from .massless import MasslessNodes
 
 __all__ = ["NotConverged", "Solution", "Stepper"]
 
@@ -57,13 +58,21 @@ class Stepper(ABC):
     treatment : of impact, None for the scheme's own formulas
     booking : called after each part of a step
     before : (local, 3) positions at the start of the last part, with ghosts [m]
+    massless : MasslessNodes where contact nodes have no mass along their walls' normals, else None
+    closed : (owned, walls) bool, nodes that have met a wall and not left it since
+    support_change : what motions of supports have put in place of the scheme's velocity, acceleration and memory of
+        their components (k,) in the last step, by name; empty without such motions
+    step_changed : whether the scheme was told to forget what holds for another step, since the last booking
+    totals_at_start, totals_solved : (3, 3) this rank's sums of support, external and damping force [N] at the start,
+        and of the balance that was solved there by a scheme that leads; None after a restart
+    walls_at_start, pairs_at_start : (walls, 3), (pairs, 3) forces at the start [N]
     renews_forces : each evaluation of the state fills another array ``state.f``, so that the last one is kept
     kept_numbers, kept_arrays, kept_bars : names of attributes that, with the state, determine what comes: numbers,
         arrays with a row for each owned node, and for each local bar
     """
 
     kept_numbers: tuple[str, ...] = ("part", "smallest")
-    kept_arrays: tuple[str, ...] = ("touching",)
+    kept_arrays: tuple[str, ...] = ("touching", "closed")
     kept_bars: tuple[str, ...] = ()
     renews_forces = False
 
@@ -91,6 +100,14 @@ class Stepper(ABC):
         self.before = mesh.points.copy()
         model.contact.state = self.state
         self.touching = model.contact.log.touching
+        self.massless = MasslessNodes(model) if model.inertia.redistribution is not None else None
+        self.closed = np.zeros_like(self.touching)
+        self.step_changed = False
+        self.support_change: dict[str, np.ndarray] = {}
+        self.totals_at_start: np.ndarray | None = None
+        self.totals_solved: np.ndarray | None = None
+        self.walls_at_start = np.zeros((len(model.contact.names), 3))
+        self.pairs_at_start = np.zeros((0, 3))
         self.solution = Solution(self.zero, self.state.f, model.contact.nothing)
 
     def start(self) -> None:
@@ -101,6 +118,10 @@ class Stepper(ABC):
         if supports.any:
             state.position[supports.at] = supports.positions(0.0)
             state.v[supports.at] = supports.rates(0.0, 0.0)[0]
+        if self.massless is not None and self.massless.settle(state.x, 0.0, 0.0) > 1e-9 * model.length:
+            self.fault = SimulationFailure(
+                "step 0, t = 0 s: contact nodes without mass found no equilibrium; take another contact.treatment"
+            )
         self.evaluate(commit=True)
         if model.external.active:
             state.external = model.external.at(0.0, np.empty_like(state.v))
@@ -115,15 +136,54 @@ class Stepper(ABC):
                 if model.pairs is not None:
                     held = np.union1d(held, model.pairs.pressed()[0])
                 self.solution.walls, self.solution.contacts = walls, len(held)
+        if self.massless is not None:
+            state.contact, self.solution.walls = self.massless.press(state.position, load, 0.0)
+            self.solution.contacts = int(self.solution.walls.touching.sum())
         if supports.any:
             inertial = model.inertia.mass_times(state.a, np.empty_like(state.a))
             state.support = np.zeros_like(state.v)
             state.support[supports.fixed] = (inertial - load - state.contact)[supports.fixed]
+        self.totals_at_start = self._totals()
+        self.walls_at_start = self.solution.walls.force
+        if model.pairs is not None:
+            self.pairs_at_start = np.array(list(model.pairs.totals().values()))
         self.scheme.start(state, self.h)
-        if model.contact.motion.free is not None:
-            model.contact.motion.free.start(self.h)
+        free = model.contact.motion.free
+        if free is not None:
+            free.start(self.h)
         if self.scheme.leads:
+            v, speeds = state.v, free.state.v if free is not None else None
             self._solve_and_finish()
+            self.totals_solved = self._totals()
+            # what is on a wall has not lost its velocity yet; the scheme goes on from its own memory
+            state.v = v
+            if free is not None:
+                free.state.v = speeds
+
+    def acceleration(self) -> np.ndarray:
+        """Acceleration (owned, 3) to record [m/s2]; collective where the mass is consistent.
+
+        Where the balance holds at the ends of steps it is the scheme's. For the others that is of first order, or holds
+        at another time: nodes that nothing holds have the one of the forces at the end of the step.
+        """
+        state, model, scheme = self.state, self.model, self.scheme
+        if scheme.at_ends or state.step == 0:
+            return state.a
+        load = -state.f[: len(state.a)]
+        if model.external.active:
+            load += model.external.at(state.time, np.empty_like(load))
+        if model.inertia.damped:
+            load -= model.inertia.damping_times(state.v, np.empty_like(load))
+        held = model.supports.fixed | (state.contact != 0.0).any(axis=1)[:, None]
+        if model.inertia.consistent:
+            known = np.where(held, state.a, 0.0)
+            load += state.contact - model.inertia.mass_times(known, np.empty_like(load))
+        return np.where(held, state.a, self.accelerate(load))
+
+    def _totals(self) -> np.ndarray:
+        state, inertia = self.state, self.model.inertia
+        damping = -inertia.damping_times(state.v, np.empty_like(state.v))
+        return np.array([state.support.sum(axis=0), state.external.sum(axis=0), damping.sum(axis=0)])
 
     def step(self) -> None:
         """Advance from t_n to t_{n+1}; the state is complete at both. Collective where the solve is."""
@@ -192,12 +252,32 @@ class Stepper(ABC):
         supports = self.model.supports
         forces_hold = sum(weight * time for weight, time in balance.loads)
         v, a = supports.rates(forces_hold, self.part)
+        self._ruled = self._by_rule(balance, a)
         balance.predictor = balance.predictor.copy()
         balance.predictor[supports.at] = supports.positions(balance.time)
         balance.v_hat = np.zeros_like(self.state.v) if balance.v_hat is None else balance.v_hat.copy()
         balance.v_hat[supports.at] = v
         balance.a_hat = np.zeros_like(self.state.v) if balance.a_hat is None else balance.a_hat.copy()
         balance.a_hat[supports.at] = a
+
+    def _by_rule(self, balance: Balance, a: np.ndarray) -> State:
+        """What the scheme would make of prescribed components (k, 1) by the acceleration (k,) of their balance.
+
+        That is the rule by which forces become impulses.
+        """
+        supports, state = self.model.supports, self.state
+
+        def pick(array: np.ndarray | None) -> np.ndarray | None:
+            return None if array is None else array[supports.at][:, None]
+
+        memory = {name: pick(state.memory[name]) for name in self.scheme.remembers if name in state.memory}
+        fields = (pick(array) for array in (state.position, state.v, state.a))
+        ruled = State(*fields, *(np.zeros((len(a), 1)) for _ in range(4)), memory=memory)
+        known = {name: pick(getattr(balance, name)) for name in ("predictor", "v_hat", "a_hat")}
+        own = replace(balance, **known)
+        u = (a[:, None] if own.a_hat is None else a[:, None] - own.a_hat) / own.alpha
+        self.scheme.finish(ruled, own, u, self.part)
+        return ruled
 
     def _take_rates(self, time: float) -> None:
         """Velocity and acceleration of prescribed components at a time, and what the scheme remembers of them."""
@@ -207,6 +287,9 @@ class Stepper(ABC):
         if self.scheme.leads:
             way = supports.positions(self.balance.time) - state.position[supports.at]
             state.memory["half_velocity"][supports.at] = way / self.part
+        ruled, given = self._ruled, {"v": state.v, "a": state.a, **state.memory}
+        made = {"v": ruled.v, "a": ruled.a, **ruled.memory}
+        self.support_change = {name: given[name][supports.at] - array[:, 0] for name, array in made.items()}
 
     def _acceleration(self, load: np.ndarray) -> np.ndarray:
         """Acceleration (owned, 3) with M a = load [N] on free components, on others as prescribed. Collective."""

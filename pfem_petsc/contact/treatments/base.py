@@ -6,7 +6,7 @@ The treatment ``scheme`` is none at all: velocity and acceleration of held nodes
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -22,12 +22,14 @@ class Jump:
     nodes : (m,) owned local indices
     v, a : (m, 3) before the jump [m/s], [m/s2]
     energy : kinetic energy that this rank's nodes gained [J]
+    memory : what the scheme remembered of them (m, 3), by name
     """
 
     nodes: np.ndarray
     v: np.ndarray
     a: np.ndarray
     energy: float
+    memory: dict[str, np.ndarray] = field(default_factory=dict)
 
 
 class Treatment(ABC):
@@ -36,7 +38,10 @@ class Treatment(ABC):
     Attributes
     ----------
     jump : of the part of a step just made, None where nothing jumped
+    elastic : whether impact loses nothing
     """
+
+    elastic = False
 
     def __init__(self, stepper) -> None:
         self.stepper = stepper
@@ -96,7 +101,7 @@ class Treatment(ABC):
         old_v, old_a = state.v[nodes], state.a[nodes]
         v, a = np.where(fixed, old_v, v), np.where(fixed, old_a, a)
         energy = 0.5 * float((inertia.mass[nodes, None] * (v * v - old_v * old_v)).sum())
-        self.jump = Jump(nodes, old_v, old_a, energy)
+        self.jump = Jump(nodes, old_v, old_a, energy, self.remembered(nodes))
         memory = state.memory.setdefault("contact_change", np.zeros_like(state.v))
         memory[nodes] = inertia.mass[nodes, None] * (a - old_a)
         if inertia.damped:
@@ -105,6 +110,11 @@ class Treatment(ABC):
         state.v, state.a = state.v.copy(), state.a.copy()
         state.v[nodes], state.a[nodes] = v, a
         stepper.scheme.restart(state, nodes, stepper.part)
+
+    def remembered(self, nodes: np.ndarray) -> dict[str, np.ndarray]:
+        """What the scheme remembers of nodes (m,): name to (m, 3)."""
+        memory = self.stepper.state.memory
+        return {name: memory[name][nodes] for name in self.stepper.scheme.remembers if name in memory}
 
     def clear(self) -> None:
         """Forget the last jump."""

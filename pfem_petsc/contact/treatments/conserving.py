@@ -19,6 +19,8 @@ __all__ = ["Treatment"]
 class Treatment(Base):
     """Velocity of held nodes such that contact does no work."""
 
+    elastic = True
+
     def before(self) -> None:
         """Keep where nodes start, and the forces there."""
         state = self.stepper.state

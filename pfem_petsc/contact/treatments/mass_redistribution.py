@@ -16,6 +16,7 @@ import numpy as np
 
 from ...errors import InputError
 from ...parallel.agreement import agreed
+from .base import Jump
 from .base import Treatment as Base
 
 __all__ = ["Redistribution", "Treatment", "redistribute"]
@@ -135,6 +136,8 @@ def _movable(contact) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
 class Treatment(Base):
     """No mass on contact nodes along the walls' normals."""
 
+    elastic = True
+
     def before(self) -> None:
         """Keep where nodes start."""
         self._start = self.stepper.state.position.copy()
@@ -146,6 +149,8 @@ class Treatment(Base):
             return
         moved = stepper.model.inertia.redistribution
         nodes, n = moved.nodes, moved.normals
+        # no momentum jumps along the normals, but the scheme's memory is made anew
+        self.jump = Jump(nodes, state.v[nodes], state.a[nodes], 0.0, self.remembered(nodes))
         secant = (state.position[nodes] - self._start[nodes]) / stepper.part
         state.v, state.a = state.v.copy(), state.a.copy()
         state.v[nodes] += np.einsum("mi,mi->m", secant - state.v[nodes], n)[:, None] * n

@@ -1,0 +1,302 @@
+"""The kinetic energy that impact takes, by its own formula: that of the velocities that closing contacts stop.
+
+A node of mass m that closes on a wall with the approach velocity s, relative to the wall and along its normal, and
+leaves it with e s, loses m/2 s^2 (1 - e^2). Several walls at a node stop the projection of its velocity on their span;
+a wall of mass M, and the other node of a pair, give way: m is the reduced mass. The approach velocity is that of the
+impact, which happens within a step: with the velocity v and acceleration a towards the wall at its start and the
+distance d, s^2 = v^2 + 2 a d. The formula is the same for all schemes; it converges with the step and does not depend
+on where in the step the impact falls.
+
+A node that a scheme lets go of for a moment, and that has not left its wall, is not struck again.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from mpi4py import MPI
+
+from ..mechanics.compiled import kernel
+
+__all__ = ["Impacts", "join_nodes", "plane_gaps", "stop_nodes", "unpressed"]
+
+_SLACK = 1e-12  # of the model's length: farther off, a node has left its wall
+
+
+@kernel
+def join_nodes(met, touched, present):
+    """Nodes of two lists, the first first; ``present`` (owned,) bool is working space, all false."""
+    nodes = np.empty(len(met) + len(touched), dtype=np.int64)
+    count = 0
+    for i in met:
+        present[i] = True
+        nodes[count] = i
+        count += 1
+    for i in touched:
+        if not present[i]:
+            nodes[count] = i
+            count += 1
+    for i in met:
+        present[i] = False
+    return nodes[:count].copy()
+
+
+@kernel
+def plane_gaps(nodes, x, normals, offsets):
+    """Normals (m, w, 3) and distances (m, w) [m] of nodes (m,) at x (owned, 3) from planes (w, 3), (w,)."""
+    w = len(offsets)
+    every = np.empty((len(nodes), w, 3))
+    gaps = np.empty((len(nodes), w))
+    for j in range(len(nodes)):
+        i = nodes[j]
+        for k in range(w):
+            gap = -offsets[k]
+            for c in range(3):
+                gap += normals[k, c] * x[i, c]
+                every[j, k, c] = normals[k, c]
+            gaps[j, k] = gap
+    return every, gaps
+
+
+@kernel
+def unpressed(nodes, v, a, contact, mass, damping, alpha, eta):
+    """Velocities and accelerations (m, 3) of nodes (m,) as they would be without forces of contact (owned, 3)."""
+    free_v, free_a = np.empty((len(nodes), 3)), np.empty((len(nodes), 3))
+    damped = len(damping) > 0
+    for j in range(len(nodes)):
+        i = nodes[j]
+        k = alpha * mass[i] + (eta * damping[i] if damped else 0.0)
+        for c in range(3):
+            u = contact[i, c] / k
+            free_v[j, c] = v[i, c] - eta * u
+            free_a[j, c] = a[i, c] - alpha * u
+    return free_v, free_a
+
+
+@kernel
+def stop_nodes(
+    nodes, touching, closed, normals, gaps, v, a, rates, pulls, mass, fixed, restitution, counted, slack, speeds
+):
+    """Energy [J] that walls take from nodes (m,) that close on them, and the nodes that are on walls then.
+
+    Parameters
+    ----------
+    touching : (owned, w) bool, who touches what in this step
+    closed : (owned, w) bool, who has met a wall and not left it yet; brought up to date
+    normals, gaps : (m, w, 3), (m, w) at the start of the step [m]
+    v, a : (m, 3) there, without contact; rates, pulls (w, 3) velocities and accelerations of the walls
+    mass, fixed : (owned,), (owned, 3)
+    restitution, counted : (w,); only walls that count take energy here
+    slack : distance at which a node has left [m]
+    speeds : (m, w) out: approach velocities of closing contacts, else zero [m/s]
+    """
+    w = closed.shape[1]
+    met = np.empty(len(nodes), dtype=np.int64)
+    count = 0
+    loss = 0.0
+    basis = np.empty((3, 3))
+    row = np.empty(3)
+    before, after = np.empty(3), np.empty(3)
+    for j in range(len(nodes)):
+        i = nodes[j]
+        fresh = False
+        here = False
+        for k in range(w):
+            speeds[j, k] = 0.0
+            if touching[i, k]:
+                if not closed[i, k]:
+                    closed[i, k] = True
+                    speed, towards = 0.0, 0.0
+                    for c in range(3):
+                        speed += normals[j, k, c] * (v[j, c] - rates[k, c])
+                        towards -= normals[j, k, c] * (a[j, c] - pulls[k, c])
+                    if speed < 0.0:
+                        square = speed * speed + 2.0 * towards * max(gaps[j, k], 0.0)
+                        speeds[j, k] = np.sqrt(max(square, 0.0))
+                        fresh = fresh or counted[k]
+            elif closed[i, k] and gaps[j, k] > slack:
+                closed[i, k] = False
+            here = here or closed[i, k]
+        if here:
+            met[count] = i
+            count += 1
+        if not fresh:
+            continue
+        # the shortest velocity with these components along the walls, by orthogonal directions of their span
+        size = 0
+        for first in (True, False):
+            for k in range(w):
+                if size == 3 or not touching[i, k] or not counted[k] or (speeds[j, k] > 0.0) != first:
+                    continue
+                left, left_after = speeds[j, k], restitution[k] * speeds[j, k]
+                for c in range(3):
+                    row[c] = 0.0 if fixed[i, c] else normals[j, k, c]
+                for b in range(size):
+                    share = row[0] * basis[b, 0] + row[1] * basis[b, 1] + row[2] * basis[b, 2]
+                    for c in range(3):
+                        row[c] -= share * basis[b, c]
+                    left -= share * before[b]
+                    left_after -= share * after[b]
+                length = np.sqrt(row[0] * row[0] + row[1] * row[1] + row[2] * row[2])
+                if length <= 1e-8:
+                    continue
+                for c in range(3):
+                    basis[size, c] = row[c] / length
+                before[size], after[size] = left / length, left_after / length
+                size += 1
+        for b in range(size):
+            loss += 0.5 * mass[i] * (before[b] * before[b] - after[b] * after[b])
+    return loss, met[:count].copy()
+
+
+class Impacts:
+    """Closing contacts of this rank's nodes, step by step.
+
+    Attributes
+    ----------
+    met : (m,) owned nodes that have met walls and not left them yet; ``stepper.closed`` (owned, walls) says which
+    closed_pairs : (p,) bool, the same of pairs, on all ranks
+    """
+
+    def __init__(self, stepper) -> None:
+        self.stepper = stepper
+        self.model = stepper.model
+        contact, pairs = self.model.contact, self.model.pairs
+        self.met = np.flatnonzero(stepper.closed.any(axis=1))
+        self.closed_pairs = np.zeros(0 if pairs is None else len(pairs.force), dtype=bool)
+        self.active = contact.any or pairs is not None
+        free = contact.motion.free
+        self.counted = np.ones(len(contact.names), dtype=bool)
+        if free is not None:
+            self.counted[free.at] = False
+        self._free_rates = free.state.v if free is not None else None  # at the start of the step
+        self.slack = _SLACK * self.model.length
+        treatment = stepper.treatment
+        # nothing is lost where nodes have no mass along the normal, or where a treatment takes the work back
+        self.elastic = treatment is not None and treatment.elastic
+
+    def step(
+        self,
+        x: np.ndarray,
+        motion: tuple[np.ndarray, np.ndarray],
+        load: np.ndarray | None,
+        time: float,
+        shifts: np.ndarray,
+    ) -> float:
+        """Energy [J] of this rank's closing contacts in the step just solved. Collective with pairs or free walls.
+
+        Parameters
+        ----------
+        x, motion : (owned, 3) at the start of the step of closure, velocity and acceleration there; for schemes that
+            solve in advance, those of the balance
+        load : (owned, 3) all forces there but those of contact and damping [N]; None where the scheme solves in advance
+        time, shifts : of the walls there
+        """
+        if not self.active:
+            return 0.0
+        loss = self._on_walls(x, motion, load, time, shifts) if self.model.contact.any else 0.0
+        if self.model.pairs is not None:
+            loss += self._of_pairs(x, motion, load)
+        return 0.0 if self.elastic else loss
+
+    def _free(self, nodes: np.ndarray, motion: tuple[np.ndarray, np.ndarray], load: np.ndarray | None) -> tuple:
+        """Velocities and accelerations (m, 3) without contact at the start of the step."""
+        inertia, state = self.model.inertia, self.stepper.state
+        v, a = motion
+        if load is None and inertia.products:
+            return v[nodes], a[nodes]
+        if load is None:
+            balance = self.stepper.balance
+            damping = inertia.damping if inertia.damped else np.empty(0)
+            return unpressed(nodes, v, a, state.contact, inertia.mass, damping, balance.alpha, balance.eta)
+        v, load = v[nodes], load[nodes]
+        if inertia.damped:
+            load = load - inertia.damping[nodes, None] * v
+        return v, load / inertia.mass[nodes, None]
+
+    def _on_walls(self, x, motion, load, time: float, shifts: np.ndarray) -> float:
+        contact, log = self.model.contact, self.model.contact.log
+        free = contact.motion.free
+        if len(self.met) == 0 and len(log.last) == 0 and free is None:
+            return 0.0
+        nodes = join_nodes(self.met, log.last, log.present)
+        if contact.plain and free is None:
+            normals, gaps = plane_gaps(nodes, x, contact.normals, contact.plane_offsets(time))
+        else:
+            normals, offsets = contact.planes(np.ones((len(nodes), len(contact.names)), dtype=bool), x[nodes], shifts)
+            gaps = np.einsum("mwi,mi->mw", normals, x[nodes]) - offsets
+        free_v, free_a = self._free(nodes, motion, load)
+        rates, speeds = contact.motion.rates(time, ahead=True), np.empty(gaps.shape)
+        pulls = np.zeros(rates.shape)
+        if free is not None:
+            free_fall = free.weight / free.mass[:, None]
+            rates[free.at], pulls[free.at] = self._free_rates, free_fall
+            if load is None:  # as they would be if nothing pushed them
+                balance = self.stepper.balance
+                rates[free.at] = free.state.v + balance.eta / balance.alpha * (free_fall - free.balanced)
+            self._free_rates = free.state.v
+        loss, self.met = stop_nodes(
+            nodes,
+            log.touching,
+            self.stepper.closed,
+            normals,
+            gaps,
+            free_v,
+            free_a,
+            rates,
+            pulls,
+            self.model.inertia.mass,
+            contact.fixed,
+            contact.restitution,
+            self.counted,
+            self.slack,
+            speeds,
+        )
+        if contact.ties.any:
+            loss += self._tied(nodes, normals, speeds, free_v, rates)
+        if free is not None:
+            loss += self._on_free_walls(nodes, normals, speeds)
+        return loss
+
+    def _tied(self, nodes, normals, speeds, v, rates) -> float:
+        """What walls that hold nodes for good take of their motion along them."""
+        contact = self.model.contact
+        across = v[:, None, :] - rates
+        across = across - np.einsum("mwi,mwi->mw", across, normals)[:, :, None] * normals
+        across[contact.fixed[nodes][:, None, :] & np.ones(across.shape, dtype=bool)] = 0.0
+        caught = (speeds > 0.0) & contact.ties.tying
+        energy = 0.5 * self.model.inertia.mass[nodes, None] * (across * across).sum(axis=2)
+        return float(energy[caught].sum())
+
+    def _on_free_walls(self, nodes, normals, speeds) -> float:
+        """Nodes that close on a wall of mass M together: sum m s^2/2 - (sum m s n)^2/(2 (M + sum m)). Collective."""
+        contact, free = self.model.contact, self.model.contact.motion.free
+        mass = self.model.inertia.mass[nodes, None]
+        keeps = 1.0 - contact.restitution[free.at] ** 2
+        sums = np.zeros((len(free.at), 5))
+        s = speeds[:, free.at]
+        closing = np.where(s > 0.0, mass, 0.0)
+        sums[:, 0] = 0.5 * (closing * s * s).sum(axis=0)
+        sums[:, 1] = closing.sum(axis=0)
+        sums[:, 2:] = np.einsum("mw,mwi->wi", closing * s, normals[:, free.at])
+        self.model.comm.Allreduce(MPI.IN_PLACE, sums)
+        if self.model.comm.rank:
+            return 0.0
+        given = 0.5 * (sums[:, 2:] ** 2).sum(axis=1) / (free.mass + sums[:, 1])
+        return float((keeps * (sums[:, 0] - given)).sum())
+
+    def _of_pairs(self, x, motion, load) -> float:
+        """The same of pairs that meet, whose reduced mass counts. Collective."""
+        pairs = self.model.pairs
+        pressing = pairs.force > 0.0
+        fresh, parted = pressing & ~self.closed_pairs, self.closed_pairs & ~pressing
+        if not fresh.any() and not parted.any():
+            return 0.0
+        free_v, free_a = self._free(np.arange(len(x)), motion, load)
+        ends = pairs.gather(np.concatenate([x, free_v, free_a], axis=1))
+        distance = pairs.distances(ends[:, :, :3]) - pairs.gaps
+        self.closed_pairs = pressing | (parted & (distance <= self.slack))
+        speed, apart = pairs.distances(ends[:, :, 3:6]), pairs.distances(ends[:, :, 6:])
+        square = np.maximum(speed * speed - 2.0 * apart * np.maximum(distance, 0.0), 0.0)
+        closing = fresh & (speed < 0.0)
+        energy = 0.5 * pairs.reduced_mass(self.model.inertia.mass) * square
+        return float(energy[closing].sum()) if self.model.comm.rank == 0 else 0.0

@@ -1,0 +1,163 @@
+"""The impulse ledger: what forces and jumps have made of the truss's momentum, by the scheme's own rule.
+
+Momentum is linear in the forces. What a scheme makes of a history of forces is what it makes of one particle of unit
+mass that they push: its velocity is their impulse. Each source of force has such a particle, so that
+
+    momentum(t) - momentum(0) = external + support + damping + sum over walls (impulse + jump_impulse)
+
+to rounding with any scheme, whatever it remembers, and with steps that are halved. Where a treatment of impact changes
+what is known of nodes (velocity, acceleration, the scheme's memory), the same changes, times the nodes' masses, are
+made to a particle that no force pushes: its velocity is the impulse of the jumps. The forces of contact pairs cancel in
+the sum; their impulse is that on the second nodes. What a jump of a pair takes from a node that a support holds goes to
+the support, and so does what a prescribed motion puts in place of the scheme's own velocities.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ..integrators.base import State
+from ..output.sums import HEAD, PAIR, WALL
+
+__all__ = ["DAMPING", "EXTERNAL", "SUPPORT", "WALLS", "Impulses", "wall_shares"]
+
+SUPPORT, EXTERNAL, DAMPING, WALLS = 0, 1, 2, 3
+"""Rows of the particles: three in the order of the totals of :mod:`~pfem_petsc.stepping.node_loops`, then walls and
+pairs, then the jumps of walls and pairs."""
+
+
+def wall_shares(stepper, nodes: np.ndarray, jumps: np.ndarray) -> np.ndarray:
+    """What of vectors (m, 3) at nodes (m,) belongs to which of the walls that they touch: (m, walls, 3)."""
+    contact = stepper.model.contact
+    touching = stepper.touching[nodes]
+    shares = np.where(touching[:, :, None], jumps[:, None, :], 0.0)
+    several = np.flatnonzero(touching.sum(axis=1) > 1)
+    if len(several):
+        at = nodes[several]
+        shifts = contact.motion.shifts(stepper.state.time)
+        normals, _ = contact.planes(touching[several], stepper.state.position[at], shifts)
+        normals = np.where(touching[several][:, :, None], normals, 0.0)
+        parts = np.einsum("miw,mi->mw", np.linalg.pinv(normals, rcond=1e-8), jumps[several])
+        own = parts[:, :, None] * normals
+        rest = jumps[several] - own.sum(axis=1)
+        count = touching[several].sum(axis=1)[:, None, None]
+        shares[several] = own + np.where(touching[several][:, :, None], rest[:, None, :] / count, 0.0)
+    return shares
+
+
+class Impulses:
+    """This rank's share of all impulses.
+
+    Attributes
+    ----------
+    state : of the particles; v (rows, 3) are the impulses [N s]
+    force : (rows, 3) of the last balance [N]
+    """
+
+    def __init__(self, stepper) -> None:
+        self.stepper = stepper
+        model = stepper.model
+        self.pairs = model.pairs
+        self.n_walls = len(model.contact.names)
+        self.n_pairs = 0 if self.pairs is None else len(self.pairs.names)
+        self.jumps = WALLS + self.n_walls + self.n_pairs
+        rows = self.jumps + self.n_walls + self.n_pairs
+        self.state = State(*(np.zeros((rows, 3)) for _ in range(7)))
+        self.force = np.zeros((rows, 3))
+        self._first = model.comm.rank == 0
+
+    def start(self, totals: np.ndarray) -> None:
+        """Begin, from this rank's sums (3, 3) of support, external and damping force at the start [N]."""
+        scheme, h = self.stepper.scheme, self.stepper.part
+        self.state.a = self.forces(totals, self.stepper.walls_at_start, self.stepper.pairs_at_start).copy()
+        scheme.start(self.state, h)
+
+    def forces(self, totals: np.ndarray, walls: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+        """Put forces into :attr:`force`: totals (3, 3), of walls (walls, 3), of pairs (pairs, 3) [N]."""
+        self.force[:WALLS] = totals
+        self.force[WALLS : WALLS + self.n_walls] = walls
+        if self.n_pairs and self._first:
+            self.force[WALLS + self.n_walls : self.jumps] = pairs
+        return self.force
+
+    def step(self, totals: np.ndarray) -> None:
+        """Add the forces of the balance just solved, of which (3, 3) are support, external and damping [N]."""
+        stepper, state = self.stepper, self.state
+        walls = stepper.solution.walls.force
+        pairs = np.array(list(self.pairs.totals().values())) if self.n_pairs else np.zeros((0, 3))
+        if stepper.step_changed:
+            stepper.scheme.step_changed(state)
+        balance = stepper.scheme.balance(state, stepper.part)
+        load = self.forces(totals, walls, pairs)
+        u = (load if balance.a_hat is None else load - balance.a_hat) / balance.alpha
+        stepper.scheme.finish(state, balance, u, stepper.part)
+        inertia, at = stepper.model.inertia, stepper.model.supports.at if stepper.support_change else None
+        for name, change in stepper.support_change.items():
+            every = np.zeros((len(inertia.mass), 3))
+            every[at] = change
+            particles = getattr(state, name) if name in ("v", "a") else state.memory[name]
+            particles[SUPPORT] += inertia.mass_times(every, np.empty_like(every)).sum(axis=0)
+
+    def jump(self) -> None:
+        """Add what the treatment has changed in this step."""
+        stepper, state = self.stepper, self.state
+        jump = stepper.treatment.jump
+        for name, before in (("v", jump.v), ("a", jump.a), *jump.memory.items()):
+            mine = getattr(state, name) if name in ("v", "a") else state.memory[name]
+            of_nodes = getattr(stepper.state, name) if name in ("v", "a") else stepper.state.memory[name]
+            self._add(mine, jump.nodes, of_nodes[jump.nodes] - before)
+
+    def _add(self, particles: np.ndarray, nodes: np.ndarray, change: np.ndarray) -> None:
+        inertia = self.stepper.model.inertia
+        every = np.zeros((len(inertia.mass), 3))
+        every[nodes] = change
+        momentum = inertia.mass_times(every, np.empty_like(every))[nodes]
+        first = self.jumps
+        if self.n_walls:
+            shares = wall_shares(self.stepper, nodes, momentum)
+            particles[first : first + self.n_walls] += shares.sum(axis=0)
+            momentum = momentum - shares.sum(axis=1)
+        if self.n_pairs:
+            table = np.full(len(inertia.mass), -1)
+            second = self.pairs.mine[1] & (self.pairs.force > 0.0)
+            table[self.pairs.local[1, second]] = self.pairs.table[second]
+            for k in range(self.n_pairs):
+                particles[first + self.n_walls + k] += momentum[table[nodes] == k].sum(axis=0)
+        # pairs keep momentum, but for what supports at their nodes take
+        particles[SUPPORT] += momentum.sum(axis=0)
+
+    def fill(self, head: np.ndarray) -> None:
+        """Put the impulses of the truss's own forces into the sums of a row."""
+        head[HEAD["external_impulse"]] = self.state.v[EXTERNAL]
+        head[HEAD["support_impulse"]] = self.state.v[SUPPORT]
+        head[HEAD["damping_impulse"]] = self.state.v[DAMPING]
+
+    def fill_walls(self, share: np.ndarray) -> None:
+        """The same of walls, into (walls, width of WALL)."""
+        share[:, WALL["impulse"]] = self.state.v[WALLS : WALLS + self.n_walls]
+        share[:, WALL["jump_impulse"]] = self.state.v[self.jumps : self.jumps + self.n_walls]
+
+    def fill_pairs(self, share: np.ndarray) -> None:
+        """The same of pairs, into (pairs, width of PAIR)."""
+        share[:, PAIR["impulse"]] = self.state.v[WALLS + self.n_walls : self.jumps]
+        share[:, PAIR["jump_impulse"]] = self.state.v[self.jumps + self.n_walls :]
+
+    def kept(self) -> dict[str, Any]:
+        """This rank's share, for a checkpoint: numbers that may be summed over ranks."""
+        state = self.state
+        return {"v": state.v.tolist(), "a": state.a.tolist()} | {
+            f"memory.{name}": array.tolist() for name, array in state.memory.items()
+        }
+
+    def put_back(self, kept: dict[str, Any]) -> None:
+        """Take the share from a checkpoint."""
+        shape = self.state.v.shape
+        self.state.memory = {}
+        for name, values in kept.items():
+            array = np.array(values, dtype=float).reshape(shape)
+            if name.startswith("memory."):
+                self.state.memory[name.removeprefix("memory.")] = array
+            else:
+                setattr(self.state, name, array)

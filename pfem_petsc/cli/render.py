@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from .parser import PROGRAM, add_result
+from .parser import PROGRAM, add_result, surviving
 
 RANKS = "one"
 
@@ -49,7 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
     from ..post.render import render
 
     written = render(
-        arguments.result,
+        surviving(arguments.result),
         arguments.output,
         field=arguments.field,
         component=arguments.component,

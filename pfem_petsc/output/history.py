@@ -11,6 +11,7 @@ import numpy as np
 from mpi4py import MPI
 
 from ..errors import InputError
+from .digests import CHECKS, row_digests
 from .hdf5 import create_growing, dataset_names, grow, write_rows, writing
 from .row import RowLayout
 
@@ -78,6 +79,7 @@ class HistoryWriter:
         self._comm, self._path = comm, path
         group = file["history"]
         self._datasets = {name: group[name] for name in columns}
+        self._digests = file[CHECKS]["history"]
         self._rows_attribute = h5py.h5a.open(group.id, b"rows")
         self.n_rows = int(group.attrs["rows"])
         row_bytes = sum(d.dtype.itemsize * int(np.prod(d.shape[1:], dtype=np.int64)) for d in self._datasets.values())
@@ -108,14 +110,16 @@ class HistoryWriter:
             return
         first, self.n_rows = self.n_rows, self.n_rows + self.n_buffered
         with writing(self._comm, self._path):
-            for dataset in self._datasets.values():
+            for dataset in (*self._datasets.values(), self._digests):
                 grow(dataset, self.n_rows)
         with writing(self._comm, self._path):
             if self._comm.rank == 0:
+                values = {}
                 for name, (at, end, shape, _) in self._layout.places.items():
-                    dataset = self._datasets[name]
                     rows = self._buffer[: self.n_buffered, at:end].reshape(self.n_buffered, *shape)
-                    write_rows(dataset, first, rows.astype(dataset.dtype))
+                    values[name] = rows.astype(self._datasets[name].dtype)
+                    write_rows(self._datasets[name], first, values[name])
+                write_rows(self._digests, first, row_digests(values, first))
         self.n_buffered = 0
 
     def commit(self) -> None:

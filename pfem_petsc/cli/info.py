@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
+from ..errors import printable
 from .parser import PROGRAM, add_result, surviving
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ def run(arguments: argparse.Namespace) -> int:
     from ..output.result import open_result
 
     with open_result(path) as result:
-        print("\n".join(describe(result)))
+        print("\n".join(printable(line) for line in describe(result)))
     if arguments.verify:
         print("All values match their checksums.")
     return 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import pickle
 import time
@@ -34,10 +35,9 @@ def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     except RuntimeError as error:
         if "no locator" not in str(error):
             raise
-        warnings.warn(
+        _warn_once(
             "compiled code cannot be cached (neither the package folder nor the home folder is writable), so every "
-            "start compiles anew; set NUMBA_CACHE_DIR to a writable folder",
-            stacklevel=2,
+            "start compiles anew; set NUMBA_CACHE_DIR to a writable folder"
         )
         return numba.njit(**options)(function)
     file = getattr(getattr(compiled, "_cache", None), "_cache_file", None)
@@ -45,6 +45,12 @@ def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
         file.__class__ = _CacheFile
         file._function = function
     return compiled
+
+
+@functools.cache
+def _warn_once(text: str) -> None:
+    """There are some forty loops: what is wrong with the folder of one is wrong with that of all."""
+    warnings.warn(text, stacklevel=3)
 
 
 def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -89,7 +95,7 @@ class _CacheFile(IndexDataCacheFile):
         try:
             super().save(key, data)
         except OSError as error:
-            warnings.warn(f"compiled code cannot be kept for the next start: {error}", stacklevel=2)
+            _warn_once(f"compiled code cannot be kept for the next start: {error.strerror}")
 
 
 def code_digest(function: Callable[..., Any]) -> str:

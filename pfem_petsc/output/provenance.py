@@ -54,7 +54,7 @@ def write_case(file: h5py.File, case_text: str, attributes: Mapping[str, Any]) -
             group.attrs[name] = value
         else:
             text = value if isinstance(value, str) else "json:" + json.dumps(value, default=_plain)
-            raw = text.encode()
+            raw = text.encode(errors="backslashreplace")
             group.pop(name, None)
             if len(raw) > LONGEST_ATTRIBUTE:
                 set_text(group, name, text)

@@ -11,7 +11,7 @@ import numpy as np
 from ..errors import InputError
 from ..output.units import prefix_for
 
-__all__ = ["COLOURS", "STYLE", "Chart", "thinned", "window_mean"]
+__all__ = ["COLOURS", "STYLE", "Chart", "literal", "thinned", "window_mean"]
 
 COLOURS = ("#2563b0", "#d9482b", "#2a9d5c", "#8a4fbf", "#e09f1f", "#3aa7c9", "#6b7280", "#b5307c")
 
@@ -80,6 +80,11 @@ def window_mean(time: np.ndarray, values: np.ndarray, width: float) -> np.ndarra
     return (primitive(high) - primitive(low)) / (high - low)
 
 
+def literal(text: str) -> str:
+    """A text as it stands: dollar signs begin no formula."""
+    return text.replace("$", r"\$")
+
+
 class Chart:
     """Panels over a common time axis, one below the other or in columns.
 
@@ -102,7 +107,7 @@ class Chart:
         self.figure = Figure(figsize=size, layout="constrained")
         FigureCanvasAgg(self.figure)
         self.axes = self.figure.subplots(rows, columns, sharex=True, squeeze=False, height_ratios=relative)
-        self.figure.suptitle(title, x=0.01, ha="left", fontsize=13, fontweight="bold", color="#1f242c")
+        self.figure.suptitle(literal(title), x=0.01, ha="left", fontsize=13, fontweight="bold", color="#1f242c")
         self.time = np.asarray(time, dtype=float)
         self.factor, self.unit = prefix_for(float(np.abs(self.time).max()) if self.time.size else 0.0, "s")
         for axes in self.axes[-1]:
@@ -124,9 +129,9 @@ class Chart:
         for number, (name, values) in enumerate(curves):
             time, thin = thinned(self.time, np.asarray(values, dtype=float) * factor)
             options = {"color": COLOURS[number % len(COLOURS)], **(styles[number] if styles else {})}
-            axes.plot(time * self.factor, thin, label=name, **options)
+            axes.plot(time * self.factor, thin, label=literal(name), **options)
         axes.set_ylabel(f"{label} [{shown}]" if shown else label)
-        axes.set_title(title)
+        axes.set_title(literal(title))
         if legend and len(curves) > 1:
             axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.0, handlelength=1.4)
         return factor, shown

@@ -175,6 +175,11 @@ def _prepare(folder: Path, restart: Restart | None, plan) -> Path | None:
                 # A later one than the results will reach back to must not be taken for the newest.
                 os.replace(folder / NAME, folder / ASIDE)
         elif any((folder / name).exists() for name in (RESULT, NAME, PREVIOUS)):
+            if folder.resolve() in (here := Path.cwd().resolve(), *here.parents):
+                raise InputError(
+                    f"{folder}: holds results, which cannot be moved aside from under the current folder; "
+                    "give another with -o, or continue them with --restart"
+                )
             number = 1
             while (free := folder.with_name(f"{folder.name}.{number}")).exists():
                 number += 1

@@ -77,8 +77,6 @@ def read_tables(data: Mapping[str, Any], folder: Path, problems: Problems) -> di
     title = data.get("title")
     if title is not None and not isinstance(title, str):
         problems.add(("title",), "expected a text in quotes", title)
-    elif title is not None and not title.isprintable():
-        problems.add(("title",), "expected a text on one line, without control characters", title)
     return {
         "title": title,
         "mesh": _mesh(data, folder, problems),

@@ -94,7 +94,10 @@ def _parse(words: list[str]) -> tuple[argparse.Namespace, ModuleType]:
         words = ["run", *words]
     # Help comes from one rank.
     with contextlib.redirect_stdout(io.StringIO()) if launched_rank() else contextlib.nullcontext():
-        arguments = parser.parse_args(words)
+        arguments, unknown = parser.parse_known_args(words)
+    if unknown:
+        # the parser of all verbs would name its own help
+        raise InputError(f"unrecognized arguments: {' '.join(unknown)}; see {PROGRAM} {arguments.verb} --help")
     return arguments, verbs[arguments.verb]
 
 

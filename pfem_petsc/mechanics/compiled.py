@@ -161,11 +161,11 @@ class Compilation(event.Listener):
 
     Parameters
     ----------
-    begun : called before the first
+    begun : called before the first, with its name
     took : called with the time that each took [s]
     """
 
-    def __init__(self, begun: Callable[[], None], took: Callable[[float], None]) -> None:
+    def __init__(self, begun: Callable[[str], None], took: Callable[[float], None]) -> None:
         self._begun, self._took = begun, took
         self._told = False
         self._nested = 0  # loops that are compiled for one that calls them
@@ -185,7 +185,7 @@ class Compilation(event.Listener):
             self._begin = time.perf_counter()
             if not self._told:
                 self._told = True
-                self._begun()
+                self._begun(getattr(getattr(event.data.get("dispatcher"), "py_func", None), "__name__", "a loop"))
         self._nested += 1
 
     def on_end(self, event: event.Event) -> None:

@@ -16,6 +16,7 @@ from mpi4py import MPI
 
 from ..errors import InputError, SimulationFailure
 from ..parallel.agreement import agreed, on_root
+from .units import unit_of
 
 __all__ = [
     "HDF5_ERRORS",
@@ -32,6 +33,7 @@ __all__ = [
     "require_parallel_hdf5",
     "require_room",
     "set_text",
+    "set_unit",
     "write_rows",
     "writing",
 ]
@@ -208,6 +210,12 @@ def set_text(group: h5py.Group, name: str, text: str) -> None:
         del group[name]
     raw = text.encode("utf-8")
     group.create_dataset(name, data=np.array(raw, dtype=h5py.string_dtype("utf-8", max(1, len(raw)))))
+
+
+def set_unit(dataset: h5py.Dataset, name: str) -> None:
+    """The attribute ``unit`` of a field or history column: "m/s", or "1" for a pure number. Collective."""
+    raw = (unit_of(name) or "1").encode()
+    dataset.attrs.create("unit", raw, dtype=h5py.string_dtype("utf-8", len(raw)))
 
 
 @contextmanager

@@ -61,15 +61,15 @@ def thinned(time: np.ndarray, values: np.ndarray, points: int = _POINTS) -> tupl
 
 
 def window_mean(time: np.ndarray, values: np.ndarray, width: float) -> np.ndarray:
-    """Mean of a piecewise linear curve over a window of this width [s] around each point, cut at the ends.
+    """Mean of a piecewise linear curve over the time of this width [s] before each point, cut at the start.
 
-    The integral is exact whatever the spacing of the points, so impulses are kept.
+    It rises with what has been, never before it. The integral is exact whatever the spacing of the points.
     """
     if len(time) < 2 or width <= 0:
         return values.copy()
     steps = np.diff(time)
     integral = np.concatenate([[0.0], np.cumsum(0.5 * steps * (values[1:] + values[:-1]))])
-    low, high = np.maximum(time - width / 2, time[0]), np.minimum(time + width / 2, time[-1])
+    low = np.maximum(time - width, time[0])
 
     def primitive(at: np.ndarray) -> np.ndarray:
         k = np.clip(np.searchsorted(time, at, side="right") - 1, 0, len(steps) - 1)
@@ -77,7 +77,8 @@ def window_mean(time: np.ndarray, values: np.ndarray, width: float) -> np.ndarra
         slope = (values[k + 1] - values[k]) / np.where(steps[k] > 0, steps[k], 1.0)
         return integral[k] + part * (values[k] + 0.5 * slope * part)
 
-    return (primitive(high) - primitive(low)) / (high - low)
+    span = time - low
+    return np.where(span > 0.0, (integral - primitive(low)) / np.where(span > 0.0, span, 1.0), values)
 
 
 def literal(text: str) -> str:

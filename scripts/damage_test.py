@@ -83,6 +83,7 @@ def main() -> int:
                 bad.append(f"{what}: went into continued results in silence")
             outcome = "refused" if done.returncode else "does not matter"
             counts[f"{what.split()[0]}: {outcome}, info --verify status {info.returncode}"] += 1
+            print(f"{what}: {outcome}, info --verify status {info.returncode}", flush=True)
     for outcome, number in sorted(counts.items()):
         print(f"{number:5}  {outcome}")
     print("\n".join(bad) or "none went into results in silence, none crashed")

@@ -104,7 +104,7 @@ def test_the_current_folder_is_not_moved_aside(tmp_path, monkeypatch):
     (tmp_path / "result.vtkhdf").write_text("x")
     for folder in (Path("."), tmp_path):
         with pytest.raises(InputError, match="cannot be moved aside from under the current folder.*-o"):
-            _prepare(folder, None)
+            _prepare(folder, None, None)
 
 
 def test_numpy_values_in_a_case():

@@ -12,6 +12,7 @@ from mpi4py import MPI
 from truss import Truss, options, write
 
 from pfem_petsc.errors import InputError
+from pfem_petsc.output.digests import damages
 from pfem_petsc.output.result import open_result
 from pfem_petsc.output.verify import examine
 from pfem_petsc.output.vtkhdf import ResultWriter
@@ -59,9 +60,10 @@ def test_a_changed_value_is_named_and_not_continued(tmp_path, name):
         dataset = file[name]
         value = dataset[rows.get(name, 3)]
         dataset[rows.get(name, 3)] = value + np.ones_like(value)
-    (line,) = examine(path, deep=True)
+    with h5py.File(path) as file:
+        (line,) = damages(file)
     assert DAMAGES[name] in line
-    if name in ("history/momentum", "VTKHDF/Points"):
+    if name == "history/momentum":
         with pytest.raises(InputError, match="damaged: .*not continued; restore it from a copy"):
             ResultWriter(path, MPI.COMM_SELF, truss.mesh, **options(append_after_step=9))
 
@@ -71,7 +73,8 @@ def test_what_follows_a_restart_has_its_checksums_too(tmp_path):
     truss = written(path)
     with ResultWriter(path, MPI.COMM_SELF, truss.mesh, **options(append_after_step=7)) as writer:
         write(writer, truss, range(8, 20), every=1)
-    assert examine(path, deep=True) == []
+    with h5py.File(path) as file:
+        assert list(damages(file)) == []
     assert len(open_result(path).times) == 20
 
 
@@ -83,7 +86,7 @@ def test_no_random_damage_is_continued_in_silence_or_ends_the_reader(tmp_path):
     shutil.copy(whole, expected)
     continued(expected, truss)
     chance = random.Random(3)
-    for k in range(12):
+    for k in range(6):
         path = tmp_path / f"{k}.vtkhdf"
         what = damaged(whole, path, chance)
         try:

@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
-__all__ = ["EarlyStop", "InputError", "PfemError", "SimulationFailure"]
+__all__ = ["EarlyStop", "InputError", "PfemError", "SimulationFailure", "printable"]
+
+
+def printable(text: str) -> str:
+    """A text without control characters but line breaks and tabs: a terminal would obey them."""
+    return "".join(c if c.isprintable() or c in "\n\t" else ascii(c)[1:-1] for c in text)
 
 
 class PfemError(Exception):

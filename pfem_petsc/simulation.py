@@ -464,8 +464,8 @@ class Simulation:
             self.restart.file.close()
         self._stop.release()
 
-    def _tell_compilation(self) -> None:
-        text = "compiling loops for this machine, once"
+    def _tell_compilation(self, name: str) -> None:
+        text = f"compiling loops for this machine, once: {name} and what else this kind of case needs, up to a minute"
         if self._progress is not None:
             self._progress.message(text)
         elif self.comm.rank == 0 and not self.quiet:

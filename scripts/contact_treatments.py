@@ -7,6 +7,7 @@ The exact force is constant, rho c A v for 2 L/c, and no energy is lost.
 
 from __future__ import annotations
 
+import argparse
 import tempfile
 from pathlib import Path
 
@@ -100,6 +101,7 @@ def figure(results: dict) -> None:
 
 def main() -> None:
     """Run everything, and put the table between its marks in the document."""
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     results = {
         (label(integrator, parameters), treatment): run(treatment, integrator, parameters)
         for integrator, parameters in SCHEMES

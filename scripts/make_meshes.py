@@ -4,11 +4,13 @@
 
 - ``ring.msh`` (Gmsh 4.1): circular plane truss, X-braced, 14 bays, radii 22.83 and 22.37 m, one node towards +x.
 - ``space_truss.msh`` (Gmsh 2.2): an irregular ball of bars along the edges of a Delaunay tetrahedralisation.
+- ``bridge.msh`` (Gmsh 2.2): the plane bridge of ``docs/case_file.md``, 8 m in eight bays, 1 m high.
 - ``mast.vtu``: a square guyed-mast section of 12 bays, braced in every face and in plan.
 """
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
 
 import numpy as np
@@ -124,6 +126,24 @@ def make_mast(path: Path) -> None:
     path.write_text("\n".join(text))
 
 
+def make_bridge(path: Path) -> None:
+    """Write a plane truss of eight bays in x and z, with its supports and chords as physical groups."""
+    bays = 8
+    points = [(float(k), 0.0, 0.0) for k in range(bays + 1)] + [(k + 0.5, 0.0, 1.0) for k in range(bays)]
+    top = bays + 1
+    chords = [(k, k + 1) for k in range(bays)] + [(top + k, top + k + 1) for k in range(bays - 1)]
+    diagonals = [pair for k in range(bays) for pair in ((k, top + k), (top + k, k + 1))]
+    names = ['0 1 "left"', '0 2 "right"', '1 3 "chords"', '1 4 "diagonals"']
+    elements = [f"15 2 1 1 {1}", f"15 2 2 2 {bays + 1}"]
+    elements += [f"1 2 3 3 {a + 1} {b + 1}" for a, b in chords] + [f"1 2 4 4 {a + 1} {b + 1}" for a, b in diagonals]
+    lines = ["$MeshFormat", "2.2 0 8", "$EndMeshFormat", "$PhysicalNames", str(len(names)), *names]
+    lines += ["$EndPhysicalNames", "$Nodes", str(len(points))]
+    lines += [f"{k} {_numbers(np.array(point))}" for k, point in enumerate(points, 1)]
+    lines += ["$EndNodes", "$Elements", str(len(elements))]
+    lines += [f"{k} {element}" for k, element in enumerate(elements, 1)]
+    path.write_text("\n".join([*lines, "$EndElements", ""]))
+
+
 def _array(kind: str, name: str, values: np.ndarray, components: int = 1) -> str:
     rows = np.asarray(values).reshape(-1, 3 if components == 3 else 2 if name == "connectivity" else 1)
     lines = [_numbers(row) if components == 3 else " ".join(str(v) for v in row) for row in rows]
@@ -136,7 +156,9 @@ def _numbers(values: np.ndarray) -> str:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     FOLDER.mkdir(exist_ok=True)
     make_ring(FOLDER / "ring.msh")
     make_space_truss(FOLDER / "space_truss.msh")
+    make_bridge(FOLDER / "bridge.msh")
     make_mast(FOLDER / "mast.vtu")

@@ -264,5 +264,7 @@ case $mode in
     distribution) from_distribution ;;
 esac
 check
+say "compiling loops for this machine"
+timeout 120 "$python" -m pfem_petsc bench --compile || say "not compiled: the first runs compile what they need"
 stamp > "$venv/setup-done"
 say "done in $((SECONDS - start)) s: ${venv#"$root"/}"

@@ -6,9 +6,11 @@ import re
 from pathlib import Path
 
 import pytest
+from mpi4py import MPI
 
 from pfem_petsc.case import settings, tables
 from pfem_petsc.case.schema import Case
+from pfem_petsc.mesh.readers.gmsh import read
 from pfem_petsc.registry import choices, lookup
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -39,4 +41,7 @@ def test_every_key_of_walls_is_named():
 def test_example_is_read(tmp_path):
     case = Case.from_toml(re.search(r"^```toml\n(.*?)^```$", TEXT, flags=re.MULTILINE | re.DOTALL)[1], tmp_path)
     assert [load.force for load in case.load] == [(0.0, 0.0, -5e4)]
+    mesh = read(DOCS.parent / "meshes" / case.mesh.file.name, MPI.COMM_SELF)
+    assert {"left", "right"} <= set(mesh.node_groups)
+    assert {"chords"} <= set(mesh.bar_groups)
     assert case.temperature[0].bars == case.section["chord"].bars == "chords"

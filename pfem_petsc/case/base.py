@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Annotated, Any
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
 __all__ = [
     "Finite",
@@ -44,6 +44,13 @@ def _tuple_from_list(value: Any) -> Any:
 listed = BeforeValidator(_tuple_from_list)
 """Put on a tuple type (``Annotated[tuple[float, float], listed]``): takes TOML's lists."""
 
+
+def _no_path_of_its_own(name: str) -> str:
+    if name in (".", ".."):
+        raise ValueError("a dot is no name; results are kept under it")
+    return name
+
+
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 PositiveFloat = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 NonNegativeFloat = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
@@ -51,8 +58,8 @@ PositiveInt = Annotated[int, Field(gt=0, lt=2**63)]
 NonNegativeInt = Annotated[int, Field(ge=0, lt=2**63)]
 Vector3 = Annotated[tuple[Finite, Finite, Finite], listed]
 PositiveInts3 = Annotated[tuple[PositiveInt, PositiveInt, PositiveInt], listed]
-Name = Annotated[str, Field(min_length=1, pattern=r"^[^/\x00-\x1f]+$")]
-"""A name that ends up as part of a path inside the result file: not empty, no slash."""
+Name = Annotated[str, Field(min_length=1, pattern=r"^[^/\x00-\x1f\x7f-\x9f]+$"), AfterValidator(_no_path_of_its_own)]
+"""A name that ends up as part of a path inside the result file: not empty, no slash, no dot alone, which HDF5 skips."""
 
 
 class WallParameters(StrictModel):

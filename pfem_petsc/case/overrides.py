@@ -22,6 +22,9 @@ LISTS = {
 }
 """Keys under which a missing value is made as a list of tables."""
 
+DEEPEST = 100
+"""Parts of a key."""
+
 _PART = re.compile(r"""(?:"((?:[^"\\]|\\.)*)"|([^.\[\]"]+))|\[(\d+)\]""")
 
 
@@ -47,6 +50,8 @@ def apply_overrides(data: dict[str, Any], overrides: Iterable[str]) -> list[tupl
     for text in overrides:
         key, equals, value = text.partition("=")
         parts = split_key(key.strip())
+        if parts is not None and len(parts) > DEEPEST:
+            raise InputError(f"--set {text[:40]} ...: a key of more than {DEEPEST} parts")
         if not equals or parts is None:
             raise InputError(f"--set {text}: expected KEY=VALUE, like time.step=1e-5 or wall.0.point=[1.0, 0.0, 0.0]")
         if not value.strip():
@@ -59,7 +64,7 @@ def apply_overrides(data: dict[str, Any], overrides: Iterable[str]) -> list[tupl
 def _value(text: str) -> Any:
     try:
         read = tomllib.loads(f"value = {text}")
-    except (tomllib.TOMLDecodeError, RecursionError):
+    except (ValueError, RecursionError):  # a syntax error, too many digits, nested too deep
         return text
     return read["value"] if len(read) == 1 else text
 
@@ -86,7 +91,7 @@ def split_key(key: str) -> list[str] | None:
 def _take_out(data: dict[str, Any], parts: list[str]) -> None:
     here: Any = data
     for k, part in enumerate(parts):
-        key = int(part) if isinstance(here, list) and part.isdigit() else part
+        key = int(part) if isinstance(here, list) and _is_place(part) else part
         if not (key in here if isinstance(here, dict) else isinstance(here, list) and key in range(len(here))):
             return
         if k == len(parts) - 1:
@@ -95,13 +100,17 @@ def _take_out(data: dict[str, Any], parts: list[str]) -> None:
             here = here[key]
 
 
+def _is_place(part: str) -> bool:
+    return part.isascii() and part.isdigit() and len(part) <= 18
+
+
 def _put(data: dict[str, Any], parts: list[str], value: Any, where: str) -> tuple[str | int, ...]:
     path: tuple[str | int, ...] = ()
     here: Any = data
     for k, part in enumerate(parts):
         last = k == len(parts) - 1
         if isinstance(here, list):
-            if not part.isdigit() or int(part) > len(here):
+            if not _is_place(part) or int(part) > len(here):
                 raise InputError(
                     f"{where}: {part!r} is not one of the places of this list: 0 to {len(here)}, of which the last is "
                     "for a new one"

@@ -67,6 +67,8 @@ class Problems:
         """Note a problem where ``name`` is not one of the ``known`` names of a ``what``."""
         if name not in known:
             hint = nearest(name, list(known)) if known else "; the case defines none"
+            if what == "node set":
+                hint += f'; a group of the mesh is made one by node_set.NAME = {{ group = "{name}" }}'
             self.add(path, f"there is no {what} of this name{hint}", name)
 
     def raise_if_any(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -24,6 +25,10 @@ WALLS = "pfem_petsc.contact.walls"
 
 M = TypeVar("M", bound=StrictModel)
 
+DEEPEST = 100
+"""Parts of a dotted key; the time that many take grows with their square."""
+_LONG_KEY = re.compile(r"""(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*)""" + f"{{{DEEPEST}}}")
+
 KEYS = [
     *("title", "mesh", "node_set", "material", "section", "initial", "support"),
     *("load", "gravity", "temperature", "wall", "contact_pair", "contact", "time", "output", "solver"),
@@ -40,9 +45,15 @@ def parse_toml(text: str, source: str) -> dict[str, Any]:
         On a syntax error; the message names line and column.
     """
     try:
+        if (found := _LONG_KEY.search(text)) is not None:
+            line = text.count("\n", 0, found.start()) + 1
+            raise InputError(f"{source}: line {line}: this is not a case: a key of more than {DEEPEST} parts")
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{source}: this is not valid TOML: {error}") from error
+    except ValueError as error:
+        # Python converts no more digits than that to an integer
+        raise InputError(f"{source}: this is not a case: it has an integer of more than 4,300 digits") from error
     except RecursionError as error:
         raise InputError(f"{source}: this is not a case: its lists or tables are nested too deep") from error
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import difflib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -16,7 +15,7 @@ from .checks import check_names
 from .overrides import apply_overrides
 from .problems import Problems
 from .reading import KEYS, parse_toml, read_tables
-from .toml import table_text
+from .toml import plain, table_text
 
 __all__ = ["Case"]
 
@@ -99,8 +98,15 @@ class Case:
         folder: str | Path = ".",
         overrides: Iterable[str] = (),
     ) -> Case:
-        """Check a case given as nested tables with the keys of the case file; see :meth:`load`."""
-        data, overrides = copy.deepcopy(dict(data)), tuple(overrides)
+        """Check a case given as nested tables with the keys of the case file; see :meth:`load`.
+
+        NumPy numbers and arrays, tuples and paths stand for what TOML has. ``folder`` is what ``mesh.file`` is relative
+        to, ``name`` the default folder of the results.
+        """
+        try:
+            data, overrides = plain(dict(data)), tuple(overrides)
+        except RecursionError as error:
+            raise InputError(f"{source}: this is not a case: its lists or tables are nested too deep") from error
         problems = Problems(source, apply_overrides(data, overrides))
         attributes = read_tables(data, Path(folder), problems)
         check_names(attributes, data, problems)

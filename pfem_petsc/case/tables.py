@@ -240,6 +240,8 @@ class ContactPair(StrictModel):
     def _has_length(cls, value: Vector3) -> Vector3:
         if not any(value):
             raise ValueError("has zero length; give the direction from first to second")
+        if not 1e-100 < max(map(abs, value)) < 1e100:
+            raise ValueError("has components out of range (1e-100 to 1e100); give a vector of about length 1")
         return value
 
 

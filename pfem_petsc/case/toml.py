@@ -5,9 +5,23 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Mapping
+from pathlib import PurePath
 from typing import Any
 
-__all__ = ["table_text", "value_text"]
+import numpy as np
+
+__all__ = ["plain", "table_text", "value_text"]
+
+
+def plain(value: Any) -> Any:
+    """A copy of nested tables and lists in Python's own types, those of NumPy, tuples and paths resolved."""
+    if isinstance(value, Mapping):
+        return {key: plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    return str(value) if isinstance(value, PurePath) else value
 
 
 def value_text(value: Any) -> str:
@@ -20,6 +34,8 @@ def value_text(value: Any) -> str:
         return "{" + ", ".join(f"{_key(k)} = {value_text(v)}" for k, v in value.items()) + "}"
     if isinstance(value, list | tuple):
         return "[" + ", ".join(value_text(v) for v in value) + "]"
+    if isinstance(value, int) and abs(value) >= 1 << 4096:
+        return hex(value)  # Python writes no decimals of so large a number
     return repr(value) if isinstance(value, int | float) else str(value)
 
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import InputError
 from .parser import PROGRAM
+from .petsc_options import start_petsc
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -51,14 +53,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--history-every", metavar="N", type=_size, default=1, help="steps between rows of the history")
     parser.add_argument("--seconds", metavar="T", type=float, default=2.0, help="to time each job for, about")
+    parser.add_argument(
+        "--compile", action="store_true", help="only compile the loops of the jobs for later runs; measure nothing"
+    )
     parser.add_argument("-o", "--output", metavar="FILE", type=Path, help="write all figures as JSON")
 
 
 def run(arguments: argparse.Namespace, comm: MPI.Comm) -> int:
     """Measure and print. Collective."""
-    import petsc4py
-
-    petsc4py.init([PROGRAM, *arguments.petsc_options])
+    start_petsc(arguments.petsc_options, comm.rank)
     from ..bench.bandwidth import measure_bandwidth
     from ..bench.cases import cells_for
     from ..bench.jobs import jobs, tiny_jobs
@@ -74,11 +77,6 @@ def run(arguments: argparse.Namespace, comm: MPI.Comm) -> int:
         if comm.rank == 0:
             print(text, flush=True)
 
-    say(f"{processor()}, {comm.size} rank{'s' if comm.size > 1 else ''}, {arguments.kind} lattices")
-    bandwidth = measure_bandwidth(comm)
-    say(bandwidth_line(bandwidth))
-    messages = measure_messages(comm)
-    say(messages_line(messages) + "\n" if messages is not None else "")
     chosen = jobs(
         arguments.jobs,
         arguments.explicit,
@@ -87,6 +85,18 @@ def run(arguments: argparse.Namespace, comm: MPI.Comm) -> int:
         arguments.plastic,
         arguments.history_every,
     )
+    if arguments.compile:
+        begin = time.perf_counter()
+        for job in chosen:
+            time_job(job, arguments.kind, 2, comm, None, 0.0)
+        time_job(tiny_jobs(arguments.explicit)[0], "cubic", 2, comm, None, 0.0, 3000)
+        say(f"loops for this machine are compiled: {time.perf_counter() - begin:.1f} s")
+        return 0
+    say(f"{processor()}, {comm.size} rank{'s' if comm.size > 1 else ''}, {arguments.kind} lattices")
+    bandwidth = measure_bandwidth(comm)
+    say(bandwidth_line(bandwidth))
+    messages = measure_messages(comm)
+    say(messages_line(messages) + "\n" if messages is not None else "")
     for job in chosen:  # kernels compiled or loaded, libraries started: not part of what follows
         time_job(job, arguments.kind, 2, comm, None, 0.0)
     say(HEADER)

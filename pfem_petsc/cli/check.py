@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
+from ..errors import printable
 from .parser import PROGRAM, add_case
 from .run import load_case
 
@@ -36,7 +37,7 @@ def run(arguments: argparse.Namespace, comm: MPI.Comm) -> int:
     summary |= closer
     if comm.rank == 0:
         width = max(map(len, summary), default=0)
-        print(case.title)
+        print(printable(case.title))
         for label, text in summary.items():
             print(f"  {label:{width}}  {text}")
         for text in warnings:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
+from ..errors import printable
 from ..output.energies import LOST, STORED, SUPPLIED
-from .parser import PROGRAM, add_result
+from .parser import PROGRAM, add_result, surviving
 
 if TYPE_CHECKING:
     from ..output.result import Result
@@ -14,21 +15,28 @@ if TYPE_CHECKING:
 RANKS = "one"
 
 EXAMPLE = f"""\
-example:
-  {PROGRAM} info results/rod_impact"""
+examples:
+  {PROGRAM} info results/rod_impact
+  {PROGRAM} info results/rod_impact --verify"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the verb."""
     add_result(parser)
+    parser.add_argument(
+        "--verify", action="store_true", help="compare all values with their checksums; status 2 where one differs"
+    )
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Print the summary of a result."""
+    path = surviving(arguments.result, deep=arguments.verify or None, refuse=arguments.verify)
     from ..output.result import open_result
 
-    with open_result(arguments.result) as result:
-        print("\n".join(describe(result)))
+    with open_result(path) as result:
+        print("\n".join(printable(line) for line in describe(result)))
+    if arguments.verify:
+        print("All values match their checksums.")
     return 0
 
 

@@ -6,14 +6,15 @@ environment that the launcher made.
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 import time
 import traceback
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TextIO
 
-from ..errors import EarlyStop, InputError, PfemError, SimulationFailure
+from ..errors import EarlyStop, InputError, PfemError, SimulationFailure, printable
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -21,6 +22,9 @@ if TYPE_CHECKING:
 __all__ = ["collectively", "launched_rank", "on_first_rank", "refuse"]
 
 RANK_VARIABLES = ("OMPI_COMM_WORLD_RANK", "PMIX_RANK", "PMI_RANK", "SLURM_PROCID")
+
+_PETSC_REFUSED = (62, 63, 83, 86)
+"""Codes of PETSc's errors: wrong or out of range argument, file cannot be opened, unknown type."""
 
 GRACE = 3.0
 """Seconds in which all ranks must report the same failure; after that the job is aborted."""
@@ -65,7 +69,9 @@ def on_first_rank(function: Callable[[], int], debug: bool, uses_mpi: bool) -> i
     if rank:
         return 0
     try:
-        return function()
+        status = function()
+        sys.stdout.flush()  # what cannot be written is told, not lost at the end of the process
+        return status
     except BrokenPipeError:
         # Who reads the output has seen enough (``list | head``); the interpreter must not flush into the closed pipe.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -90,6 +96,7 @@ def collectively(function: Callable[[MPI.Comm], int], debug: bool) -> int:
     failures = comm.Dup()
     try:
         status = function(comm)
+        sys.stdout.flush()
     except (Exception, KeyboardInterrupt) as error:
         if not _all_arrive(failures):
             comm.Abort(_print(error, debug, f"rank {comm.rank}: "))
@@ -117,13 +124,18 @@ def _print(error: BaseException, debug: bool, who: str = "") -> int:
         text = "".join(traceback.format_exception(error)) + text
     try:
         sys.stdout.flush()
-        print(f"{who}{text}", file=sys.stderr, flush=True)
     except OSError:
-        # the terminal has gone; the interpreter must not flush into it at its end
-        nowhere = os.open(os.devnull, os.O_WRONLY)
-        for stream in (sys.stdout, sys.stderr):
-            os.dup2(nowhere, stream.fileno())
+        _to_nowhere(sys.stdout)
+    try:
+        print(f"{who}{printable(text)}", file=sys.stderr, flush=True)
+    except OSError:
+        _to_nowhere(sys.stderr)
     return status
+
+
+def _to_nowhere(stream: TextIO) -> None:
+    """The terminal has gone, or its disk is full: the interpreter must not flush into it at its end."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 def _message(error: BaseException) -> tuple[int, str]:
@@ -138,6 +150,15 @@ def _message(error: BaseException) -> tuple[int, str]:
     if isinstance(error, ModuleNotFoundError) and not str(error.name).startswith(__package__.partition(".")[0]):
         way = "scripts/setup.sh makes an environment that has it: source .venv/bin/activate"
         return InputError.exit_status, f"error: {error}; {way}"
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EIO):
+        where = f"{error.filename}: " if error.filename else "standard output, or a file that is being written: "
+        return SimulationFailure.exit_status, f"error: {where}{error.strerror}; make room, or write elsewhere"
+    if type(error).__module__ == "petsc4py.PETSc" and getattr(error, "ierr", 0) in _PETSC_REFUSED:
+        reason = " ".join(str(error).split())
+        return (
+            InputError.exit_status,
+            f"error: PETSc refuses an option: {reason}; check what follows -- (docs/linear_solvers.md)",
+        )
     detail = " ".join(str(error).split()) or "no message"
 
     return (

@@ -8,6 +8,7 @@ import difflib
 import importlib
 import io
 import sys
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
@@ -50,7 +51,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     cut = words.index("--") if "--" in words else len(words)
     own, petsc_options = words[:cut], words[cut + 1 :]
     debug = "--debug" in own
+    # numbers that overflow are told as what they lead to
+    warnings.filterwarnings("default" if debug else "ignore", category=RuntimeWarning)
     try:
+        _require_text(words)
         arguments, verb = _parse(own)
         if petsc_options and verb.RANKS != "all":
             raise InputError(f"{arguments.verb} takes no PETSc options: {' '.join(petsc_options)}")
@@ -70,6 +74,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     return on_first_rank(run_verb, debug, uses_mpi=verb.RANKS == "one")
 
 
+def _require_text(words: Sequence[str]) -> None:
+    for word in words:
+        try:
+            word.encode()
+        except UnicodeEncodeError as error:
+            shown = word.encode(errors="surrogateescape").decode(errors="backslashreplace")
+            raise InputError(f"{shown}: has bytes that are not UTF-8: rename the file, or give other text") from error
+
+
 def _parse(words: list[str]) -> tuple[argparse.Namespace, ModuleType]:
     parser, verbs = _parser()
     if not words:
@@ -81,7 +94,10 @@ def _parse(words: list[str]) -> tuple[argparse.Namespace, ModuleType]:
         words = ["run", *words]
     # Help comes from one rank.
     with contextlib.redirect_stdout(io.StringIO()) if launched_rank() else contextlib.nullcontext():
-        arguments = parser.parse_args(words)
+        arguments, unknown = parser.parse_known_args(words)
+    if unknown:
+        # the parser of all verbs would name its own help
+        raise InputError(f"unrecognized arguments: {' '.join(unknown)}; see {PROGRAM} {arguments.verb} --help")
     return arguments, verbs[arguments.verb]
 
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import argparse
 import re
+import sys
+from pathlib import Path
 from typing import NoReturn
 
 from ..errors import InputError
 
-__all__ = ["Parser", "add_case", "add_debug", "add_result", "seconds"]
+__all__ = ["Parser", "add_case", "add_debug", "add_result", "seconds", "surviving"]
 
 PROGRAM = "python -m pfem_petsc"
 
@@ -45,6 +47,30 @@ def add_case(parser: argparse.ArgumentParser) -> None:
 def add_result(parser: argparse.ArgumentParser) -> None:
     """RESULT."""
     parser.add_argument("result", metavar="RESULT", help="result file, or its folder")
+
+
+def surviving(result: str, deep: bool | None = None, refuse: bool = False) -> Path:
+    """The result file of RESULT, after a process of its own has read it: HDF5 may crash on a damaged one.
+
+    Values that do not match their checksums are a warning on stderr, or refused.
+
+    Raises
+    ------
+    InputError
+        There is no such file, or it cannot be read; with ``refuse`` also where values do not match.
+    """
+    from ..output.result import result_file
+    from ..output.verify import SHOWN, examine
+
+    path = result_file(result)
+    wrong = examine(path, deep) if path.is_file() else []
+    if wrong:
+        lines = wrong if len(wrong) <= SHOWN else [*wrong[:SHOWN], f"... and {len(wrong) - SHOWN} more"]
+        text = f"{path}: damaged: " + "\n  ".join(lines)
+        if refuse:
+            raise InputError(f"{text}\nrestore it from a copy; what is not named is sound")
+        print(f"warning: {text}", file=sys.stderr, flush=True)
+    return path
 
 
 def add_debug(parser: argparse.ArgumentParser) -> None:

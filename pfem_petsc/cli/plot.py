@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from .parser import PROGRAM, add_result
+from .parser import PROGRAM, add_result, surviving
 
 RANKS = "one"
 
@@ -34,6 +34,6 @@ def run(arguments: argparse.Namespace) -> int:
     """Plot, and say what was written."""
     from ..post.plot import plot
 
-    for path in plot(arguments.result, arguments.output, curves=arguments.curves):
+    for path in plot(surviving(arguments.result), arguments.output, curves=arguments.curves):
         print(path)
     return 0

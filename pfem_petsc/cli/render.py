@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from .parser import PROGRAM, add_result
+from .parser import PROGRAM, add_result, surviving
 
 RANKS = "one"
 
@@ -36,7 +36,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--clim", metavar=("LOW", "HIGH"), nargs=2, type=float, help="range of the colours [SI]; default: the values'"
     )
     parser.add_argument("--cmap", help="name of a matplotlib colour map")
-    parser.add_argument("--scale", type=float, default=1.0, help="of the displacements; default: %(default)g")
+    parser.add_argument(
+        "--scale", type=float, default=1.0, help="of nodes' displacements, not of walls; default: %(default)g"
+    )
     parser.add_argument("--bar-width", metavar="PIXELS", type=float, help="width of the bars")
     parser.add_argument(
         "--nodes", action=argparse.BooleanOptionalAction, help="draw nodes as balls; default: for small models"
@@ -49,7 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
     from ..post.render import render
 
     written = render(
-        arguments.result,
+        surviving(arguments.result),
         arguments.output,
         field=arguments.field,
         component=arguments.component,

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from ..errors import EarlyStop, SimulationFailure
 from .parser import PROGRAM, add_case, seconds
+from .petsc_options import start_petsc
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -75,9 +76,7 @@ def load_case(arguments: argparse.Namespace, comm: MPI.Comm):  # noqa: ANN201 - 
 
     A restart goes on with the values that the run it continues was given by ``--set``, and those given now over them.
     """
-    import petsc4py
-
-    petsc4py.init([PROGRAM, *arguments.petsc_options])
+    start_petsc(arguments.petsc_options, comm.rank)
     from ..parallel.agreement import on_root
 
     return on_root(comm, _load, arguments)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import pickle
 import time
@@ -34,10 +35,9 @@ def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     except RuntimeError as error:
         if "no locator" not in str(error):
             raise
-        warnings.warn(
+        _warn_once(
             "compiled code cannot be cached (neither the package folder nor the home folder is writable), so every "
-            "start compiles anew; set NUMBA_CACHE_DIR to a writable folder",
-            stacklevel=2,
+            "start compiles anew; set NUMBA_CACHE_DIR to a writable folder"
         )
         return numba.njit(**options)(function)
     file = getattr(getattr(compiled, "_cache", None), "_cache_file", None)
@@ -45,6 +45,12 @@ def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
         file.__class__ = _CacheFile
         file._function = function
     return compiled
+
+
+@functools.cache
+def _warn_once(text: str) -> None:
+    """There are some forty loops: what is wrong with the folder of one is wrong with that of all."""
+    warnings.warn(text, stacklevel=3)
 
 
 def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -89,7 +95,7 @@ class _CacheFile(IndexDataCacheFile):
         try:
             super().save(key, data)
         except OSError as error:
-            warnings.warn(f"compiled code cannot be kept for the next start: {error}", stacklevel=2)
+            _warn_once(f"compiled code cannot be kept for the next start: {error.strerror}")
 
 
 def code_digest(function: Callable[..., Any]) -> str:
@@ -155,11 +161,11 @@ class Compilation(event.Listener):
 
     Parameters
     ----------
-    begun : called before the first
+    begun : called before the first, with its name
     took : called with the time that each took [s]
     """
 
-    def __init__(self, begun: Callable[[], None], took: Callable[[float], None]) -> None:
+    def __init__(self, begun: Callable[[str], None], took: Callable[[float], None]) -> None:
         self._begun, self._took = begun, took
         self._told = False
         self._nested = 0  # loops that are compiled for one that calls them
@@ -179,7 +185,7 @@ class Compilation(event.Listener):
             self._begin = time.perf_counter()
             if not self._told:
                 self._told = True
-                self._begun()
+                self._begun(getattr(getattr(event.data.get("dispatcher"), "py_func", None), "__name__", "a loop"))
         self._nested += 1
 
     def on_end(self, event: event.Event) -> None:

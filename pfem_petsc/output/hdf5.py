@@ -16,10 +16,12 @@ from mpi4py import MPI
 
 from ..errors import InputError, SimulationFailure
 from ..parallel.agreement import agreed, on_root
+from .units import unit_of
 
 __all__ = [
     "HDF5_ERRORS",
     "chunk_rows",
+    "create_checked",
     "create_growing",
     "create_new",
     "dataset_names",
@@ -31,6 +33,7 @@ __all__ = [
     "require_parallel_hdf5",
     "require_room",
     "set_text",
+    "set_unit",
     "write_rows",
     "writing",
 ]
@@ -39,6 +42,11 @@ __all__ = [
 HDF5_ERRORS = (OSError, RuntimeError, ValueError, KeyError)
 
 CHUNK_BYTES = 1 << 20
+# Formats of a result file, lowest and highest. With 1.8's superblock and objects as of 1.10 all that HDF5 writes about
+# the data has its checksum, and chunks along one growing direction are found through an extensible array, whose
+# entries stay where they are: the B-tree of the earlier formats is divided from time to time, and a kill between the
+# writes of a division lost the file. The superblock of 1.10 would refuse a file whose writer was killed.
+SUPERBLOCK, OBJECTS = ("v108", "v108"), ("v110", "v110")
 # Bytes of chunks that HDF5 keeps in memory for each dataset: its own 1 MiB, times all columns and fields, would fill up
 # over a long run, and rows are never written a second time.
 CHUNK_CACHE = 1 << 16
@@ -64,11 +72,17 @@ def require_parallel_hdf5(comm: MPI.Comm) -> None:
 
 
 def create_new(
-    path: Path, comm: MPI.Comm, build: Callable[..., None], *arguments: Any, userblock_size: int = 0
+    path: Path,
+    comm: MPI.Comm,
+    build: Callable[..., None],
+    *arguments: Any,
+    userblock_size: int = 0,
+    checked: bool = False,
 ) -> Path:
     """Make an HDF5 file with its whole structure on rank 0, under a temporary name, which is given back.
 
-    ``build(file, *arguments)`` fills it; the first ``userblock_size`` bytes are left to the caller. Serial creation
+    ``build(file, *arguments)`` fills it; the first ``userblock_size`` bytes are left to the caller; a ``checked`` file
+    is in the formats in which HDF5 keeps checksums of all but the values. Serial creation
     makes the structure the same for any number of ranks, and an unwritable folder the same error on all of them.
     Collective.
 
@@ -83,8 +97,11 @@ def create_new(
     def create() -> None:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            with h5py.File(temporary, "w", locking=False, userblock_size=userblock_size) as file:
-                build(file, *arguments)
+            if checked:
+                create_checked(temporary, build, *arguments)
+            else:
+                with h5py.File(temporary, "w", locking=False, userblock_size=userblock_size) as file:
+                    build(file, *arguments)
         except (OSError, RuntimeError) as error:
             number = getattr(error, "errno", None)
             raise InputError(
@@ -106,11 +123,18 @@ def create_new(
     return temporary
 
 
+def create_checked(path: Path, build: Callable[..., None], *arguments: Any) -> None:
+    """Make a file in which HDF5 keeps checksums of all but the values, and fill it: ``build(file, *arguments)``."""
+    h5py.File(path, "w", locking=False, libver=SUPERBLOCK).close()
+    with h5py.File(path, "r+", locking=False, libver=OBJECTS) as file:
+        build(file, *arguments)
+
+
 def open_shared(path: Path, comm: MPI.Comm) -> h5py.File:
     """Open an existing file for writing on all ranks; on one rank without locking, so that others may read it."""
     if comm.size == 1:
-        return h5py.File(path, "r+", locking=False, rdcc_nbytes=CHUNK_CACHE)
-    return h5py.File(path, "r+", driver="mpio", comm=comm)
+        return h5py.File(path, "r+", locking=False, rdcc_nbytes=CHUNK_CACHE, libver=OBJECTS)
+    return h5py.File(path, "r+", driver="mpio", comm=comm, libver=OBJECTS)
 
 
 def chunk_rows(n_rows: int, row_bytes: int) -> int:
@@ -186,6 +210,12 @@ def set_text(group: h5py.Group, name: str, text: str) -> None:
         del group[name]
     raw = text.encode("utf-8")
     group.create_dataset(name, data=np.array(raw, dtype=h5py.string_dtype("utf-8", max(1, len(raw)))))
+
+
+def set_unit(dataset: h5py.Dataset, name: str) -> None:
+    """The attribute ``unit`` of a field or history column: "m/s", or "1" for a pure number. Collective."""
+    raw = (unit_of(name) or "1").encode()
+    dataset.attrs.create("unit", raw, dtype=h5py.string_dtype("utf-8", len(raw)))
 
 
 @contextmanager

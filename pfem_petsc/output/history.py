@@ -11,7 +11,8 @@ import numpy as np
 from mpi4py import MPI
 
 from ..errors import InputError
-from .hdf5 import create_growing, dataset_names, grow, write_rows, writing
+from .digests import CHECKS, row_digests
+from .hdf5 import create_growing, dataset_names, grow, set_unit, write_rows, writing
 from .row import RowLayout
 
 __all__ = ["HistoryWriter", "check_columns", "create_history"]
@@ -31,7 +32,8 @@ def create_history(file: h5py.File, columns: Mapping[str, tuple[int, ...]], type
     for name, shape in columns.items():
         dtype = np.dtype(types.get(name, np.float64))
         per_chunk = CHUNK_BYTES // max(1, dtype.itemsize * int(np.prod(shape, dtype=np.int64)))
-        create_growing(group, name, tuple(shape), dtype, max(1, min(ROWS_PER_CHUNK, per_chunk)))
+        made = create_growing(group, name, tuple(shape), dtype, max(1, min(ROWS_PER_CHUNK, per_chunk)))
+        set_unit(made, name)
 
 
 def check_columns(file: h5py.File, path: Path, columns: Mapping[str, tuple[int, ...]]) -> None:
@@ -78,6 +80,7 @@ class HistoryWriter:
         self._comm, self._path = comm, path
         group = file["history"]
         self._datasets = {name: group[name] for name in columns}
+        self._digests = file[CHECKS]["history"]
         self._rows_attribute = h5py.h5a.open(group.id, b"rows")
         self.n_rows = int(group.attrs["rows"])
         row_bytes = sum(d.dtype.itemsize * int(np.prod(d.shape[1:], dtype=np.int64)) for d in self._datasets.values())
@@ -108,14 +111,16 @@ class HistoryWriter:
             return
         first, self.n_rows = self.n_rows, self.n_rows + self.n_buffered
         with writing(self._comm, self._path):
-            for dataset in self._datasets.values():
+            for dataset in (*self._datasets.values(), self._digests):
                 grow(dataset, self.n_rows)
         with writing(self._comm, self._path):
             if self._comm.rank == 0:
+                values = {}
                 for name, (at, end, shape, _) in self._layout.places.items():
-                    dataset = self._datasets[name]
                     rows = self._buffer[: self.n_buffered, at:end].reshape(self.n_buffered, *shape)
-                    write_rows(dataset, first, rows.astype(dataset.dtype))
+                    values[name] = rows.astype(self._datasets[name].dtype)
+                    write_rows(self._datasets[name], first, values[name])
+                write_rows(self._digests, first, row_digests(values, first))
         self.n_buffered = 0
 
     def commit(self) -> None:

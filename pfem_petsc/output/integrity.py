@@ -19,7 +19,7 @@ from mpi4py import MPI
 
 from ..errors import InputError
 
-__all__ = ["check_seal", "checksum", "seal", "seal_size", "way_out"]
+__all__ = ["check_seal", "checksum", "seal", "seal_size", "way_out", "word_sum"]
 
 FORMAT, VERSION = "pfem_petsc checkpoint", 1
 LARGEST_SEAL = 1 << 20
@@ -41,6 +41,13 @@ def checksum(comm: MPI.Comm, slab: np.ndarray, first: int) -> int:
     first : int
         Row of the whole array at which the slab begins.
     """
+    total = np.array([word_sum(slab, first)], dtype=np.uint64)
+    comm.Allreduce(MPI.IN_PLACE, total, op=MPI.SUM)
+    return int(total[0])
+
+
+def word_sum(slab: np.ndarray, first: int) -> int:
+    """This process's part of :func:`checksum`: sums of parts add up, modulo 2^64, to that of the whole."""
     words = np.ascontiguousarray(slab).reshape(-1).view(f"u{slab.dtype.itemsize}")
     start = first * int(np.prod(slab.shape[1:], dtype=np.int64))
     total = np.zeros(1, dtype=np.uint64)
@@ -50,7 +57,6 @@ def checksum(comm: MPI.Comm, slab: np.ndarray, first: int) -> int:
         factor = (index + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
         factor ^= factor >> np.uint64(29)
         total += np.sum(block * (factor | np.uint64(1)), dtype=np.uint64)
-    comm.Allreduce(MPI.IN_PLACE, total, op=MPI.SUM)
     return int(total[0])
 
 

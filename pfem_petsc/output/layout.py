@@ -8,8 +8,9 @@ from typing import Any
 import h5py
 import numpy as np
 
-from .hdf5 import chunk_rows, create_growing, dataset_names
-from .history import create_history
+from .digests import CHECKS
+from .hdf5 import chunk_rows, create_growing, dataset_names, set_unit
+from .history import ROWS_PER_CHUNK, create_history
 from .provenance import write_case
 
 __all__ = [
@@ -18,6 +19,7 @@ __all__ = [
     "complete_snapshots",
     "create_field",
     "create_result",
+    "create_snapshot_checks",
     "field_datasets",
 ]
 
@@ -68,6 +70,9 @@ def create_result(
     snapshots = file.create_group("snapshots")
     create_growing(snapshots, "step", (), np.int64, STEPS_PER_CHUNK)
     create_growing(snapshots, "time", (), np.float64, STEPS_PER_CHUNK)
+    checks = file.create_group(CHECKS)
+    checks.create_dataset("mesh", data=np.zeros(1, dtype=np.uint64))
+    create_growing(checks, "history", (), np.uint64, ROWS_PER_CHUNK)
     create_history(file, columns, column_types)
     write_case(file, case_text, attributes)
 
@@ -81,8 +86,16 @@ def create_field(vtk: h5py.Group, kind: str, name: str, row_shape: tuple[int, ..
     n_rows = int(vtk["NumberOfPoints" if kind == "PointData" else "NumberOfCells"][0])
     row_bytes = dtype.itemsize * int(np.prod(row_shape, dtype=np.int64))
     dataset = create_growing(vtk[kind], name, row_shape, dtype, chunk_rows(n_rows, row_bytes))
+    set_unit(dataset, name)
     vtk["Steps"][kind + "Offsets"][name] = vtk["Steps"]["PointOffsets" if kind == "PointData" else "CellDataRows"]
     return dataset
+
+
+def create_snapshot_checks(file: h5py.File) -> h5py.Dataset:
+    """Make the checksums of snapshots once all fields are there. Collective where the file is."""
+    return create_growing(
+        file[CHECKS], "snapshots", (1 + len(field_datasets(file["VTKHDF"])),), np.uint64, STEPS_PER_CHUNK
+    )
 
 
 def field_datasets(vtk: h5py.Group) -> dict[str, h5py.Dataset]:
@@ -104,6 +117,7 @@ def complete_snapshots(file: h5py.File) -> int:
         len(file["snapshots/time"]),
     ]
     lengths += [len(steps[name]) for name in PER_STEP]
+    lengths.append(len(file[CHECKS]["snapshots"]) if "snapshots" in file[CHECKS] else 0)
     n_nodes, n_bars = int(vtk["NumberOfPoints"][0]), int(vtk["NumberOfCells"][0])
     for name, dataset in field_datasets(vtk).items():
         rows = n_bars if name.startswith("CellData") else n_nodes
@@ -114,4 +128,10 @@ def complete_snapshots(file: h5py.File) -> int:
 def complete_rows(file: h5py.File) -> int:
     """How many rows of the history are complete."""
     history = file["history"]
-    return min([int(history.attrs["rows"]), *(len(history[name]) for name in dataset_names(history))])
+    return min(
+        [
+            int(history.attrs["rows"]),
+            len(file[CHECKS]["history"]),
+            *(len(history[name]) for name in dataset_names(history)),
+        ]
+    )

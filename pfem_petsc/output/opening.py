@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from ..errors import printable
 from ..preflight.inspection import warnings_before
 from ..restart.folder import RESULT
 from .progress import Progress
@@ -21,7 +22,7 @@ def open_progress(simulation, aside: Path | None) -> Progress:
     case, model, plan, state = simulation.case, simulation.model, simulation.plan, simulation.state
     progress = Progress(
         simulation.comm,
-        case.title,
+        printable(case.title),
         plan.steps,
         plan.step * plan.steps,
         simulation.quiet,

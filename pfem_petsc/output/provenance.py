@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import platform
+import zlib
 from collections.abc import Mapping
 from importlib import metadata
 from typing import Any
@@ -53,7 +54,7 @@ def write_case(file: h5py.File, case_text: str, attributes: Mapping[str, Any]) -
             group.attrs[name] = value
         else:
             text = value if isinstance(value, str) else "json:" + json.dumps(value, default=_plain)
-            raw = text.encode()
+            raw = text.encode(errors="backslashreplace")
             group.pop(name, None)
             if len(raw) > LONGEST_ATTRIBUTE:
                 set_text(group, name, text)
@@ -61,6 +62,7 @@ def write_case(file: h5py.File, case_text: str, attributes: Mapping[str, Any]) -
             else:
                 group.attrs.create(name, raw, dtype=h5py.string_dtype("utf-8", max(1, len(raw))))
     set_text(group, "text", case_text)
+    group["text"].attrs["checksum"] = zlib.crc32(case_text.encode())
 
 
 def read_attributes(group: h5py.Group) -> dict[str, Any]:

@@ -13,15 +13,28 @@ import h5py
 import numpy as np
 
 from ..errors import InputError
-from .hdf5 import dataset_names, fsync_all, grow, write_rows
+from .digests import CHECKS
+from .hdf5 import create_checked, dataset_names, fsync_all, grow, write_rows
 from .history import check_columns
-from .layout import PER_STEP, complete_rows, complete_snapshots, field_datasets
+from .layout import (
+    PER_STEP,
+    complete_rows,
+    complete_snapshots,
+    create_field,
+    create_result,
+    create_snapshot_checks,
+    field_datasets,
+)
 from .provenance import read_attributes, write_case
+from .result import readable
+from .verify import examine
 
 __all__ = ["reopen", "repair"]
 
 COPIED = 1 << 28
-"""Files up to this size [B] are repaired for a restart as a copy, which then takes the file's place."""
+"""Files up to this size [B] are made anew for a restart, and then take the file's place."""
+PIECE = 1 << 24
+"""Bytes that are read and written at once."""
 
 
 def repair(path: Path | str, last: tuple[int, int] | None = None) -> tuple[int, int]:
@@ -43,15 +56,10 @@ def repair(path: Path | str, last: tuple[int, int] | None = None) -> tuple[int, 
     InputError
         When there is no such file, or it is not a readable result.
     """
-    from .result import readable
-
     path = Path(path)
     with readable(path), h5py.File(path, "r+", locking=False) as file:
-        n_snapshots, n_rows = complete_snapshots(file), complete_rows(file)
+        n_snapshots, n_rows = _kept(file, last)
         vtk, steps, history = file["VTKHDF"], file["VTKHDF/Steps"], file["history"]
-        if last is not None:
-            n_snapshots = int(np.searchsorted(file["snapshots/step"][:n_snapshots], last[0], side="right"))
-            n_rows = int(np.searchsorted(history["step"][:n_rows], last[1], side="right"))
         # A kill in between leaves a file that VTK reads: it crashes on more times than steps, so the times go first; it
         # finds nothing for steps without data, so the data go last.
         if len(steps["Values"]) > n_snapshots:
@@ -67,6 +75,7 @@ def repair(path: Path | str, last: tuple[int, int] | None = None) -> tuple[int, 
             grow(file["snapshots"][name], n_snapshots)
         if n_snapshots == 0:
             # The first snapshot makes the fields, perhaps not all of them were made.
+            file[CHECKS].pop("snapshots", None)
             for kind in ("PointData", "CellData"):
                 for name in list(vtk[kind]):
                     del vtk[kind][name]
@@ -77,6 +86,9 @@ def repair(path: Path | str, last: tuple[int, int] | None = None) -> tuple[int, 
             grow(dataset, n_snapshots * n)
         for name in dataset_names(history):
             grow(history[name], n_rows)
+        grow(file[CHECKS]["history"], n_rows)
+        if n_snapshots:
+            grow(file[CHECKS]["snapshots"], n_snapshots)
     fsync_all(path)
     return n_snapshots, n_rows
 
@@ -112,40 +124,114 @@ def reopen(
     InputError
         When the file is missing, damaged, or of another mesh, other fields or columns.
     """
+    _refuse_damaged(path)
     with _replaced(path) as target:
-        n_snapshots, _ = repair(target, last)
-        with h5py.File(target, "r+", locking=False) as file:
-            vtk = file["VTKHDF"]
-            has = (int(vtk["NumberOfPoints"][0]), int(vtk["NumberOfCells"][0]))
-            if has != sizes:
-                raise InputError(
-                    f"{path}: has {has[0]} nodes and {has[1]} bars, the case has {sizes[0]} and {sizes[1]}: it was "
-                    "written with another mesh; restart the case it belongs to, or write elsewhere (-o)"
-                )
-            for kind, names in fields.items():
-                if n_snapshots and sorted(vtk[kind]) != names:
-                    raise InputError(
-                        f"{path}: has the fields {', '.join(sorted(vtk[kind])) or 'none'} ({kind}), the case asks for "
-                        f"{', '.join(names) or 'none'}: keep [output] fields as it was, or write elsewhere (-o)"
-                    )
-            check_columns(file, path, columns)
+        with readable(path), h5py.File(path, "r", locking=False) as file:
+            n_snapshots, n_rows = _kept(file, last)
+            _check_same(file, path, n_snapshots, sizes, fields, columns)
             earlier = list(read_attributes(file["case"]).get("restarts_after_step", []))
-            write_case(file, case_text, {**attributes, "restarts_after_step": [*earlier, after_step]})
+            described = {**attributes, "restarts_after_step": [*earlier, after_step]}
+            if target != path:
+                create_checked(target, _rebuild, file, n_snapshots, n_rows, case_text, described)
+                return
+        repair(target, last)
+        with h5py.File(target, "r+", locking=False) as file:
+            write_case(file, case_text, described)
+
+
+def _refuse_damaged(path: Path) -> None:
+    if not path.is_file():
+        return
+    wrong = examine(path, deep=True)
+    if wrong:
+        more = f", and {len(wrong) - 1} more like it" if len(wrong) > 1 else ""
+        raise InputError(
+            f"{path}: damaged: {wrong[0]}{more} (info --verify lists all): it is not continued; restore it from a "
+            "copy, or restart into another folder (-o), where new results begin at the checkpoint"
+        )
+
+
+def _check_same(
+    file: h5py.File,
+    path: Path,
+    n_snapshots: int,
+    sizes: tuple[int, int],
+    fields: Mapping[str, list[str]],
+    columns: Mapping[str, tuple[int, ...]],
+) -> None:
+    vtk = file["VTKHDF"]
+    has = (int(vtk["NumberOfPoints"][0]), int(vtk["NumberOfCells"][0]))
+    if has != sizes:
+        raise InputError(
+            f"{path}: has {has[0]} nodes and {has[1]} bars, the case has {sizes[0]} and {sizes[1]}: it was "
+            "written with another mesh; restart the case it belongs to, or write elsewhere (-o)"
+        )
+    for kind, names in fields.items():
+        if n_snapshots and sorted(vtk[kind]) != names:
+            raise InputError(
+                f"{path}: has the fields {', '.join(sorted(vtk[kind])) or 'none'} ({kind}), the case asks for "
+                f"{', '.join(names) or 'none'}: keep [output] fields as it was, or write elsewhere (-o)"
+            )
+    check_columns(file, path, columns)
+
+
+def _rebuild(
+    target: h5py.File,
+    source: h5py.File,
+    n_snapshots: int,
+    n_rows: int,
+    case_text: str,
+    attributes: Mapping[str, Any],
+) -> None:
+    """Fill a new file with what is kept of another: nothing that a kill or damage has left in that one comes along."""
+    vtk, history = source["VTKHDF"], source["history"]
+    n_nodes, n_bars = int(vtk["NumberOfPoints"][0]), int(vtk["NumberOfCells"][0])
+    columns = {name: history[name].shape[1:] for name in dataset_names(history)}
+    types = {name: history[name].dtype for name in columns}
+    create_result(target, n_nodes, n_bars, columns, types, case_text, attributes)
+    rows: dict[str, int] = {"VTKHDF/Connectivity": 2 * n_bars, "VTKHDF/Offsets": n_bars + 1, f"{CHECKS}/mesh": 1}
+    rows |= {f"VTKHDF/Steps/{name}": n_snapshots for name in (*PER_STEP, "Values")}
+    rows |= {f"snapshots/{name}": n_snapshots for name in ("step", "time")}
+    rows |= {f"history/{name}": n_rows for name in columns} | {f"{CHECKS}/history": n_rows}
+    if n_snapshots:
+        for name, dataset in field_datasets(vtk).items():
+            kind, _, field = name.partition("/")
+            if field:
+                create_field(target["VTKHDF"], kind, field, dataset.shape[1:], dataset.dtype)
+            rows[f"VTKHDF/{name}"] = n_snapshots * (n_bars if kind == "CellData" else n_nodes)
+        create_snapshot_checks(target)
+        rows[f"{CHECKS}/snapshots"] = n_snapshots
+    for name, n in rows.items():
+        old, new = source[name], target[name]
+        if new.maxshape[0] is None:
+            grow(new, n)
+        piece = max(1, PIECE // max(1, old.dtype.itemsize * int(np.prod(old.shape[1:], dtype=np.int64))))
+        for first in range(0, n, piece):
+            write_rows(new, first, old[first : min(first + piece, n)])
+    target["VTKHDF/Steps"].attrs.modify("NSteps", np.int64(n_snapshots))
+    target["history"].attrs.modify("rows", np.int64(n_rows))
+
+
+def _kept(file: h5py.File, last: tuple[int, int] | None) -> tuple[int, int]:
+    """Complete snapshots and history rows, up to the ``last`` steps."""
+    n_snapshots, n_rows = complete_snapshots(file), complete_rows(file)
+    if last is not None:
+        n_snapshots = int(np.searchsorted(file["snapshots/step"][:n_snapshots], last[0], side="right"))
+        n_rows = int(np.searchsorted(file["history/step"][:n_rows], last[1], side="right"))
+    return n_snapshots, n_rows
 
 
 @contextmanager
 def _replaced(path: Path) -> Iterator[Path]:
-    """The file to work on for a restart, which takes the place of ``path`` in the end; messages name that.
+    """The file to make for a restart, which takes the place of ``path`` in the end; messages name that.
 
-    A kill between the few writes that replace the case would leave a file that HDF5 cannot open; a copy costs little
-    but where the file is large: that one is worked on itself.
+    A kill between the few writes that replace the case would leave a file that HDF5 cannot open; a new file costs
+    little but where it is large: that one is worked on itself.
     """
     size = path.stat().st_size if path.is_file() else 0
     copied = 0 < size <= COPIED and shutil.disk_usage(path.parent).free > 2 * size
     target = path.with_name(path.name + ".new") if copied else path
     try:
-        if copied:
-            shutil.copyfile(path, target)
         yield target
         if copied:
             fsync_all(target)

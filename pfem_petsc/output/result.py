@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from ..case.schema import Case
 
-__all__ = ["History", "Result", "open_result", "readable"]
+__all__ = ["History", "Result", "open_result", "readable", "result_file"]
 
 RESULT_NAME = "result.vtkhdf"
 # A file that is being written may be caught between two states; how often, and after how many seconds, to look again.
@@ -39,8 +39,13 @@ def open_result(path: Path | str) -> Result:
     InputError
         When there is no such file, or it is not a readable result of pfem_petsc.
     """
+    return Result(result_file(path))
+
+
+def result_file(path: Path | str) -> Path:
+    """The result file of a folder, or the file itself."""
     path = Path(path)
-    return Result(path / RESULT_NAME if path.is_dir() else path)
+    return path / RESULT_NAME if path.is_dir() else path
 
 
 @contextmanager

@@ -14,6 +14,7 @@ from mpi4py import MPI
 
 from ..errors import PfemError, SimulationFailure
 from ..parallel.agreement import on_root
+from .digests import CHECKS, mark_digest, mesh_digest, snapshot_digests
 from .hdf5 import (
     create_new,
     grow,
@@ -25,12 +26,14 @@ from .hdf5 import (
     writing,
 )
 from .history import HistoryWriter
-from .layout import PER_STEP, create_field, create_result, field_datasets
+from .integrity import word_sum
+from .layout import PER_STEP, create_field, create_result, create_snapshot_checks, field_datasets
 from .provenance import describe_run
 from .repair import reopen
 
 if TYPE_CHECKING:
     from ..mesh.distribution import DistributedMesh
+    from ..parallel.natural import NaturalOrder
 
 __all__ = ["ResultWriter"]
 
@@ -113,7 +116,7 @@ class ResultWriter:
         sizes = (self.n_nodes, self.n_bars)
         if append_after_step is None:
             self._unpublished = create_new(
-                self.path, comm, create_result, *sizes, columns, column_types, case_text, described
+                self.path, comm, create_result, *sizes, columns, column_types, case_text, described, checked=True
             )
         else:
             last = last or (append_after_step, append_after_step)
@@ -130,6 +133,7 @@ class ResultWriter:
         self.n_snapshots = int(steps.attrs["NSteps"])
         # Points and fields; made with the first snapshot, which knows the shapes.
         self._data = field_datasets(vtk) if self.n_snapshots else {}
+        self._digests = self._file[CHECKS]["snapshots"] if self.n_snapshots else None
         self._history = HistoryWriter(self._file, comm, self.path, columns)
         if append_after_step is None:
             with self._whole_or_failed():
@@ -172,19 +176,21 @@ class ResultWriter:
             slabs[f"PointData/{name}"] = self.node_order.to_slab(np.asarray(point_data[name]))
         for name in self._fields["CellData"]:
             slabs[f"CellData/{name}"] = self.bar_order.to_slab(np.asarray(cell_data[name])[self.counted])
+        slabs = {name: slab.astype(self._row_type(name, slab), copy=False) for name, slab in slabs.items()}
         self._require_room(sum(self._global_bytes(name, slab) for name, slab in slabs.items()))
+        digests = snapshot_digests(self.comm, {name: (slab, self._order(name).first) for name, slab in slabs.items()})
         n = self.n_snapshots
         with self._whole_or_failed():
             if not self._data:
                 self._create_fields(slabs)
             for name, slab in slabs.items():
-                order = self.bar_order if name.startswith("CellData") else self.node_order
+                order = self._order(name)
                 with writing(self.comm, self.path):
                     grow(self._data[name], (n + 1) * order.n_global)
                 with writing(self.comm, self.path):
                     first = n * order.n_global + order.first
                     write_rows(self._data[name], first, slab, collective=self.comm.size > 1)
-            self._append_marks(n, step, time)
+            self._append_marks(n, step, time, digests)
             self._history.write()
             with writing(self.comm, self.path):
                 file.flush()
@@ -284,6 +290,9 @@ class ResultWriter:
             self._failure = error
             raise
 
+    def _order(self, name: str) -> NaturalOrder:
+        return self.bar_order if name.startswith("CellData") else self.node_order
+
     def _row_type(self, name: str, slab: np.ndarray) -> np.dtype:
         return self._precision if slab.dtype.kind == "f" and name != "Points" else slab.dtype
 
@@ -296,19 +305,24 @@ class ResultWriter:
         together = self.comm.size > 1
         # one rank holds all bars: pieces keep the working arrays small
         piece = count if together else min(count, _PIECE)
+        total = 0
         for start in range(0, max(count, 1), max(piece, 1)):
             stop = min(start + piece, count)
             if together:
                 ends = self.bar_order.to_slab(mesh.node_ids[mesh.bars[self.counted]].astype(np.int64).reshape(-1, 2))
             else:
                 ends = mesh.node_ids[mesh.bars[self.bar_order.owned_rows(start, stop)]].astype(np.int64)
+            total += word_sum(ends.ravel(), 2 * (first + start))
             with writing(self.comm, self.path):
                 write_rows(vtk["Connectivity"], 2 * (first + start), ends.ravel(), collective=together)
             # one offset more than bars: the last rank's
             end = first + stop + (stop == count and self.comm.rank == self.comm.size - 1)
             with writing(self.comm, self.path):
                 write_rows(vtk["Offsets"], first + start, 2 * np.arange(first + start, end), collective=together)
+        digest = mesh_digest(self.comm, total & (2**64 - 1))
         with writing(self.comm, self.path):
+            if self.comm.rank == 0:
+                write_rows(self._file[CHECKS]["mesh"], 0, digest)
             self._file.flush()
 
     def _create_fields(self, slabs: Mapping[str, np.ndarray]) -> None:
@@ -319,11 +333,12 @@ class ResultWriter:
                     kind, _, field = name.partition("/")
                     create_field(vtk, kind, field, slab.shape[1:], self._row_type(name, slab))
             self._data = field_datasets(vtk)
+            self._digests = create_snapshot_checks(self._file)
 
-    def _append_marks(self, n: int, step: int, time: float) -> None:
+    def _append_marks(self, n: int, step: int, time: float, digests: np.ndarray) -> None:
         """The rows of snapshot n in everything that has one row a snapshot, but for its time in VTKHDF."""
         with writing(self.comm, self.path):
-            for dataset in (*self._per_step.values(), *self._marks.values()):
+            for dataset in (*self._per_step.values(), *self._marks.values(), self._digests):
                 grow(dataset, n + 1)
         rows = {"PointOffsets": n * self.n_nodes, "CellDataRows": n * self.n_bars, "NumberOfParts": 1}
         with writing(self.comm, self.path):
@@ -332,3 +347,5 @@ class ResultWriter:
                     write_rows(dataset, n, np.full((1, *dataset.shape[1:]), rows.get(name, 0)))
                 write_rows(self._marks["step"], n, np.array([step]))
                 write_rows(self._marks["time"], n, np.array([time]))
+                mark = np.array([mark_digest(n, step, time)], dtype=np.uint64)
+                write_rows(self._digests, n, np.concatenate([mark, digests])[None])

@@ -11,7 +11,7 @@ import numpy as np
 from ..errors import InputError
 from ..output.units import prefix_for
 
-__all__ = ["COLOURS", "STYLE", "Chart", "thinned", "window_mean"]
+__all__ = ["COLOURS", "STYLE", "Chart", "literal", "thinned", "window_mean"]
 
 COLOURS = ("#2563b0", "#d9482b", "#2a9d5c", "#8a4fbf", "#e09f1f", "#3aa7c9", "#6b7280", "#b5307c")
 
@@ -61,15 +61,15 @@ def thinned(time: np.ndarray, values: np.ndarray, points: int = _POINTS) -> tupl
 
 
 def window_mean(time: np.ndarray, values: np.ndarray, width: float) -> np.ndarray:
-    """Mean of a piecewise linear curve over a window of this width [s] around each point, cut at the ends.
+    """Mean of a piecewise linear curve over the time of this width [s] before each point, cut at the start.
 
-    The integral is exact whatever the spacing of the points, so impulses are kept.
+    It rises with what has been, never before it. The integral is exact whatever the spacing of the points.
     """
     if len(time) < 2 or width <= 0:
         return values.copy()
     steps = np.diff(time)
     integral = np.concatenate([[0.0], np.cumsum(0.5 * steps * (values[1:] + values[:-1]))])
-    low, high = np.maximum(time - width / 2, time[0]), np.minimum(time + width / 2, time[-1])
+    low = np.maximum(time - width, time[0])
 
     def primitive(at: np.ndarray) -> np.ndarray:
         k = np.clip(np.searchsorted(time, at, side="right") - 1, 0, len(steps) - 1)
@@ -77,7 +77,13 @@ def window_mean(time: np.ndarray, values: np.ndarray, width: float) -> np.ndarra
         slope = (values[k + 1] - values[k]) / np.where(steps[k] > 0, steps[k], 1.0)
         return integral[k] + part * (values[k] + 0.5 * slope * part)
 
-    return (primitive(high) - primitive(low)) / (high - low)
+    span = time - low
+    return np.where(span > 0.0, (integral - primitive(low)) / np.where(span > 0.0, span, 1.0), values)
+
+
+def literal(text: str) -> str:
+    """A text as it stands: dollar signs begin no formula."""
+    return text.replace("$", r"\$")
 
 
 class Chart:
@@ -102,7 +108,7 @@ class Chart:
         self.figure = Figure(figsize=size, layout="constrained")
         FigureCanvasAgg(self.figure)
         self.axes = self.figure.subplots(rows, columns, sharex=True, squeeze=False, height_ratios=relative)
-        self.figure.suptitle(title, x=0.01, ha="left", fontsize=13, fontweight="bold", color="#1f242c")
+        self.figure.suptitle(literal(title), x=0.01, ha="left", fontsize=13, fontweight="bold", color="#1f242c")
         self.time = np.asarray(time, dtype=float)
         self.factor, self.unit = prefix_for(float(np.abs(self.time).max()) if self.time.size else 0.0, "s")
         for axes in self.axes[-1]:
@@ -124,9 +130,9 @@ class Chart:
         for number, (name, values) in enumerate(curves):
             time, thin = thinned(self.time, np.asarray(values, dtype=float) * factor)
             options = {"color": COLOURS[number % len(COLOURS)], **(styles[number] if styles else {})}
-            axes.plot(time * self.factor, thin, label=name, **options)
+            axes.plot(time * self.factor, thin, label=literal(name), **options)
         axes.set_ylabel(f"{label} [{shown}]" if shown else label)
-        axes.set_title(title)
+        axes.set_title(literal(title))
         if legend and len(curves) > 1:
             axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.0, handlelength=1.4)
         return factor, shown

@@ -76,7 +76,8 @@ class ColourField:
             sizes = np.abs(values)
             bulk = max(bulk, float(np.quantile(sizes, 0.99)))
             largest = max(largest, float(sizes.max()))
-            signed = signed or bool((values < 0).any())
+            # not for what rounding leaves of a field that cannot be negative
+            signed = signed or bool((values < -1e-9 * sizes.max()).any())
         limit = largest if largest <= 2.0 * bulk or bulk == 0.0 else bulk
         limit = limit or 1.0
         return (-limit, limit) if signed else (0.0, limit)

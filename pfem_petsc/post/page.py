@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from .camera import Camera
+from .chart import literal
 from .fields import ColourScale
 
 __all__ = ["Page"]
@@ -99,11 +100,13 @@ class Page:
         left, top, inner_width, inner_height = self.region
         # room for the time is kept free
         room = inner_width - 230 * self._unit
-        text = figure.text(left / width, 1 - 22 * self._unit / height, title, va="top", color=INK, weight="bold")
+        text = figure.text(
+            left / width, 1 - 22 * self._unit / height, literal(title), va="top", color=INK, weight="bold"
+        )
         text.set_fontsize(self._points(22))
         while len(title) > 4 and text.get_window_extent(canvas.get_renderer()).width > room:
             title = title[:-2].rstrip(" …") + "…"
-            text.set_text(title)
+            text.set_text(literal(title))
         self._colour_bar(figure, field, scale)
         if camera.parallel:
             self._length_scale(figure, 2 * camera.half_height / self._drawn_height, left)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import nullcontext
@@ -32,7 +33,8 @@ def plot(
     ----------
     result_path : result file or its folder, or an open result
     output : folder of the pictures; None: beside the result
-    curves : names of history columns, drawn into ``curves.png`` in place of the other pictures
+    curves : names of history columns, drawn into ``curves.png`` in place of the other pictures; the ``curves.png`` of
+        other columns stays, and the new one is ``curves_2.png`` and so on
 
     Returns
     -------
@@ -54,7 +56,7 @@ def plot(
         case = result.case
         title = case.title or case.name
         if curves is not None:
-            return [_named(history, list(curves), title, folder / "curves.png")]
+            return [_named(history, list(curves), title, _free(folder / "curves.png"))]
         drawn = [
             _energies(history, title, folder / "energies.png"),
             _momentum(history, title, folder / "momentum.png"),
@@ -71,6 +73,12 @@ def _opened(result: Path | str | Any) -> Any:
     from ..output.result import open_result
 
     return open_result(result)
+
+
+def _free(file: Path) -> Path:
+    """The name, or the next with a number that is not taken."""
+    numbered = (file.with_name(f"{file.stem}_{k}{file.suffix}") for k in itertools.count(2))
+    return next(path for path in itertools.chain([file], numbered) if not path.exists())
 
 
 def _read(history: History, name: str) -> np.ndarray:
@@ -181,9 +189,13 @@ def _probes(history: History, title: str, file: Path) -> Path | None:
             if quantity == "position":
                 values = values - values[:1]
             nodes = values.shape[1]
-            name = f"{probe} (mean and range of {nodes} nodes)" if nodes > 1 else probe
-            _vector(chart, axes, labels.get(quantity, quantity), unit_of(quantity), values.mean(axis=1), name)
-            if nodes > 1:
+            # what a support carries is the sum of its nodes
+            total = quantity == "reaction"
+            how = f"sum of {nodes} nodes" if total else f"mean and range of {nodes} nodes"
+            name = f"{probe} ({how})" if nodes > 1 else probe
+            shown = values.sum(axis=1) if total else values.mean(axis=1)
+            _vector(chart, axes, labels.get(quantity, quantity), unit_of(quantity), shown, name)
+            if nodes > 1 and not total:
                 _range(chart, axes, quantity, values)
     return chart.save(file)
 
@@ -213,35 +225,25 @@ def _walls(history: History, walls: Iterable[Any], title: str, file: Path) -> Pa
         return None
     time = _read(history, "time")
     normals = {wall.name: np.asarray(wall.normal, dtype=float) for wall in walls if hasattr(wall, "normal")}
-    chart = Chart(time, title, 2 * len(names), heights=[1.3, 0.5] * len(names))
+    chart = Chart(time, title, 3 * len(names), heights=[0.9, 0.9, 0.5] * len(names))
     width = WINDOW * float(time[-1] - time[0])
     for number, name in enumerate(names):
-        upper, lower = chart.axes[2 * number : 2 * number + 2, 0]
+        # peaks (the inertia of a node that is stopped within a step) and means need scales of their own
+        upper, middle, lower = chart.axes[3 * number : 3 * number + 3, 0]
         force = _read(history, f"wall/{name}/force")
         if name in normals:
             values, label = force @ normals[name] / np.linalg.norm(normals[name]), "normal force"
         else:
             values, label = np.linalg.norm(force, axis=1), "force"
         smooth = window_mean(time, values, width)
-        styles = [{"color": "#9db7d9", "linewidth": 0.8}, {"color": COLOURS[0], "linewidth": 1.8}]
-        curves = [("as computed", values), (f"mean over {engineering(width, 's', 3)}", smooth)]
-        factor, unit = chart.curves(upper, label, "N", curves, f"Wall '{name}'", styles, legend=False)
-        _cut_peaks(upper, values * factor, smooth * factor, unit)
-        upper.legend(loc="upper right")
+        chart.curves(upper, label, "N", [("as computed", values)], f"Wall '{name}'", [{"linewidth": 0.9}])
+        mean = f"{label},\nmean of the\n{engineering(width, 's', 3)} before"
+        chart.curves(middle, mean, "N", [("mean", smooth)], styles=[{"linewidth": 1.6}])
         if f"wall/{name}/contacts" in history:
             chart.counts(lower, "nodes in\ncontact", history[f"wall/{name}/contacts"], COLOURS[1])
         else:
             lower.set_axis_off()
     return chart.save(file)
-
-
-def _cut_peaks(axes: Any, values: np.ndarray, smooth: np.ndarray, unit: str) -> None:
-    """Where single peaks (the inertia of a node that is stopped within a step) would flatten the rest: say how high."""
-    highest, mean = float(np.nanmax(values)), float(np.nanmax(smooth))
-    if mean > 0.0 and highest > 5.0 * mean:
-        axes.set_ylim(-0.15 * mean, 3.0 * mean)
-        text = f"peaks reach {highest:.4g} {unit}"
-        axes.annotate(text, (0.01, 0.97), xycoords="axes fraction", fontsize=9, color="#5b6472", va="top")
 
 
 def _solver(history: History, title: str, file: Path) -> Path | None:
@@ -273,8 +275,9 @@ def _named(history: History, names: list[str], title: str, file: Path) -> Path:
         values = _read(history, name)
         label, unit = _words(name.rsplit("/", 1)[-1]), unit_of(name)
         if values.ndim == 3:  # nodes of a probe
-            values = values.mean(axis=1)
-            label += " (mean)" if np.asarray(history[name]).shape[1] > 1 else ""
+            many, total = values.shape[1] > 1, name.endswith("/reaction")
+            values = values.sum(axis=1) if total else values.mean(axis=1)
+            label += (" (sum)" if total else " (mean)") if many else ""
         if values.ndim == 2:
             _vector(chart, axes, label, unit, values, name)
         else:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
@@ -23,6 +24,8 @@ __all__ = ["render"]
 VIDEOS = ("mp4", "gif", "both", "none")
 MOST_FRAMES = 300  # where frames are not asked for: more make a film of over ten seconds
 POSTER_TILES = 6
+SHORT = 2.0  # seconds of a film that is over before one has seen it
+TELL = 5.0  # seconds between two words on the progress
 
 
 def render(
@@ -61,11 +64,11 @@ def render(
     poster : also draw six instants on one page
     clim : range of the colours in the field's SI unit; None: from the snapshots, symmetric for signed fields
     cmap : matplotlib colour map or its name
-    scale : of the displacements since the first snapshot
+    scale : of the nodes' displacements since the first snapshot; walls are where they are
     bar_width : in pixels
     nodes : draw nodes as balls; None: for small models
     title : None: the case's
-    note : takes what is to be said, such as walls that cannot be drawn
+    note : takes what is to be said, such as walls that cannot be drawn, and how far the drawing is
 
     Returns
     -------
@@ -92,6 +95,9 @@ def render(
         scale_of_colours = ColourScale(clim or colour.limits(chosen), cmap, colour.unit)
         film = _Film(result, colour, scale_of_colours, chosen, view, scale, note)
         style = {"bar_width": bar_width, "nodes": nodes}
+        if video != "none" and len(chosen) > 1 and len(chosen) / fps < SHORT:
+            slower = max(1, round(len(chosen) / 5.0))
+            note(f"the film of {len(chosen)} frames lasts {len(chosen) / fps:.1f} s; fps = {slower} makes it slower")
         heading = title if title is not None else (result.case.title or result.case.name)
         pictures = _draw_frames(film, _emptied(folder / "frames"), size, heading, style)
         written = []
@@ -185,7 +191,7 @@ class _Film:
             if wall.name not in still:
                 continue
             for frame in self.frames:
-                surface, shift = still[wall.name], self.scale * shifts[frame][k]
+                surface, shift = still[wall.name], shifts[frame][k]
                 if shift.any():
                     point = tuple((np.asarray(wall.point) + shift).tolist())
                     (surface,) = wall_surfaces([wall.model_copy(update={"point": point})], self.bounds)
@@ -243,7 +249,11 @@ def _draw_frames(film: _Film, folder: Path, size: tuple[int, int], title: str, s
     page = Page(size, title, film.colour.title, film.colours, camera)
     scene = film.scene(camera, (width, height), style)
     files = []
+    told = time.monotonic()
     for number, frame in enumerate(film.frames):
+        if time.monotonic() - told > TELL:
+            told = time.monotonic()
+            film.note(f"{number} of {len(film.frames)} frames are drawn")
         files.append(folder / f"frame_{number:04d}.png")
         _save(page.compose(film.draw(scene, frame), film.time(frame)), files[-1])
     scene.close()

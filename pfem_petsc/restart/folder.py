@@ -14,6 +14,7 @@ from ..output import result as results
 from ..output.checkpoint import NAME, PREVIOUS, OpenCheckpoint, newest_checkpoint
 from ..output.integrity import check_seal
 from ..output.units import engineering
+from ..output.verify import examine
 from ..parallel.agreement import on_root
 from .compare import changed_keys, check_version
 
@@ -94,6 +95,7 @@ def _finished(case, path: Path, end: float) -> float | None:
     if not path.is_file():
         return None
     try:
+        examine(path)
         with results.open_result(path) as result:
             reached = [float(times[-1]) for times in (result.history["time"], result.times) if len(times)]
             changed_keys(path, result.case.to_dict(), case.to_dict(), case.source)
@@ -151,6 +153,7 @@ def _refuse_loss(path: Path, plan) -> None:
 
 def _refuse_gap(path: Path, restart: Restart) -> None:
     """Results that end before the checkpoint cannot be continued from it."""
+    examine(path, deep=False)
     with results.open_result(path) as result:
         steps = result.history["step"]
         last = int(steps[-1]) if len(steps) else -1
@@ -172,6 +175,11 @@ def _prepare(folder: Path, restart: Restart | None, plan) -> Path | None:
                 # A later one than the results will reach back to must not be taken for the newest.
                 os.replace(folder / NAME, folder / ASIDE)
         elif any((folder / name).exists() for name in (RESULT, NAME, PREVIOUS)):
+            if folder.resolve() in (here := Path.cwd().resolve(), *here.parents):
+                raise InputError(
+                    f"{folder}: holds results, which cannot be moved aside from under the current folder; "
+                    "give another with -o, or continue them with --restart"
+                )
             number = 1
             while (free := folder.with_name(f"{folder.name}.{number}")).exists():
                 number += 1

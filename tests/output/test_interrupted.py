@@ -30,13 +30,10 @@ from pfem_petsc.output.vtkhdf import ResultWriter
 truss = Truss(MPI.COMM_SELF, n_nodes=400, n_bars=900)
 writer = ResultWriter(sys.argv[2], MPI.COMM_SELF, truss.mesh, **options())
 print("open", flush=True)
-for step in range(60):
+for step in range(80):
     write(writer, truss, [step], every=1)
 time.sleep(60.0)
 """
-# Not more steps: HDF5 divides the index of a dataset's chunks at the 65th and every 32 after it, and a kill between the
-# few writes of that one flush is the case that the order of writing cannot save.
-
 
 # VTK in a process of its own: what it cannot read might end it.
 READER = """

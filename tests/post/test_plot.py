@@ -110,4 +110,22 @@ def test_window_mean_keeps_the_impulse_of_uneven_steps():
     assert smooth.max() < 0.8 * values.max()
     line = 3.0 * time - 1.0
     inner = slice(50, 350)
-    assert window_mean(time, line, 0.03)[inner] == pytest.approx(line[inner], rel=1e-9, abs=1e-12)
+    # of the time before each point
+    assert window_mean(time, line, 0.03)[inner] == pytest.approx(line[inner] - 3.0 * 0.015, rel=1e-9, abs=1e-12)
+
+
+def test_window_mean_does_not_rise_before_its_cause():
+    time = np.linspace(0.0, 1.0, 101)
+    values = np.where(time > 0.5, 1.0, 0.0)
+    assert not window_mean(time, values, 0.1)[time <= 0.5].any()
+
+
+def test_curves_of_an_earlier_call_stay(tmp_path, result):
+    (first,) = plot(result, tmp_path, curves=["kinetic_energy"])
+    (second,) = plot(result, tmp_path, curves=["momentum"])
+    assert [first.name, second.name] == ["curves.png", "curves_2.png"]
+
+
+def test_titles_are_no_formulas(tmp_path, result):
+    result.case.title = r"a force of $\frac{1}$ N"
+    assert len(plot(result, tmp_path)) == 5

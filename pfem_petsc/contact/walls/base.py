@@ -97,6 +97,10 @@ class BaseWall(ABC):
 
 def direction(value: tuple[float, float, float], what: str) -> tuple[float, float, float]:
     """A vector of any length but zero."""
-    if not np.linalg.norm(value) > 0.0:
+    largest = max(map(abs, value))
+    if not largest > 0.0:
         raise ValueError(f"has zero length; give {what}")
+    if not 1e-100 < largest < 1e100:
+        # the squares of its components would overflow or vanish
+        raise ValueError(f"has components out of range (1e-100 to 1e100); give {what} as a vector of about length 1")
     return value

@@ -1,0 +1,131 @@
+"""Input that nobody means, each with one message and status 2, and no traceback."""
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pfem_petsc import Case
+from pfem_petsc.cli.launcher import _message
+from pfem_petsc.cli.main import main
+from pfem_petsc.cli.petsc_options import without_effect
+from pfem_petsc.errors import InputError, printable
+from pfem_petsc.restart.folder import _prepare
+
+ROD = Path("pfem_petsc/cases/rod_impact.toml").resolve()
+
+
+def refused(capsys, *words):
+    status = main(list(words))
+    said = capsys.readouterr().err
+    assert status == 2, said
+    assert "internal error" not in said
+    assert "Traceback" not in said
+    return said
+
+
+def text_of(**changes):
+    return ROD.read_text() + "".join(f"\n{line}" for line in changes.values())
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("x = " + "7" * 5000, "an integer of more than 4,300 digits"),
+        ("[" + ".".join("a" * 20000) + "]", "line 1: .* a key of more than 100 parts"),
+        ("a\n" + ".".join("b" * 100000) + " = 1", "line 2: .* a key of more than 100 parts"),
+        ("a = " + "[" * 20000 + "]" * 20000, "nested too deep"),
+        ("a = " + "{a=" * 3000 + "1" + "}" * 3000, "nested too deep"),
+        ("time = " + "0x" + "f" * 5000, "expected a table"),
+    ],
+    ids=["digits", "tables", "dotted", "lists", "inline", "hex"],
+)
+def test_texts_that_are_no_cases(text, expected):
+    with pytest.raises(InputError, match=f"(?s){expected}"):
+        Case.from_toml(text)
+
+
+@pytest.mark.parametrize("value", ["wall.0.name=.", "output.probe.0.name=..", "wall.0.axis=1"])
+def test_names_that_would_be_lost_in_the_results(capsys, value):
+    assert value.rpartition(".")[0].split("=")[0].split(".")[0] in refused(capsys, "check", str(ROD), "--set", value)
+
+
+@pytest.mark.parametrize("axis", [[0.0, 1e160, 1e160], [1e-200, 0.0, 0.0]])
+def test_directions_whose_length_overflows(axis):
+    wall = {"name": "w", "type": "cylinder", "point": [0.0, 0.0, 9.0], "axis": axis, "radius": 1.0}
+    data = Case.load("rod_impact").to_dict()
+    with pytest.raises(InputError, match="axis.*out of range"):
+        Case.from_dict({**data, "wall": [wall]})
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("rod\udcff.toml",),
+        ("check", "rod_impact", "--set", "title=\udcff"),
+        ("rod_impact", "--", "-pfem_\udcff"),
+    ],
+)
+def test_bytes_that_are_no_text(capsys, words):
+    assert "not UTF-8" in refused(capsys, *words)
+
+
+@pytest.mark.parametrize("key", ["wall." + "9" * 5000 + ".friction", ".".join("a" * 100000), "wall.².friction"])
+def test_keys_on_the_command_line(capsys, key):
+    assert "--set" in refused(capsys, "check", "rod_impact", "--set", f"{key}=1")
+
+
+def test_an_options_file_that_is_not_there(capsys):
+    assert "-options_file gone: there is no such file" in refused(capsys, "rod_impact", "--", "-options_file", "gone")
+    assert "-options_file : there is no such file" in refused(capsys, "rod_impact", "--", "-options_file")
+
+
+def test_solver_options_without_effect_are_told():
+    assert without_effect(["-pfem_snes_monitor", "-pfem_assembled_pc_gamg_threshold", "0.02", "-log_view"]) == []
+    (line,) = without_effect(["-ksp_rtol", "1e-3"])
+    assert "did you mean -pfem_ksp_rtol?" in line
+    (line,) = without_effect(["-pfem_contct_snes_type", "nope"])
+    assert "did you mean -pfem_contact_snes_type?" in line
+
+
+def test_control_characters_do_not_reach_the_terminal():
+    assert printable("a\x1b[31m\nb\x9b") == "a\\x1b[31m\nb\\x9b"
+
+
+def test_a_full_disk_under_the_output_is_told():
+    status, text = _message(OSError(28, os.strerror(28)))
+    assert status == 3
+    assert "No space left on device" in text
+
+
+def test_the_current_folder_is_not_moved_aside(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "result.vtkhdf").write_text("x")
+    for folder in (Path("."), tmp_path):
+        with pytest.raises(InputError, match="cannot be moved aside from under the current folder.*-o"):
+            _prepare(folder, None, None)
+
+
+def test_numpy_values_in_a_case():
+    data = Case.load("rod_impact").to_dict()
+    data["initial"]["velocity"] = np.array([0.5, 0.0, 0.0])
+    data["mesh"]["elements"] = np.int64(7)
+    data["time"]["end"] = np.float32(2.0)
+    case = Case.from_dict(data)
+    assert case.mesh.parameters.elements == 7
+    assert case.initial[0].velocity == (0.5, 0.0, 0.0)
+    assert case.time.end == 2.0
+
+
+def test_an_unknown_option_names_the_help_of_its_verb(capsys):
+    assert "unrecognized arguments: --zoom; see python -m pfem_petsc render --help" in refused(
+        capsys, "render", "results", "--zoom"
+    )
+
+
+def test_a_group_used_as_a_node_set_is_told_how():
+    data = Case.load("rod_impact").to_dict()
+    data["support"] = [{"node_set": "start", "fix": "x"}]
+    with pytest.raises(InputError, match=r'node_set.NAME = \{ group = "start" \}'):
+        Case.from_dict(data)

@@ -1,0 +1,108 @@
+"""Results whose bits, bytes or pages have changed: found before they go into anything, and no reason to crash."""
+
+import random
+import shutil
+import sys
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from mpi4py import MPI
+from truss import Truss, options, write
+
+from pfem_petsc.errors import InputError
+from pfem_petsc.output.digests import damages
+from pfem_petsc.output.result import open_result
+from pfem_petsc.output.verify import examine
+from pfem_petsc.output.vtkhdf import ResultWriter
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
+from damage_test import damaged  # noqa: E402
+
+STEPS = 12
+
+
+def written(path):
+    truss = Truss(MPI.COMM_SELF)
+    with ResultWriter(path, MPI.COMM_SELF, truss.mesh, **options()) as writer:
+        write(writer, truss, range(STEPS), every=1)
+    return truss
+
+
+def test_a_sound_file_is_sound(tmp_path):
+    written(tmp_path / "result.vtkhdf")
+    assert examine(tmp_path / "result.vtkhdf", deep=True) == []
+
+
+DAMAGES = {
+    "VTKHDF/Points": "Points of snapshot 3 (t = 0.03 s) does not match its checksum",
+    "VTKHDF/PointData/displacement": "PointData/displacement of snapshot 3",
+    "VTKHDF/CellData/stress": "CellData/stress of snapshot 3",
+    "VTKHDF/Connectivity": "the connectivity of the bars",
+    "VTKHDF/Offsets": "VTKHDF/Offsets does not match the mesh",
+    "VTKHDF/Types": "other cells than lines",
+    "VTKHDF/Steps/Values": "step and time of snapshot 3",
+    "VTKHDF/Steps/PointOffsets": "VTKHDF/Steps/PointOffsets does not match",
+    "snapshots/step": "step and time of snapshot 3",
+    "history/momentum": "history: 1 rows do not match their checksums, the first is row 3",
+    "history/wall/floor/force": "the first is row 3",
+    "checks/history": "the first is row 3",
+}
+
+
+@pytest.mark.parametrize("name", DAMAGES)
+def test_a_changed_value_is_named_and_not_continued(tmp_path, name):
+    path = tmp_path / "result.vtkhdf"
+    truss = written(path)
+    with h5py.File(path, "r+") as file:
+        rows = {"VTKHDF/Points": 3 * 23, "VTKHDF/PointData/displacement": 3 * 23, "VTKHDF/CellData/stress": 3 * 41}
+        dataset = file[name]
+        value = dataset[rows.get(name, 3)]
+        dataset[rows.get(name, 3)] = value + np.ones_like(value)
+    with h5py.File(path) as file:
+        (line,) = damages(file)
+    assert DAMAGES[name] in line
+    if name == "history/momentum":
+        with pytest.raises(InputError, match="damaged: .*not continued; restore it from a copy"):
+            ResultWriter(path, MPI.COMM_SELF, truss.mesh, **options(append_after_step=9))
+
+
+def test_what_follows_a_restart_has_its_checksums_too(tmp_path):
+    path = tmp_path / "result.vtkhdf"
+    truss = written(path)
+    with ResultWriter(path, MPI.COMM_SELF, truss.mesh, **options(append_after_step=7)) as writer:
+        write(writer, truss, range(8, 20), every=1)
+    with h5py.File(path) as file:
+        assert list(damages(file)) == []
+    assert len(open_result(path).times) == 20
+
+
+@pytest.mark.slow
+def test_no_random_damage_is_continued_in_silence_or_ends_the_reader(tmp_path):
+    whole = tmp_path / "whole.vtkhdf"
+    truss = written(whole)
+    expected = tmp_path / "expected.vtkhdf"
+    shutil.copy(whole, expected)
+    continued(expected, truss)
+    chance = random.Random(3)
+    for k in range(6):
+        path = tmp_path / f"{k}.vtkhdf"
+        what = damaged(whole, path, chance)
+        try:
+            continued(path, truss)
+        except InputError:
+            continue
+        assert same(path, expected), what
+
+
+def continued(path, truss):
+    with ResultWriter(path, MPI.COMM_SELF, truss.mesh, **options(append_after_step=7)) as writer:
+        write(writer, truss, range(8, STEPS), every=1)
+
+
+def same(one, other):
+    with h5py.File(one) as a, h5py.File(other) as b:
+        names = []
+        b.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None)
+        return all(np.array_equal(a[name][()], b[name][()]) for name in names)

@@ -35,8 +35,8 @@ class ImpactScan:
     releases : how often the wall let go
     force : largest force over the exact one, rho c A v
     swing : largest energy over that of the start of a rod that flies on from a wall that holds it for good: the energy
-        of the scheme's own states is not constant, where nothing closes or opens either; not followed beyond what
-        :data:`SWING` lets pass
+        of an explicit scheme's own states is not constant, where nothing closes or opens either; not followed beyond
+        what :data:`SWING` lets pass, and 1 for implicit schemes, which get no allowance
     """
 
     largest: np.ndarray
@@ -241,13 +241,7 @@ def scan_impacts(scheme: Scheme, asked: Asked, elements: int = 20, phases: int =
     """
     # omega = 2 is the highest frequency of unit springs and masses, so h = 1 is the limit of central differences
     steps = int(np.ceil(2.5 * elements / asked.step)) + 2 * _START + 2
-    swing = 1.0
-    held = _Rods(scheme, replace(asked, treatment="scheme"), elements, 1, held=True)
-    for _ in range(steps):
-        held.step()
-        swing = max(swing, float(np.nan_to_num(held.energy()[0], nan=np.inf)))
-        if swing > 1.0 + SWING:
-            break
+    swing = _swing(scheme, asked, elements, steps) if scheme.explicit else 1.0
     rods = _Rods(scheme, asked, elements, phases)
     largest, force, releases = np.ones(phases), np.zeros(phases), np.zeros(phases, dtype=int)
     for _ in range(steps):
@@ -260,3 +254,15 @@ def scan_impacts(scheme: Scheme, asked: Asked, elements: int = 20, phases: int =
             largest = np.where(np.isfinite(energy), largest, np.inf)
             break
     return ImpactScan(largest, energy, releases, force, swing)
+
+
+def _swing(scheme: Scheme, asked: Asked, elements: int, steps: int) -> float:
+    """See :class:`ImpactScan`."""
+    rod = _Rods(scheme, replace(asked, treatment="scheme"), elements, 1, held=True)
+    swing = 1.0
+    for _ in range(steps):
+        rod.step()
+        swing = max(swing, float(np.nan_to_num(rod.energy()[0], nan=np.inf)))
+        if swing > 1.0 + SWING:
+            break
+    return swing

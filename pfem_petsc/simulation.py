@@ -30,6 +30,7 @@ from .restart.folder import Restart, find_restart, finished, prepare_folder
 from .restart.stop import Meetings, StopRequest
 from .stepping.batch import WORTH, Batches
 from .stepping.blowup import BlowUp
+from .stepping.contact_watch import ContactWatch
 from .stepping.fields import Fields
 from .stepping.ledger import Ledger
 from .stepping.model import Model
@@ -237,12 +238,14 @@ class Simulation:
         self.recorder = Recorder(self.stepper, self.ledger)
         self.blow_up = BlowUp(self.model)
         self._piercing = Piercing(self.model)
+        self.contact_watch = ContactWatch(self.model, self._progress.warning)
         lay_over(self)
         continues = False
         if self.restart is not None:
             continues = self.restart.continues
             self.row = self._checkpoints.state.put_back_sums(checkpoint, self.ledger, self.recorder, self.blow_up)
             self._last_snapshot = self.restart.last[0]
+            self.contact_watch.start = self.recorder.start_energy
             changes = f"; changed: {'; '.join(self.restart.changed)}" if self.restart.changed else ""
             self._progress.message(
                 f"restart from {self.restart.path}: step {self.state.step}, t = {engineering(self.state.time, 's')}"
@@ -372,6 +375,7 @@ class Simulation:
     def take(self, row: Row) -> None:
         """Look at a row, keep it and add it to the history."""
         self.blow_up.check(row, self.state)
+        self.contact_watch.check(row)
         self.row = row
         self._writer.append_history(row if self.comm.rank == 0 else None)
 

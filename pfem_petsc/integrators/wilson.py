@@ -7,8 +7,10 @@ With tau = theta h the unknown is x_tau at t0 + tau:
     a1 = a0 + (a_tau - a0)/theta,   v1 = v0 + h (a0 + a1)/2,   x1 = x0 + h v0 + h^2 (2 a0 + a1)/6.
 
 Walls bound x_tau, not x1. A node held so moves as at infinite frequency: at theta = 1.4 by a factor -0.778 a step, so
-its reaction alternates, the wall lets go, and contact chatters and gains energy; from theta = 1.5 on a complex pair
-(0.533 in magnitude) dies out. Plastic strains are kept from x1, not from x_tau.
+its reaction alternates, the wall lets go, and contact chatters and gains energy. That a held node calms down (0.533 a
+step at theta = 1.5) does not make contact safe: false releases depend on where in a step the impact falls, and gain
+energy below theta = 1.8 at small steps (docs/contact.md has the table). Plastic strains are kept from x1, not from
+x_tau.
 """
 
 from __future__ import annotations

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 
 from ..contact.free import FreeWalls
-from ..contact.held_node import held_growth
 from ..contact.treatments.mass_redistribution import redistribute
 from ..contact.treatments.restitution import Treatment as Restitution
 from ..errors import InputError
 from ..integrators.base import Scheme
 from ..registry import lookup
 from ..solvers.linear import LinearChoice, choose_linear
+from .contact_check import warn_of_gain
 from .explicit import ExplicitStepper
 from .implicit import ImplicitStepper
 from .redistributed import RedistributedStepper
@@ -157,16 +157,12 @@ def make_stepper(model, plan: Plan) -> Stepper:
     _check_walls(model, plan)
     name = model.case.contact.treatment
     touch = model.contact.any or model.pairs is not None
-    if name == "scheme" and touch and (growth := held_growth(plan.scheme)) > 1.0 + 1e-9:
-        model.warnings.append(
-            f'contact: with contact.treatment = "scheme" {model.case.time.integrator} with these parameters amplifies '
-            f"the motion of nodes that contact holds (by {growth:.3f} a step): they chatter and gain energy; take "
-            'contact.treatment = "stick"'
-        )
     if name == "scheme" or not touch:
         stepper = _stepper(model, plan, ExplicitStepper)
         if model.contact.restitution.any() and not model.contact.rebounds:
             stepper.treatment = Restitution(stepper)
+        if touch:
+            _warn_of_gain(model, plan)
         return stepper
     key = f'{model.case.source}: contact.treatment = "{name}"'
     if model.inertia.consistent:
@@ -181,7 +177,16 @@ def make_stepper(model, plan: Plan) -> Stepper:
         explicit = RedistributedStepper
     stepper = _stepper(model, plan, explicit)
     stepper.treatment = lookup("pfem_petsc.contact.treatments", name, "contact.treatment").Treatment(stepper)
+    _warn_of_gain(model, plan)
     return stepper
+
+
+def _warn_of_gain(model, plan: Plan) -> None:
+    """Warn where contact gains energy with this scheme, treatment, mass and step."""
+    fastest = plan.frequency.upper / (np.sqrt(3.0) if model.inertia.consistent else 1.0)
+    warning = warn_of_gain(model.case, 0.5 * fastest * plan.step)
+    if warning:
+        model.warnings.append(warning)
 
 
 def _check_walls(model, plan: Plan) -> None:

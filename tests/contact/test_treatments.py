@@ -5,9 +5,7 @@ import pytest
 from lattices import lattice_case, planes, simulation
 
 from pfem_petsc import Case, Simulation
-from pfem_petsc.contact.held_node import held_growth
 from pfem_petsc.errors import InputError
-from pfem_petsc.registry import lookup
 
 TRAPEZOID = {"beta": 0.25, "gamma": 0.5}
 FORCE, ENERGY = 0.1, 0.005  # rho c A v and m v^2/2 of the rod at v = 0.1
@@ -119,28 +117,7 @@ def test_own_formulas_of_the_trapezoid_gain_energy(comm, shared_tmp_path):
     assert energy[-1] > 5.0
     case = Case.load("rod_impact", ["time.integrator=newmark", "time.beta=0.25", "time.gamma=0.5"])
     run = Simulation(case, comm, output=shared_tmp_path / "b", quiet=True)
-    assert any("amplifies" in warning for warning in run.model.warnings)
-
-
-@pytest.mark.parametrize(
-    "integrator, parameters, radius",
-    [
-        ("newmark", {}, 0.0),
-        ("wilson", {"theta": 1.4}, 0.778),
-        ("newmark", {"beta": 1 / 6}, None),
-        ("newmark", {"beta": 0.3025, "gamma": 0.6}, 0.82),
-        ("chung_lee", {}, 0.189),
-        ("central_differences", {}, 0.0),
-    ],
-)
-def test_held_node(integrator, parameters, radius):
-    """Spectral radii of the recursion of a held node, by the amplification matrices."""
-    module = lookup("pfem_petsc.integrators", integrator, "")
-    growth = held_growth(module.Scheme(module.Parameters(**parameters)))
-    if radius is None:
-        assert growth > 1.5
-    else:
-        assert growth == pytest.approx(radius, abs=0.03) or (radius < 0.2 and growth < 0.2)
+    assert any("gains energy in impacts" in warning for warning in run.model.warnings)
 
 
 @pytest.mark.parallel

@@ -2,10 +2,11 @@
 
 A node that touches a wall in this step and did not in the one before has closed: its normal velocity relative to the
 wall becomes -e times that at the impact, and its acceleration the one without contact, so that it leaves. The impact
-happened within the step: with the velocity v and acceleration a towards the wall at its start, at a distance d, it had
-sqrt(v^2 + 2 a d), which keeps the energy of a falling node whatever the step. One that is pressed for longer has the
-wall's velocity and no acceleration, as with ``stick``. The energy that is lost, (1 - e^2) of that of the approach, is
-work of contact.
+happened within the step: with the velocity v towards the wall at its start, at a distance d, it had
+sqrt(v^2 + (a0 + a1) d), with the accelerations a0 and a1 that all but the wall give the node at both ends of the step.
+That is the work of these forces, so that it keeps the energy of a falling node whatever the step, and takes no energy
+from bars that they have not given. One that is pressed for longer has the wall's velocity and no acceleration, as with
+``stick``. The energy that is lost, (1 - e^2) of that of the approach, is work of contact.
 
 This is the treatment of walls with restitution where the others are left to the scheme.
 """
@@ -22,14 +23,26 @@ _STILL = 1e-13  # of the model's length: a slip that is rounding
 
 
 class Treatment(Base):
-    """Nodes that close against walls with restitution leave them."""
+    """Nodes that close against walls with restitution leave them.
+
+    ``everywhere`` : whether the treatment is that of nodes at walls without restitution, too.
+    """
+
+    everywhere = False
 
     def before(self) -> None:
         """Keep who touches what, and how nodes move."""
         self._touched = self.stepper.touching.copy()
         contact, state = self.stepper.model.contact, self.stepper.state
-        if contact.rough or contact.restitution.any():
+        scheme = self.stepper.scheme
+        self._frees = scheme.at_ends and not scheme.leads  # nodes whose first free step the wall's old force works on
+        if self._frees or contact.rough or contact.restitution.any():
             self._time, self._place = state.time, state.position.copy()
+        if self._frees:
+            mine = self._touched if self.everywhere else self._touched & (contact.restitution > 0.0)
+            self._held = np.flatnonzero(mine.any(axis=1))
+            change = state.memory.get("contact_change")
+            self._force = state.contact[self._held] + (0.0 if change is None else change[self._held])
         if not contact.restitution.any():
             return
         self._speed = state.v
@@ -47,8 +60,38 @@ class Treatment(Base):
         """See :class:`~pfem_petsc.contact.treatments.base.Treatment`."""
         self.clear()
         nodes, v, a = self.on_walls(self.stepper.model.contact.restitution > 0.0)
+        self.put(nodes, v, a)
+
+    def put(self, nodes: np.ndarray, v: np.ndarray, a: np.ndarray) -> None:
+        """Give held nodes (m,) and those that were just let go their velocities and accelerations (m, 3)."""
+        gone, slower = self._let_go()
+        if len(gone):
+            nodes, v, a = np.append(nodes, gone), np.vstack([v, slower]), np.vstack([a, self.stepper.state.a[gone]])
         if len(nodes):
             self.set(nodes, v, a)
+
+    def _let_go(self) -> tuple[np.ndarray, np.ndarray]:
+        """Nodes (m,) that this treatment held and that walls let go in this step, and their velocities (m, 3).
+
+        By schemes whose forces work by the trapezoidal rule the force that held a node at the start of the step pushes
+        it off, at rest as it was, which would be work of a wall: it is taken back from the velocity away from the wall.
+        """
+        state, stepper = self.stepper.state, self.stepper
+        if not self._frees or not len(self._held):
+            return np.empty(0, dtype=np.int64), np.empty((0, 3))
+        left = ~stepper.touching[self._held].any(axis=1)
+        gone, force = self._held[left], self._force[left]
+        walls = self._touched[gone].argmax(axis=1)
+        motion = stepper.model.contact.motion
+        way = (motion.shifts(state.time) - motion.shifts(self._time))[walls]
+        rate = motion.rates(state.time)[walls]
+        work = 0.5 * np.einsum("mi,mi->m", force, state.position[gone] - self._place[gone] - way)
+        away = force / np.maximum(np.linalg.norm(force, axis=1), 1e-300)[:, None]
+        speed = np.einsum("mi,mi->m", away, state.v[gone] - rate)
+        left = (work > 0.0) & (speed > 0.0)
+        gone, away, speed, work = gone[left], away[left], speed[left], work[left]
+        slower = np.sqrt(np.maximum(speed * speed - 2.0 * work / stepper.model.inertia.mass[gone], 0.0))
+        return gone, state.v[gone] + (slower - speed)[:, None] * away
 
     def leaving(self, nodes: np.ndarray, touching: np.ndarray, normals: np.ndarray, rates: np.ndarray) -> np.ndarray:
         """See :class:`~pfem_petsc.contact.treatments.base.Treatment`."""
@@ -58,8 +101,8 @@ class Treatment(Base):
         moved = self._moved(nodes)
         speed = np.einsum("mwi,mwi->mw", normals, self._speed[nodes][:, None, :] - rates)
         distance = np.maximum(-np.einsum("mwi,mwi->mw", normals, moved), 0.0)
-        towards = -np.einsum("mwi,mi->mw", normals, self._free[nodes])
-        impact = np.sqrt(np.maximum(speed * speed + 2.0 * towards * distance, 0.0))
+        towards = -np.einsum("mwi,mi->mw", normals, self._free[nodes] + self._without_contact(nodes))
+        impact = np.sqrt(np.maximum(speed * speed + towards * distance, 0.0))
         fresh = touching & ~self._touched[nodes]
         return np.where(fresh & (speed < 0.0), contact.restitution * impact, 0.0)
 

@@ -5,8 +5,8 @@ Where friction keeps them from slipping, or a tied wall, that holds in all direc
 The nodes of a pressed contact pair move on together: their normal velocity is the one that keeps their momentum.
 
 On closure a node loses the kinetic energy of its approach, m v_n^2/2, an O(element length) part of the whole; on
-release it starts from rest. Energy never grows by contact with a wall at rest. At a wall with restitution e a node that
-closes leaves with e times the velocity of its approach, and loses (1 - e^2) of that energy: see
+release it starts from rest, and the wall does no work on it. At a wall with restitution e a node that closes leaves
+with e times the velocity of its approach, and loses (1 - e^2) of that energy: see
 :mod:`~pfem_petsc.contact.treatments.restitution`.
 """
 
@@ -22,6 +22,8 @@ __all__ = ["Treatment"]
 class Treatment(Restitution):
     """Velocity and acceleration of held nodes as those of the wall."""
 
+    everywhere = True
+
     def after(self) -> None:
         """See :class:`~pfem_petsc.contact.treatments.base.Treatment`."""
         self.clear()
@@ -33,5 +35,4 @@ class Treatment(Restitution):
             nodes = np.append(nodes, ends)
             v = np.vstack([v, pairs.together(state.v, mass)[ends]])
             a = np.vstack([a, pairs.together(state.a, mass)[ends]])
-        if len(nodes):
-            self.set(nodes, v, a)
+        self.put(nodes, v, a)

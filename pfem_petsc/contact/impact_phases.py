@@ -1,0 +1,268 @@
+"""Stability of contact, judged over the phases of an impact: an elastic rod flies against a rigid wall.
+
+Whether contact gains energy depends on where in a step the impact falls: a node that is stopped gets a velocity that
+may lead it off its wall again (a false release), and what it does then depends on the phase. The motion of one node
+that is held does not show that. So equal rods, each a fraction of a step further from the wall than the one before,
+run against it with the integrator itself, in its affine form (:mod:`pfem_petsc.integrators.base`), here with a linear
+rod of springs c and masses m, dense matrices and one bound for each rod. In the exact problem energy stays as it is
+and there is one release.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..integrators.base import Balance, Scheme, State
+
+__all__ = ["PHASES", "SWING", "Asked", "ImpactScan", "scan_impacts"]
+
+PHASES = 14
+SWING = 0.05
+"""Part of the energy by which a scheme's own states may swing: near the limits of explicit schemes they do."""
+_START = 3  # steps of free flight before the earliest impact: schemes with a memory have filled it
+_CONTACT = 1e-12  # of the force of a node stopped in a step: a force that is rounding
+
+
+@dataclass(frozen=True)
+class ImpactScan:
+    """What impact made of the rods; arrays are (phases,).
+
+    Attributes
+    ----------
+    largest, last : largest energy met and energy at the end, over that of the flight
+    releases : how often the wall let go
+    force : largest force over the exact one, rho c A v
+    swing : largest energy over that of the start of a rod that flies on from a wall that holds it for good: the energy
+        of an explicit scheme's own states is not constant, where nothing closes or opens either; not followed beyond
+        what :data:`SWING` lets pass, and 1 for implicit schemes, which get no allowance
+    """
+
+    largest: np.ndarray
+    last: np.ndarray
+    releases: np.ndarray
+    force: np.ndarray
+    swing: float
+
+    @property
+    def gain(self) -> float:
+        """Largest part of the energy that contact gains in any phase, beyond the scheme's own swing (of which
+        :data:`SWING` is let pass); infinite where the motion blew up."""
+        worst = float(self.largest.max()) / min(self.swing, 1.0 + SWING)
+        return max(worst - 1.0, 0.0) if np.isfinite(worst) else np.inf
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What a case asks for of contact.
+
+    Attributes
+    ----------
+    treatment : ``contact.treatment``
+    consistent : mass matrix; else lumped
+    step : over the explicit limit of the lumped rod, l/c
+    restitution : of the wall
+    """
+
+    treatment: str
+    consistent: bool
+    step: float
+    restitution: float = 0.0
+
+
+class _Rods:
+    """The rods: unit spring constant and inner mass, so that the explicit limit of the step (lumped mass) is one.
+
+    The arrays of a state have a row for every node, rod after rod, and one column.
+    """
+
+    def __init__(self, scheme: Scheme, asked: Asked, elements: int, phases: int, held: bool = False) -> None:
+        self.scheme, self.treatment, self.h, self.held = scheme, asked.treatment, asked.step, held
+        consistent, step = asked.consistent, asked.step
+        self.restitution = 0.0 if held else asked.restitution
+        nodes = elements + 1
+        self.shape = (phases, nodes)
+        k = 2.0 * np.eye(nodes) - np.eye(nodes, k=1) - np.eye(nodes, k=-1)
+        k[0, 0] = k[-1, -1] = 1.0
+        mass = np.eye(nodes)
+        mass[0, 0] = mass[-1, -1] = 0.5
+        if consistent:
+            mass = mass - k / 6.0
+        self.massless = asked.treatment == "mass_redistribution" and not held
+        if self.massless:
+            mass[-2, -2] += mass[-1, -1]
+            mass[-1, -1] = 0.0
+        self.k, self.m = k, mass
+        self.tip = 0.5  # the lumped mass of the node that hits, where it has some
+        self.tips = np.arange(1, phases + 1) * nodes - 1
+        self.wall = step * (_START + (np.arange(phases) + 0.5) / phases)  # gaps at unit speed
+        zeros = np.zeros((phases * nodes, 1))
+        self.state = State(zeros.copy(), zeros + 1.0, *(zeros.copy() for _ in range(5)))
+        if held:
+            self.wall[:] = 0.0
+            self.state.v[self.tips] = 0.0
+        self.start = self._energy()
+        self.touching = np.zeros(phases, dtype=bool)
+        self.strength = np.zeros(phases)
+        self.change = np.zeros(phases)
+        self.debt = np.zeros(phases)
+        self.rebound = np.zeros(
+            phases
+        )  # way off the wall in the step after an impact, where the next position is bound
+        self._inverse: tuple[float, np.ndarray] | None = None
+        scheme.start(self.state, step)
+        if scheme.leads:
+            self._solve()
+
+    def rods(self, values: np.ndarray) -> np.ndarray:
+        """(phases, nodes) view of an array of the state."""
+        return values.reshape(self.shape)
+
+    def energy(self) -> np.ndarray:
+        """(phases,) kinetic and elastic energy over that of the start."""
+        return self._energy() / self.start
+
+    def _energy(self) -> np.ndarray:
+        x, v = self.rods(self.state.x), self.rods(self.state.v)
+        return 0.5 * (np.einsum("pi,ij,pj->p", v, self.m, v) + np.einsum("pi,ij,pj->p", x, self.k, x))
+
+    def step(self) -> None:
+        """Advance all rods by a step, with the treatment of impact."""
+        state = self.state
+        start = state.x[self.tips, 0].copy()
+        before, touched = self.strength + self.change, self.touching
+        speed, free = state.v[self.tips, 0].copy(), self._free()
+        if self.scheme.leads:
+            self.scheme.advance(state, self.h)
+            state.time += self.h
+            self._solve()
+        else:
+            self._solve()
+            state.time += self.h
+        self.change[:] = 0.0
+        if self.massless:
+            if not self.scheme.explicit:
+                self._set(np.ones_like(self.touching), (state.x[self.tips, 0] - start) / self.h, 0.0)
+        elif self.treatment == "stick" or (self.restitution and not self.scheme.leads):
+            self._set(self.touching, 0.0, 0.0)
+            if self.restitution:
+                work = (free + self._free()) * np.maximum(state.x[self.tips, 0] - start, 0.0)
+                impact = np.where(speed > 0.0, np.sqrt(np.maximum(speed * speed + work, 0.0)), 0.0)
+                self._set(self.touching & ~touched, -self.restitution * impact, self._free())
+            if self.scheme.at_ends and not self.scheme.leads:
+                self._let_go(touched & ~self.touching, start, before)
+        elif self.treatment == "conserving":
+            self._take_back(start, before)
+
+    def _solve(self) -> None:
+        balance = self.scheme.balance(self.state, self.h)
+        x, predictor = self.rods(self.state.x), self.rods(balance.predictor)
+        load = np.zeros(self.shape)
+        if balance.a_hat is not None:
+            load -= self.rods(balance.a_hat) @ self.m
+        weight = 0.5 * balance.weight if balance.from_start else balance.weight
+        load -= (weight * predictor + (1.0 - weight) * x) @ self.k
+        if self.massless and self.scheme.explicit:
+            u, self.strength = self._in_equilibrium(balance, load, predictor, x)
+        else:
+            u, self.strength = self._bounded(balance.alpha * self.m + weight * self.k, load, predictor)
+        self.touching = self.strength > _CONTACT / self.h
+        self.scheme.finish(self.state, balance, u.reshape(-1, 1), self.h)
+
+    def _bounded(self, hessian: np.ndarray, load: np.ndarray, predictor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Increments of a step in which the wall bounds the last node, and forces (phases,) of the wall, positive."""
+        wall = self.wall - self.rebound
+        if self._inverse is None or self._inverse[0] != hessian[0, 0]:
+            self._inverse = hessian[0, 0], np.linalg.inv(hessian)
+        inverse = self._inverse[1]
+        u = load @ inverse
+        strength = (predictor[:, -1] + u[:, -1] - wall) / inverse[-1, -1]
+        if not self.held:
+            strength = np.maximum(strength, 0.0)
+        if self.restitution and self.scheme.leads:
+            approach = predictor[:, -1] + u[:, -1] - self.state.x[self.tips, 0]
+            fresh = (strength > _CONTACT / self.h) & ~self.touching
+            self.rebound = np.where(fresh, self.restitution * np.maximum(approach, 0.0), 0.0)
+        return u - strength[:, None] * inverse[-1], strength
+
+    def _in_equilibrium(
+        self, balance: Balance, load: np.ndarray, predictor: np.ndarray, x: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """As :meth:`_bounded`, of explicit steps with a last node without mass: it follows its neighbour to the wall.
+
+        The force is that of the step's start.
+        """
+        strength = np.where(x[:, -1] >= self.wall - 1e-12, np.maximum(load[:, -1], 0.0), 0.0)
+        u = np.zeros(self.shape)
+        u[:, :-1] = load[:, :-1] / (balance.alpha * np.diag(self.m)[:-1])
+        u[:, -1] = np.minimum(predictor[:, -2] + u[:, -2], self.wall) - predictor[:, -1]
+        return u, strength
+
+    def _set(self, chosen: np.ndarray, v: np.ndarray | float, a: np.ndarray | float) -> None:
+        """Give the last nodes of some rods other velocities and accelerations."""
+        state, at = self.state, self.tips[chosen]
+        if not len(at):
+            return
+        state.v, state.a = state.v.copy(), state.a.copy()
+        old = state.a[at, 0]
+        state.v[at, 0] = np.broadcast_to(v, chosen.shape)[chosen]
+        state.a[at, 0] = np.broadcast_to(a, chosen.shape)[chosen]
+        if not self.massless:
+            self.change[chosen] -= self.tip * (state.a[at, 0] - old)
+        self.scheme.restart(state, at, self.h)
+
+    def _let_go(self, chosen: np.ndarray, start: np.ndarray, before: np.ndarray) -> None:
+        """Take the work that the force at the start of the step does on nodes let go in it back from their velocity."""
+        v = self.state.v[self.tips, 0]
+        work = -0.5 * before * (self.state.x[self.tips, 0] - start)
+        chosen = chosen & (work > 0.0) & (v < 0.0)
+        self._set(chosen, -np.sqrt(np.maximum(v * v - 2.0 * work / self.tip, 0.0)), self.state.a[self.tips, 0])
+
+    def _take_back(self, start: np.ndarray, before: np.ndarray) -> None:
+        """The velocity of Laursen and Love: it takes the work of contact back."""
+        state = self.state
+        force = 0.5 * (self.strength + before) if self.scheme.at_ends else self.strength
+        work = self.debt - force * (state.x[self.tips, 0] - start)
+        square = state.v[self.tips, 0] ** 2 - 2.0 * work / self.tip
+        self.debt = np.where(self.touching, np.maximum(-0.5 * self.tip * square, 0.0), self.debt)
+        self._set(self.touching, -np.sqrt(np.maximum(square, 0.0)), self._free())
+
+    def _free(self) -> np.ndarray:
+        """(phases,) acceleration of the last nodes without contact."""
+        return -(self.rods(self.state.x) @ self.k)[:, -1] / self.tip
+
+
+@np.errstate(all="ignore")
+def scan_impacts(scheme: Scheme, asked: Asked, elements: int = 20, phases: int = PHASES) -> ImpactScan:
+    """Let rods fly against a wall, impacts a fraction of a step apart, until the exact ones have left it.
+
+    ``elements``, ``phases`` : bars of a rod, and number of rods.
+    """
+    # omega = 2 is the highest frequency of unit springs and masses, so h = 1 is the limit of central differences
+    steps = int(np.ceil(2.5 * elements / asked.step)) + 2 * _START + 2
+    swing = _swing(scheme, asked, elements, steps) if scheme.explicit else 1.0
+    rods = _Rods(scheme, asked, elements, phases)
+    largest, force, releases = np.ones(phases), np.zeros(phases), np.zeros(phases, dtype=int)
+    for _ in range(steps):
+        touched = rods.touching
+        rods.step()
+        energy = rods.energy()
+        largest, force = np.fmax(largest, energy), np.fmax(force, rods.strength)
+        releases += touched & ~rods.touching
+        if not np.isfinite(energy).all() or energy.max() > 1e6:
+            largest = np.where(np.isfinite(energy), largest, np.inf)
+            break
+    return ImpactScan(largest, energy, releases, force, swing)
+
+
+def _swing(scheme: Scheme, asked: Asked, elements: int, steps: int) -> float:
+    """See :class:`ImpactScan`."""
+    rod = _Rods(scheme, replace(asked, treatment="scheme"), elements, 1, held=True)
+    swing = 1.0
+    for _ in range(steps):
+        rod.step()
+        swing = max(swing, float(np.nan_to_num(rod.energy()[0], nan=np.inf)))
+        if swing > 1.0 + SWING:
+            break
+    return swing

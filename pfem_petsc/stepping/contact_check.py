@@ -1,0 +1,84 @@
+"""Whether contact gains energy with what a case asks for: judged before the first step, by impacts on a small rod."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+from ..contact.impact_phases import PHASES, Asked, scan_impacts
+from ..registry import lookup
+
+__all__ = ["BOUND", "contact_gain", "warn_of_gain"]
+
+BOUND = 0.005
+"""Part of the energy that impacts on the small rod may gain without a warning."""
+
+_STEPS = 0.1, 50.0  # over the explicit limit: smaller and larger ones do as these
+
+
+@cache
+def contact_gain(integrator: str, parameters: str, asked: Asked) -> float:
+    """Largest part of the energy that impacts gain in any phase, at steps of this size and a quarter of it.
+
+    A quarter, because a truss has nodes that are slower than its fastest one, and chatter depends on the step.
+    ``parameters`` are those of the integrator as JSON.
+    """
+    module = lookup("pfem_petsc.integrators", integrator, "time.integrator")
+    scheme = module.Scheme(module.Parameters.model_validate_json(parameters))
+    low, high = _STEPS
+    sizes = sorted({min(max(size, low), high) for size in (asked.step, 0.25 * asked.step)})
+    return max(scan_impacts(scheme, replace(asked, step=size)).gain for size in sizes)
+
+
+def warn_of_gain(case, step: float) -> str:
+    """What to tell of a case whose contact gains energy beyond :data:`BOUND`; empty for nothing.
+
+    ``step`` : over the limit of central differences with lumped mass.
+    """
+    time = case.time
+    step = float(f"{step:.2g}")  # so that much the same cases are judged once
+    gains = {}
+    for restitution in sorted({0.0, *(float(f"{wall.restitution:.2g}") for wall in case.wall)}):
+        asked = Asked(case.contact.treatment, time.mass == "consistent", step, restitution)
+        gains[contact_gain(time.integrator, time.scheme.model_dump_json(), asked)] = asked
+    gain = max(gains)
+    asked = gains[gain]
+    if gain <= BOUND:
+        return ""
+    named = ", ".join(f"{name} = {value:.4g}" for name, value in time.scheme.model_dump().items())
+    size = f"by {100.0 * gain:.2g} % of the energy" if gain < 10.0 else "by more than ten times the energy"
+    restitution = f"restitution {asked.restitution:g}, " if asked.restitution else ""
+    return (
+        f'contact: {time.integrator}{f" ({named})" if named else ""} with contact.treatment = "{asked.treatment}", '
+        f'{restitution}time.mass = "{time.mass}" and steps of {step:.2g} times the explicit limit gains energy in '
+        f"impacts: {size} in the worst of {PHASES} phases of a step at which a rod meets a wall; take "
+        f"{_ways_out(time, asked)}"
+    )
+
+
+def _ways_out(time, asked: Asked) -> str:
+    """What else does not gain energy, nearest first: two at most."""
+    parameters = time.scheme.model_dump_json()
+    tries = []
+    for other in ("stick", "scheme"):
+        if other != asked.treatment and not asked.restitution:
+            lumped = other == "stick" and asked.consistent
+            text = f'contact.treatment = "{other}"' + (' and time.mass = "lumped"' if lumped else "")
+            changed = replace(asked, treatment=other, consistent=asked.consistent and not lumped)
+            tries.append((text, time.integrator, parameters, changed))
+    if time.integrator == "wilson":
+        tries.append(("time.theta = 2", "wilson", '{"theta": 2.0}', asked))
+    for size in (1.0, 0.2):
+        if asked.step > size:
+            text = f"a time.step of at most {size:g} times the explicit limit"
+            tries.append((text, time.integrator, parameters, replace(asked, step=size)))
+    newmark = 'time.integrator = "newmark" with its default parameters'
+    tries.append((newmark, "newmark", "{}", asked))
+    if asked.restitution:
+        tries.append(('time.integrator = "energy_momentum"', "energy_momentum", "{}", asked))
+        for less in (0.9, 0.5):
+            if asked.restitution > less:
+                text = f"a restitution of at most {less:g}"
+                tries.append((text, time.integrator, parameters, replace(asked, restitution=less)))
+    found = [text for text, *what in tries if contact_gain(*what) <= BOUND]
+    return ", or ".join(found[:2]) if found else newmark

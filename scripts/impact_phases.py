@@ -1,0 +1,237 @@
+"""The table of impact phases in docs/contact.md: does contact gain energy, wherever in a step the impact falls?
+
+    python scripts/impact_phases.py            # rewrites it, in two minutes
+    python scripts/impact_phases.py --program  # prints it from runs of the program itself, in half an hour
+
+Every integrator, treatment and mass matrix runs the rod against the wall of `rod_impact` in 14 phases: equal rods, each
+a fourteenth of v h further from the wall than the one before. The table is that of the small linear rods that the
+program itself judges by; in its own runs all rods are one mesh, so that one run does all phases, and the tests hold
+both against each other. The exact energy ratios and releases are 1.
+"""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+from mpi4py import MPI
+
+from pfem_petsc import Case
+from pfem_petsc.contact.impact_phases import Asked, scan_impacts
+from pfem_petsc.errors import InputError, SimulationFailure
+from pfem_petsc.registry import lookup
+from pfem_petsc.stepping.contact_check import BOUND, contact_gain
+from pfem_petsc.stepping.model import Model
+from pfem_petsc.stepping.prepare import CONSERVING, make_plan, make_stepper
+
+DOCS = Path(__file__).parent.parent / "docs"
+START, END = "<!-- table: scripts/impact_phases.py -->\n", "<!-- end of phases -->"
+PHASES, ELEMENTS = 14, 20
+SPEED = 1e-4  # over the wave speed: small enough for linear rods also where large steps throw nodes about
+LIMIT = 1.0 / ELEMENTS  # explicit limit of the step with lumped mass, l/c [s]
+COLUMNS = (("scheme", "lumped"), ("scheme", "consistent"), ("stick", "lumped"), ("conserving", "lumped"))
+COLUMNS += (("mass_redistribution", "lumped"),)
+EXPLICIT = "central_differences", "chung_lee", "hulbert_chung", "souza_moura"
+STEPS = 0.2, 1.0, 5.0, 20.0
+"""Over the explicit limit of the lumped rod; explicit schemes take 0.2 and 0.9 of their own limit."""
+SCHEMES = (
+    ("central_differences", {}),
+    ("chung_lee", {"beta": 1.0}),
+    ("chung_lee", {"beta": 28.0 / 27.0}),
+    ("hulbert_chung", {"rho_b": 0.0}),
+    ("hulbert_chung", {"rho_b": 0.8}),
+    ("hulbert_chung", {"rho_b": 1.0}),
+    ("souza_moura", {}),
+    ("newmark", {"beta": 1.0, "gamma": 1.5}),
+    ("newmark", {"beta": 0.25, "gamma": 0.5}),
+    ("newmark", {"beta": 0.3025, "gamma": 0.6}),
+    ("houbolt", {}),
+    *(("wilson", {"theta": theta}) for theta in (1.4, 1.5, 1.6, 1.8, 2.0)),
+    *(("generalized_alpha", {"rho_inf": rho}) for rho in (0.0, 0.5, 0.8, 1.0)),
+    ("energy_momentum", {}),
+)
+
+
+@dataclass(frozen=True)
+class Impacts:
+    """What impact made of the rods; arrays (phases,) as of :class:`pfem_petsc.contact.impact_phases.ImpactScan`.
+
+    ``warned``: the program warned of gains before it started.
+    """
+
+    largest: np.ndarray
+    last: np.ndarray
+    releases: np.ndarray
+    force: np.ndarray
+    warned: bool
+
+
+def write_rods(file: Path, step: float, speed: float = SPEED) -> None:
+    """A mesh of all rods side by side, tips at x = 0 less three steps of flight and (k + 1/2)/14 of one."""
+    x = np.linspace(-1.0, 0.0, ELEMENTS + 1)
+    points = np.zeros((PHASES, ELEMENTS + 1, 3))
+    points[:, :, 0] = x - speed * step * (3.0 + (np.arange(PHASES)[:, None] + 0.5) / PHASES)
+    points[:, :, 1] = 0.2 * np.arange(PHASES)[:, None]
+    start = np.arange(ELEMENTS) + (ELEMENTS + 1) * np.arange(PHASES)[:, None]
+    with h5py.File(file, "w") as mesh:
+        mesh["points"] = points.reshape(-1, 3)
+        mesh["bars"] = np.stack([start, start + 1], axis=2).reshape(-1, 2)
+        mesh["node_groups/tips"] = (ELEMENTS + 1) * np.arange(1, PHASES + 1) - 1
+
+
+def case_of(
+    file: Path, integrator: str, parameters: dict, treatment: str, mass: str, step: float, restitution: float = 0.0
+) -> Case:
+    """The rods as a case."""
+    # along its axis alone: a rod that is pressed would buckle within a few large steps, from rounding
+    supports = [] if integrator in EXPLICIT else [{"node_set": "all", "fix": "yz"}]
+    wall = {"name": "wall", "type": "plane", "point": [0.0] * 3, "normal": [-1.0, 0.0, 0.0], "node_set": "tips"}
+    return Case.from_dict(
+        {
+            "mesh": {"file": str(file)},
+            "node_set": {"tips": {"group": "tips"}, "all": {"all": True}},
+            "support": supports,
+            "material": {"m": {"young_modulus": 1.0, "density": 1.0}},
+            "section": {"s": {"area": 1.0, "material": "m"}},
+            "initial": {"velocity": [SPEED, 0.0, 0.0]},
+            "wall": [wall | {"restitution": restitution}],
+            "contact": {"treatment": treatment},
+            "time": {"integrator": integrator, "step": step, "end": 100.0, "mass": mass, **parameters},
+            "solver": {"linear": "mumps", "rtol": 1e-10},
+        }
+    )
+
+
+def impacts(
+    integrator: str, parameters: dict, treatment: str, mass: str, step: float, restitution: float = 0.0
+) -> Impacts | None:
+    """Run all phases; ``step`` over the explicit limit. None where the program refuses the pair."""
+    h = step * LIMIT
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "rods.h5"
+        write_rods(file, h)
+        model = Model(case_of(file, integrator, parameters, treatment, mass, h, restitution), MPI.COMM_SELF)
+        try:
+            stepper = make_stepper(model, make_plan(model))
+        except InputError:
+            return None
+    return _run(model, stepper, int(np.ceil(2.5 / h)) + 8)
+
+
+def _run(model, stepper, steps: int) -> Impacts:
+    ids = model.mesh.node_ids[: model.mesh.n_owned]
+    rod, order = ids // (ELEMENTS + 1), np.argsort(ids)
+    tips = order.reshape(PHASES, -1)[:, -1]
+    bars = model.mesh.bars
+    momentum = np.empty((len(ids), 3))
+
+    def energy() -> np.ndarray:
+        state = stepper.state
+        model.inertia.mass_times(state.v, momentum)
+        total = np.bincount(rod, 0.5 * (momentum * state.v).sum(axis=1), PHASES)
+        length = np.linalg.norm(state.x[bars[:, 1]] - state.x[bars[:, 0]], axis=1)
+        strain = length / model.bars.rest - 1.0  # the default measure
+        return total + np.bincount(rod[bars[:, 0]], 0.5 * model.bars.rest * strain**2, PHASES)
+
+    stepper.start()
+    first = energy()
+    largest, force, releases = np.ones(PHASES), np.zeros(PHASES), np.zeros(PHASES, dtype=int)
+    last, touching = largest, np.zeros(PHASES, dtype=bool)
+    try:
+        for _ in range(steps):
+            stepper.step()
+            now = stepper.touching[tips, 0].copy()
+            releases += touching & ~now
+            touching, last = now, energy() / first
+            largest = np.fmax(largest, last)
+            force = np.fmax(force, -stepper.state.contact[tips, 0] / SPEED)
+            if stepper.fault is not None:
+                raise stepper.fault
+    except SimulationFailure:
+        largest = last = np.full(PHASES, np.inf)
+    if hasattr(stepper, "destroy"):
+        stepper.destroy()
+    return Impacts(largest, last, releases, force, any("gains energy" in text for text in model.warnings))
+
+
+def own_limit(integrator: str, parameters: dict, mass: str) -> float:
+    """Largest step of a scheme over l/c, infinite for most implicit ones."""
+    module = lookup("pfem_petsc.integrators", integrator, "")
+    limit = module.Scheme(module.Parameters(**parameters)).limit()
+    return 0.5 * limit / (np.sqrt(3.0) if mass == "consistent" else 1.0)
+
+
+def steps_of(integrator: str, parameters: dict, mass: str) -> list[float]:
+    """Steps over l/c that the table has."""
+    limit = own_limit(integrator, parameters, mass)
+    return list(STEPS) if np.isinf(limit) else [0.2 * limit, 0.9 * limit]
+
+
+def label(integrator: str, parameters: dict) -> str:
+    """Scheme and parameters as in a case file."""
+    numbers = {28.0 / 27.0: "28/27", 0.25: "1/4", 0.5: "1/2", 1.5: "3/2"}
+    parts = [
+        f"{name} {numbers.get(value, f'{value:g}') if integrator != 'wilson' else value}"
+        for name, value in parameters.items()
+    ]
+    return ", ".join([f"`{integrator}`", *parts])
+
+
+def cell(found: Impacts | None) -> str:
+    """Largest energy on the way, largest at the end, false releases, largest force; an asterisk where it warns."""
+    if found is None:
+        return "-"
+    star = "*" if found.warned else ""
+    if not np.isfinite(found.largest).all():
+        return f"blows up{star}"
+    releases = int(found.releases.max()) - 1
+    return f"{found.largest.max():.3f}, {found.last.max():.3f}, {max(releases, 0)}, {found.force.max():.2f}{star}"
+
+
+def judged(integrator: str, parameters: dict, treatment: str, mass: str, step: float) -> Impacts | None:
+    """As :func:`impacts`, of the small rods; ``step`` over the explicit limit."""
+    module = lookup("pfem_petsc.integrators", integrator, "")
+    known = module.Parameters(**parameters)
+    scheme = module.Scheme(known)
+    if treatment == "conserving" and integrator not in CONSERVING:
+        return None
+    if treatment == "mass_redistribution" and scheme.explicit and not scheme.leads:
+        return None
+    asked = Asked(treatment, mass == "consistent", step)
+    found = scan_impacts(scheme, asked)
+    warned = contact_gain(integrator, known.model_dump_json(), asked) > BOUND
+    return Impacts(found.largest, found.last, found.releases, found.force, warned)
+
+
+def lines(of: Callable[..., Impacts | None]) -> Iterator[str]:
+    """The rows of the table."""
+    yield "| integrator | step | " + " | ".join(f"{treatment}, {mass}" for treatment, mass in COLUMNS) + " |"
+    yield "|---" * (2 + len(COLUMNS)) + "|"
+    for integrator, parameters in SCHEMES:
+        for k, size in enumerate(steps_of(integrator, parameters, "lumped")):
+            found = [
+                of(integrator, parameters, treatment, mass, steps_of(integrator, parameters, mass)[k])
+                for treatment, mass in COLUMNS
+            ]
+            yield f"| {label(integrator, parameters)} | {size:.3g} | " + " | ".join(map(cell, found)) + " |"
+
+
+def main() -> None:
+    """Run everything, and put the table between its marks in the document."""
+    if "--program" in sys.argv[1:]:
+        for line in lines(impacts):
+            print(line, flush=True)
+        return
+    rows = list(lines(judged))
+    document = DOCS / "contact.md"
+    before, rest = document.read_text().split(START)
+    document.write_text(before + START + "\n".join(rows) + "\n" + END + rest.split(END)[1])
+
+
+if __name__ == "__main__":
+    main()

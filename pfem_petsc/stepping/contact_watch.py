@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from ..output.energies import STORED, SUPPLIED
+
 __all__ = ["ContactWatch"]
 
 _SHARE = 0.02  # of the energy that the run started with or was given: more than schemes' own energies swing by
@@ -13,9 +15,9 @@ _SHARE = 0.02  # of the energy that the run started with or was given: more than
 class ContactWatch:
     """Compares energy with what was put in, once nodes have touched walls or each other.
 
-    What is held, dissipated by plasticity and by damping, less the work of loads, supports, temperatures and moving
-    walls, cannot grow beyond what it was at the start: integration and impact only take from it. Its rows are the same
-    on all ranks, so that all tell it, or none.
+    What is stored, and dissipated by plasticity and damping, less what was supplied, cannot grow beyond what it was at
+    the start: friction, impact and integration only take from it. Its rows are the same on all ranks, so that all tell
+    it, or none.
 
     Parameters
     ----------
@@ -28,7 +30,6 @@ class ContactWatch:
         self.told = not (model.contact.any or model.pairs is not None)
         contact, time = model.case.contact, model.case.time
         self.what = f'{time.integrator} with contact.treatment = "{contact.treatment}" and time.mass = "{time.mass}"'
-        self.moving = any(wall.mass is not None or any(wall.velocity or ()) or wall.motion for wall in model.case.wall)
         self.start: float | None = None
         self.scale = 0.0
         self.touched = False
@@ -37,12 +38,11 @@ class ContactWatch:
         """Look at a row of the history."""
         if self.told:
             return
-        held = row["kinetic_energy"] + row["elastic_energy"] + row["plastic_dissipation"]
-        given = row["external_work"] + row["thermal_work"] + (row["contact_work"] if self.moving else 0.0)
-        net = held + row["damping_dissipation"] - given
+        given = sum(row[name] for name in SUPPLIED)
+        net = sum(row[name] for name in STORED) + row["plastic_dissipation"] + row["damping_dissipation"] - given
         if self.start is None:
             self.start = net
-        self.scale = max(self.scale, abs(self.start), abs(row["external_work"]), abs(row["thermal_work"]), abs(given))
+        self.scale = max(self.scale, abs(self.start), *(abs(row[name]) for name in SUPPLIED))
         self.touched = self.touched or row["active_contacts"] > 0
         gain = net - self.start
         if self.touched and gain > _SHARE * self.scale:

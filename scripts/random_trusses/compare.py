@@ -7,8 +7,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from pfem_petsc import open_result
-
+from .loading import Loaded
 from .oracle import energy_scale
 
 __all__ = ["bitwise", "distance", "paths_distance"]
@@ -42,18 +41,17 @@ def distance(one: Path, other: Path) -> tuple[float, str]:
     Positions are over the truss's size, energies over the largest energy, momenta over the largest momentum (or that of
     the centre's way, where they cancel), forces of walls over the largest force.
     """
-    a, b = open_result(one), open_result(other)
-    worst = paths_distance(one, other)
-    history = {name: np.asarray(a.history[name], dtype=float) for name in a._columns}
+    a, b = Loaded(one), Loaded(other)
+    worst = paths_distance(a, b)
+    history = a.history
     energy = max(energy_scale(history), 1e-300)
     speed = np.abs(history["momentum"]).max()
-    size = max(float(np.ptp(a.positions(0), axis=0).max()), 1e-300) if len(a.times) else 1.0
+    size = max(a.size, 1e-300)
     scales = {"momentum": speed, "angular_momentum": speed * size, "centre_of_mass": size}
-    other_history = b.history
-    for name, x in history.items():
+    for name in history:
         if name.endswith(("_iterations", "releases", "changes", "contact_time", "active_contacts", "contacts")):
             continue
-        y = np.asarray(other_history[name], dtype=float)
+        x, y = (np.asarray(run.history[name], dtype=float) for run in (a, b))
         if x.shape != y.shape:
             return np.inf, f"{name}: {x.shape} and {y.shape}"
         if name.endswith(("_energy", "_work", "_dissipation", "_heat", "_imbalance")):
@@ -70,15 +68,12 @@ def distance(one: Path, other: Path) -> tuple[float, str]:
     return worst
 
 
-def paths_distance(one: Path, other: Path) -> tuple[float, str]:
+def paths_distance(a: Loaded, b: Loaded) -> tuple[float, str]:
     """Largest distance of a node in one result from itself in the other, over the truss's size."""
-    a, b = open_result(one), open_result(other)
-    if len(a.times) != len(b.times):
-        return np.inf, f"{len(a.times)} and {len(b.times)} snapshots"
-    worst = 0.0, "nothing"
-    for i in range(len(a.times)):
-        x, y = a.positions(i), b.positions(i)
-        apart = float(np.abs(x - y).max() / max(np.ptp(a.positions(0), axis=0).max(), 1e-300))
-        if apart > worst[0]:
-            worst = apart, f"positions in snapshot {i} of {len(a.times)}"
-    return worst
+    if a.positions.shape != b.positions.shape:
+        return np.inf, f"{len(a.steps)} and {len(b.steps)} snapshots"
+    if not a.positions.size:
+        return 0.0, "nothing"
+    apart = np.abs(a.positions - b.positions).max(axis=(1, 2)) / max(a.size, 1e-300)
+    i = int(apart.argmax())
+    return float(apart[i]), f"positions in snapshot {i} of {len(a.steps)}"

@@ -75,7 +75,7 @@ def _time(chance: random.Random, body: Body) -> dict[str, Any]:
         time["mass"] = "consistent"
     limit = body.limit * (0.55 if "mass" in time else 1.0)
     if explicit:
-        steps, safety = chance.randint(50, 160), chance.uniform(0.3, 0.95)
+        steps, safety = chance.randint(40, 100), chance.uniform(0.3, 0.95)
         step = safety * limit * EXPLICIT[name] / 2.0
         damped = any("damping" in material for material in body.tables["material"].values())
         if chance.random() < 0.5:
@@ -84,7 +84,7 @@ def _time(chance: random.Random, body: Body) -> dict[str, Any]:
             step *= 0.7 if damped else 0.95
             time |= {"step": step, "end": steps * step}
     else:
-        steps, step = chance.randint(15, 50), body.limit * 10 ** chance.uniform(-0.7, 1.0)
+        steps, step = chance.randint(12, 32), body.limit * 10 ** chance.uniform(-0.7, 1.0)
         # an end that is not a whole number of steps, too
         time |= {"step": step, "end": step * (steps - chance.choice((0.0, 0.0, 0.5)))}
     time |= _parameters(chance, name)

@@ -18,9 +18,9 @@ from pathlib import Path
 
 import numpy as np
 
-from pfem_petsc import open_result
 from pfem_petsc.case.schema import Case
-from pfem_petsc.output.result import Result
+
+from .loading import Loaded
 
 __all__ = ["check_result", "energy_scale"]
 
@@ -31,15 +31,13 @@ LOSSES = ("numerical_dissipation", "impact_dissipation", "friction_dissipation")
 
 def check_result(folder: Path, warned: list[str]) -> Faults:
     """All checks of a result that is complete."""
-    result = open_result(folder)
-    case = result.case
-    history = {name: np.asarray(result.history[name]) for name in result._columns}
-    faults = _finite(result, history)
+    result = Loaded(folder)
+    case, history = result.case, result.history
+    faults = _finite(result)
     if faults:
         return faults
     faults += _walls(result, case, history)
-    size = float(np.ptp(result.positions(0), axis=0).max()) if len(result.times) else 1.0
-    faults += _energy(case, history, warned, size)
+    faults += _energy(case, history, warned, result.size)
     faults += _momentum(case, history)
     return faults
 
@@ -49,24 +47,19 @@ def energy_scale(history: dict[str, np.ndarray]) -> float:
     return max(float(np.abs(column).max()) for name, column in history.items() if name.endswith(_ENDS))
 
 
-def _finite(result: Result, history: dict[str, np.ndarray]) -> Faults:
-    for name, column in history.items():
-        if not np.isfinite(column).all():
+def _finite(result: Loaded) -> Faults:
+    for name, values in (result.history | result.fields | {"positions": result.positions}).items():
+        if not np.isfinite(values).all():
             return [("not finite", name)]
-    for i in range(len(result.times)):
-        fields = [result.positions(i), *(result.field(n, i) for n in (*result.point_fields, *result.cell_fields))]
-        if not all(np.isfinite(values).all() for values in fields):
-            return [("not finite", f"snapshot {i}")]
     return []
 
 
-def _walls(result: Result, case: Case, history: dict[str, np.ndarray]) -> Faults:
+def _walls(result: Loaded, case: Case, history: dict[str, np.ndarray]) -> Faults:
     """No node is beyond a wall in a snapshot."""
     faults: Faults = []
-    if not len(result.times) or not case.wall:
+    if not len(result.steps) or not case.wall:
         return faults
-    start = result.positions(0)
-    size = float(np.ptp(start, axis=0).max())
+    start, size = result.positions[0], result.size
     tolerance = (1e-6 if case.output.precision == "float32" else 1e-9) * max(size, float(np.abs(start).max()))
     rows = {int(step): row for row, step in enumerate(history["step"])}
     for wall in case.wall:
@@ -78,23 +71,23 @@ def _walls(result: Result, case: Case, history: dict[str, np.ndarray]) -> Faults
             if moved is not None and row is None:
                 continue
             shift = np.zeros(3) if moved is None else moved[row] - moved[0]
-            at = result.positions(i)[members] - shift
+            at = result.positions[i][members] - shift
             depth = -_distances(wall, at)
             if wall.type == "rectangle":
                 depth[~_before_rectangle(wall, result, i, members, at, moved, rows)] = 0.0
             if len(depth) and depth.max() > worst[0]:
-                worst = (float(depth.max()), f"snapshot {i} of {len(result.times)}, node {members[depth.argmax()]}")
+                worst = (float(depth.max()), f"snapshot {i} of {len(result.steps)}, node {members[depth.argmax()]}")
         if worst[0] > tolerance + _wilson(case, history, result):
             faults.append(("node beyond a wall", f"{wall.name} ({wall.type}) by {worst[0]:.3g} m in {worst[1]}"))
     return faults
 
 
-def _members(case: Case, name: str | None, result: Result) -> np.ndarray:
+def _members(case: Case, name: str | None, result: Loaded) -> np.ndarray:
     """Mesh numbers of the nodes that a wall stops; groups are read from the mesh."""
-    everyone = np.arange(result.n_nodes)
+    everyone = np.arange(result.positions.shape[1])
     if name is None or case.node_set[name].all:
         return everyone
-    table, points = case.node_set[name], result.positions(0)
+    table, points = case.node_set[name], result.positions[0]
     if table.indices is not None:
         return np.array(table.indices)
     if table.group is not None:
@@ -121,14 +114,14 @@ def _distances(wall, x: np.ndarray) -> np.ndarray:
     return length - wall.radius if wall.side == "outside" else wall.radius - length
 
 
-def _before_rectangle(wall, result: Result, i: int, members, at: np.ndarray, moved, rows) -> np.ndarray:
+def _before_rectangle(wall, result: Loaded, i: int, members, at: np.ndarray, moved, rows) -> np.ndarray:
     """Nodes that were before the rectangle in the last snapshot and well inside of its edges then and now."""
     if i == 0 or result.steps[i] - result.steps[i - 1] > 1:
         return np.zeros(len(at), dtype=bool)
     row = rows.get(int(result.steps[i - 1]))
     if moved is not None and row is None:
         return np.zeros(len(at), dtype=bool)
-    before = result.positions(i - 1)[members] - (0.0 if moved is None else moved[row] - moved[0])
+    before = result.positions[i - 1][members] - (0.0 if moved is None else moved[row] - moved[0])
     normal = np.array(wall.normal) / np.linalg.norm(wall.normal)
     along = np.array(wall.along) - (np.array(wall.along) @ normal) * normal
     along /= np.linalg.norm(along)
@@ -140,12 +133,12 @@ def _before_rectangle(wall, result: Result, i: int, members, at: np.ndarray, mov
     return inside
 
 
-def _wilson(case: Case, history: dict[str, np.ndarray], result: Result) -> float:
+def _wilson(case: Case, history: dict[str, np.ndarray], result: Loaded) -> float:
     if case.time.integrator != "wilson":
         return 0.0
-    if "velocity" not in result.point_fields:
+    if "velocity" not in result.fields:
         return np.inf
-    fastest = max(float(np.abs(result.field("velocity", i)).max()) for i in range(len(result.times)))
+    fastest = float(np.abs(result.fields["velocity"]).max())
     walls = [np.abs(c).max() for n, c in history.items() if n.startswith("wall/") and n.endswith("/velocity")]
     return 2.0 * (case.time.scheme.theta - 1.0) * float(history["step_size"].max()) * (fastest + sum(walls))
 

@@ -25,6 +25,9 @@ from pfem_petsc.errors import EarlyStop, InputError, SimulationFailure
 
 __all__ = ["Outcome", "case_text", "run_case", "run_in_two_parts"]
 
+COLLECT = 20
+"""Cases between collections of garbage, which take as long as a case."""
+_cleared = 0
 GRACE = 20.0
 """Seconds in which all ranks must come to the end of a case."""
 STATUS = {InputError: 2, SimulationFailure: 3}
@@ -186,11 +189,15 @@ def _meet(comm: MPI.Comm, outcome: Outcome) -> None:
 
 def clear(comm: MPI.Comm, *folders: Path) -> None:
     """Remove folders, and what PETSc and Python hold of earlier cases. Collective."""
-    gc.collect()
-    from petsc4py import PETSc
+    global _cleared
+    _cleared += 1
+    if _cleared % COLLECT == 0:
+        # at the same case on all ranks: PETSc destroys collectively
+        gc.collect()
+        from petsc4py import PETSc
 
-    if hasattr(PETSc, "garbage_cleanup"):
-        PETSc.garbage_cleanup()
+        if hasattr(PETSc, "garbage_cleanup"):
+            PETSc.garbage_cleanup()
     comm.Barrier()
     if comm.rank == 0:
         for folder in folders:

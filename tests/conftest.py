@@ -23,7 +23,17 @@ from pathlib import Path
 
 import pytest
 from hypothesis import settings
-from mpi4py import MPI
+
+# What MPI leaves in the environment of a process that has started it, and that would confuse another launch.
+OF_A_LAUNCH = (
+    *("PMIX_", "PMI_", "OPAL_", "ORTE_", "OMPI_COMM_", "OMPI_APP_", "OMPI_UNIVERSE_"),
+    *("OMPI_MCA_orte_", "OMPI_MCA_ess", "OMPI_MCA_pmix"),
+)
+if "PYTEST_XDIST_WORKER" in os.environ:
+    for _name in [name for name in os.environ if name.startswith(OF_A_LAUNCH)]:
+        del os.environ[_name]
+
+from mpi4py import MPI  # noqa: E402
 
 WORLD = MPI.COMM_WORLD
 AGREEMENT = WORLD.Dup() if WORLD.size > 1 else None
@@ -177,9 +187,7 @@ def on_ranks() -> Callable[..., subprocess.CompletedProcess]:
     """
 
     def run(ranks: int, *arguments: str | Path, timeout: float = 400.0, **options) -> subprocess.CompletedProcess:
-        # This process may have started MPI: what that left in the environment would confuse another launch.
-        left = ("PMIX_", "PMI_", "OMPI_COMM_", "OMPI_MCA_orte_", "OMPI_MCA_ess_", "OMPI_UNIVERSE_", "OPAL_", "ORTE_")
-        environment = {name: value for name, value in os.environ.items() if not name.startswith(left)}
+        environment = {name: value for name, value in os.environ.items() if not name.startswith(OF_A_LAUNCH)}
         environment |= dict.fromkeys(
             ("OMPI_ALLOW_RUN_AS_ROOT", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM", "OMPI_MCA_rmaps_base_oversubscribe"), "1"
         )

@@ -166,13 +166,13 @@ class ContactPairs:
         self._move(u, force, stiffness)
         return force
 
-    def together(self, values: np.ndarray, mass: np.ndarray, rates: np.ndarray | float = 0.0) -> np.ndarray:
-        """Velocities or accelerations (owned, 3) at which pressed pairs part at ``rates`` (p,); momentum is kept.
-
-        Collective.
-        """
-        same = values.copy()
-        self._move(same, self._needed(values[self._ends], mass, np.where(self.force > 0.0, rates, -np.inf)), mass)
+    def together(
+        self, values: np.ndarray, mass: np.ndarray, rates: np.ndarray | float = 0.0, which: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Velocities or accelerations (owned, 3) at which pairs ``which`` (p,) part at ``rates`` (p,); default: those
+        that are pressed. Momentum is kept. Collective."""
+        same, which = values.copy(), self.force > 0.0 if which is None else which
+        self._move(same, self._needed(values[self._ends], mass, np.where(which, rates, -np.inf)), mass)
         return same
 
     def resting(self, x: np.ndarray, v: np.ndarray, slack: float, still: float) -> np.ndarray:

@@ -385,3 +385,37 @@ def test_valley_of_almost_parallel_planes(comm, shared_tmp_path):
     gaps = run.model.contact.gaps(run.state.position, run.state.time)
     assert gaps.min() >= -1e-13
     assert min(row["wall/left/contacts"] + row["wall/right/contacts"] for row in rows) >= 1
+
+
+@pytest.mark.parametrize("steps", [120])
+def test_node_between_a_floor_and_a_sphere(steps, comm, shared_tmp_path):
+    """Pushed up and down below the pole of a sphere, whose plane is 1e-9 to 1e-7 off that of the floor, node by node."""
+    step = 1e-3
+    floor = {"type": "plane", "name": "floor", "point": [0, 0, 0], "normal": [0, 0, 1.0]}
+    ball = {"type": "sphere", "name": "ball", "point": [1e-8, 0, 0.3 + 2e-4], "radius": 0.3, "node_set": "below"}
+    factors = [[20.0 * k * step, float((-1) ** k)] for k in range(2 + steps // 20)]
+    case = lattice_case([floor, ball], integrator="newmark", step=step, end=steps * step, gravity=(0.0, 0.0, -1.0))
+    case["mesh"] = {"generator": "rod", "length": 0.1, "elements": 1}
+    case["node_set"] = {"below": {"indices": [0]}, "all": {"all": True}}
+    case["load"] = [{"node_set": "all", "force": [0.0, 0.0, 5e-3], "table": factors}]
+    case["initial"]["velocity"] = [-1e-7, 0.0, -1e-2]
+    rows, run = rows_of(case, comm, shared_tmp_path)
+    for name in ("floor", "ball"):
+        touching = np.array([row[f"wall/{name}/contacts"] > 0 for row in rows])
+        assert 5 < touching.sum() < steps and np.diff(touching).sum() >= 2
+    assert run.state.position[:, 2].min(initial=1.0) >= -1e-15
+    assert max(abs(row["energy_imbalance"]) for row in rows) < 1e-12
+
+
+def test_ball_with_mass_on_a_lattice_that_lies_on_a_rough_floor(comm, shared_tmp_path):
+    """The floor's nodes are out of the ball's reach: they settle as if it was not there, through the whole impact."""
+    floor = {"type": "plane", "name": "floor", "point": [0, 0, 0], "normal": [0, 0, 1.0], "friction": 0.3}
+    ball = {"type": "sphere", "name": "ball", "point": [0.1, 0.1, 0.2505], "radius": 0.05, "mass": 0.05}
+    ball |= {"velocity": [0, 0, -1.0], "gravity": True}
+    case = lattice_case([floor, ball], cells=(2, 2, 2), integrator="newmark", end=0.02, step=1e-3)
+    case["gravity"] = {"acceleration": [0, 0, -G]}
+    rows, _ = rows_of(case, comm, shared_tmp_path)
+    assert sum(row["wall/ball/contacts"] > 0 for row in rows) > 5
+    assert rows[-1]["wall/ball/velocity"][2] > rows[1]["wall/ball/velocity"][2] + 0.1
+    assert min(row["wall/floor/contacts"] for row in rows[1:]) > 0
+    assert max(abs(row["energy_imbalance"]) for row in rows) < 1e-9

@@ -2,11 +2,9 @@
 
 Positions that a step was solved for keep every wall to rounding, with all schemes and treatments; so they are what is
 looked at. With Wilson's method these are x_tau at t + theta h, not x1, which may lie beyond a wall by no more than the
-way from one to the other, (theta - 1) h v. No wall at all is
-
-- a rectangle, which nodes pass beside,
-- a wall whose ``node_set`` does not contain the node,
-- one along whose normal supports prescribe the node: they decide over walls.
+way from one to the other, (theta - 1) h v. No wall at all is a rectangle, which nodes pass beside, and a wall whose
+``node_set`` does not contain the node. Supports that prescribe a node along the normal decide over the wall; where
+they take it beyond, both cannot be meant, and that is told as well.
 """
 
 from __future__ import annotations
@@ -53,12 +51,6 @@ def check_positions(stepper) -> None:
     tolerance = TOLERANCE * max(model.length, model.reach)
     # NaN is no number that a wall could be kept with, but has its own message
     suspects = np.flatnonzero((gaps < -tolerance).any(axis=1))
-    if len(suspects):
-        every = np.ones((len(suspects), len(contact.walls)), dtype=bool)
-        normals, _ = contact.planes(every, x[suspects], contact.motion.shifts(time))
-        free = np.where(contact.fixed[suspects][:, None, :], 0.0, normals)
-        gaps[suspects] = np.where((free * free).sum(axis=2) > _THIN, gaps[suspects], np.inf)
-        suspects = suspects[(gaps[suspects] < -tolerance).any(axis=1)]
     if comm.allreduce(len(suspects), op=MPI.MAX) == 0:
         return
     deepest = (0.0, -1, -1)
@@ -67,6 +59,13 @@ def check_positions(stepper) -> None:
         deepest = (float(gaps[suspects[at], wall]), int(model.mesh.node_ids[suspects[at]]), int(wall))
     depth, node, wall = min(comm.allgather(deepest))
     count = comm.allreduce(int((gaps[:, wall] < -tolerance).sum()))
+    carried = comm.allreduce(deepest == (depth, node, wall) and _prescribed(contact, suspects[at], wall, x, time))
+    if carried:
+        raise SimulationFailure(
+            f"step {state.step}, t = {time:.6g} s: node {node} is {-depth:.3g} m beyond wall {contact.names[wall]!r} "
+            f"({count} node{'s' if count > 1 else ''} in all), along whose normal its supports prescribe it; let the "
+            "wall move with the supports, or name the nodes that it concerns with 'node_set'"
+        )
     case = model.case
     others = "another contact.treatment or time.integrator"
     if case.contact.treatment != "scheme":
@@ -76,3 +75,10 @@ def check_positions(stepper) -> None:
         f"({count} node{'s' if count > 1 else ''} in all), which contact has not kept: what was computed since it "
         f"passed is wrong; take a smaller time.step, or {others}"
     )
+
+
+def _prescribed(contact, node: int, wall: int, x: np.ndarray, time: float) -> bool:
+    """Whether supports prescribe an owned node of those at (owned, 3) along a wall's normal."""
+    normals, _ = contact.planes(np.ones((1, len(contact.walls)), dtype=bool), x[[node]], contact.motion.shifts(time))
+    free = np.where(contact.fixed[node], 0.0, normals[0, wall])
+    return bool(free @ free <= _THIN)

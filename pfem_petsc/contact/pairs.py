@@ -19,6 +19,7 @@ from mpi4py import MPI
 
 from ..errors import InputError
 from .coupled import CoupledPairs
+from .matching import nearest_across
 
 __all__ = ["ContactPairs"]
 
@@ -165,13 +166,13 @@ class ContactPairs:
         self._move(u, force, stiffness)
         return force
 
-    def together(self, values: np.ndarray, mass: np.ndarray, rates: np.ndarray | float = 0.0) -> np.ndarray:
-        """Velocities or accelerations (owned, 3) at which pressed pairs part at ``rates`` (p,); momentum is kept.
-
-        Collective.
-        """
-        same = values.copy()
-        self._move(same, self._needed(values[self._ends], mass, np.where(self.force > 0.0, rates, -np.inf)), mass)
+    def together(
+        self, values: np.ndarray, mass: np.ndarray, rates: np.ndarray | float = 0.0, which: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Velocities or accelerations (owned, 3) at which pairs ``which`` (p,) part at ``rates`` (p,); default: those
+        that are pressed. Momentum is kept. Collective."""
+        same, which = values.copy(), self.force > 0.0 if which is None else which
+        self._move(same, self._needed(values[self._ends], mass, np.where(which, rates, -np.inf)), mass)
         return same
 
     def resting(self, x: np.ndarray, v: np.ndarray, slack: float, still: float) -> np.ndarray:
@@ -267,11 +268,11 @@ def _match(pair, nodes, mesh, normal: np.ndarray, key: str) -> tuple[np.ndarray,
         ids = np.concatenate([part[0] for part in parts])
         order = np.argsort(ids)
         points = np.concatenate([part[1] for part in parts])[order]
-        found.append((ids[order], points - np.outer(points @ normal, normal)))
+        found.append((ids[order], points))
     (first, here), (second, there) = found
     if len(first) != len(second):
         raise InputError(f"{key}: first has {len(first)} nodes and second {len(second)}: they cannot be paired")
-    nearest = np.array([int(np.argmin(((here - point) ** 2).sum(axis=1))) for point in there], dtype=np.int64)
+    nearest = nearest_across(here, there, normal) if len(first) else np.empty(0, dtype=np.int64)
     if len(np.unique(nearest)) < len(nearest):
         raise InputError(f"{key}: two nodes of second are nearest to the same node of first, seen along the direction")
     return first[nearest], second

@@ -125,7 +125,7 @@ def code_digest(function: Callable[..., Any]) -> str:
             code(called)
             for cell in thing.__closure__ or ():
                 value(cell.cell_contents)
-            for name in _global_names(called):
+            for name in sorted(_global_names(called)):  # the order of a set of names changes from run to run
                 if name in thing.__globals__:
                     digest.update(name.encode())
                     value(thing.__globals__[name])

@@ -30,6 +30,7 @@ class ContactWatch:
         self.told = not (model.contact.any or model.pairs is not None)
         contact, time = model.case.contact, model.case.time
         self.what = f'{time.integrator} with contact.treatment = "{contact.treatment}" and time.mass = "{time.mass}"'
+        self.rounding = model.rounding * model.length  # of energies: what is at rest has no other
         self.start: float | None = None
         self.scale = 0.0
         self.touched = False
@@ -42,10 +43,10 @@ class ContactWatch:
         net = sum(row[name] for name in STORED) + row["plastic_dissipation"] + row["damping_dissipation"] - given
         if self.start is None:
             self.start = net
-        self.scale = max(self.scale, abs(self.start), *(abs(row[name]) for name in SUPPLIED))
+        self.scale = max(self.scale, self.rounding, abs(self.start), *(abs(row[name]) for name in SUPPLIED))
         self.touched = self.touched or row["active_contacts"] > 0
         gain = net - self.start
-        if self.touched and gain > _SHARE * self.scale:
+        if self.touched and gain > _SHARE * self.scale + self.rounding:
             self.told = True
             self.tell(
                 f"step {row['step']}, t = {row['time']:.6g} s: contact has made {gain:.3g} J, "

@@ -1,5 +1,7 @@
 """The alarm of contact: a node beyond a wall ends the run, and what schemes legitimately leave does not."""
 
+import re
+
 import pytest
 
 from pfem_petsc import Case, Simulation
@@ -44,12 +46,23 @@ def test_wilson_may_leave_x1_beyond(comm, shared_tmp_path):
 
 @pytest.mark.parallel
 def test_what_is_no_concern_of_a_wall_may_be_beyond_it(comm, shared_tmp_path):
-    """Nodes out of its node set, one that a support carries through it, and whoever passed beside a rectangle."""
-    motion = "motion=[[0.0, 0.0, 0.0, 0.0], [0.7, 0.2, 0.0, 0.0]]"
-    run(comm, shared_tmp_path, f'support=[{{node_set="tip", fix="x", {motion}}}]')
+    """Nodes out of its node set, and whoever passed beside a rectangle."""
     free = ["initial.velocity=[0.5, 0, 0]", "node_set.base.nearest=[0,0,0]", 'wall.0.node_set="base"']
     last = run(comm, shared_tmp_path, *free)
     assert max(comm.allgather(float(last.state.position[:, 0].max(initial=0.0)))) > 1.3
     rectangle = "along=[0,1,0], size=[0.1,0.1], node_set='tip'"
     keys = [f'wall=[{{name="wall", type="rectangle", point=[1.05,1,0], normal=[-1,0,0], {rectangle}}}]']
     run(comm, shared_tmp_path, "initial.velocity=[0.5, 0, 0]", *keys)
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("mass", ["lumped", "consistent"])
+@pytest.mark.parametrize("tied", ["false", "true"])
+def test_supports_that_carry_a_node_through_a_wall_are_told(mass, tied, comm, shared_tmp_path):
+    """What is prescribed along the normal decides over the wall; both cannot be meant."""
+    motion = "motion=[[0.0, 0.0, 0.0, 0.0], [0.7, 0.2, 0.0, 0.0]]"
+    keys = [f'support=[{{node_set="tip", fix="x", {motion}}}]', f"wall.0.tied={tied}", f'time.mass="{mass}"']
+    with pytest.raises(SimulationFailure) as failure:
+        run(comm, shared_tmp_path, "output.fields_every=10", *keys)
+    message = r"node 20 is 0.0\d+ m beyond wall 'wall' \(1 node in all\), along whose normal its supports prescribe it"
+    assert all(re.search(message, text) for text in comm.allgather(str(failure.value)))

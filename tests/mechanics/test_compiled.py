@@ -1,11 +1,14 @@
 """Loops that are compiled by a process are noticed, those that are loaded are not, and a run says so."""
 
 import importlib
+import os
+import subprocess
 import sys
 
 import numba
 import numpy as np
 import pytest
+from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation
 from pfem_petsc.mechanics.compiled import Compilation
@@ -103,3 +106,20 @@ def test_damaged_machine_code_is_compiled_anew(module, tmp_path, suffix):
     for path in damaged:
         path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     assert module().outer(3.0) == 7.0
+
+
+@pytest.mark.skipif(MPI.COMM_WORLD.size > 1, reason="starts Python itself")
+def test_machine_code_is_valid_in_other_processes():
+    """The digest of a loop does not depend on the order of sets, which Python changes from process to process."""
+    program = (
+        "from pfem_petsc.contact import frames, projection\nfrom pfem_petsc.mechanics.compiled import code_digest\n"
+        "print(code_digest(projection.project.py_func), code_digest(frames._build.py_func))"
+    )
+    found = set()
+    for seed in ("1", "2", "3"):
+        environment = os.environ | {"PYTHONHASHSEED": seed}
+        run = subprocess.run(
+            [sys.executable, "-c", program], capture_output=True, text=True, env=environment, check=True
+        )
+        found.add(run.stdout)
+    assert len(found) == 1 and len(found.pop().split()) == 2

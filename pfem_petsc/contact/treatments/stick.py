@@ -24,6 +24,17 @@ class Treatment(Restitution):
 
     everywhere = True
 
+    def before(self) -> None:
+        """Keep how pressed pairs stand and what presses them, as well."""
+        super().before()
+        state, pairs = self.stepper.state, self.stepper.model.pairs
+        self._pressed = None
+        if self._frees and pairs is not None and pairs.force.any():
+            change = state.memory.get("contact_change", 0.0)
+            ends = pairs.gather(np.concatenate([state.contact + change, state.position], axis=1))
+            force = 0.5 * pairs.distances(ends[:, :, :3])  # half of what the ends bear against each other
+            self._pressed = pairs.force > 0.0, force, pairs.distances(ends[:, :, 3:])
+
     def after(self) -> None:
         """See :class:`~pfem_petsc.contact.treatments.base.Treatment`."""
         self.clear()
@@ -35,4 +46,25 @@ class Treatment(Restitution):
             nodes = np.append(nodes, ends)
             v = np.vstack([v, pairs.together(state.v, mass)[ends]])
             a = np.vstack([a, pairs.together(state.a, mass)[ends]])
+        if self._pressed is not None:
+            ends, slower = self._pairs_let_go()
+            nodes, v, a = np.append(nodes, ends), np.vstack([v, slower]), np.vstack([a, state.a[ends]])
         self.put(nodes, v, a)
+
+    def _pairs_let_go(self) -> tuple[np.ndarray, np.ndarray]:
+        """Ends (m,) of pairs that came free in this step, and their velocities (m, 3): see :meth:`_let_go`.
+
+        Collective.
+        """
+        state, pairs, mass = self.stepper.state, self.stepper.model.pairs, self.stepper.model.inertia.mass
+        pressed, force, before = self._pressed
+        gone = pressed & ~(pairs.force > 0.0)
+        if not gone.any():
+            return np.empty(0, dtype=np.int64), np.empty((0, 3))
+        ends = pairs.gather(np.concatenate([state.position, state.v], axis=1))
+        work = 0.5 * force * (pairs.distances(ends[:, :, :3]) - before)
+        speed = pairs.distances(ends[:, :, 3:])
+        gone &= (work > 0.0) & (speed > 0.0)
+        slower = np.sqrt(np.maximum(speed * speed - 2.0 * work / pairs.reduced_mass(mass), 0.0))
+        ends = pairs.local[pairs.mine & gone]
+        return ends, pairs.together(state.v, mass, slower, gone)[ends]

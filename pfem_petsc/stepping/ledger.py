@@ -23,6 +23,7 @@ import numpy as np
 
 from ..contact.impact import Impacts
 from ..mechanics.bars import StrainEnergy
+from ..mechanics.conserving import mean_stress_of_flow
 from ..output.energies import ENERGIES
 from ..output.sums import HEAD
 from .impulses import Impulses, wall_shares
@@ -336,20 +337,25 @@ class Ledger:
 
     def _thermal_before(self) -> None:
         if self.model.temperatures.varying:
-            self._stress = self.model.bars.fields(self.stepper.state.x)["stress"]
+            fields = self.model.bars.fields(self.stepper.state.x)
+            self._stress, self._plastic = fields["stress"], fields["plastic_strain"]
             self._thermal = self.model.bars.thermal.copy()
 
     def _heating(self) -> float:
-        """Work that a changing temperature does on the counted bars: -A l0 (s0 + s1)/2 (change of thermal strain)."""
+        """Work that a changing temperature does on the counted bars: -A l0 S (change of thermal strain), with the mean
+        stress S of :mod:`~pfem_petsc.mechanics.conserving`, (s0 + s1)/2 where a bar does not yield."""
         model = self.model
         if not model.temperatures.varying:
             return 0.0
-        stress, thermal = self._stress, self._thermal
+        stress, plastic, thermal = self._stress, self._plastic, self._thermal
         self._thermal_before()
         total = 0.0
         for block in model.bars.blocks:
             part = slice(block.start, block.counted)
             mean = 0.5 * (stress[part] + self._stress[part])
+            if block.history.size:
+                flow = self._plastic[part] - plastic[part]
+                mean += mean_stress_of_flow(block.parameters, self._stress[part] - stress[part], flow)
             change = self._thermal[part] - thermal[part]
             total -= block.area * float((model.bars.rest[part] * mean * change).sum())
         return total

@@ -197,8 +197,8 @@ def _warn_of_damping(model, plan: Plan) -> None:
     if rate * plan.step > _DAMPED:
         model.warnings.append(
             f"time.step = {plan.step:.4g} s: damping stops nodes within a few steps (material.damping / density * step "
-            f"= {rate * plan.step:.2g}), so that the energy it dissipates is booked with an error of this order; take a "
-            f"time.step of at most {_DAMPED / rate:.2g} s, or less damping"
+            f"= {rate * plan.step:.2g}), so that the energy it dissipates is booked with an error of this order; take "
+            f"a time.step of at most {_DAMPED / rate:.2g} s, or less damping"
         )
 
 

@@ -238,7 +238,7 @@ class Simulation:
         self.recorder = Recorder(self.stepper, self.ledger)
         self.blow_up = BlowUp(self.model)
         self._piercing = Piercing(self.model)
-        self.contact_watch = ContactWatch(self.model, self._progress.warning)
+        self.contact_watch = ContactWatch(self.model, self._progress.warning, self.plan.scheme.explicit)
         lay_over(self)
         continues = False
         if self.restart is not None:

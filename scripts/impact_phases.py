@@ -25,7 +25,7 @@ from pfem_petsc import Case
 from pfem_petsc.contact.impact_phases import Asked, scan_impacts
 from pfem_petsc.errors import InputError, SimulationFailure
 from pfem_petsc.registry import lookup
-from pfem_petsc.stepping.contact_check import BOUND, contact_gain
+from pfem_petsc.stepping.contact_check import BOUND, contact_gain, overshoots
 from pfem_petsc.stepping.model import Model
 from pfem_petsc.stepping.prepare import CONSERVING, make_plan, make_stepper
 
@@ -204,7 +204,7 @@ def judged(integrator: str, parameters: dict, treatment: str, mass: str, step: f
         return None
     asked = Asked(treatment, mass == "consistent", step)
     found = scan_impacts(scheme, asked)
-    warned = contact_gain(integrator, known.model_dump_json(), asked) > BOUND
+    warned = contact_gain(integrator, known.model_dump_json(), asked) > BOUND or overshoots(integrator, step)
     return Impacts(found.largest, found.last, found.releases, found.force, warned)
 
 

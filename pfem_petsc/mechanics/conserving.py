@@ -1,10 +1,19 @@
 """Bars between two positions: the discrete-gradient force of Simo-Tarnow type, which conserves energy and momenta.
 
 Between d0 and d1 (end differences of a bar at the start and end of a step) with d = (d0 + d1)/2, the force on the ends
-is -+ A l0 S R d, with the mean stress S = (s0 + s1)/2 and R = (e1 - e0)/((l1^2 - l0^2)/2). Its work over the step is
-exactly A l0 S (e1 - e0), which is the change of energy of a linear elastic bar; it is along d, so that both momenta
+is -+ A l0 S R d, with R = (e1 - e0)/((l1^2 - l0^2)/2) and the stress S, the mean over a path on which the strain goes
+from e0 to e1 in one direction. Its work over the step is exactly A l0 S (e1 - e0); it is along d, so that both momenta
 are kept. For engineering strain R = 2/(L (l0 + l1)), for Green's 1/L^2, for the logarithmic
 ln(l1/l0)/((l1^2 - l0^2)/2).
+
+For an elastic bar S = (s0 + s1)/2, and the work is the change of its energy. A bar that yields at the part q of the
+strain's change before the end follows the line of modulus E to its yield stress and that of modulus Et from there:
+
+    S = (s0 + s1)/2 + E de_p (1 - q)/2,   q = E de_p/((E - Et)(e1 - e0)),   dS/de1 = (Et + (E - Et)(1 - q)^2)/2,
+
+with the plastic strain de_p of the step. The law's energies are functions of state on that path, so that the work is
+the change of elastic energy and the plastic dissipation, which is not negative. (s0 + s1)/2 would work less than is
+dissipated: such a step gains energy. Where temperature changes, e is the strain less the thermal strain.
 """
 
 from __future__ import annotations
@@ -14,13 +23,14 @@ from collections.abc import Callable
 from functools import cache
 from types import SimpleNamespace
 
+import numpy as np
 from numba.extending import register_jitable
 
 from .compiled import kernel
 from .kernels import COLLAPSED_STRETCH
 from .strain import engineering, green, logarithmic
 
-__all__ = ["make_conserving_kernels"]
+__all__ = ["make_conserving_kernels", "mean_stress_of_flow"]
 
 
 @register_jitable
@@ -70,8 +80,15 @@ def make_conserving_kernels(response: Callable, remembers: bool, measure: Callab
         e0, _, _ = measure(s0)
         e1, slope, _ = measure(s1)
         stress0, _, _, _, _, _, _ = response(e0 - shift0, p, plastic, accumulated)
-        stress1, modulus, _, _, _, _, _ = response(e1 - shift, p, plastic, accumulated)
+        stress1, modulus, flowed, _, _, _, _ = response(e1 - shift, p, plastic, accumulated)
         mean = 0.5 * (stress0 + stress1)
+        if remembers and flowed != plastic:
+            young, change = p[0], (e1 - shift) - (e0 - shift0)
+            lost = young - modulus
+            q = young * (flowed - plastic) / (lost * change) if change != 0.0 else 1.0
+            q = min(max(q, 0.0), 1.0)  # beyond by rounding only: the start is not outside of the yield surface
+            mean += 0.5 * young * (flowed - plastic) * (1.0 - q)
+            modulus += lost * (1.0 - q) * (1.0 - q)
         r, dr = ratio(s0, s1)
         c = area * mean * r / rest
         dc = area * (0.5 * modulus * slope * r + mean * dr) / (rest * rest)
@@ -139,3 +156,15 @@ def make_conserving_kernels(response: Callable, remembers: bool, measure: Callab
                     values[at + i * wide + i] += sign * 0.5 * c + m
 
     return SimpleNamespace(forces=forces, tangents=tangents)
+
+
+def mean_stress_of_flow(parameters: tuple[float, ...], stress: np.ndarray, flow: np.ndarray) -> np.ndarray:
+    """What yielding adds to the mean stress (s0 + s1)/2 of a step: E de_p (1 - q)/2 [Pa].
+
+    ``parameters`` of the elastoplastic law; ``stress`` s1 - s0 [Pa] and ``flow`` de_p of each bar.
+    """
+    young, *_, inverse = parameters
+    change = stress / young + flow
+    with np.errstate(divide="ignore", invalid="ignore"):
+        q = np.where(flow != 0.0, flow / (young * inverse * change), 1.0)
+    return 0.5 * young * flow * (1.0 - np.clip(np.nan_to_num(q, nan=1.0, posinf=1.0, neginf=1.0), 0.0, 1.0))

@@ -1,4 +1,4 @@
-"""Energy that contact makes: watched while a run goes on, and told once."""
+"""Energy that contact or an implicit scheme makes: watched while a run goes on, and told once."""
 
 from __future__ import annotations
 
@@ -10,10 +10,14 @@ from ..output.energies import STORED, SUPPLIED
 __all__ = ["ContactWatch"]
 
 _SHARE = 0.02  # of the energy that the run started with or was given: more than schemes' own energies swing by
+_ROWS = 4  # rows in succession that gain without contact: a peak that passes is none
 
 
 class ContactWatch:
-    """Compares energy with what was put in, once nodes have touched walls or each other.
+    """Compares energy with what was put in: once nodes have touched walls or each other, and at implicit steps.
+
+    An implicit step may be so large that bars yield, or damping stops nodes, within it: the forces of its balance then
+    work less than is dissipated. The energy of explicit schemes swings without contact near the limit of their steps.
 
     What is stored, and dissipated by plasticity and damping, less what was supplied, cannot grow beyond what it was at
     the start: friction, impact and integration only take from it. Its rows are the same on all ranks, so that all tell
@@ -23,11 +27,15 @@ class ContactWatch:
     ----------
     model : Model
     tell : takes the warning
+    explicit : whether the scheme is
     """
 
-    def __init__(self, model, tell: Callable[[str], None]) -> None:
+    def __init__(self, model, tell: Callable[[str], None], explicit: bool) -> None:
         self.tell = tell
-        self.told = not (model.contact.any or model.pairs is not None)
+        self.contact = model.contact.any or model.pairs is not None
+        self.told = not self.contact and explicit
+        self.steady = not explicit
+        self.rows = 0
         contact, time = model.case.contact, model.case.time
         self.what = f'{time.integrator} with contact.treatment = "{contact.treatment}" and time.mass = "{time.mass}"'
         self.rounding = model.rounding * model.length  # of energies: what is at rest has no other
@@ -46,11 +54,28 @@ class ContactWatch:
         self.scale = max(self.scale, self.rounding, abs(self.start), *(abs(row[name]) for name in SUPPLIED))
         self.touched = self.touched or row["active_contacts"] > 0
         gain = net - self.start
-        if self.touched and gain > _SHARE * self.scale + self.rounding:
+        self.rows = self.rows + 1 if gain > _SHARE * self.scale + self.rounding else 0
+        if not self.rows:
+            return
+        made = f"{gain:.3g} J, {100.0 * gain / self.scale:.2g} % of the energy that the run had or was given"
+        at = f"step {row['step']}, t = {row['time']:.6g} s"
+        if self.touched:
             self.told = True
             self.tell(
-                f"step {row['step']}, t = {row['time']:.6g} s: contact has made {gain:.3g} J, "
-                f"{100.0 * gain / self.scale:.2g} % of the energy that the run had or was given: {self.what} gains "
+                f"{at}: contact has made {made}: {self.what} gains "
                 "energy at impacts; take another contact.treatment or time.integrator, or a smaller time.step "
                 "(docs/contact.md, phases of an impact)"
             )
+        elif self.steady and self.rows >= _ROWS:
+            self.told = True
+            self.tell(
+                f"{at}: the energy in the books, dissipated energy included, has grown by {made}, without contact: the "
+                f"steps are too large for what happens within them{self._causes(row)}; take a smaller time.step"
+            )
+
+    @staticmethod
+    def _causes(row: dict[str, Any]) -> str:
+        """What dissipates, as a part of a sentence."""
+        causes = {"plastic_dissipation": "bars yield", "damping_dissipation": "damping stops nodes"}
+        found = [text for name, text in causes.items() if row[name] > 0.0]
+        return f" ({' and '.join(found)})" if found else ""

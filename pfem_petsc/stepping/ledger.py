@@ -4,7 +4,7 @@ For a scheme whose balance holds at the ends of steps (``at_ends``), works follo
 dx = x1 - x0, external work = (e0 + e1) dx/2, contact work (r0 + r1) dx/2, damping dissipation (C v0 + C v1) dx/2, and
 the numerical dissipation is what inertia and internal force work beyond the change of their energies:
 (M a0 + M a1) dx/2 - dT + (f0 + f1) dx/2 - dU - dD + dH, with the work dH of changing temperatures. For the others the
-forces of the one balance work over the whole step.
+forces of the one balance work over the whole step, and damping takes C dx . dx/h.
 The sum of all changes is then the work of the residual, zero up to the solver's tolerance.
 
 What contact does is told apart by formulas that are the same for all schemes and treatments: ``contact_work`` is the
@@ -23,6 +23,7 @@ import numpy as np
 
 from ..contact.impact import Impacts
 from ..mechanics.bars import StrainEnergy
+from ..mechanics.conserving import mean_stress_of_flow
 from ..output.energies import ENERGIES
 from ..output.sums import HEAD
 from .impulses import Impulses, wall_shares
@@ -114,6 +115,10 @@ class Ledger:
         heating = self._heating()
         external, contact, damping, inertial, internal = self._works.tolist()
         work, given, weight, lost = self._work_of_walls(before)
+        if self.model.inertia.damped and not stepper.scheme.at_ends:
+            inertial += damping
+            damping = self._damped()
+            inertial -= damping
         self.sums[at["external_work"]] += external + weight
         self.sums[at["contact_work"]] += work
         self.sums[at["damping_dissipation"]] += damping
@@ -123,6 +128,17 @@ class Ledger:
         # what contact did to nodes beyond the work of walls and the losses of friction and impact
         left = contact + jumped - work - given + friction
         self.sums[at["numerical_dissipation"]] += inertial + internal + heating - stored - left - impact + lost
+
+    def _damped(self) -> float:
+        """What damping takes in the step just made, C dx . dx / h [J]: never negative.
+
+        The velocity of a balance within the step, or beyond its end, may point against the way of the step: what the
+        damping force of the balance works otherwise is the scheme's.
+        """
+        stepper = self.stepper
+        way = stepper.state.position - stepper.before[: self.model.mesh.n_owned]
+        drag = self.model.inertia.damping_times(way, np.zeros_like(way))
+        return float((drag * way).sum()) / stepper.part
 
     def _dissipated(self, before: Moment) -> tuple[float, float]:
         """What impact and friction take in the step just made [J]."""
@@ -336,20 +352,25 @@ class Ledger:
 
     def _thermal_before(self) -> None:
         if self.model.temperatures.varying:
-            self._stress = self.model.bars.fields(self.stepper.state.x)["stress"]
+            fields = self.model.bars.fields(self.stepper.state.x)
+            self._stress, self._plastic = fields["stress"], fields["plastic_strain"]
             self._thermal = self.model.bars.thermal.copy()
 
     def _heating(self) -> float:
-        """Work that a changing temperature does on the counted bars: -A l0 (s0 + s1)/2 (change of thermal strain)."""
+        """Work that a changing temperature does on the counted bars: -A l0 S (change of thermal strain), with the mean
+        stress S of :mod:`~pfem_petsc.mechanics.conserving`, (s0 + s1)/2 where a bar does not yield."""
         model = self.model
         if not model.temperatures.varying:
             return 0.0
-        stress, thermal = self._stress, self._thermal
+        stress, plastic, thermal = self._stress, self._plastic, self._thermal
         self._thermal_before()
         total = 0.0
         for block in model.bars.blocks:
             part = slice(block.start, block.counted)
             mean = 0.5 * (stress[part] + self._stress[part])
+            if block.history.size:
+                flow = self._plastic[part] - plastic[part]
+                mean += mean_stress_of_flow(block.parameters, self._stress[part] - stress[part], flow)
             change = self._thermal[part] - thermal[part]
             total -= block.area * float((model.bars.rest[part] * mean * change).sum())
         return total

@@ -24,6 +24,7 @@ from .stepper import Stepper
 
 __all__ = ["Plan", "make_plan", "make_stepper"]
 
+_DAMPED = 0.2  # of a step: the time in which damping alone takes a velocity to 1/e, inverted
 _MOST_STEPS = 2.0**53  # beyond, the time of a step is not a number of its own
 
 CONSERVING = ("newmark", "houbolt", "energy_momentum")
@@ -155,6 +156,7 @@ def make_stepper(model, plan: Plan) -> Stepper:
         On all ranks, where the scheme does not go with the treatment.
     """
     _check_walls(model, plan)
+    _warn_of_damping(model, plan)
     name = model.case.contact.treatment
     touch = model.contact.any or model.pairs is not None
     if name == "scheme" or not touch:
@@ -187,6 +189,17 @@ def _warn_of_gain(model, plan: Plan) -> None:
     warning = warn_of_gain(model.case, 0.5 * fastest * plan.step)
     if warning:
         model.warnings.append(warning)
+
+
+def _warn_of_damping(model, plan: Plan) -> None:
+    """Warn where damping stops nodes within a few steps: no rule over steps knows then what it dissipates."""
+    rate = max(material.damping / material.density for material in model.case.material.values())
+    if rate * plan.step > _DAMPED:
+        model.warnings.append(
+            f"time.step = {plan.step:.4g} s: damping stops nodes within a few steps (material.damping / density * step "
+            f"= {rate * plan.step:.2g}), so that the energy it dissipates is booked with an error of this order; take "
+            f"a time.step of at most {_DAMPED / rate:.2g} s, or less damping"
+        )
 
 
 def _check_walls(model, plan: Plan) -> None:

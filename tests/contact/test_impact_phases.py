@@ -10,7 +10,7 @@ from mpi4py import MPI
 from pfem_petsc import Case, Simulation
 from pfem_petsc.contact.impact_phases import SWING, Asked, scan_impacts
 from pfem_petsc.registry import lookup
-from pfem_petsc.stepping.contact_check import BOUND, contact_gain
+from pfem_petsc.stepping.contact_check import BOUND, contact_gain, warn_of_gain
 
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "scripts"))
@@ -119,6 +119,19 @@ def test_gains_that_are_warned_of(integrator, parameters, asked):
     assert contact_gain(integrator, module.Parameters(**parameters).model_dump_json(), asked) > BOUND
 
 
+@pytest.mark.parametrize("treatment", ["scheme", "stick"])
+def test_wilson_beyond_the_explicit_limit_is_always_warned_of(treatment):
+    """Lattices gain by the overshoot after an impact what the small rod does not show, at any theta."""
+    for theta in (1.8, 2.0):
+        overrides = ["time.integrator=wilson", f"time.theta={theta}", f"contact.treatment={treatment}"]
+        case = Case.load("rod_impact", overrides)
+        text = warn_of_gain(case, 2.0)
+        assert "gains energy in impacts" in text
+        assert "theta = 2 " not in text.split("; take ")[1]
+    assert warn_of_gain(Case.load("rod_impact", ["time.integrator=wilson", "time.theta=1.8"]), 1.0) == ""
+    assert warn_of_gain(Case.load("rod_impact", ["time.integrator=houbolt"]), 5.0) == ""
+
+
 def test_every_row_of_the_page_that_gains_is_marked():
     """No cell of the table without an asterisk has more energy than it began with, but for explicit schemes' swing."""
     rows = table.DOCS.joinpath("contact.md").read_text().split(table.START)[1].split(table.END)[0].splitlines()[2:]
@@ -150,3 +163,45 @@ def test_gain_is_told_while_it_runs(tmp_path, capfd):
     assert any("gains energy in impacts" in text for text in run.model.warnings)
     run.run()
     assert capfd.readouterr().err.count("contact has made") == 1
+
+
+def rod_held_at_one_end(integrator, step, **material):
+    """A rod that flies off its support, in steps over the explicit limit, without any contact."""
+    length, bars, young, density = 1.0, 4, 1e7, 1e3
+    return Case.from_dict(
+        {
+            "mesh": {"generator": "rod", "length": length, "elements": bars},
+            "material": {"it": {"young_modulus": young, "density": density, **material}},
+            "section": {"it": {"area": 1e-4, "material": "it"}},
+            "node_set": {"start": {"group": "start"}},
+            "support": [{"node_set": "start", "fix": "xyz"}],
+            "initial": {"velocity": [2.0, 0.0, 0.0]},
+            "time": {
+                "integrator": integrator,
+                "step": step * length / bars / (young / density) ** 0.5,
+                "end": 30 * step * length / bars / (young / density) ** 0.5,
+            },
+        }
+    )
+
+
+@pytest.mark.parametrize(
+    ("integrator", "step", "material", "cause"),
+    [
+        ("generalized_alpha", 4.0, {"yield_stress": 2e4}, "bars yield"),
+        ("newmark", 1.0, {"damping": 2e6}, "damping stops nodes"),
+        ("generalized_alpha", 0.5, {"yield_stress": 2e4}, None),
+        ("newmark", 0.5, {"damping": 2e3}, None),
+        ("energy_momentum", 4.0, {"yield_stress": 2e4}, None),
+    ],
+)
+def test_energy_that_steps_make_without_contact_is_told(integrator, step, material, cause, tmp_path, capfd):
+    run = Simulation(rod_held_at_one_end(integrator, step, **material), MPI.COMM_SELF, output=tmp_path, quiet=True)
+    assert any("energy it dissipates" in text for text in run.model.warnings) == (cause == "damping stops nodes")
+    run.run()
+    told = capfd.readouterr().err
+    if cause is None:
+        assert "has grown by" not in told
+    else:
+        assert told.count("has grown by") == 1
+        assert f"({cause})" in told

@@ -31,3 +31,30 @@ def test_conservation(strain, shared_tmp_path, comm):
         scale = max(np.linalg.norm(history["angular_momentum"][0]), np.linalg.norm(history[name][0]))
         assert np.abs(history[name] - history[name][0]).max() < 1e-12 * scale
     assert imbalance(history) < 1e-12
+
+
+@pytest.mark.parametrize("hardening", [0.0, 0.05])
+def test_plastic_work_is_what_is_lost(hardening, shared_tmp_path, comm):
+    """A free truss that yields: energy and plastic dissipation together are kept, momenta too."""
+    case = Case.load("tumbling_lattice")
+    material = next(iter(case.material))
+    young = case.material[material].young_modulus
+    case = Case.load(
+        "tumbling_lattice",
+        [
+            "time.integrator=energy_momentum",
+            "time.step=2e-4",
+            "time.end=0.02",
+            "solver.rtol=1e-13",
+            "output.fields_every=0",
+            f"material.{material}.yield_stress={5e-4 * young}",
+            f"material.{material}.isotropic_hardening={hardening * young}",
+        ],
+    )
+    history = run(case, shared_tmp_path)
+    start = energy(history)[0]
+    assert history["plastic_dissipation"][-1] > 0.01 * start
+    assert (np.diff(history["plastic_heat"]) >= 0.0).all()
+    assert np.abs(energy(history) + history["plastic_dissipation"] - start).max() < 1e-11 * start
+    assert np.abs(history["numerical_dissipation"]).max() < 1e-11 * start
+    assert imbalance(history) < 1e-12

@@ -15,7 +15,6 @@ from .contact.piercing import Piercing
 from .errors import EarlyStop, InputError, PfemError, SimulationFailure
 from .mechanics.compiled import Compilation
 from .output.lock import FolderLock
-from .output.opening import open_progress, open_result_file
 from .output.progress import Progress
 from .output.row import Row
 from .output.units import engineering
@@ -27,7 +26,8 @@ from .preflight.inspection import inspect, warnings_before
 from .preflight.summary import summarise
 from .restart.checkpoints import Checkpoints
 from .restart.folder import Restart, find_restart, finished, prepare_folder
-from .restart.stop import Meetings, StopRequest
+from .run.opening import open_progress, open_result_file
+from .run.stop import Meetings, StopRequest
 from .stepping.batch import WORTH, Batches
 from .stepping.blowup import BlowUp
 from .stepping.contact_watch import ContactWatch

@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 
 from pfem_petsc import Case, Simulation
-from pfem_petsc.errors import SimulationFailure
+from pfem_petsc.errors import NotConverged, SimulationFailure
 from pfem_petsc.stepping.guard import LARGEST, NOTICEABLE, StepGuard
-from pfem_petsc.stepping.stepper import NotConverged
 
 pytestmark = pytest.mark.parallel
 

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import printable
+from ..output.progress import Progress
+from ..output.vtkhdf import ResultWriter
 from ..preflight.inspection import warnings_before
 from ..restart.folder import RESULT
-from .progress import Progress
-from .vtkhdf import ResultWriter
 
 __all__ = ["open_progress", "open_result_file"]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -9,60 +10,68 @@ from ..errors import printable
 from ..output.progress import Progress
 from ..output.vtkhdf import ResultWriter
 from ..preflight.inspection import warnings_before
-from ..restart.folder import RESULT
+from ..preflight.summary import summarise
+from ..recording.fields import Fields
+from ..recording.recorder import Recorder
+from ..restart.folder import RESULT, Restart
+from ..stepping.model import Model
+from ..stepping.prepare import Plan
 
 __all__ = ["open_progress", "open_result_file"]
 
 
-def open_progress(simulation, aside: Path | None) -> Progress:
+def open_progress(
+    model: Model, plan: Plan, start: tuple[int, float], folder: Path, quiet: bool, notes: Iterable[str]
+) -> Progress:
     """The report, with summary, warnings and notes told. Collective.
 
-    ``aside``: where results went that the folder held.
+    ``start``: step and time [s] from which the run goes on.
     """
-    case, model, plan, state = simulation.case, simulation.model, simulation.plan, simulation.state
+    case = model.case
     progress = Progress(
-        simulation.comm,
+        model.comm,
         printable(case.title),
         plan.steps,
         plan.step * plan.steps,
-        simulation.quiet,
-        simulation.folder / "log.txt",
-        start_step=state.step,
-        start_time=state.time,
+        quiet,
+        folder / "log.txt",
+        start_step=start[0],
+        start_time=start[1],
     )
-    progress.summary(simulation.summary())
+    progress.summary(summarise(case, model, plan))
     for warning in model.warnings + warnings_before(case, model, plan):
         progress.warning(warning)
     if plan.scheme.notice:
         progress.message(plan.scheme.notice)
-    for note in simulation.notes:
+    for note in notes:
         progress.message(note)
-    if aside is not None:
-        progress.message(f"{simulation.folder}: held results, which are in {aside} now")
     return progress
 
 
-def open_result_file(simulation, continues: bool) -> ResultWriter:
-    """The result file, new or, where it ``continues``, with what came after the checkpoint cut off. Collective."""
-    case, recorder, fields = simulation.case, simulation.recorder, simulation.fields
+def open_result_file(
+    model: Model, plan: Plan, recorder: Recorder, fields: Fields, folder: Path, restart: Restart | None, step: int
+) -> ResultWriter:
+    """The result file, new or, where a restart continues it, with what came after ``step`` cut off. Collective."""
+    case = model.case
+    continues = restart is not None and restart.continues
     return ResultWriter(
-        simulation.folder / RESULT,
-        simulation.comm,
-        simulation.mesh,
+        folder / RESULT,
+        model.comm,
+        model.mesh,
         point_fields=fields.points,
         cell_fields=fields.cells,
         columns=recorder.columns,
         column_types=recorder.types,
         case_text=case.to_toml(),
-        attributes=_attributes(simulation),
+        attributes=_attributes(model, plan, recorder),
         precision=case.output.precision,
-        append_after_step=simulation.state.step if continues else None,
-        last=simulation.restart.last if continues else None,
+        append_after_step=step if continues else None,
+        last=restart.last if continues else None,
     )
 
 
-def _attributes(simulation) -> dict[str, Any]:
-    case, plan = simulation.case, simulation.plan
+def _attributes(model: Model, plan: Plan, recorder: Recorder) -> dict[str, Any]:
+    case = model.case
     attributes: dict[str, Any] = {
         "name": case.name,
         "folder": str(case.folder.resolve()),
@@ -70,8 +79,8 @@ def _attributes(simulation) -> dict[str, Any]:
         "time_step": plan.step,
         "steps": plan.steps,
         "linear_solver": plan.linear.why if plan.linear is not None else "none",
-        "partitioner": simulation.mesh.partitioner,
+        "partitioner": model.mesh.partitioner,
     }
-    for name, nodes in simulation.recorder.probe_nodes.items():
+    for name, nodes in recorder.probe_nodes.items():
         attributes[f"probe_nodes/{name}"] = nodes.tolist()
     return attributes

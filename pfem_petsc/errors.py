@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-__all__ = ["EarlyStop", "InputError", "PfemError", "SimulationFailure", "printable"]
+__all__ = ["EarlyStop", "InputError", "NotConverged", "PfemError", "SimulationFailure", "printable"]
 
 
 def printable(text: str) -> str:
@@ -29,6 +29,10 @@ class SimulationFailure(PfemError):
     """The simulation failed on its way: no convergence, collapsed bar, instability, disk full."""
 
     exit_status = 3
+
+
+class NotConverged(SimulationFailure):
+    """A solve failed before anything of the state was changed: a smaller step may do. Raised on all ranks."""
 
 
 class EarlyStop(PfemError):

@@ -16,10 +16,15 @@ import argparse
 import json
 import tempfile
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
+
+if TYPE_CHECKING:
+    from pfem_petsc import Case
 
 SOLVERS = {
     "CG, Jacobi, matrix-free": ("solver.linear=cg", "solver.operator=matrix_free"),
@@ -36,7 +41,7 @@ FACTORISED_UP_TO = 100_000  # unknowns; a lattice of 10^6 bars would take some 1
 ENDED = 10.0  # times the best
 
 
-def case(cells: int, step: float, steps: int, overrides: tuple[str, ...]):
+def case(cells: int, step: float, steps: int, overrides: tuple[str, ...]) -> Case:
     """The lattice with a velocity field that bends and stretches it: a rotation and a shear."""
     from pfem_petsc import Case
 
@@ -105,7 +110,7 @@ def measure(
     }
 
 
-def timed(function, seconds: list[float]):
+def timed(function: Callable[..., Any], seconds: list[float]) -> Callable[..., Any]:
     """The function, which adds the CPU seconds it takes."""
 
     def call(*arguments):

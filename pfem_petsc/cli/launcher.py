@@ -76,7 +76,7 @@ def on_first_rank(function: Callable[[], int], debug: bool, uses_mpi: bool) -> i
         # Who reads the output has seen enough (``list | head``); the interpreter must not flush into the closed pipe.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
-    except (Exception, KeyboardInterrupt) as error:
+    except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - whatever it is becomes a message and a status
         return _print(error, debug)
 
 
@@ -97,7 +97,7 @@ def collectively(function: Callable[[MPI.Comm], int], debug: bool) -> int:
     try:
         status = function(comm)
         sys.stdout.flush()
-    except (Exception, KeyboardInterrupt) as error:
+    except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - whatever it is becomes a message and a status
         if not _all_arrive(failures):
             comm.Abort(_print(error, debug, f"rank {comm.rank}: "))
         status = _print(error, debug) if comm.rank == 0 else None

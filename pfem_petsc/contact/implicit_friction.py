@@ -85,7 +85,7 @@ class StepFriction:
 
     def settle(
         self, frames, x: np.ndarray, reaction: np.ndarray, strengths: np.ndarray, noise: float, tolerance: float
-    ):
+    ) -> np.ndarray:
         """Find the nodes whose solution does not keep the law; normal forces (m, walls) of all nodes of the frames [N].
 
         Parameters

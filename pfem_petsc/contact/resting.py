@@ -16,6 +16,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from .forces import WallForces
 from .friction import add_friction
 from .projection import project
 
@@ -26,7 +27,7 @@ _SLACK = 1e-12  # of lengths and wave speeds: strains that rounding makes
 _FAST = 1e16  # by so much a velocity that decides over the direction of slip is above an acceleration
 
 
-def start_at_rest(model, state, accelerate: Callable[[np.ndarray], np.ndarray], load: np.ndarray):
+def start_at_rest(model, state, accelerate: Callable[[np.ndarray], np.ndarray], load: np.ndarray) -> WallForces | None:
     """Put the acceleration and the contact forces of resting nodes into the state; the forces per wall. Collective.
 
     The forces are found by projections with the lumped mass: at once where the mass is lumped. A consistent mass is

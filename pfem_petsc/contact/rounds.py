@@ -11,9 +11,9 @@ from __future__ import annotations
 import numpy as np
 from mpi4py import MPI
 
+from ..errors import NotConverged
 from ..integrators.base import Balance, State
 from ..solvers.newton import zero_tolerance
-from ..stepping.stepper import NotConverged
 from .forces import WallForces
 from .frames import MIN_VOLUME, NodalFrames
 from .implicit_friction import StepFriction

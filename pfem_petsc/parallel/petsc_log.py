@@ -25,9 +25,9 @@ EVENTS: dict[str, tuple[str, ...]] = {
     "pfemPreconditioner": ("stepper.lagged.renew",),
     "pfemContact": ("model.contact.explicit", "model.contact.near", "model.contact.frames"),
     "pfemLedger": ("stepper.booking",),
-    "pfemHistory": ("_record",),
-    "pfemSnapshot": ("_snapshot",),
-    "pfemCheckpoint": ("_checkpoint",),
+    "pfemHistory": ("outputs.history.record",),
+    "pfemSnapshot": ("outputs.snapshots.write",),
+    "pfemCheckpoint": ("outputs.checkpointing.write",),
 }
 """Event: the methods of a simulation that it covers. Those within another are counted in both."""
 

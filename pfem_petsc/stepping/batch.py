@@ -30,7 +30,7 @@ class Batch:
 
     Attributes
     ----------
-    sums : (:data:`MOST`, width) of each step, what :meth:`~pfem_petsc.stepping.recorder.Recorder.row` sums up
+    sums : (:data:`MOST`, width) of each step, what :meth:`~pfem_petsc.recording.recorder.Recorder.row` sums up
     """
 
     def __init__(self, stepper, ledger, recorder) -> None:
@@ -157,39 +157,43 @@ class Batches:
         self._batch: Batch | None = None
         self._refused = False
 
-    def advance(self, simulation) -> None:
-        """Make the steps before the next after which more is to be done than a row of the history.
+    def advance(self, analysis, history, left: int) -> bool:
+        """Make steps together, after which nothing is to be done but rows of the history.
 
-        Raises
-        ------
-        SimulationFailure
-            As a single step of the simulation does.
+        Parameters
+        ----------
+        analysis : TimeStepping
+        history : History
+            Takes the rows.
+        left : steps to the next after which more is to be done
+
+        Returns
+        -------
+        bool
+            False where a step failed: the stepper has the fault.
         """
-        case, stepper, state = simulation.case, simulation.stepper, simulation.state
-        output, begin, end = case.output, state.step, simulation.plan.steps
-        left = [simulation.meetings.steps_left(begin), end - begin]
-        called = (every for _, every in simulation.on_steps)
-        left += [every - begin % every for every in (output.fields_every, output.checkpoint_every, *called) if every]
-        count = min(*left, MOST + 1) - 1
+        stepper, state, end = analysis.stepper, analysis.state, analysis.last_step
+        begin = state.step
+        count = min(left, end - begin, MOST + 1) - 1
         if self._refused or count < _FEWEST or end < self._worth:
-            return
+            return True
         if self._batch is None:
             self._refused = not Batch.serves(stepper)
             if self._refused:
-                return
-            self._batch = Batch(stepper, simulation.ledger, simulation.recorder)
+                return True
+            self._batch = Batch(stepper, history.ledger, history.recorder)
         made, touched = self._batch.make(count)
         failed = stepper.fault is not None
-        contact = simulation.model.contact
+        contact, comm = analysis.model.contact, analysis.model.comm
         for k in range(made - failed):
             sums = self._batch.sums[k]
             state.step, state.time = begin + k + 1, (begin + k + 1) * stepper.h
             if contact.any:
-                contact.log.note(touched[k], stepper.h, simulation.comm)
+                contact.log.note(touched[k], stepper.h, comm)
                 contact.log.changes += int(sums[HEAD.width])
                 sums[HEAD.width] = contact.log.changes
-            if state.step % output.history_every == 0:
-                simulation.take(simulation.recorder.row_of(sums))
+            if history.due(state.step):
+                history.take(history.recorder.row_of(sums))
         if failed:
             state.step, state.time = begin + made, (begin + made) * stepper.h
-            simulation.meet()
+        return not failed

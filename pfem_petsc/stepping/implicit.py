@@ -13,7 +13,7 @@ from petsc4py import PETSc
 
 from ..contact.pair_coordinates import PairCoordinates
 from ..contact.rounds import ContactRounds
-from ..errors import SimulationFailure
+from ..errors import NotConverged, SimulationFailure
 from ..integrators.base import Balance
 from ..solvers.lagged import LaggedPreconditioner
 from ..solvers.linear import LinearChoice, unsymmetric
@@ -23,7 +23,7 @@ from ..solvers.matrix_free import MatrixFreeHessian
 from ..solvers.newton import NewtonReport, NewtonSolver
 from .guard import StepGuard
 from .problem import StepProblem
-from .stepper import NotConverged, Solution, Stepper
+from .stepper import Solution, Stepper
 
 # What PETSc holds when it is finalised, after Python, cannot call Python any more: matrices and preconditioners of
 # ours that wait in cycles of references are let go before.

@@ -16,11 +16,7 @@ from ..mechanics.bars import StrainEnergy
 from .collapse import tell_collapse
 from .massless import MasslessNodes
 
-__all__ = ["NotConverged", "Solution", "Stepper"]
-
-
-class NotConverged(SimulationFailure):
-    """A solve failed before anything of the state was changed: a smaller step may do. Raised on all ranks."""
+__all__ = ["Solution", "Stepper"]
 
 
 @dataclass

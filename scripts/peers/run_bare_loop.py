@@ -14,7 +14,7 @@ import numpy as np
 
 
 @numba.njit(fastmath=True, error_model="numpy")
-def march(steps, x, v, f, bars, rest, mass, plastic, back, contact, h, area, young, hardening, yield_stress):
+def march(steps, x, v, f, bars, rest, mass, plastic, back, contact, h, area, young, hardening, yield_stress):  # noqa: ANN201 - Numba infers
     """Advance by leapfrog; ``plastic`` strain (b,), or (0,) for elastic bars."""
     yields = len(plastic) > 0
     for _ in range(steps):

@@ -38,7 +38,7 @@ class Point:
 
 def points_of(
     studies: list[str], kinds: list[str], jobs: list[str], sizes: dict[str, list[int]], ranks: list[int], names
-):
+) -> list[Point]:
     """All points, smallest first. ``names``: the integrator of a job."""
     found = [
         Point(study, kind, job, names(job), size, r)

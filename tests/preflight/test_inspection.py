@@ -273,9 +273,9 @@ def test_files_are_as_large_as_forecast(comm, shared_tmp_path, name, overrides):
     case = Case.load(name, [*overrides, "output.checkpoint_every=100"])
     simulation = Simulation(case, comm, output=shared_tmp_path / "out", quiet=True)
     from pfem_petsc.preflight.forecast import result_bytes
-    from pfem_petsc.stepping.recorder import Recorder
+    from pfem_petsc.recording.recorder import Recorder
 
-    recorder, fields = Recorder(simulation.stepper, None), simulation.fields
+    recorder, fields = Recorder(simulation.stepper, None), simulation.outputs.fields
     forecast = result_bytes(
         case, simulation.mesh, simulation.plan.steps, fields.points, fields.cells, recorder.columns, recorder.types
     )

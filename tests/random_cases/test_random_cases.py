@@ -18,7 +18,8 @@ from random_trusses.oracle import check_result  # noqa: E402
 from random_trusses.running import case_text, run_case  # noqa: E402
 from random_trusses.work import check_case, judge_ranks  # noqa: E402
 
-from pfem_petsc import Case, Simulation  # noqa: E402
+from pfem_petsc import Case  # noqa: E402
+from pfem_petsc.recording.snapshots import Snapshots  # noqa: E402
 
 COUNTED = ("energy balance above 1e-9", "chaotic: ")
 """What is no fault: rounding, and motions that part whatever is done."""
@@ -161,7 +162,7 @@ def test_an_exception_is_found_and_told(monkeypatch, tmp_path):
     def fails(self):
         raise KeyError("lost")
 
-    monkeypatch.setattr(Simulation, "_snapshot", fails)
+    monkeypatch.setattr(Snapshots, "write", fails)
     outcome = run_case(FALLING, MPI.COMM_SELF, tmp_path)
     assert outcome.status == 1
     assert outcome.faults[0][0] == "internal error"

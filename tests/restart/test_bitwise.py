@@ -7,6 +7,8 @@ from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.errors import EarlyStop
+from pfem_petsc.recording.history import History
+from pfem_petsc.recording.snapshots import Snapshots
 
 SHORT = ("time.end=1.6", "output.fields_every=7")
 LATTICE = ("mesh.cells=[3,3,3]", "time.end=1.2e-4", "time.step=1e-6")
@@ -132,6 +134,11 @@ def test_motion_that_has_come_to_rest_is_not_taken_for_unstable_after_a_restart(
     assert differences(*(folder / "result.vtkhdf" for folder in folders)) == {}
 
 
+def _watched(simulation):
+    history = simulation.outputs.history
+    return history.blow_up.kept(), history.recorder.energy_scale, simulation.model.pairs.force.copy()
+
+
 @pytest.mark.parallel
 def test_all_that_is_looked_at_in_later_steps_is_put_back(comm, shared_tmp_path):
     """Also what only messages and rows show: the watch, the largest energy, the forces of pairs."""
@@ -141,10 +148,10 @@ def test_all_that_is_looked_at_in_later_steps_is_put_back(comm, shared_tmp_path)
         case = Case.load("rod_impact", [*overrides, f"time.end={end}"])
         simulation = Simulation(case, comm, output=shared_tmp_path / "out", quiet=True, restart=end > 0.3)
         simulation.start()
-        found.append((simulation.blow_up.kept(), simulation.recorder.energy_scale, simulation.model.pairs.force.copy()))
+        found.append(_watched(simulation))
         while simulation.state.step < simulation.plan.steps:
             simulation._advance()
-        found.append((simulation.blow_up.kept(), simulation.recorder.energy_scale, simulation.model.pairs.force.copy()))
+        found.append(_watched(simulation))
         simulation.close()
     (_, before, after, _) = found
     assert before[:2] == after[:2]
@@ -183,7 +190,7 @@ def _last_steps(folder):
         return int(result.history["step"][-1]), int(result.steps[-1])
 
 
-class Killed(Exception):
+class Killed(Exception):  # noqa: N818
     """In place of a signal that nobody can catch."""
 
 
@@ -196,15 +203,16 @@ def test_killed_between_the_last_checkpoint_and_the_end_of_the_results(comm, sha
     simulate(case, overrides, folders[0], comm)
 
     def killed(self):
-        if self.state.step != 33:
+        if self._stepper.state.step != 33:
             return done(self)
         if lost == "snapshot":
-            self._writer.flush_history()
+            self.writer.flush_history()
         raise Killed
 
     with monkeypatch.context() as patch:
-        done = Simulation._record if lost == "row" else Simulation._snapshot
-        patch.setattr(Simulation, "_record" if lost == "row" else "_snapshot", killed)
+        writer, name = (History, "record") if lost == "row" else (Snapshots, "write")
+        done = getattr(writer, name)
+        patch.setattr(writer, name, killed)
         simulation = Simulation(Case.load(case, overrides), comm, output=folders[1], quiet=True)
         with pytest.raises(Killed):
             simulation.run()

@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 
 from pfem_petsc import Case, Simulation
-from pfem_petsc.errors import SimulationFailure
+from pfem_petsc.errors import NotConverged, SimulationFailure
 from pfem_petsc.stepping.guard import LARGEST, NOTICEABLE, StepGuard
-from pfem_petsc.stepping.stepper import NotConverged
 
 pytestmark = pytest.mark.parallel
 
@@ -79,7 +78,7 @@ def test_a_step_that_is_refused_leaves_the_state_as_it_was(comm, shared_tmp_path
         stepper.step()
     state = stepper.state
     before = {name: getattr(state, name).copy() for name in ("x", "v", "a", "f", "external", "contact", "support")}
-    held, ledger = stepper.held.copy(), simulation.ledger.sums.copy()
+    held, ledger = stepper.held.copy(), simulation.outputs.history.ledger.sums.copy()
     monkeypatch.setattr(StepGuard, "check", lambda self, *rest: "the solution is suspicious")
     with pytest.raises(NotConverged, match="step 4, .*suspicious.*guard = false.*halved 10 times") as failure:
         stepper.step()
@@ -87,7 +86,7 @@ def test_a_step_that_is_refused_leaves_the_state_as_it_was(comm, shared_tmp_path
     for name, array in before.items():
         np.testing.assert_array_equal(getattr(state, name), array)
     np.testing.assert_array_equal(stepper.held, held)
-    np.testing.assert_array_equal(simulation.ledger.sums, ledger)
+    np.testing.assert_array_equal(simulation.outputs.history.ledger.sums, ledger)
     assert state.step == 3 and state.time == pytest.approx(0.03)
 
 

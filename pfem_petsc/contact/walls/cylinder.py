@@ -8,6 +8,7 @@ import numpy as np
 from pydantic import field_validator
 
 from ...case.base import PositiveFloat, Vector3
+from ..surfaces import Surface, revolved
 from .base import BaseWall, WallKeys, direction
 from .sphere import radial_planes
 
@@ -54,10 +55,8 @@ def _across(axis: np.ndarray) -> np.ndarray:
     return across / np.linalg.norm(across)
 
 
-def surface(parameters: Parameters, bounds: np.ndarray):
+def surface(parameters: Parameters, bounds: np.ndarray) -> Surface:
     """The cylinder as it is drawn: as long as the structure's shadow on its axis and a margin."""
-    from ...post.walls import revolved
-
     wall = Wall(parameters)
     corners = np.array([[bounds[i, 0], bounds[j, 1], bounds[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
     along = (corners - wall.centre) @ wall.axis

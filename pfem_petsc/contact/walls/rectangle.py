@@ -8,6 +8,7 @@ import numpy as np
 from pydantic import model_validator
 
 from ...case.base import PositiveFloat, Vector3, listed
+from ..surfaces import Surface, slab
 from .base import WallKeys, direction
 from .plane import Wall as Plane
 
@@ -60,10 +61,8 @@ class Wall(Plane):
         return inside & (start >= -tolerance)
 
 
-def surface(parameters: Parameters, bounds: np.ndarray):
+def surface(parameters: Parameters, bounds: np.ndarray) -> Surface:
     """The rectangle as it is drawn."""
-    from ...post.walls import slab
-
     wall = Wall(parameters)
     a, b = wall.half[0] * wall.first, wall.half[1] * wall.second
     face = np.array([wall.centre - a - b, wall.centre + a - b, wall.centre + a + b, wall.centre - a + b])

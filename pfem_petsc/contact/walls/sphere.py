@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 
 from ...case.base import PositiveFloat, Vector3
+from ..surfaces import Surface, revolved
 from .base import BaseWall, WallKeys
 
 __all__ = ["Parameters", "Wall", "surface"]
@@ -49,10 +50,8 @@ class Wall(BaseWall):
         return radial_planes(x - self.centre, centres, self.radius, self.sign, np.array([0.0, 0.0, 1.0]))
 
 
-def surface(parameters: Parameters, bounds: np.ndarray):
+def surface(parameters: Parameters, bounds: np.ndarray) -> Surface:
     """The sphere as it is drawn."""
-    from ...post.walls import revolved
-
     angles = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 17)
     profile = parameters.radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     return revolved(parameters.name, profile, np.array(parameters.point), np.array([0.0, 0.0, 1.0]))

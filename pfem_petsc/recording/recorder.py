@@ -11,7 +11,7 @@ from ..contact.history import ContactColumns, contact_columns
 from ..output.energies import ENERGIES
 from ..output.row import Row, RowLayout
 from ..output.sums import HEAD, PAIR
-from .ledger import Ledger
+from ..stepping.ledger import Ledger
 
 __all__ = ["Recorder"]
 

@@ -1,0 +1,97 @@
+"""The rows of the history: energies booked step by step, rows written, and what they show of a run that goes wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from ..analysis import Step
+from ..output.row import Row
+from ..output.vtkhdf import ResultWriter
+from ..stepping.ledger import Ledger
+from .blowup import BlowUp
+from .contact_watch import ContactWatch
+from .observer import NEVER, Observer
+from .recorder import Recorder
+
+__all__ = ["History"]
+
+
+class History(Observer):
+    """Records rows, and watches them. Construction is collective, after the start of the stepper.
+
+    The reduction that makes a row also carries the news of a fault on any rank.
+
+    Parameters
+    ----------
+    stepper : Stepper
+    synchroniser : Synchroniser
+    warn : takes a warning
+
+    Attributes
+    ----------
+    row : the last one
+    writer : of the result file
+    """
+
+    def __init__(self, stepper, synchroniser, warn: Callable[[str], None]) -> None:
+        model = stepper.model
+        self.every = model.case.output.history_every
+        self._stepper, self._synchroniser, self._model = stepper, synchroniser, model
+        self.ledger = Ledger(stepper)
+        self.recorder = Recorder(stepper, self.ledger)
+        self.blow_up = BlowUp(model)
+        self.contact_watch = ContactWatch(model, warn, stepper.scheme.explicit)
+        self.row: dict[str, Any] | None = None
+        self.writer: ResultWriter | None = None
+        stepper.booking = self._book
+
+    def _book(self) -> None:
+        """Energies and iterations of a step, or of each part of a halved one."""
+        self.ledger.update()
+        self.recorder.count(self._stepper.solution.newton, self._stepper.solution.linear)
+
+    def steps_left(self, step: int) -> int:
+        """None must be waited for: rows of steps that are made together come by :meth:`take`."""
+        return NEVER
+
+    def observe(self, made: Step) -> None:
+        """Record a row."""
+        self.record()
+
+    def record(self) -> None:
+        """A history row, unless a rank has a fault, which is raised on all."""
+        row = self.recorder.row(alarm=self._synchroniser.alarm)
+        if self.recorder.alarmed:
+            self._synchroniser.synchronise()
+        self.take(row)
+
+    def take(self, row: Row) -> None:
+        """Look at a row, keep it and add it to the history."""
+        self.blow_up.check(row, self._stepper.state)
+        self.contact_watch.check(row)
+        self.row = row
+        self.writer.append_history(row if self._model.comm.rank == 0 else None)
+
+    def complete(self) -> None:
+        """The row of the last step."""
+        if self.row["step"] != self._stepper.state.step:
+            self.record()
+
+    @property
+    def drift(self) -> float | None:
+        """Imbalance of energy of the last row, of the largest energy so far; None while there is none."""
+        scale = self.recorder.energy_scale
+        return self.row["energy_imbalance"] / scale if scale > 0.0 else None
+
+    def remarks(self) -> list[str]:
+        """Walls without a contact, which may not be what was meant."""
+        contact = self._model.contact
+        times = contact.log.times(self._model.comm)
+        touched = np.array(times["sum"]) > 0.0
+        for flags in times["flags"]:
+            touched |= np.array(flags, dtype=bool)
+        names = np.array(contact.names, dtype=object)[~touched]
+        return [f"wall {name!r} was never touched by a node" for name in names]

@@ -1,0 +1,31 @@
+"""Progress of a run, told after each step."""
+
+from __future__ import annotations
+
+from ..analysis import Analysis, Step
+from ..output.progress import Progress
+from .history import History
+from .observer import NEVER, Observer
+
+__all__ = ["ProgressReport"]
+
+
+class ProgressReport(Observer):
+    """Tells the progress bar, or the lines in its place, of each step."""
+
+    every = 1
+
+    def __init__(self, progress: Progress, analysis: Analysis, history: History) -> None:
+        self._progress, self._analysis, self._history = progress, analysis, history
+
+    def steps_left(self, step: int) -> int:
+        """None must be waited for: of steps that are made together the last is told."""
+        return NEVER
+
+    def observe(self, made: Step) -> None:
+        """Tell of a step."""
+        history = self._history
+        contacts = history.row["active_contacts"]
+        self._progress.update(
+            made.step, made.time, self._analysis.step_size, made.newton, made.linear, contacts, history.drift
+        )

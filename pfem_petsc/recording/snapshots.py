@@ -1,0 +1,65 @@
+"""Snapshots of the fields, with a look at walls before each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from ..analysis import Step
+from ..contact.alarm import check_positions
+from ..contact.piercing import Piercing
+from ..output.vtkhdf import ResultWriter
+from .fields import Fields
+from .observer import Observer
+
+__all__ = ["Snapshots"]
+
+
+class Snapshots(Observer):
+    """Writes snapshots, at the start and the end of a run at least. Construction is collective.
+
+    Parameters
+    ----------
+    stepper : Stepper
+    last_step : number of the last step of the run
+    fields : Fields
+    warn : takes a warning
+
+    Attributes
+    ----------
+    last : step of the last snapshot, -1 before the first
+    writer : of the result file
+    """
+
+    needs_agreement = True
+
+    def __init__(self, stepper, last_step: int, fields: Fields, warn: Callable[[str], None]) -> None:
+        self.every = stepper.model.case.output.fields_every
+        self._stepper, self._last_step, self._fields, self._warn = stepper, last_step, fields, warn
+        self._piercing = Piercing(stepper.model)
+        self.last = -1
+        self.writer: ResultWriter | None = None
+
+    def observe(self, made: Step) -> None:
+        """Write one."""
+        self.write()
+
+    def write(self) -> None:
+        """A snapshot of the present state, once nodes are known to keep the walls."""
+        state, fields = self._stepper.state, self._fields
+        if not self.every and 0 < state.step < self._last_step:
+            return
+        check_positions(self._stepper)
+        at_nodes = fields.at_nodes(state, self._stepper.acceleration)
+        self.writer.write_snapshot(state.time, state.step, state.position, at_nodes, fields.at_bars(state))
+        self.last = state.step
+        for text in self._piercing.look(state.x, state.time):
+            self._warn(text)
+
+    def complete(self) -> None:
+        """The snapshot of the last step."""
+        if self.last != self._stepper.state.step:
+            self.write()
+
+    def remarks(self) -> list[str]:
+        """Bars across walls."""
+        return self._piercing.summary()

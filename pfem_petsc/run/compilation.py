@@ -1,0 +1,35 @@
+"""What a run tells of the compilation of loops."""
+
+from __future__ import annotations
+
+from mpi4py import MPI
+
+from ..mechanics.compiled import Compilation
+from ..output.progress import Progress
+
+__all__ = ["ReportedCompilation"]
+
+
+class ReportedCompilation(Compilation):
+    """Tells once that loops are compiled, and leaves that time out of the rate of steps.
+
+    Attributes
+    ----------
+    progress : the report of the run; None before it is open: then rank 0 prints, unless told to be quiet
+    """
+
+    def __init__(self, comm: MPI.Comm, quiet: bool) -> None:
+        super().__init__(self._tell, self._leave_out)
+        self.progress: Progress | None = None
+        self._speaks = comm.rank == 0 and not quiet
+
+    def _tell(self, name: str) -> None:
+        text = f"compiling loops for this machine, once: {name} and what else this kind of case needs, up to a minute"
+        if self.progress is not None:
+            self.progress.message(text)
+        elif self._speaks:
+            print(text, flush=True)
+
+    def _leave_out(self, seconds: float) -> None:
+        if self.progress is not None:
+            self.progress.compiled(seconds)

@@ -1,0 +1,86 @@
+"""What a run opens at its start: the report of its progress, and the result file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+from ..errors import printable
+from ..output.progress import Progress
+from ..output.vtkhdf import ResultWriter
+from ..preflight.inspection import warnings_before
+from ..preflight.summary import summarise
+from ..recording.fields import Fields
+from ..recording.recorder import Recorder
+from ..restart.folder import RESULT, Restart
+from ..stepping.model import Model
+from ..stepping.prepare import Plan
+
+__all__ = ["open_progress", "open_result_file"]
+
+
+def open_progress(
+    model: Model, plan: Plan, start: tuple[int, float], folder: Path, quiet: bool, notes: Iterable[str]
+) -> Progress:
+    """The report, with summary, warnings and notes told. Collective.
+
+    ``start``: step and time [s] from which the run goes on.
+    """
+    case = model.case
+    progress = Progress(
+        model.comm,
+        printable(case.title),
+        plan.steps,
+        plan.step * plan.steps,
+        quiet,
+        folder / "log.txt",
+        start_step=start[0],
+        start_time=start[1],
+    )
+    progress.summary(summarise(case, model, plan))
+    for warning in model.warnings + warnings_before(case, model, plan):
+        progress.warning(warning)
+    if plan.scheme.notice:
+        progress.message(plan.scheme.notice)
+    for note in notes:
+        progress.message(note)
+    return progress
+
+
+def open_result_file(
+    model: Model, plan: Plan, recorder: Recorder, fields: Fields, folder: Path, restart: Restart | None, step: int
+) -> ResultWriter:
+    """The result file, new or, where a restart continues it, with what came after ``step`` cut off. Collective."""
+    case = model.case
+    continues = restart is not None and restart.continues
+    return ResultWriter(
+        folder / RESULT,
+        model.comm,
+        model.mesh,
+        point_fields=fields.points,
+        cell_fields=fields.cells,
+        columns=recorder.columns,
+        column_types=recorder.types,
+        case_text=case.to_toml(),
+        attributes=_attributes(model, plan, recorder),
+        precision=case.output.precision,
+        append_after_step=step if continues else None,
+        last=restart.last if continues else None,
+    )
+
+
+def _attributes(model: Model, plan: Plan, recorder: Recorder) -> dict[str, Any]:
+    case = model.case
+    attributes: dict[str, Any] = {
+        "name": case.name,
+        "folder": str(case.folder.resolve()),
+        "overrides": list(case.overrides),
+        "time_step": plan.step,
+        "steps": plan.steps,
+        "linear_solver": plan.linear.why if plan.linear is not None else "none",
+        "partitioner": model.mesh.partitioner,
+    }
+    for name, nodes in recorder.probe_nodes.items():
+        attributes[f"probe_nodes/{name}"] = nodes.tolist()
+    return attributes

@@ -1,0 +1,217 @@
+"""All that a run writes and tells: opened at its start, served after its steps in a fixed order, closed at its end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from ..analysis import Step
+from ..errors import EarlyStop, SimulationFailure
+from ..output.progress import Progress
+from ..output.units import engineering
+from ..output.vtkhdf import ResultWriter
+from ..recording.checkpointing import Checkpointing
+from ..recording.fields import Fields
+from ..recording.history import History
+from ..recording.observer import Callback, Observer
+from ..recording.report import ProgressReport
+from ..recording.snapshots import Snapshots
+from ..restart.checkpoints import Checkpoints
+from ..restart.folder import Restart, prepare_folder
+from ..stepping.batch import Batches
+from ..stepping.time_stepping import TimeStepping
+from .compilation import ReportedCompilation
+from .opening import open_progress, open_result_file
+from .synchroniser import Synchroniser
+
+__all__ = ["Outputs"]
+
+
+class Outputs:
+    """The observers of a run, in the order in which they are served.
+
+    Parameters
+    ----------
+    analysis : TimeStepping
+    synchroniser : Synchroniser
+    folder : of the results
+    quiet : print nothing on stdout
+    compilation : ReportedCompilation, which speaks through the report of progress once that is open
+
+    Attributes
+    ----------
+    fields : of the snapshots
+    progress, history, snapshots, checkpointing : None before :meth:`open`
+    """
+
+    def __init__(
+        self,
+        analysis: TimeStepping,
+        synchroniser: Synchroniser,
+        folder: Path,
+        quiet: bool,
+        compilation: ReportedCompilation,
+    ) -> None:
+        self._analysis, self._synchroniser, self._folder, self._quiet = analysis, synchroniser, folder, quiet
+        self._compilation = compilation
+        self.fields = Fields(analysis.model)
+        self.progress: Progress | None = None
+        self.history: History | None = None
+        self.snapshots: Snapshots | None = None
+        self.checkpointing: Checkpointing | None = None
+        self._report: ProgressReport | None = None
+        self._callbacks: list[Callback] = []
+        self._writer: ResultWriter | None = None
+        self._continues = False
+
+    @property
+    def is_open(self) -> bool:
+        """Whether results are being written."""
+        return self._writer is not None
+
+    @property
+    def _recording(self) -> tuple[Observer, ...]:
+        return self.history, self.snapshots, self.checkpointing
+
+    @property
+    def _observers(self) -> tuple[Observer, ...]:
+        return *self._recording, self._report, *self._callbacks
+
+    def call(self, function: Callable[[Step], object], every: int) -> None:
+        """Call a function after each step whose number is a multiple of ``every``."""
+        self._callbacks.append(Callback(function, every))
+
+    def open(self, restart: Restart | None, notes: list[str]) -> None:
+        """Complete the state at the start, or restore it from a checkpoint, and open all outputs. Collective.
+
+        Raises
+        ------
+        PfemError
+            On all ranks.
+        """
+        analysis, folder = self._analysis, self._folder
+        stepper, model, plan = analysis.stepper, analysis.model, analysis.plan
+        checkpoints = Checkpoints(model.case, stepper, plan, folder)
+        if restart is not None:
+            # before anything in the folder changes: it may be refused
+            checkpoint = checkpoints.take_back(restart)
+        aside = prepare_folder(model.comm, folder, restart, plan)
+        notes = [*notes, *([] if aside is None else [f"{folder}: held results, which are in {aside} now"])]
+        start = analysis.state.step, analysis.state.time
+        self.progress = open_progress(model, plan, start, folder, self._quiet, notes)
+        self._compilation.progress = self.progress
+        if restart is None:
+            analysis.start()
+            self._synchroniser.synchronise()
+        warn = self.progress.warning
+        self.history = history = History(stepper, self._synchroniser, warn)
+        if hasattr(stepper, "message"):
+            stepper.message = warn
+        self.snapshots = Snapshots(stepper, plan.steps, self.fields, warn)
+        self.checkpointing = Checkpointing(checkpoints, history, self.snapshots, self._synchroniser)
+        self._report = ProgressReport(self.progress, analysis, history)
+        if restart is not None:
+            self._continues = restart.continues
+            sums = history.ledger, history.recorder, history.blow_up
+            history.row = checkpoints.state.put_back_sums(checkpoint, *sums)
+            self.snapshots.last = restart.last[0]
+            history.contact_watch.start = history.recorder.start_energy
+            changes = f"; changed: {'; '.join(restart.changed)}" if restart.changed else ""
+            place = f"step {start[0]}, t = {engineering(start[1], 's')}"
+            self.progress.message(f"restart from {restart.path}: {place}{changes}")
+        self._writer = open_result_file(model, plan, history.recorder, self.fields, folder, restart, start[0])
+        history.writer = self.snapshots.writer = self._writer
+
+    def record_start(self) -> None:
+        """The row and the snapshot of the start, unless the results that are continued have them. Collective."""
+        if not self._continues:
+            self.history.record()
+            self.snapshots.write()
+
+    def after(self, made: Step) -> Step:
+        """Serve what is due after a step; gives the step with its row. Collective."""
+        step, synchroniser = made.step, self._synchroniser
+        last = step == self._analysis.last_step
+        history, *others = self._recording
+        recorded = history.due(step)
+        if recorded:
+            history.observe(made)
+        elif last or any(observer.needs_agreement and observer.due(step) for observer in others):
+            synchroniser.synchronise()
+        if synchroniser.due(step):
+            synchroniser.synchronise()
+        for observer in others:
+            if observer.due(step):
+                observer.observe(made)
+        if last:
+            self.complete()
+        if recorded or last:
+            made = made._replace(row=history.row)
+        for observer in (self._report, *self._callbacks):
+            if observer.due(step):
+                observer.observe(made)
+        return made
+
+    def steps_left(self, step: int) -> int:
+        """Steps from this one to the next after which an observer must act or the ranks synchronise."""
+        return min(self._synchroniser.steps_left(step), *(each.steps_left(step) for each in self._observers))
+
+    def advance_together(self, batches: Batches) -> None:
+        """Make the steps before the next after which more is to be done than rows, where that can be. Collective.
+
+        Raises
+        ------
+        SimulationFailure
+            As a single step does.
+        """
+        left = self.steps_left(self._analysis.state.step)
+        if not batches.advance(self._analysis, self.history, left):
+            self._synchroniser.synchronise()
+
+    def stop_early(self) -> None:
+        """Leave with a checkpoint where the ranks have agreed to stop, unless the run is at its end. Collective.
+
+        Raises
+        ------
+        EarlyStop
+            On all ranks.
+        """
+        code, state = self._synchroniser.request, self._analysis.state
+        if not code or state.step >= self._analysis.last_step:
+            return
+        self.checkpointing.write()
+        raise EarlyStop(
+            f"{self._synchroniser.stop.reason(code)}; step {state.step} is finished, t = {state.time:.6g} s, and a "
+            f"checkpoint written: continue with --restart (results in {self._folder})"
+        )
+
+    def complete(self) -> None:
+        """Bring checkpoint and results to the end of the run. Collective.
+
+        The checkpoint comes before a row and a snapshot off their schedule: a run that is given a later end goes on as
+        if they had not been.
+        """
+        for observer in (self.checkpointing, self.history, self.snapshots):
+            observer.complete()
+
+    def tell_remarks(self) -> None:
+        """Tell what became of the walls, where it may not be what was meant. Collective."""
+        for observer in self._observers:
+            for text in observer.remarks():
+                self.progress.message(text)
+
+    def close(self, outcome: str) -> None:
+        """Close the result file; the report of progress stays open. Collective."""
+        writer, self._writer = self._writer, None
+        try:
+            if writer is not None:
+                writer.close()
+        except SimulationFailure:
+            # after a failure, that one is told
+            if outcome == "done":
+                raise
+
+    def leave(self, outcome: str) -> None:
+        """Close the report of progress, which this rank can do alone."""
+        if self.progress is not None:
+            self.progress.close(outcome)

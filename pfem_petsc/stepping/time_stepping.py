@@ -1,0 +1,50 @@
+"""Motion over time, step by step: the analysis of a case with a table ``[time]``."""
+
+from __future__ import annotations
+
+from ..analysis import Analysis, Step
+from ..errors import PfemError
+from ..integrators.base import State
+from .prepare import Plan, make_stepper
+
+__all__ = ["TimeStepping"]
+
+
+class TimeStepping(Analysis):
+    """Advances the state of a model by the integrator of a plan. Construction is collective.
+
+    Parameters
+    ----------
+    model : Model
+    plan : Plan
+
+    Attributes
+    ----------
+    stepper : Stepper
+    """
+
+    def __init__(self, model, plan: Plan) -> None:
+        self.model, self.plan = model, plan
+        self.last_step, self.step_size = plan.steps, plan.step
+        self.stepper = make_stepper(model, plan)
+
+    @property
+    def state(self) -> State:
+        return self.stepper.state
+
+    @property
+    def fault(self) -> PfemError | None:
+        return self.stepper.fault
+
+    def start(self) -> None:
+        self.stepper.start()
+
+    def advance(self) -> Step:
+        self.stepper.step()
+        state, solution = self.stepper.state, self.stepper.solution
+        return Step(state.step, state.time, solution.newton, solution.linear, None)
+
+    def close(self) -> None:
+        destroy = getattr(self.stepper, "destroy", None)
+        if destroy is not None:
+            destroy()

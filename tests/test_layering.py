@@ -1,0 +1,109 @@
+"""Imports never climb: a folder of the package imports only from floors below its own, within functions as well."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).resolve().parent.parent / "pfem_petsc"
+
+FLOORS = (
+    ("errors", "signals"),
+    ("registry",),
+    ("parallel",),
+    ("case", "cases"),
+    ("mesh",),
+    ("mechanics",),
+    ("integrators",),
+    ("analysis",),
+    ("solvers",),
+    ("output",),
+    ("contact",),
+    ("stepping",),
+    ("restart",),
+    ("preflight",),
+    ("recording",),
+    ("run",),
+    ("simulation",),
+    ("__init__",),  # the public interface
+    ("bench", "post"),
+    ("cli",),
+    ("__main__",),
+)
+"""Folders and modules of the package from the lowest floor to the highest; those of one floor know nothing of each
+other."""
+
+FLOOR = {name: number for number, names in enumerate(FLOORS) for name in names}
+
+
+def imports(path: Path, package: Path) -> Iterator[tuple[int, str]]:
+    """Line, and folder or module of the package, of each import of its parts in a file."""
+    # the package that relative imports of the file start from, below the root of all
+    here = path.relative_to(package).parts[:-1]
+    for node in ast.walk(ast.parse(path.read_text(), str(path))):
+        found: list[tuple[str, ...]] = []
+        if isinstance(node, ast.Import):
+            names = (alias.name.split(".") for alias in node.names)
+            found = [tuple(name[1:]) for name in names if name[0] == package.name]
+        elif isinstance(node, ast.ImportFrom):
+            base = tuple(node.module.split(".")) if node.module else ()
+            if node.level:
+                base = here[: len(here) - node.level + 1] + base
+            elif base[0] == package.name:
+                base = base[1:]
+            else:
+                continue
+            # of the package itself: its parts, or names of its public interface
+            found = [base] if base else [(alias.name,) for alias in node.names]
+        for target in found:
+            top = target[0] if target else "__init__"
+            yield node.lineno, top if (package / top).is_dir() or (package / f"{top}.py").exists() else "__init__"
+
+
+def climbing(package: Path) -> list[str]:
+    """File, line and what is wrong, of each import that does not go to a floor below."""
+    wrong = []
+    for path in sorted(package.rglob("*.py")):
+        inside = path.relative_to(package)
+        own = inside.parts[0] if len(inside.parts) > 1 else inside.stem
+        if own not in FLOOR:
+            wrong.append(f"{path}: {own!r} has no floor in {Path(__file__).name}")
+            continue
+        for line, other in imports(path, package):
+            if other != own and FLOOR.get(other, len(FLOORS)) >= FLOOR[own]:
+                wrong.append(f"{path}:{line}: {own} (floor {FLOOR[own]}) imports {other} (floor {FLOOR.get(other)})")
+    return wrong
+
+
+def test_no_import_climbs():
+    assert climbing(PACKAGE) == []
+
+
+def test_every_floor_exists():
+    names = {path.stem for path in PACKAGE.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()}
+    assert names == set(FLOOR)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "from ..stepping.stepper import Stepper",
+        "def f():\n    from ..stepping import stepper",
+        "import pfem_petsc.stepping.stepper",
+        "from pfem_petsc.stepping import stepper",
+        "from .. import stepping",
+        "from pfem_petsc import Simulation",
+    ],
+)
+def test_a_climbing_import_is_found_with_its_line(tmp_path, text):
+    package = tmp_path / "pfem_petsc"
+    for folder in ("contact", "stepping", "mechanics"):
+        (package / folder).mkdir(parents=True)
+    (package / "contact" / "one.py").write_text(f"from ..mechanics import bars\nfrom . import two\n{text}\n")
+    line = 3 + text.count("\n")
+    (found,) = climbing(package)
+    assert f"contact/one.py:{line}: contact" in found
+    assert "stepping" in found or "__init__" in found

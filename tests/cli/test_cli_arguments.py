@@ -5,6 +5,7 @@ import sys
 
 import pytest
 
+from pfem_petsc import __version__
 from pfem_petsc.case.builtin import built_in_cases
 from pfem_petsc.cli.main import VERBS, main
 from pfem_petsc.cli.parser import seconds
@@ -24,7 +25,7 @@ def test_help_and_version(capsys):
     printed = capsys.readouterr().out
     assert all(f"  {verb} " in printed for verb in VERBS)
     assert main(["--version"]) == 0
-    assert capsys.readouterr().out == "pfem_petsc 0.1.0\n"
+    assert capsys.readouterr().out == f"pfem_petsc {__version__}\n"
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Case", "Simulation", "__version__", "open_result"]
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 _HOMES = {"Case": ".case.schema", "Simulation": ".simulation", "open_result": ".output.result"}
 

@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, InstanceOf, field_validator
 
+from ..registry import choices, nearest
 from .base import Name, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, StrictModel, listed
 
 __all__ = [
@@ -20,6 +21,8 @@ __all__ = [
     "Time",
     "TimeKeys",
 ]
+
+TREATMENTS = "pfem_petsc.contact.treatments"
 
 POINT_FIELDS = ("displacement", "velocity", "acceleration", "contact_force")
 CELL_FIELDS = ("strain", "stress", "axial_force", "plastic_strain", "temperature")
@@ -92,8 +95,16 @@ class Output(OutputKeys):
 class ContactSettings(StrictModel):
     """How contact is treated."""
 
-    treatment: Literal["scheme", "stick", "conserving", "mass_redistribution"] = "scheme"
+    treatment: str = "scheme"
     """what velocity and acceleration a node has on impact"""
+
+    @field_validator("treatment")
+    @classmethod
+    def _exists(cls, treatment: str) -> str:
+        known = ["scheme", *choices(TREATMENTS)]
+        if treatment not in known:
+            raise ValueError(f"unknown value{nearest(treatment, known)}")
+        return treatment
 
 
 class Solver(StrictModel):

@@ -1,4 +1,4 @@
-"""List the built-in cases, integrators, mesh generators and walls."""
+"""List the built-in cases, integrators, mesh generators, walls and treatments of impact."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ KINDS = {
     "integrators": "pfem_petsc.integrators",
     "mesh generators": "pfem_petsc.mesh.generators",
     "walls": "pfem_petsc.contact.walls",
+    "treatments of impact": "pfem_petsc.contact.treatments",
 }
 
 

@@ -16,7 +16,10 @@ import numpy as np
 
 from ..integrators.base import Balance, Scheme, State
 
-__all__ = ["PHASES", "SWING", "Asked", "ImpactScan", "scan_impacts"]
+__all__ = ["KNOWN", "PHASES", "SWING", "Asked", "ImpactScan", "scan_impacts"]
+
+KNOWN = ("scheme", "stick", "conserving", "mass_redistribution")
+"""Treatments that the rods have; of others nothing is predicted."""
 
 PHASES = 14
 SWING = 0.05

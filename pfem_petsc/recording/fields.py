@@ -6,10 +6,9 @@ from collections.abc import Callable
 
 import numpy as np
 
-__all__ = ["CELL_FIELDS", "POINT_FIELDS", "Fields"]
+from ..case.settings import CELL_FIELDS, POINT_FIELDS
 
-POINT_FIELDS = ("displacement", "velocity", "acceleration", "contact_force")
-CELL_FIELDS = ("strain", "stress", "axial_force", "plastic_strain", "temperature")
+__all__ = ["CELL_FIELDS", "POINT_FIELDS", "Fields"]
 
 
 class Fields:

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from ..contact.free import FreeWalls
+from ..contact.restitution import Treatment as Restitution
 from ..contact.treatments.mass_redistribution import redistribute
-from ..contact.treatments.restitution import Treatment as Restitution
 from ..errors import InputError
 from ..integrators.base import Scheme
 from ..registry import lookup

@@ -5,6 +5,7 @@ import sys
 
 import pytest
 
+from pfem_petsc import __version__
 from pfem_petsc.case.builtin import built_in_cases
 from pfem_petsc.cli.main import VERBS, main
 from pfem_petsc.cli.parser import seconds
@@ -24,7 +25,7 @@ def test_help_and_version(capsys):
     printed = capsys.readouterr().out
     assert all(f"  {verb} " in printed for verb in VERBS)
     assert main(["--version"]) == 0
-    assert capsys.readouterr().out == "pfem_petsc 0.1.0\n"
+    assert capsys.readouterr().out == f"pfem_petsc {__version__}\n"
 
 
 @pytest.mark.parametrize(
@@ -68,8 +69,8 @@ def test_list_names_everything_on_offer(capsys):
     assert main(["list"]) == 0
     lines = capsys.readouterr().out.splitlines()
     shown = {line.split()[0]: line.split(maxsplit=1)[1:] for line in lines if line.startswith("  ")}
-    kinds = ("pfem_petsc.integrators", "pfem_petsc.mesh.generators", "pfem_petsc.contact.walls")
-    expected = {*built_in_cases(), *(name for kind in kinds for name in choices(kind))}
+    kinds = ("integrators", "mesh.generators", "contact.walls", "contact.treatments")
+    expected = {*built_in_cases(), *(name for kind in kinds for name in choices(f"pfem_petsc.{kind}"))}
     assert set(shown) == expected
     assert all(text for text in shown.values())
     assert "Elastic rod against a rigid wall" in "\n".join(lines)

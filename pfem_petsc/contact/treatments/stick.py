@@ -7,14 +7,14 @@ The nodes of a pressed contact pair move on together: their normal velocity is t
 On closure a node loses the kinetic energy of its approach, m v_n^2/2, an O(element length) part of the whole; on
 release it starts from rest, and the wall does no work on it. At a wall with restitution e a node that closes leaves
 with e times the velocity of its approach, and loses (1 - e^2) of that energy: see
-:mod:`~pfem_petsc.contact.treatments.restitution`.
+:mod:`~pfem_petsc.contact.restitution`.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from .restitution import Treatment as Restitution
+from ..restitution import Treatment as Restitution
 
 __all__ = ["Treatment"]
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .base import Treatment as Base
+from .treatments.base import Treatment as Base
 
 __all__ = ["Treatment"]
 

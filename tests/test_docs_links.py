@@ -1,0 +1,67 @@
+"""Pages point to things that exist, and README leads to every page and every script."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from pfem_petsc import __version__
+
+ROOT = Path(__file__).parents[1]
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
+
+
+def prose(page: Path) -> str:
+    return re.sub(r"^```.*?^```$", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
+
+
+def anchors(page: Path) -> set[str]:
+    """As GitHub makes them of headings."""
+    headings = re.findall(r"^#+ (.*)$", prose(page), flags=re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_lead_somewhere(page):
+    for target in re.findall(r"\]\(([^)\s]+)\)", prose(page)):
+        if target.startswith("http"):
+            continue
+        path, _, anchor = target.partition("#")
+        file = (page.parent / path).resolve() if path else page
+        assert file.exists(), target
+        if anchor:
+            assert anchor in anchors(file), target
+
+
+@pytest.mark.parametrize("page", [ROOT / "docs" / "architecture.md", ROOT / "CONTRIBUTING.md"], ids=lambda p: p.name)
+def test_modules_named_exist(page):
+    for path in re.findall(r"`((?:\w+/)*\w+\.(?:py|sh))`", prose(page)):
+        assert "NAME" in path or any((ROOT / base / path).exists() for base in ("", "pfem_petsc")), path
+    for folder in re.findall(r"^\| `(\w+)` \|", prose(page), flags=re.MULTILINE):
+        assert (ROOT / "pfem_petsc" / folder).is_dir(), folder
+
+
+def test_every_folder_has_its_floor():
+    picture = re.search(r"^```\n(  cli/.*?)^```$", (ROOT / "docs" / "architecture.md").read_text(), re.M | re.S)[1]
+    folders = {p.parent.name for p in (ROOT / "pfem_petsc").glob("*/__init__.py")}
+    assert {name for name in re.findall(r"(\w+)/", picture)} == folders
+
+
+def test_readme_leads_to_every_page_and_script():
+    text = (ROOT / "README.md").read_text()
+    for page in PAGES:
+        if page.name != "README.md":
+            assert f"]({page.relative_to(ROOT)})" in text, page
+    for script in sorted([*(ROOT / "scripts").glob("*.py"), *(ROOT / "scripts").glob("*.sh")]):
+        if script.name not in ("environment.sh", "build_petsc.sh"):  # parts of setup.sh
+            assert f"scripts/{script.name}" in text, script
+
+
+def test_one_version():
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    assert version == __version__
+    assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text()
+    assert re.findall(r"^## (\S+)$", (ROOT / "CHANGELOG.md").read_text(), flags=re.MULTILINE)[0] == version

@@ -8,7 +8,6 @@ import sys
 import numba
 import numpy as np
 import pytest
-from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation
 from pfem_petsc.mechanics.compiled import Compilation

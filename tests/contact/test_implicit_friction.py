@@ -389,7 +389,7 @@ def test_valley_of_almost_parallel_planes(comm, shared_tmp_path):
 
 @pytest.mark.parametrize("steps", [120])
 def test_node_between_a_floor_and_a_sphere(steps, comm, shared_tmp_path):
-    """Pushed up and down below the pole of a sphere, whose plane is 1e-9 to 1e-7 off that of the floor, node by node."""
+    """Pushed up and down below the pole of a sphere, whose plane is almost that of the floor."""
     step = 1e-3
     floor = {"type": "plane", "name": "floor", "point": [0, 0, 0], "normal": [0, 0, 1.0]}
     ball = {"type": "sphere", "name": "ball", "point": [1e-8, 0, 0.3 + 2e-4], "radius": 0.3, "node_set": "below"}

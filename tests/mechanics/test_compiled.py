@@ -45,7 +45,7 @@ def module(tmp_path, monkeypatch):
 
 def test_compiling_is_noticed_once_and_loading_is_not(module):
     told, took = [], []
-    with Compilation(lambda: told.append(1), took.append):
+    with Compilation(lambda name: told.append(1), took.append):
         assert module().outer(3.0) == 7.0  # the inner one is compiled on the way: one time for both
         assert (len(told), len(took)) == (1, 1)
         assert 0.0 < took[0] < 60.0
@@ -87,7 +87,7 @@ def test_machine_code_is_never_older_than_what_a_loop_inlines(tmp_path, monkeypa
             sys.modules.pop(name, None)
         importlib.invalidate_caches()
         took = []
-        with Compilation(lambda: None, took.append):
+        with Compilation(lambda name: None, took.append):
             value = importlib.import_module("loop_of_a_test").loop(3.0)
         return value, len(took)
 

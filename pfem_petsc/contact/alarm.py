@@ -63,8 +63,8 @@ def check_positions(stepper) -> None:
     if carried:
         raise SimulationFailure(
             f"step {state.step}, t = {time:.6g} s: node {node} is {-depth:.3g} m beyond wall {contact.names[wall]!r} "
-            f"({count} node{'s' if count > 1 else ''} in all), along whose normal its supports prescribe it; let the "
-            "wall move with the supports, or name the nodes that it concerns with 'node_set'"
+            f"({count} node{'s' if count > 1 else ''} in all), where its supports take it; let the wall move with "
+            "the supports, name the nodes that it concerns with 'node_set', or do not tie them"
         )
     case = model.case
     others = "another contact.treatment or time.integrator"
@@ -78,7 +78,9 @@ def check_positions(stepper) -> None:
 
 
 def _prescribed(contact, node: int, wall: int, x: np.ndarray, time: float) -> bool:
-    """Whether supports prescribe an owned node of those at (owned, 3) along a wall's normal."""
+    """Whether supports prescribe an owned node of those at (owned, 3) along a wall's normal, or in part a tied node."""
+    if contact.ties.any and contact.ties.held[node] and contact.fixed[node].any():
+        return True
     normals, _ = contact.planes(np.ones((1, len(contact.walls)), dtype=bool), x[[node]], contact.motion.shifts(time))
     free = np.where(contact.fixed[node], 0.0, normals[0, wall])
     return bool(free @ free <= _THIN)

@@ -20,6 +20,7 @@ from .treatments.base import Treatment as Base
 __all__ = ["Treatment"]
 
 _STILL = 1e-13  # of the model's length: a slip that is rounding
+_NONE = 1e-9  # of a force: what of it is rounding, and of the tolerance of the solve
 
 
 class Treatment(Base):
@@ -42,7 +43,11 @@ class Treatment(Base):
             mine = self._touched if self.everywhere else self._touched & (contact.restitution > 0.0)
             self._held = np.flatnonzero(mine.any(axis=1))
             change = state.memory.get("contact_change")
-            self._force = state.contact[self._held] + (0.0 if change is None else change[self._held])
+            pressed = state.contact[self._held]
+            self._force = pressed + (0.0 if change is None else change[self._held])
+            # a node that leaves by restitution had its force taken back: what rounding leaves of it is none
+            none = np.linalg.norm(self._force, axis=1) <= _NONE * np.linalg.norm(pressed, axis=1)
+            self._force[none] = 0.0
         if not contact.restitution.any():
             return
         self._speed = state.v

@@ -308,10 +308,16 @@ class ContactRounds:
         return False
 
     def _off_surface(self, x: np.ndarray, tolerance: float) -> bool:
-        """Whether a node pressed on a curved wall is off its surface, or was held by the plane of another point."""
+        """Whether a node pressed on a curved wall is off its surface, or was held by the plane of another point.
+
+        One that the wall does not press may keep the plane of another point and be beyond the wall for all that.
+        """
         at = self._frames.nodes
         for k in np.flatnonzero(~self.contact.flat):
             pressed = self.strengths[:, k] > 0.0
+            passed = ~pressed & (self._frames.rows[:, k] >= 0)
+            if passed.any() and (self.contact.gap(k, x[at[passed]], self._shifts) < -tolerance).any():
+                return True
             if pressed.any():
                 place = x[at[pressed]] - self._shifts[k]
                 normals, offsets = self.contact.walls[k].planes(place)

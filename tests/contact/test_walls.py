@@ -210,3 +210,23 @@ def test_on_ranks(comm, shared_tmp_path):
     for integrator in ("central_differences", "newmark"):
         test_walls_that_leave_no_room(integrator, {}, comm, shared_tmp_path / integrator)
     test_reports_of_a_bounce(comm, shared_tmp_path / "bounce")
+
+
+@pytest.mark.parametrize("integrator", ["central_differences", "newmark"])
+def test_inside_of_a_tiny_sphere(integrator, comm, shared_tmp_path):
+    """A node that crosses the sphere in one step: the plane of the side it comes from does not stop it at the other."""
+    ball = {"type": "sphere", "name": "ball", "point": [1.0, 0, 0], "radius": 1e-8, "side": "inside", "node_set": "tip"}
+    case = {
+        "mesh": {"generator": "rod", "length": 1.0, "elements": 4},
+        "material": {"m": {"young_modulus": 1.0, "density": 1.0}},
+        "section": {"s": {"area": 1.0, "material": "m"}},
+        "node_set": {"tip": {"nearest": [1.0, 0.0, 0.0]}},
+        "initial": {"velocity": [0.01, 0.0, 0.0]},
+        "wall": [ball],
+        "time": {"integrator": integrator, "mass": "consistent", "step": 0.02, "end": 0.4},
+        "output": {"fields_every": 0},
+    }
+    run = simulation(case, comm, shared_tmp_path)
+    for _ in run:
+        gaps = run.model.contact.gaps(run.state.position, run.state.time)
+        assert gaps.min(initial=0.0) > -1e-12

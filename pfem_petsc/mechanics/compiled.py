@@ -103,48 +103,60 @@ def code_digest(function: Callable[..., Any]) -> str:
 
     Machine code depends on nothing else of the program; compiled functions that are called are followed as well.
     """
-    digest = hashlib.sha256()
-    seen: set[int] = set()
+    digest = _Digest()
+    digest.add(function)
+    return digest.hexdigest()
 
-    def code(part: CodeType) -> None:
-        digest.update(part.co_code)
-        digest.update(repr((part.co_names, part.co_varnames, part.co_freevars)).encode())
-        for constant in part.co_consts:
-            value(constant)
 
-    def value(thing: Any) -> None:
+class _Digest:
+    """Of things that machine code may be made of, and of all that they refer to."""
+
+    def __init__(self) -> None:
+        self._digest = hashlib.sha256()
+        self._seen: set[int] = set()
+        self.hexdigest = self._digest.hexdigest
+
+    def add(self, thing: Any) -> None:
+        """Add a function, or what functions refer to."""
+        update = self._digest.update
         if isinstance(thing, CodeType):
-            code(thing)
+            self._add_code(thing)
         elif isinstance(thing, Dispatcher):
-            value(thing.py_func)
+            self.add(thing.py_func)
         elif isinstance(thing, FunctionType):
-            if id(thing) in seen:
-                return
-            seen.add(id(thing))
-            called = thing.__code__
-            code(called)
-            for cell in thing.__closure__ or ():
-                value(cell.cell_contents)
-            for name in _global_names(called):
-                if name in thing.__globals__:
-                    digest.update(name.encode())
-                    value(thing.__globals__[name])
+            self._add_function(thing)
         elif isinstance(thing, np.ndarray):
-            digest.update(repr((thing.shape, thing.dtype)).encode() + thing.tobytes())
+            update(repr((thing.shape, thing.dtype)).encode() + thing.tobytes())
         elif isinstance(thing, ModuleType):
-            digest.update(thing.__name__.encode())
+            update(thing.__name__.encode())
         elif isinstance(thing, type):
-            digest.update(repr((thing.__qualname__, getattr(thing, "_fields", ()))).encode())
+            update(repr((thing.__qualname__, getattr(thing, "_fields", ()))).encode())
         elif isinstance(thing, (tuple, list, frozenset)):
             for part in sorted(thing, key=repr) if isinstance(thing, frozenset) else thing:
-                value(part)
+                self.add(part)
         elif isinstance(thing, (bool, int, float, complex, str, bytes, type(None), type(...), np.generic)):
-            digest.update(repr(thing).encode())
+            update(repr(thing).encode())
         else:
-            digest.update(type(thing).__qualname__.encode())
+            update(type(thing).__qualname__.encode())
 
-    value(function)
-    return digest.hexdigest()
+    def _add_code(self, code: CodeType) -> None:
+        self._digest.update(code.co_code)
+        self._digest.update(repr((code.co_names, code.co_varnames, code.co_freevars)).encode())
+        for constant in code.co_consts:
+            self.add(constant)
+
+    def _add_function(self, function: FunctionType) -> None:
+        if id(function) in self._seen:
+            return
+        self._seen.add(id(function))
+        self._add_code(function.__code__)
+        for cell in function.__closure__ or ():
+            self.add(cell.cell_contents)
+        # sorted: the order of a set of names is another in every process
+        for name in sorted(_global_names(function.__code__)):
+            if name in function.__globals__:
+                self._digest.update(name.encode())
+                self.add(function.__globals__[name])
 
 
 def _global_names(code: CodeType) -> set[str]:

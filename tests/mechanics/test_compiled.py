@@ -1,6 +1,8 @@
 """Loops that are compiled by a process are noticed, those that are loaded are not, and a run says so."""
 
 import importlib
+import os
+import subprocess
 import sys
 
 import numba
@@ -42,7 +44,7 @@ def module(tmp_path, monkeypatch):
 
 def test_compiling_is_noticed_once_and_loading_is_not(module):
     told, took = [], []
-    with Compilation(lambda: told.append(1), took.append):
+    with Compilation(told.append, took.append):
         assert module().outer(3.0) == 7.0  # the inner one is compiled on the way: one time for both
         assert (len(told), len(took)) == (1, 1)
         assert 0.0 < took[0] < 60.0
@@ -84,7 +86,7 @@ def test_machine_code_is_never_older_than_what_a_loop_inlines(tmp_path, monkeypa
             sys.modules.pop(name, None)
         importlib.invalidate_caches()
         took = []
-        with Compilation(lambda: None, took.append):
+        with Compilation(lambda name: None, took.append):
             value = importlib.import_module("loop_of_a_test").loop(3.0)
         return value, len(took)
 
@@ -103,3 +105,18 @@ def test_damaged_machine_code_is_compiled_anew(module, tmp_path, suffix):
     for path in damaged:
         path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     assert module().outer(3.0) == 7.0
+
+
+def test_every_process_finds_the_machine_code_of_another():
+    """The digest of loops does not depend on the order of sets, which is another in every process."""
+    program = (
+        "from pfem_petsc.contact import frames, projection\n"
+        "from pfem_petsc.mechanics.compiled import code_digest\n"
+        "print(code_digest(frames._build), code_digest(projection.project))"
+    )
+    digests = set()
+    for seed in ("1", "2", "3"):
+        environment = os.environ | {"PYTHONHASHSEED": seed}
+        command = [sys.executable, "-c", program]
+        digests.add(subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout)
+    assert len(digests) == 1

@@ -10,6 +10,7 @@ from ..output.energies import STORED, SUPPLIED
 __all__ = ["ContactWatch"]
 
 _SHARE = 0.02  # of the energy that the run started with or was given: more than schemes' own energies swing by
+_ROUNDING = 1e-24  # of E A l: energies that are squares of rounding errors, of a truss at rest
 _ROWS = 4  # rows in succession that gain without contact: a peak that passes is none
 
 
@@ -35,6 +36,9 @@ class ContactWatch:
         self.contact = model.contact.any or model.pairs is not None
         self.told = not self.contact and explicit
         self.steady = not explicit
+        strongest = max(m.young_modulus for m in model.case.material.values())
+        strongest *= max(section.area for section in model.case.section.values())
+        self.rounding = _ROUNDING * strongest * model.length
         self.rows = 0
         contact, time = model.case.contact, model.case.time
         self.what = f'{time.integrator} with contact.treatment = "{contact.treatment}" and time.mass = "{time.mass}"'
@@ -53,7 +57,7 @@ class ContactWatch:
         self.scale = max(self.scale, abs(self.start), *(abs(row[name]) for name in SUPPLIED))
         self.touched = self.touched or row["active_contacts"] > 0
         gain = net - self.start
-        self.rows = self.rows + 1 if gain > _SHARE * self.scale else 0
+        self.rows = self.rows + 1 if gain > _SHARE * self.scale and self.scale > self.rounding else 0
         if not self.rows:
             return
         made = f"{gain:.3g} J, {100.0 * gain / self.scale:.2g} % of the energy that the run had or was given"

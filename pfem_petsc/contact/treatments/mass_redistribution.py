@@ -78,8 +78,8 @@ def redistribute(model) -> Redistribution:
     for k, wall in enumerate(contact.walls):
         if not wall.flat or wall.partial or contact.everyone[k]:
             raise InputError(
-                f"{key}: wall {contact.names[k]!r} must be a plane, not curved nor a rectangle, and name a node_set: its "
-                "nodes lose mass; take another contact.treatment"
+                f"{key}: wall {contact.names[k]!r} must be a plane, not curved nor a rectangle, and name a node_set: "
+                "its nodes lose mass; take another contact.treatment"
             )
     if inertia.damped:
         raise InputError(f"{key}: a node without mass cannot be damped; take a material without damping")

@@ -62,8 +62,11 @@ def _walls(result: Loaded, case: Case, history: dict[str, np.ndarray]) -> Faults
     start, size = result.positions[0], result.size
     tolerance = (1e-6 if case.output.precision == "float32" else 1e-9) * max(size, float(np.abs(start).max()))
     rows = {int(step): row for row, step in enumerate(history["step"])}
+    # supports that prescribe all components of a node carry it where they say: walls do not count
+    whole = [_members(case, support.node_set, result) for support in case.support if set(support.fix) == set("xyz")]
+    carried = np.concatenate([np.empty(0, dtype=np.int64), *whole])
     for wall in case.wall:
-        members = _members(case, wall.node_set, result)
+        members = np.setdiff1d(_members(case, wall.node_set, result), carried)
         moved = history.get(f"wall/{wall.name}/position")
         worst = (0.0, "")
         for i, step in enumerate(result.steps):

@@ -446,3 +446,30 @@ def test_damped_nodes_that_start_on_a_wall(integrator, shared_tmp_path):
     assert chatters or history["impact_dissipation"][-1] == pytest.approx(stopped, rel=1e-9)
     assert (np.diff(history["damping_dissipation"]) >= 0.0).all()
     assert unexplained(history) < 1e-9
+
+
+@pytest.mark.parametrize("treatment", ["scheme", "stick", "mass_redistribution", "conserving"])
+@pytest.mark.parametrize("integrator", ["newmark", "houbolt", "energy_momentum"])
+def test_start_on_a_wall_is_an_impact_at_the_start(integrator, treatment, shared_tmp_path):
+    """A velocity into the wall that nodes start on does what it does at a gap that is next to nothing."""
+    found = []
+    for gap in (0.0, 1e-10):
+        asked = case(
+            integrator,
+            step=2e-3,
+            steps=15,
+            treatment=treatment,
+            mesh={"generator": "rod", "length": 1.0, "elements": 4},
+            node_set={"tip": {"group": "end"}},
+            walls=[{"point": [1.0 + gap, 0.0, 0.0], "normal": [-1.0, 0.0, 0.0], "node_set": "tip"}],
+            initial={"velocity": [0.5, 0.0, 0.0]},
+            solver={"rtol": 1e-12},
+        )
+        found.append(run(asked, shared_tmp_path / str(gap)))
+    at_once, later = found
+    start = at_once["kinetic_energy"][0]
+    assert at_once["active_contacts"][1] == 1
+    for name in ("kinetic_energy", "elastic_energy", "impact_dissipation", "numerical_dissipation"):
+        np.testing.assert_allclose(at_once[name], later[name], atol=1e-5 * start)
+    assert np.abs(at_once["energy_imbalance"]).max() < 1e-9 * start
+    assert unexplained(at_once) < 1e-9

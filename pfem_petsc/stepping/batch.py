@@ -175,7 +175,8 @@ class Batches:
         stepper, state, end = analysis.stepper, analysis.state, analysis.last_step
         begin = state.step
         count = min(left, end - begin, MOST + 1) - 1
-        if self._refused or count < _FEWEST or end < self._worth:
+        # the first step is damped by velocities that are not those of the state, where walls stop nodes at once
+        if self._refused or count < _FEWEST or end < self._worth or begin == 0:
             return True
         if self._batch is None:
             self._refused = not Batch.serves(stepper)

@@ -93,6 +93,9 @@ class Ledger:
                 self.impulses.step(stepper.totals_solved)
                 self.impulses.state.v[:] = 0.0  # as the velocities of nodes, which have not jumped yet
                 self._pending = [self._impact(self._before, started=True), stepper.solution.walls.friction]
+                if inertia.damped:  # nodes that walls stop at once are damped as if they were stopped already
+                    v = stepper.velocity_solved
+                    self._before.v = inertia.damping_times(v, np.empty_like(v)) if inertia.products else v
 
     def update(self) -> None:
         """Book the step just made."""

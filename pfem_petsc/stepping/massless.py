@@ -10,6 +10,9 @@ from ..contact.forces import WallForces
 __all__ = ["MasslessNodes"]
 
 _ITERATIONS = 200
+_CALMER, _BOLDER = 0.7, 1.3  # by which moves become smaller while they swing, and larger again, up to whole ones
+_FARTHEST = 0.25  # of a node's shortest bar: the longest single move
+_STEEPEST = 0.05  # cosine squared to the normal that bars are taken to have at least
 _SOFTEST = 1e-4  # secant stiffness over the elastic one, or the other way round, that is taken for more than rounding
 
 
@@ -35,8 +38,9 @@ class MasslessNodes:
             model.external.at(time, external)
         if model.temperatures.varying:
             model.temperatures.apply(time)
-        elastic = self._stiffness(x)
+        elastic, farthest = self._stiffness(x)
         stiffness, force, step = elastic, np.full(len(nodes), np.nan), np.zeros(len(nodes))
+        part, largest = np.ones(len(nodes)), 0.0
         for _ in range(_ITERATIONS):
             gap = self.gaps(x[:owned], time)
             x[nodes] -= np.minimum(gap, 0.0)[:, None] * n
@@ -47,9 +51,14 @@ class MasslessNodes:
                 secant = (last - force) / step
             # where bars yield or turn, the elastic stiffness would take hundreds of moves
             stiffness = np.where((secant > _SOFTEST * elastic) & (secant < elastic / _SOFTEST), secant, elastic)
-            step = np.maximum(force / stiffness, -np.maximum(gap, 0.0))
+            swings = step * force < 0.0  # neighbours that have no mass either push each other to and fro
+            part = np.where(swings, _CALMER * part, np.minimum(_BOLDER * part, 1.0))
+            move = np.clip(part * force / stiffness, -farthest, farthest)
+            step = np.maximum(move, -np.maximum(gap, 0.0))
             x[nodes] += step[:, None] * n
-            largest = model.comm.allreduce(float(np.abs(step).max(initial=0.0)), op=MPI.MAX)
+            # a bar square to the normal may leave the place open that a force of rounding decides over
+            open_way = np.minimum(np.abs(step), np.abs(force) / elastic)
+            largest = model.comm.allreduce(float(open_way.max(initial=0.0)), op=MPI.MAX)
             if largest <= 1e-14 * model.length:
                 break
         model.mesh.update_ghosts(x)
@@ -82,11 +91,15 @@ class MasslessNodes:
         each = touched[:, :, None] * (strength[:, None] * full)[:, None, :]
         return force, contact.sums(nodes, each, x[nodes], touched)
 
-    def _stiffness(self, x: np.ndarray) -> np.ndarray:
-        """Stiffness (m,) of the nodes along their normals, their neighbours at rest [N/m]."""
+    def _stiffness(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Stiffness (m,) of the nodes along their normals, their neighbours at rest [N/m], and their longest moves [m].
+
+        A bar that is square to the normal has its force alone to give stiffness: it is taken to lean a little.
+        """
         mesh, model = self.model.mesh, self.model
         a, b = mesh.bars.T
         total = np.zeros(mesh.n_local)
+        shortest = np.full(mesh.n_local, np.inf)
         normal = np.zeros((mesh.n_local, 3))
         normal[self.moved.nodes] = self.moved.normals
         way = x[b] - x[a]
@@ -96,5 +109,6 @@ class MasslessNodes:
         )
         for end in (a, b):
             along = np.einsum("bi,bi->b", way, normal[end]) / length
-            np.add.at(total, end, axial / model.bars.rest * along * along)
-        return total[self.moved.nodes]
+            np.add.at(total, end, axial / model.bars.rest * np.maximum(along * along, _STEEPEST))
+            np.minimum.at(shortest, end, model.bars.rest)
+        return total[self.moved.nodes], _FARTHEST * shortest[self.moved.nodes]

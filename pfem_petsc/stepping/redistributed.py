@@ -42,7 +42,10 @@ class RedistributedStepper(Stepper):
             held = np.zeros_like(load)
             held[at] = supports.positions(balance.time) - balance.predictor[at]
             # mass that is a matrix couples the free components to those that supports move
-            pull[moved.touched] -= balance.alpha * np.einsum("kij,kj->ki", moved.tensors, held[moved.touched])
+            carried = balance.alpha * held
+            if balance.a_hat is not None:  # the acceleration of supports that move
+                carried += balance.a_hat
+            pull[moved.touched] -= np.einsum("kij,kj->ki", moved.tensors, carried[moved.touched])
         u = self.accelerate(pull) / balance.alpha
         if supports.any:
             u[at] = held[at]

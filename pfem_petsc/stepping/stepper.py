@@ -61,6 +61,7 @@ class Stepper(ABC):
     step_changed : whether the scheme was told to forget what holds for another step, since the last booking
     totals_at_start, totals_solved : (3, 3) this rank's sums of support, external and damping force [N] at the start,
         and of the balance that was solved there by a scheme that leads; None after a restart
+    velocity_solved : (owned, 3) of that balance, in which its damping force acts [m/s]
     walls_at_start, pairs_at_start : (walls, 3), (pairs, 3) forces at the start [N]
     renews_forces : each evaluation of the state fills another array ``state.f``, so that the last one is kept
     kept_numbers, kept_arrays, kept_bars : names of attributes that, with the state, determine what comes: numbers,
@@ -102,6 +103,7 @@ class Stepper(ABC):
         self.support_change: dict[str, np.ndarray] = {}
         self.totals_at_start: np.ndarray | None = None
         self.totals_solved: np.ndarray | None = None
+        self.velocity_solved = self.zero
         self.walls_at_start = np.zeros((len(model.contact.names), 3))
         self.pairs_at_start = np.zeros((0, 3))
         self.solution = Solution(self.zero, self.state.f, model.contact.nothing)
@@ -151,6 +153,7 @@ class Stepper(ABC):
             v, speeds = state.v, free.state.v if free is not None else None
             self._solve_and_finish()
             self.totals_solved = self._totals()
+            self.velocity_solved = state.v
             # what is on a wall has not lost its velocity yet; the scheme goes on from its own memory
             state.v = v
             if free is not None:

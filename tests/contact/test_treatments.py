@@ -179,7 +179,10 @@ def test_mass_redistribution_without_a_matrix(comm, shared_tmp_path):
     "tables, message",
     [
         ({"contact": {"treatment": "conserving"}}, "goes with the integrators newmark"),
-        ({"contact": {"treatment": "mass_redistribution"}}, "must be plane and name a node_set"),
+        (
+            {"contact": {"treatment": "mass_redistribution"}},
+            "must be a plane, not curved nor a rectangle, and name a node_set",
+        ),
         ({"contact": {"treatment": "sticky"}}, "contact.treatment"),
     ],
 )

@@ -20,6 +20,7 @@ SCHEMES = [
     "energy_momentum",
 ]
 GRAVITY = 9.81
+MIDDLE = [[0.2, -1.0, -1.0], [0.3, 1.0, 1.0]]
 
 
 def case(integrator, *, step, steps, treatment="scheme", mass="lumped", mesh=None, walls=(), **more) -> Case:
@@ -374,3 +375,101 @@ def test_damping_only_takes(integrator, mass, shared_tmp_path):
     assert (np.diff(history["damping_dissipation"]) >= 0.0).all()
     assert history["damping_dissipation"][-1] > 0.05 * start
     assert np.abs(history["energy_imbalance"]).max() < 1e-10 * start
+
+
+@pytest.mark.parametrize("integrator", ["central_differences", "newmark", "generalized_alpha"])
+def test_supports_that_move_beside_nodes_without_mass(integrator, shared_tmp_path):
+    """The mass of a node on an oblique wall couples the components of its neighbour, whose x a support moves."""
+    history = run(
+        case(
+            integrator,
+            step=1e-3,
+            steps=40,
+            treatment="mass_redistribution",
+            mesh={"generator": "lattice", "kind": "octet", "cells": [1, 1, 1], "pitch": 0.5},
+            node_set={"right": {"group": "right"}, "left": {"group": "left"}, "middle": {"box": MIDDLE}},
+            walls=[{"point": [0.51, 0.5, 0.0], "normal": [-2.0, -1.0, 0.5], "node_set": "right"}],
+            support=[
+                {"node_set": "middle", "fix": "x", "motion": [[0.0, 0, 0, 0], [0.015, 0.02, 0, 0], [1.0, 0, 0, 0]]}
+            ],
+            initial={"velocity": [0.2, 0.1, 0.0]},
+        ),
+        shared_tmp_path,
+    )
+    assert np.abs(history["external_work"]).max() > 0.0
+    scale = max(np.abs(history[name]).max() for name in ("kinetic_energy", "elastic_energy"))
+    assert np.abs(history["energy_imbalance"]).max() < 1e-9 * scale
+    assert unexplained(history) < 1e-9
+
+
+def test_a_node_without_mass_turns_round_its_bar(shared_tmp_path):
+    """The bar comes square to the way of its node, where its force alone holds it: no move may be far."""
+    history = run(
+        case(
+            "central_differences",
+            step=1e-3,
+            steps=300,
+            treatment="mass_redistribution",
+            mesh={"generator": "rod", "length": 1.0, "elements": 2},
+            node_set={"tip": {"group": "end"}, "root": {"group": "start"}},
+            walls=[{"point": [1.2, 0.1, 0.0], "normal": [-2.0, -1.0, 0.0], "node_set": "tip"}],
+            support=[{"node_set": "root", "fix": "xyz", "motion": [[0.0, 0, 0, 0], [0.3, -0.5, 2.0, 0]]}],
+            initial={"velocity": [0.0, -3.0, 0.0]},
+        ),
+        shared_tmp_path,
+    )
+    scale = max(np.abs(history[name]).max() for name in ("kinetic_energy", "elastic_energy"))
+    assert np.abs(history["energy_imbalance"]).max() < 1e-9 * scale
+
+
+@pytest.mark.parametrize("integrator", SCHEMES)
+def test_damped_nodes_that_start_on_a_wall(integrator, shared_tmp_path):
+    """An impact in the first instant: what walls stop is damped as if it were stopped already."""
+    history = run(
+        case(
+            integrator,
+            step=1e-4,
+            steps=40,
+            mesh={"generator": "rod", "length": 1.0, "elements": 4},
+            material={"default": {"young_modulus": 1e4, "density": 1.0, "damping": 200.0}},
+            walls=[{"point": [1.0, 0.0, 0.0], "normal": [-1.0, 0.0, 0.0]}],
+            initial={"velocity": [0.5, 0.0, 0.0]},
+        ),
+        shared_tmp_path,
+    )
+    assert history["active_contacts"][1] == 1
+    start = history["kinetic_energy"][0]
+    assert np.abs(history["energy_imbalance"]).max() < 1e-9 * start
+    stopped = start / 8.0  # the kinetic energy of the node; schemes that let go of it strike it again
+    chatters = integrator in ("chung_lee", "houbolt", "generalized_alpha", "energy_momentum")
+    assert history["impact_dissipation"][1] == pytest.approx(stopped, rel=1e-9)
+    assert chatters or history["impact_dissipation"][-1] == pytest.approx(stopped, rel=1e-9)
+    assert (np.diff(history["damping_dissipation"]) >= 0.0).all()
+    assert unexplained(history) < 1e-9
+
+
+@pytest.mark.parametrize("treatment", ["scheme", "stick", "mass_redistribution", "conserving"])
+@pytest.mark.parametrize("integrator", ["newmark", "houbolt", "energy_momentum"])
+def test_start_on_a_wall_is_an_impact_at_the_start(integrator, treatment, shared_tmp_path):
+    """A velocity into the wall that nodes start on does what it does at a gap that is next to nothing."""
+    found = []
+    for gap in (0.0, 1e-10):
+        asked = case(
+            integrator,
+            step=2e-3,
+            steps=15,
+            treatment=treatment,
+            mesh={"generator": "rod", "length": 1.0, "elements": 4},
+            node_set={"tip": {"group": "end"}},
+            walls=[{"point": [1.0 + gap, 0.0, 0.0], "normal": [-1.0, 0.0, 0.0], "node_set": "tip"}],
+            initial={"velocity": [0.5, 0.0, 0.0]},
+            solver={"rtol": 1e-12},
+        )
+        found.append(run(asked, shared_tmp_path / str(gap)))
+    at_once, later = found
+    start = at_once["kinetic_energy"][0]
+    assert at_once["active_contacts"][1] == 1
+    for name in ("kinetic_energy", "elastic_energy", "impact_dissipation", "numerical_dissipation"):
+        np.testing.assert_allclose(at_once[name], later[name], atol=1e-5 * start)
+    assert np.abs(at_once["energy_imbalance"]).max() < 1e-9 * start
+    assert unexplained(at_once) < 1e-9

@@ -70,14 +70,17 @@ def redistribute(model) -> Redistribution:
     Raises
     ------
     InputError
-        On all ranks: walls that are not plane or name no node set, nodes of several walls, nodes without neighbours.
+        On all ranks: walls that are no planes or name no node set, nodes of several walls, nodes without neighbours.
     """
     contact, mesh, inertia = model.contact, model.mesh, model.inertia
     source = model.case.source
     key = f'{source}: contact.treatment = "mass_redistribution"'
     for k, wall in enumerate(contact.walls):
-        if not wall.flat or contact.everyone[k]:
-            raise InputError(f"{key}: wall {contact.names[k]!r} must be plane and name a node_set: its nodes lose mass")
+        if not wall.flat or wall.partial or contact.everyone[k]:
+            raise InputError(
+                f"{key}: wall {contact.names[k]!r} must be a plane, not curved nor a rectangle, and name a node_set: "
+                "its nodes lose mass; take another contact.treatment"
+            )
     if inertia.damped:
         raise InputError(f"{key}: a node without mass cannot be damped; take a material without damping")
     owned = mesh.n_owned

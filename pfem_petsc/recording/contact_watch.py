@@ -27,7 +27,7 @@ class ContactWatch:
 
     def __init__(self, model, tell: Callable[[str], None]) -> None:
         self.tell = tell
-        self.told = not (model.contact.any or model.pairs is not None)
+        self.told = not model.can_touch
         contact, time = model.case.contact, model.case.time
         self.what = f'{time.integrator} with contact.treatment = "{contact.treatment}" and time.mass = "{time.mass}"'
         self.start: float | None = None

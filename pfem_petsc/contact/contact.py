@@ -79,6 +79,11 @@ class Contact:
         mesh.comm.Allreduce(MPI.IN_PLACE, ends, op=MPI.MAX)
         self.length = float(ends.sum(axis=0).max())
 
+    @property
+    def symmetric(self) -> bool:
+        """Whether the Hessian of a step with these walls is symmetric: friction makes it unsymmetric."""
+        return not self.rough
+
     @cached_property
     def nothing(self) -> WallForces:
         """No contact; not to be written to."""

@@ -163,7 +163,7 @@ class Impacts:
         contact, pairs = self.model.contact, self.model.pairs
         self.met = np.flatnonzero(stepper.closed.any(axis=1))
         self.closed_pairs = np.zeros(0 if pairs is None else len(pairs.force), dtype=bool)
-        self.active = contact.any or pairs is not None
+        self.active = self.model.can_touch
         free = contact.motion.free
         self.counted = np.ones(len(contact.names), dtype=bool)
         if free is not None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from ..mechanics.motion import motion_of
@@ -25,6 +27,45 @@ class WallMotion:
             [wall.velocity is not None or wall.motion is not None or wall.mass is not None for wall in walls],
             dtype=bool,
         )
+
+    @property
+    def speeds(self) -> np.ndarray:
+        """Velocities (f, 3) [m/s] of walls with mass; (0, 3) where there are none."""
+        return self.free.state.v if self.free is not None else np.zeros((0, 3))
+
+    def set_speeds(self, v: np.ndarray) -> None:
+        """Give walls with mass the velocities (f, 3) [m/s]."""
+        if self.free is not None:
+            self.free.state.v = v
+
+    def start(self, h: float) -> None:
+        """Complete the state of walls with mass at the start of steps of ``h`` [s]."""
+        if self.free is not None:
+            self.free.start(h)
+
+    def begin(self, time: float, h: float) -> None:
+        """Begin a step of ``h`` from ``time`` [s], with walls that have mass."""
+        if self.free is not None:
+            self.free.begin(time, h)
+
+    def finish(self, h: float) -> None:
+        """Complete the state of walls with mass after a step of ``h`` [s]."""
+        if self.free is not None:
+            self.free.finish(h)
+
+    def step_changed(self, scheme) -> None:
+        """Tell the scheme to forget of walls with mass what holds for steps of another size."""
+        if self.free is not None:
+            scheme.step_changed(self.free.state)
+
+    def kept(self) -> dict[str, Any] | None:
+        """What a checkpoint must hold, None where no wall has mass."""
+        return self.free.kept() if self.free is not None else None
+
+    def put_back(self, kept: dict[str, Any] | None) -> None:
+        """Restore walls with mass from a checkpoint."""
+        if kept is not None:
+            self.free.put_back(kept)
 
     def shifts(self, time: float) -> np.ndarray:
         """Displacements (w, 3) [m] at a time [s]."""

@@ -10,7 +10,6 @@ from ..output.energies import STORED, SUPPLIED
 __all__ = ["ContactWatch"]
 
 _SHARE = 0.02  # of the energy that the run started with or was given: more than schemes' own energies swing by
-_ROUNDING = 1e-24  # of E A l: energies that are squares of rounding errors, of a truss at rest
 _ROWS = 4  # rows in succession that gain without contact: a peak that passes is none
 
 
@@ -33,13 +32,10 @@ class ContactWatch:
 
     def __init__(self, model, tell: Callable[[str], None], explicit: bool) -> None:
         self.tell = tell
-        self.contact = model.contact.any or model.pairs is not None
+        self.contact = model.can_touch
         self.told = not self.contact and explicit
         self.steady = not explicit
-        strongest = max(m.young_modulus for m in model.case.material.values())
-        strongest *= max(section.area for section in model.case.section.values())
-        # of energies [J]: what is at rest has no other
-        self.rounding = max(_ROUNDING * strongest, model.rounding) * model.length
+        self.rounding = model.rounding * model.length  # of energies [J]: what is at rest has no other
         self.rows = 0
         contact, time = model.case.contact, model.case.time
         self.what = f'{time.integrator} with contact.treatment = "{contact.treatment}" and time.mass = "{time.mass}"'

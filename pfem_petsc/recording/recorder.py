@@ -55,10 +55,8 @@ class Recorder:
         )
         self.columns |= {name: shape for name, shape, _ in contact_columns(self.model.contact)}
         self.types |= {name: kind for name, _, kind in contact_columns(self.model.contact) if kind is not float}
-        self._pairs = self.model.pairs
-        if self._pairs is not None:
-            for name in self._pairs.names:
-                self.columns |= {f"pair/{name}/{what}": (3,) for what in ("force", *PAIR.sizes)}
+        for name in self.model.pair_names:
+            self.columns |= {f"pair/{name}/{what}": (3,) for what in ("force", *PAIR.sizes)}
         self.probe_nodes: dict[str, np.ndarray] = {}
         self._probes: list[tuple[str, np.ndarray, np.ndarray]] = []
         for probe in case.output.probe:
@@ -72,7 +70,7 @@ class Recorder:
         self.layout = RowLayout(self.columns, self.types)
         self._contact = ContactColumns(self.model.contact)
         probed = sum(12 * len(nodes) for nodes in self.probe_nodes.values())
-        pairs = 0 if self._pairs is None else PAIR.width * len(self._pairs.names)
+        pairs = PAIR.width * len(self.model.pair_names)
         # where the sums of walls, pairs and probes begin
         self._starts = np.cumsum([HEAD.width, self._contact.size, pairs, probed])
         self._sums = np.zeros(self._starts[-1])
@@ -161,9 +159,10 @@ class Recorder:
         if self._contact.size:
             self._contact.put(sums[walls:pairs], state.time, vector[begin : begin + self._contact.width])
             begin += self._contact.width
-        if self._pairs is not None:
-            columns = vector[begin : begin + (3 + PAIR.width) * len(self._pairs.names)].reshape(-1, 3 + PAIR.width)
-            columns[:, :3] = list(self._pairs.totals().values())
+        names = self.model.pair_names
+        if names:
+            columns = vector[begin : begin + (3 + PAIR.width) * len(names)].reshape(-1, 3 + PAIR.width)
+            columns[:, :3] = list(self.model.pairs.totals().values())
             columns[:, 3:] = sums[pairs:probes].reshape(-1, PAIR.width)
             begin += columns.size
         vector[begin:] = sums[probes:]

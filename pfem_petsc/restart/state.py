@@ -91,7 +91,7 @@ class RunState:
             "energy_scale": recorder.energy_scale,
             "blow_up": blow_up.kept(),
             "pairs": pairs.force.tolist() if (pairs := self.model.pairs) is not None else None,
-            "free_walls": free.kept() if (free := self.model.contact.motion.free) is not None else None,
+            "free_walls": self.model.contact.motion.kept(),
             "contact_times": self.model.contact.log.times(self.comm),
             "row": {name: float(row[name]) for name in ("energy_imbalance", "active_contacts", "step")},
             "closed_pairs": ledger.impacts.closed_pairs.tolist(),
@@ -139,8 +139,7 @@ class RunState:
         sums = {n: np.array(mine["walls"][n], dtype=a.dtype).reshape(a.shape) for n, a in like.items()}
         stepper.solution.walls = dataclasses.replace(walls, **sums)
         stepper.solution.contacts = int(mine["contacts"])
-        if scalars["free_walls"] is not None:
-            self.model.contact.motion.free.put_back(scalars["free_walls"])
+        self.model.contact.motion.put_back(scalars["free_walls"])
         if scalars["pairs"] is not None:
             self.model.pairs.force = np.array(scalars["pairs"], dtype=float)
         self.model.contact.log.put_back(mine["contact_log"], scalars["contact_times"], stepper.touching)

@@ -48,7 +48,7 @@ def _cause(stepper, wave: float) -> str:
             "stronger material, or a smaller time step"
         )
     others = ["take a smaller time.step"]
-    touch = model.contact.any or model.pairs is not None
+    touch = model.can_touch
     if touch and case.contact.treatment == "scheme" and not stepper.scheme.explicit:
         grows = ", which gains energy in impacts" * any("gains energy in impacts" in text for text in model.warnings)
         others.append(f'contact.treatment = "stick" instead of what {case.time.integrator} makes of impact{grows}')

@@ -45,7 +45,7 @@ class ImplicitStepper(Stepper):
     def __init__(self, model, scheme, h: float, choice: LinearChoice) -> None:
         super().__init__(model, scheme, h)
         _free_left_over(model.comm)
-        symmetric = scheme.symmetric and not model.contact.rough
+        symmetric = scheme.symmetric and model.contact.symmetric
         if choice.matrix_free:
             self.hessian = MatrixFreeHessian(model)
         else:
@@ -60,10 +60,10 @@ class ImplicitStepper(Stepper):
             self.hessian.couple(self.pairs)
             if self.lagged is not None:
                 self.lagged.matrix.couple(self.pairs)
-        bounded = unsymmetric(choice) if model.contact.rough else choice
+        bounded = choice if model.contact.symmetric else unsymmetric(choice)
         most = model.case.solver.max_newton
         self.newton = NewtonSolver(model.mesh, self.hessian, choice, bounded, most, model.length, self.lagged)
-        self.newton.prepare(model.contact.any or self.pairs is not None)
+        self.newton.prepare(model.can_touch)
         self.guard = StepGuard(model) if model.case.solver.guard else None
         self._after = np.zeros_like(self.state.x)
         self.level = 0  # the next step is made in 2**level parts
@@ -105,8 +105,7 @@ class ImplicitStepper(Stepper):
     def _set_part(self, part: float) -> None:
         if part != self.part:
             self.scheme.step_changed(self.state)
-            if self.model.contact.motion.free is not None:
-                self.scheme.step_changed(self.model.contact.motion.free.state)
+            self.model.contact.motion.step_changed(self.scheme)
             self.step_changed = True
             self.part = part
         self.smallest = min(self.smallest, part)

@@ -61,7 +61,7 @@ class Impulses:
         model = stepper.model
         self.pairs = model.pairs
         self.n_walls = len(model.contact.names)
-        self.n_pairs = 0 if self.pairs is None else len(self.pairs.names)
+        self.n_pairs = len(model.pair_names)
         self.jumps = WALLS + self.n_walls + self.n_pairs
         rows = self.jumps + self.n_walls + self.n_pairs
         self.state = State(*(np.zeros((rows, 3)) for _ in range(7)))

@@ -41,6 +41,8 @@ class Model:
     nodal_stiffness : (owned,) sum of E A/l0 of a node's bars [N/m]
     rounding : 2-norm of the residual that rounding of positions leaves [N]
     warnings : of the mesh
+    pair_names : of contact pairs, in the order of the case
+    can_touch : whether there is anything that nodes can touch: walls, or each other
     """
 
     def __init__(self, case, comm: MPI.Comm) -> None:
@@ -71,6 +73,9 @@ class Model:
         self.pairs = None
         if case.contact_pair:
             self.pairs = ContactPairs(case, self.nodes, mesh, self.supports.fixed, self.contact)
+
+        self.pair_names = list(self.pairs.names) if self.pairs is not None else []
+        self.can_touch = self.contact.any or self.pairs is not None
 
         points = mesh.points[: mesh.n_owned]
         low, high = points.min(axis=0, initial=np.inf), points.max(axis=0, initial=-np.inf)

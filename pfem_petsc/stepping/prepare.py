@@ -127,13 +127,13 @@ def _linear(model, scheme: Scheme, over: float, steps: int) -> LinearChoice:
     """The choice for steps ``over`` times the limit of central differences."""
     case = model.case
     yielding = any(material.yield_stress is not None for material in case.material.values())
-    impact = yielding or model.contact.any or model.pairs is not None
+    impact = yielding or model.can_touch
     solver, unknowns = case.solver, 3 * model.mesh.n_nodes
     try:
         choice = choose_linear(solver.linear, unknowns, over, scheme.symmetric, solver.operator, steps, impact)
     except InputError as error:
         raise InputError(f"{case.source}: {error}") from error
-    if model.contact.rough and choice.krylov == "cg":
+    if not model.contact.symmetric and choice.krylov == "cg":
         return replace(choice, why=f"{choice.why}; GMRES near walls with friction")
     return choice
 
@@ -158,7 +158,7 @@ def make_stepper(model, plan: Plan) -> Stepper:
     _check_walls(model, plan)
     _warn_of_damping(model, plan)
     name = model.case.contact.treatment
-    touch = model.contact.any or model.pairs is not None
+    touch = model.can_touch
     if name == "scheme" or not touch:
         stepper = _stepper(model, plan, ExplicitStepper)
         if model.contact.restitution.any() and not model.contact.rebounds:

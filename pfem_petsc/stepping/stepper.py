@@ -127,7 +127,7 @@ class Stepper(ABC):
         if model.inertia.damped:
             load -= model.inertia.damping_times(state.v, np.zeros_like(load))
         state.a = self._acceleration(load)
-        if (model.contact.any or model.pairs is not None) and model.inertia.redistribution is None:
+        if model.can_touch and model.inertia.redistribution is None:
             walls = start_at_rest(model, state, self._acceleration, load)
             if walls is not None:
                 held = walls.nodes[walls.touching.any(axis=1)]
@@ -146,18 +146,16 @@ class Stepper(ABC):
         if model.pairs is not None:
             self.pairs_at_start = np.array(list(model.pairs.totals().values()))
         self.scheme.start(state, self.h)
-        free = model.contact.motion.free
-        if free is not None:
-            free.start(self.h)
+        motion = model.contact.motion
+        motion.start(self.h)
         if self.scheme.leads:
-            v, speeds = state.v, free.state.v if free is not None else None
+            v, speeds = state.v, motion.speeds
             self._solve_and_finish()
             self.totals_solved = self._totals()
             self.velocity_solved = state.v
             # what is on a wall has not lost its velocity yet; the scheme goes on from its own memory
             state.v = v
-            if free is not None:
-                free.state.v = speeds
+            motion.set_speeds(speeds)
 
     def acceleration(self) -> np.ndarray:
         """Acceleration (owned, 3) to record [m/s2]; collective where the mass is consistent.
@@ -223,9 +221,7 @@ class Stepper(ABC):
         self.balance = self.scheme.balance(state, self.part)
         if self.model.supports.moving:
             self._prescribe(self.balance)
-        free = self.model.contact.motion.free
-        if free is not None:
-            free.begin(state.time, self.part)
+        self.model.contact.motion.begin(state.time, self.part)
         state.external = self._load(self.balance)
         self.solution = self.solve(self.balance)
         ties = self.model.contact.ties
@@ -239,8 +235,7 @@ class Stepper(ABC):
         self.scheme.finish(state, self.balance, self.solution.u, self.part)
         if self.scheme.leads and self.model.supports.moving:
             self._take_rates(state.time)
-        if free is not None:
-            free.finish(self.part)
+        self.model.contact.motion.finish(self.part)
         if ties.any and self.scheme.turns_held and self.treatment is None:
             rates = self.model.contact.motion.rates(self.balance.time)
             ties.calm(*fresh, state.v, rates, self.part)

@@ -137,7 +137,7 @@ class Simulation:
     def _usable(self) -> None:
         if self._closed:
             raise InputError(
-                f"{self.folder}: this simulation was closed; go on with a new Simulation with restart=True"
+                f"{self.folder}: this simulation was closed; continue with a new Simulation with restart=True"
             )
 
     @property
@@ -225,7 +225,7 @@ class Simulation:
         if self._started and not self.outputs.is_open and self.state.step < self.plan.steps:
             raise InputError(
                 f"{self.folder}: the results of this simulation were closed at step {self.state.step}, when its "
-                "iteration ended; go on with a new Simulation with restart=True, from a checkpoint"
+                "iteration ended; continue with a new Simulation with restart=True, from a checkpoint"
             )
         try:
             self.start()

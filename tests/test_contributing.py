@@ -14,6 +14,7 @@ import pytest
 from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.case import builtin
 from pfem_petsc.cli.main import main
+from pfem_petsc.post.walls import wall_surfaces
 
 TEXT = (Path(__file__).parents[1] / "CONTRIBUTING.md").read_text()
 PACKAGES = ("integrators", "contact.walls", "mesh.generators", "contact.treatments")
@@ -140,6 +141,12 @@ def test_wall_pushes_along_its_normal(integrator, treatment, examples, comm, sha
     scale = np.abs(history["momentum"][0]).max()
     assert np.abs(gained - impulse).max() < 1e-9 * scale
     assert np.abs(history["energy_imbalance"]).max() < 1e-9 * history["kinetic_energy"][0]
+
+
+def test_wall_is_drawn(examples):
+    (surface,) = wall_surfaces(Case.load("polygon_spin").wall, np.array([[-0.5, -0.5, -0.2], [0.5, 0.5, 0.0]]))
+    radius, height = np.linalg.norm(surface.points[:, :2], axis=1), surface.points[:, 2] + 0.6
+    assert radius == pytest.approx(height, abs=1e-12) and height.max() == pytest.approx(0.6)
 
 
 @pytest.mark.parallel

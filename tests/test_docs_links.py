@@ -7,6 +7,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from test_layering import FLOOR
 
 from pfem_petsc import __version__
 
@@ -44,10 +45,13 @@ def test_modules_named_exist(page):
         assert (ROOT / "pfem_petsc" / folder).is_dir(), folder
 
 
-def test_every_folder_has_its_floor():
+def test_every_folder_is_on_its_floor():
+    """The picture is the order that imports are checked against."""
     picture = re.search(r"^```\n(  cli/.*?)^```$", (ROOT / "docs" / "architecture.md").read_text(), re.M | re.S)[1]
-    folders = {p.parent.name for p in (ROOT / "pfem_petsc").glob("*/__init__.py")}
-    assert {name for name in re.findall(r"(\w+)/", picture)} == folders
+    rows = [re.findall(r"(\w+)(?:/|\.py)", row) for row in picture.splitlines()]
+    floors = [[FLOOR[name] for name in row] for row in rows if row]
+    assert {name for row in rows for name in row} == set(FLOOR) - {"__init__", "__main__"}
+    assert all(max(below) < min(above) for above, below in zip(floors, floors[1:], strict=False))
 
 
 def test_readme_leads_to_every_page_and_script():

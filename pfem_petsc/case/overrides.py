@@ -112,8 +112,8 @@ def _put(data: dict[str, Any], parts: list[str], value: Any, where: str) -> tupl
         if isinstance(here, list):
             if not _is_place(part) or int(part) > len(here):
                 raise InputError(
-                    f"{where}: {part!r} is not one of the places of this list: 0 to {len(here)}, of which the last is "
-                    "for a new one"
+                    f"{where}: {part!r} is not an index of this list: 0 to {len(here)}, where the last one "
+                    "appends an item"
                 )
             key: str | int = int(part)
             if key == len(here):

@@ -133,7 +133,7 @@ class Problems:
             owners = [name for name, keys in siblings().items() if key in keys] if len(item["loc"]) == 1 else []
             text = _unknown_key(key, list(model.model_fields), known, taker, owners)
             if taker and where not in self.overridden and any(p[:-1] == where[:-1] for p in self.overridden):
-                text += f"; --set {key_text(where)}= takes it out"
+                text += f"; --set {key_text(where)}= removes it"
             self.add(where, text)
         elif kind == "missing" and len(item["loc"]) == 1:
             self.add(where, f"this key is missing{about}")

@@ -47,7 +47,9 @@ class Case:
         self.__dict__.update(name=name, source=source, folder=Path(folder), overrides=())
 
     def __setattr__(self, key: str, value: Any) -> None:
-        raise AttributeError(f"a case is not changed after it was checked; give {key} to Case.load as an override")
+        raise AttributeError(
+            f"a case cannot be changed after it has been checked; pass {key} to Case.load as an override"
+        )
 
     def __eq__(self, other: object) -> bool:
         """Same content; name, source and folder aside."""

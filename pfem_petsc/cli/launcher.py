@@ -144,7 +144,7 @@ def _message(error: BaseException) -> tuple[int, str]:
     if isinstance(error, PfemError):
         return error.exit_status, f"error: {error}"
     if isinstance(error, KeyboardInterrupt):
-        return SimulationFailure.exit_status, "stopped: interrupted, nothing was saved on this account"
+        return SimulationFailure.exit_status, "stopped: interrupted; no checkpoint was written"
     if isinstance(error, MemoryError):
         return SimulationFailure.exit_status, f"error: out of memory: {error}; use more machines or a smaller mesh"
     if isinstance(error, ModuleNotFoundError) and not str(error.name).startswith(__package__.partition(".")[0]):

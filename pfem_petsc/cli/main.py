@@ -37,7 +37,7 @@ examples:
   {PROGRAM} info results/rod_impact
   mpirun -n 2 {PROGRAM} bench --sizes 100000
 
-CASE alone means run. Everything after -- goes to PETSc. VERB --help tells more."""
+CASE alone means run. Everything after -- goes to PETSc. VERB --help shows more."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:

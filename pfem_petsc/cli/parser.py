@@ -40,7 +40,7 @@ def add_case(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         action="extend",
         default=[],
-        help="set values over those of the case: time.step=1e-5 wall.0.point=[1,0,0]; KEY= takes a key out",
+        help="set values over those of the case: time.step=1e-5 wall.0.point=[1,0,0]; KEY= removes a key",
     )
 
 
@@ -68,7 +68,7 @@ def surviving(result: str, deep: bool | None = None, refuse: bool = False) -> Pa
         lines = wrong if len(wrong) <= SHOWN else [*wrong[:SHOWN], f"... and {len(wrong) - SHOWN} more"]
         text = f"{path}: damaged: " + "\n  ".join(lines)
         if refuse:
-            raise InputError(f"{text}\nrestore it from a copy; what is not named is sound")
+            raise InputError(f"{text}\nrestore it from a copy; everything that is not named is undamaged")
         print(f"warning: {text}", file=sys.stderr, flush=True)
     return path
 

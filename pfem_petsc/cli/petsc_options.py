@@ -13,8 +13,8 @@ from .parser import PROGRAM
 
 __all__ = ["PREFIXES", "start_petsc", "without_effect"]
 
-PREFIXES = ("pfem_contact_full_", "pfem_contact_", "pfem_assembled_", "pfem_")
-"""Of the program's solvers; docs/linear_solvers.md says what each is for."""
+PREFIXES = ("pfem_contact_full_", "pfem_contact_", "pfem_assembled_", "pfem_mass_", "pfem_")
+"""Of the program's solvers, described in docs/linear_solvers.md."""
 
 _SOLVER = ("snes_", "ksp_", "pc_", "mg_", "sub_", "mat_mumps_", "esteig_", "linesearch_")
 _FILES = ("-options_file", "-options_file_yaml")

@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         nargs="?",
         const=True,
-        help="go on from a checkpoint; default: the newest of the output folder; what --set set then stays",
+        help="continue from a checkpoint; default: the newest of the output folder; earlier --set values stay in force",
     )
     parser.add_argument("--quiet", action="store_true", help="no progress on the screen")
     parser.add_argument(

@@ -72,8 +72,8 @@ def check_positions(stepper) -> None:
         others = f'contact.treatment = "scheme" instead of "{case.contact.treatment}"'
     raise SimulationFailure(
         f"step {state.step}, t = {time:.6g} s: node {node} is {-depth:.3g} m beyond wall {contact.names[wall]!r} "
-        f"({count} node{'s' if count > 1 else ''} in all), which contact has not kept: what was computed since it "
-        f"passed is wrong; take a smaller time.step, or {others}"
+        f"({count} node{'s' if count > 1 else ''} in all), which contact did not prevent: what was computed since it "
+        f"passed it is wrong; reduce time.step, or use {others}"
     )
 
 

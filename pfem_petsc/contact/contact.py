@@ -167,7 +167,7 @@ class Contact:
                 raise InputError(
                     f"{self.source}: wall {self.names[k]!r}: node {node} starts {-depth:.6g} "
                     f"m beyond the wall ({count} node{'s' if count > 1 else ''} in all); move the wall or the mesh, "
-                    "turn the normal to the allowed side, name the nodes that it concerns with 'node_set', or let "
+                    "turn the normal to the allowed side, name the nodes that it applies to with 'node_set', or let "
                     "'adjust = true' move the nodes"
                 )
 
@@ -225,7 +225,8 @@ class Contact:
         touched = [name for name, offset in zip(self.names, offsets, strict=True) if offset > -np.inf]
         return (
             f"no position of node {self.mesh.node_ids[node]} satisfies all walls "
-            f"({', '.join(touched)}) and its supports; the walls leave it no room"
+            f"({', '.join(touched)}) and its supports: they are infeasible together; move the "
+            "walls apart, or free the node"
         )
 
     def frames(

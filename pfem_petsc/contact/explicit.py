@@ -146,8 +146,8 @@ class ExplicitContact:
         else:
             node = self.contact.mesh.node_ids[nodes[np.argmax(np.abs(moved - at).max(axis=1))]]
             raise SimulationFailure(
-                f"the place of node {node} on curved walls was not found in {_CURVED_ROUNDS} "
-                "rounds; take a smaller time step"
+                f"the position of node {node} on curved walls did not converge in {_CURVED_ROUNDS} "
+                "iterations; reduce time.step"
             )
         strength = multipliers * stiffness[nodes][:, None]
         force = strength[:, :, None] * normals
@@ -213,7 +213,7 @@ class ExplicitContact:
             if unsettled >= 0:
                 raise SimulationFailure(
                     f"the friction of node {contact.mesh.node_ids[nodes[unsettled]]} on "
-                    "several walls was not settled; take a smaller time step"
+                    "several walls did not converge; reduce time.step"
                 )
             if self.contact.flat.all():
                 break

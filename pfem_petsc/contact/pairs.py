@@ -112,7 +112,7 @@ class ContactPairs:
             pair = int(np.argmin(distance))
             raise InputError(
                 f"{source}: contact_pair {self.names[self.table[pair]]!r}: nodes {self.first[pair]} and "
-                f"{self.second[pair]} start {-distance[pair]:.6g} m beyond each other; turn the direction, which "
+                f"{self.second[pair]} start {-distance[pair]:.6g} m beyond each other; reverse the direction, which "
                 "points from the first to the second, or move the mesh"
             )
 

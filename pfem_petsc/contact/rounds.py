@@ -234,8 +234,8 @@ class ContactRounds:
             names = self.model.comm.allgather(self.model.mesh.node_ids[left[:3]].tolist())
             shown = ", ".join(str(node) for part in names for node in part)
             raise NotConverged(
-                f"step {self.state.step + 1}, t = {self.balance.time:.6g} s: the nodes that touch walls could not be "
-                f"settled in {_ROUNDS} solves{f' (nodes {shown})' if shown else ''}; take a smaller time step"
+                f"step {self.state.step + 1}, t = {self.balance.time:.6g} s: the active set of the walls did not "
+                f"converge in {_ROUNDS} solves{f' (nodes {shown})' if shown else ''}; reduce time.step"
             )
         self._join(joined, broken, x)
         return False
@@ -258,7 +258,7 @@ class ContactRounds:
             raise NotConverged(
                 f"step {self.state.step + 1}, t = {self.balance.time:.6g} s: walls take all directions in which nodes "
                 f"{pairs.first[blocked[0]]} and {pairs.second[blocked[0]]} of contact_pair "
-                f"{pairs.names[pairs.table[blocked[0]]]!r} can part; take an explicit integrator"
+                f"{pairs.names[pairs.table[blocked[0]]]!r} can separate; use an explicit integrator"
             )
 
     def _strengths(self, w: np.ndarray, g: np.ndarray, noise: float) -> np.ndarray:

@@ -87,4 +87,6 @@ def check_length(value: float, where: str) -> None:
         Outside 1e-150 to 1e150.
     """
     if not 1e-150 < value < 1e150:
-        raise InputError(f"{where}: length {value:g} m cannot be computed with; choose one between 1e-150 and 1e150")
+        raise InputError(
+            f"{where}: length {value:g} m overflows double precision when squared; choose one between 1e-150 and 1e150"
+        )

@@ -47,7 +47,7 @@ class LogFile:
             self._file = None
             print(
                 f"warning: {self.path}: the log cannot be written any more ({error.strerror}); "
-                "the run goes on without it",
+                "the run continues without it",
                 file=sys.stderr,
                 flush=True,
             )

@@ -297,7 +297,7 @@ class Progress:
             # what Python itself flushes at exit must find an open end
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         self._stream = self._bar = None
-        self._log_line("nobody reads stdout any more: the run goes on and reports here only", "WARNING")
+        self._log_line("stdout is closed: the run continues and reports here only", "WARNING")
 
     def _log_line(self, text: str, level: str) -> None:
         if self._log is not None:

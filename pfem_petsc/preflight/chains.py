@@ -36,7 +36,8 @@ def chain_warning(count: int, first: int) -> str:
     """What to tell about nodes of :func:`chain_nodes`."""
     nodes = "1 node is" if count == 1 else f"{count} nodes are"
     return (
-        f"{nodes} only connected to two collinear bars, and nothing holds them across; the first is node {first}: was "
-        "the mesh subdivided? Each member of a truss is one bar: in Gmsh `Transfinite Curve {:} = 2;` (a chain of bars "
-        "that is meant, like a cable, needs tension to be stiff)"
+        f"{nodes} only connected to two collinear bars, and nothing supports them laterally; the first is node "
+        f"{first}. "
+        "Was the mesh subdivided? Each member of a truss is one bar: in Gmsh `Transfinite Curve {:} = 2;` (an intended "
+        "chain of bars, such as a cable, needs tension to be stiff)"
     )

@@ -29,8 +29,8 @@ def warnings_before(case, model, plan) -> list[str]:
     pairs, shown = overlapping_bars(model.mesh) if case.mesh.generator is None else (0, [])
     if pairs:
         texts.append(
-            f"{pairs} pair{'s' if pairs > 1 else ''} of bars lie{'' if pairs > 1 else 's'} along each other, from a "
-            f"common node on: {_list(pairs, shown)}; where a node is meant to divide the longer one, take that bar out"
+            f"{pairs} pair{'s' if pairs > 1 else ''} of bars overlap{'' if pairs > 1 else 's'} from a common node on: "
+            f"{_list(pairs, shown)}; if a node is intended to divide the longer one, remove that bar"
         )
     # what is generated is of members in one piece
     chained, first_chained = chain_nodes(model) if case.mesh.generator is None else (0, -1)
@@ -75,9 +75,10 @@ def _nodes_on_bars(mesh, entries: dict[str, str]) -> list[str]:
         entries["same place"] = f"{found.coinciding:,} nodes, {pairs}: merge them unless they are of different bodies"
     if not found.between:
         return []
-    what = "nodes lie on bars that do not use them" if found.between > 1 else "node lies on a bar that does not use it"
+    many = "nodes lie on bars that they are not connected to"
+    what = many if found.between > 1 else "node lies on a bar that it is not connected to"
     shown = _list(found.between, found.shown_between)
-    return [f"{found.between} {what}: {shown}; where they are meant to be connected, divide the bar there"]
+    return [f"{found.between} {what}: {shown}; if they are intended to be connected, divide the bar there"]
 
 
 def _list(count: int, shown: list[str]) -> str:

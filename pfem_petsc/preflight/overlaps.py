@@ -1,4 +1,4 @@
-"""Bars that lie along each other, and bars that pass through nodes which they do not use.
+"""Overlapping bars, and nodes that lie on bars they are not connected to.
 
 The commonest slip of the kind: a bar from node 0 to node 2, and bars 0-1 and 1-2 on the same line. The truss is then
 stiffer and heavier there than meant. Bars that cross at an angle, like bracings, are sound and not told.
@@ -16,7 +16,7 @@ from ..mechanics.compiled import kernel
 __all__ = ["LARGEST", "NodesOnBars", "nodes_on_bars", "overlapping_bars"]
 
 ANGLE = 1e-6
-"""Bars that leave a node at a smaller angle lie along each other [rad]; a node nearer to a bar than that fraction of
+"""Bars that leave a node at a smaller angle overlap [rad]; a node nearer to a bar than that fraction of
 its length lies on it. Coordinates saved in single precision are that exact."""
 
 LARGEST = 20_000_000

@@ -38,8 +38,8 @@ def _materials(case) -> Iterator[str]:
             )
         if material.yield_stress is not None and material.isotropic_hardening + material.kinematic_hardening == 0.0:
             yield (
-                f"{key} yields without hardening: of bars in a row one alone takes all plastic strain, more of it the "
-                "shorter it is, so that results depend on the mesh; give isotropic_hardening or kinematic_hardening"
+                f"{key} yields without hardening: one bar of a row takes all plastic strain, the more the shorter it "
+                "is, so results depend on the mesh; give isotropic_hardening or kinematic_hardening"
             )
 
 
@@ -72,5 +72,5 @@ def _mesh(case, model) -> Iterator[str]:
     if fastest > model.wave_speed:
         yield (
             f"node {node} starts at {engineering(fastest, 'm/s')}, faster than waves in the bars "
-            f"({engineering(model.wave_speed, 'm/s')}): an impact at that speed crushes bars to nothing"
+            f"({engineering(model.wave_speed, 'm/s')}): an impact at that speed crushes bars to zero length"
         )

@@ -37,8 +37,8 @@ def wall_gaps(model) -> tuple[dict[str, str], list[str]]:
         gap, node = min(comm.allgather(mine))
         closing = -min(comm.allgather(float(np.nanmin(rate[:, k], initial=np.inf))))
         if not np.isfinite(gap):
-            told[name] = "concerns no node"
-            warnings.append(f"wall {name!r} concerns no node: name a node_set with nodes, or leave node_set out")
+            told[name] = "applies to no node"
+            warnings.append(f"wall {name!r} applies to no node: name a node_set that has nodes, or omit node_set")
             continue
         told[name] = f"gap {engineering(gap, 'm')} at node {node}"
         if closing > 0.0:
@@ -46,7 +46,7 @@ def wall_gaps(model) -> tuple[dict[str, str], list[str]]:
         elif not pushed and not model.supports.any:
             told[name] += ", not approached"
             warnings.append(
-                f"no node moves towards wall {name!r}, and no force does anything about it: is its normal, or the "
-                "initial velocity, the wrong way round?"
+                f"no node moves towards wall {name!r}, and no force drives one there: check the direction of its "
+                "normal and of the initial velocity"
             )
     return told, warnings

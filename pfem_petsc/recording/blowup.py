@@ -50,7 +50,7 @@ class BlowUp:
             )
         if not np.isfinite(held):
             raise SimulationFailure(
-                f"{when}: the energy is not finite: the motion blew up{self._where(state)}; take a smaller time.step"
+                f"{when}: the energy is not finite: the motion diverged{self._where(state)}; reduce time.step"
             )
         start = held + row["plastic_dissipation"] if self._rows == 0 else 0.0
         self._most = max(self._most, abs(start), *(abs(row[name]) for name in SUPPLIED))
@@ -60,7 +60,7 @@ class BlowUp:
         if self._strange > _ROWS:
             raise SimulationFailure(
                 f"{when}: the integration has created {created:.3g} J, where {self._most:.3g} J were put in: the "
-                f"motion is unstable, fastest at {self._fastest(state)}; take a smaller time.step"
+                f"motion is unstable, fastest at {self._fastest(state)}; reduce time.step"
             )
 
     def _where(self, state) -> str:

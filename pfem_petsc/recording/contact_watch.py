@@ -69,8 +69,8 @@ class ContactWatch:
         elif self.steady and self.rows >= _ROWS:
             self.told = True
             self.tell(
-                f"{at}: the energy in the books, dissipated energy included, has grown by {made}, without contact: the "
-                f"steps are too large for what happens within them{self._causes(row)}; take a smaller time.step"
+                f"{at}: the total energy, dissipated energy included, has grown by {made}, without contact: the "
+                f"steps are too large for the motion within them{self._causes(row)}; reduce time.step"
             )
 
     @staticmethod

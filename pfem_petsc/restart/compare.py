@@ -44,9 +44,9 @@ def changed_keys(path: Path, before: Mapping[str, Any], now: Mapping[str, Any], 
     if refused:
         more = f" (and {len(refused) - 5} more)" if len(refused) > 5 else ""
         raise InputError(
-            f"{path}: belongs to another case than {source}: {'; '.join(lines[key] for key in refused[:5])}{more}. A "
-            f"restart goes on with the same model and time step, and may change {', '.join(FREE)} alone: set the case "
-            "back, or start without --restart"
+            f"{path}: belongs to a different case than {source}: {'; '.join(lines[key] for key in refused[:5])}{more}. "
+            f"A restart continues with the same model and time step, and may change {', '.join(FREE)} only: restore "
+            "the case, or start without --restart"
         )
     return list(lines.values())
 

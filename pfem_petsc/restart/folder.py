@@ -145,7 +145,7 @@ def _refuse_loss(path: Path, plan) -> None:
         reached = max([*times[-1:], *result.times[-1:]])
         raise InputError(
             f"{path}: the results reach t = {engineering(reached, 's')}, beyond time.end = "
-            f"{engineering(plan.step * plan.steps, 's')}: to go on from the checkpoint up to there would cut off "
+            f"{engineering(plan.step * plan.steps, 's')}: to continue from the checkpoint up to there would cut off "
             f"{rows} rows of the history and {snapshots} snapshots; take a later end (--set time.end={reached:.6g} or "
             "more), another folder (-o), or start without --restart, which moves the results aside"
         )

@@ -24,7 +24,9 @@ class ReportedCompilation(Compilation):
         self._speaks = comm.rank == 0 and not quiet
 
     def _tell(self, name: str) -> None:
-        text = f"compiling loops for this machine, once: {name} and what else this kind of case needs, up to a minute"
+        text = (
+            f"compiling loops for this machine (once, up to a minute): {name} and others that this kind of case needs"
+        )
         if self.progress is not None:
             self.progress.message(text)
         elif self._speaks:

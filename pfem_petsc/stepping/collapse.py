@@ -24,7 +24,7 @@ def tell_collapse(stepper, bar: int) -> str:
     way = state.x[b] - state.x[a]
     length, rest = float(np.linalg.norm(way)), float(model.bars.rest[bar])
     if not np.isfinite(length):
-        return f"{when}: the positions of {name} are not finite: the motion blew up; take a smaller time step"
+        return f"{when}: the positions of {name} are not finite: the motion diverged; reduce time.step"
     how = f"collapsed to {length:.3g} m" if bar == stepper.energy.failed else "gone through zero length"
     past = stepper.before[b] - stepper.before[a]
     speed = float(np.linalg.norm(way - past)) / stepper.part
@@ -45,15 +45,22 @@ def _cause(stepper, wave: float) -> str:
     if fastest >= _STRONG * wave:
         return (
             f"at {engineering(fastest, 'm/s')} the impact is too strong for a truss model: take a lower speed, a "
-            "stronger material, or a smaller time step"
+            "stronger material, or a smaller time.step"
         )
+<<<<<<< HEAD
     others = ["take a smaller time.step"]
     touch = model.can_touch
+=======
+    others = ["reduce time.step"]
+    touch = model.contact.any or model.pairs is not None
+>>>>>>> docs
     if touch and case.contact.treatment == "scheme" and not stepper.scheme.explicit:
         grows = ", which gains energy in impacts" * any("gains energy in impacts" in text for text in model.warnings)
-        others.append(f'contact.treatment = "stick" instead of what {case.time.integrator} makes of impact{grows}')
+        others.append(
+            f'use contact.treatment = "stick" instead of the formulas of {case.time.integrator} at impact{grows}'
+        )
     if touch and case.contact.treatment != "scheme":
-        others.append(f'another contact.treatment than "{case.contact.treatment}"')
+        others.append(f'use another contact.treatment than "{case.contact.treatment}"')
     ways = ", or ".join(others)
     if model.external.active or any(s.motion is not None or s.velocity is not None for s in case.support):
         return f"loads and supports crush it, or the time integration does not follow the motion: {ways}"

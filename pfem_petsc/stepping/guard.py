@@ -89,7 +89,7 @@ class StepGuard:
         if largest > LARGEST:
             worst = max(comm.allgather(worst))
             return (
-                f"the solution found is too far from the state before it: bar {worst.bar} between nodes "
+                f"the solution is too far from the previous state: bar {worst.bar} between nodes "
                 f"{worst.nodes[0]} and {worst.nodes[1]} changes by {worst.change:.3g} of its length and turns by "
                 f"{worst.turn:.3g} degrees, {worst.value:.3g} lengths from where its motion leads"
             )
@@ -123,16 +123,16 @@ class StepGuard:
         start, end, straight, curved, energy = sums.tolist()
         if end - start > GAIN * energy:
             return (
-                f"the solution found has energy from nowhere: the bars hold {end:.3g} J instead of {start:.3g} J "
-                f"before, and {2.0 * energy:.3g} J were at hand"
+                f"the solution has gained energy without a source: the bars hold {end:.3g} J instead of {start:.3g} J "
+                f"before, and {2.0 * energy:.3g} J were available"
             )
         top = min(straight, curved)
         height = top - max(start, end)
         if not height > OVER * energy:
             return None
         return (
-            f"the solution found lies beyond a barrier: on the way the bars hold {top:.3g} J, before and after "
-            f"{start:.3g} and {end:.3g} J, and {energy:.3g} J were at hand to pass it"
+            f"the solution lies beyond an energy barrier: on the way there the bars hold {top:.3g} J, before and after "
+            f"{start:.3g} and {end:.3g} J, and {energy:.3g} J were available to pass it"
         )
 
     def _stored(self, x: np.ndarray) -> float:

@@ -32,7 +32,7 @@ atexit.register(gc.collect)
 __all__ = ["ImplicitStepper"]
 
 _HALVINGS = 10  # most halvings of a step: to 1/1024
-_WAY_OUT = "Take a smaller time.step; where such jumps are meant, solver.guard = false"
+_WAY_OUT = "Reduce time.step; if such jumps are intended, set solver.guard = false"
 
 
 class ImplicitStepper(Stepper):
@@ -90,13 +90,13 @@ class ImplicitStepper(Stepper):
                 self._make_part(end if done + size == ticks else start + self.h * ((done + size) / ticks))
             except NotConverged as failure:
                 if size == 1:
-                    raise NotConverged(f"{failure} (the step was halved {_HALVINGS} times)") from failure
+                    raise NotConverged(f"{failure} (the step was bisected {_HALVINGS} times)") from failure
                 if self.model.temperatures.varying:
                     # the failed solve has heated the bars to its own end
                     self.model.temperatures.apply(self.state.time)
                 size //= 2
                 self.level += 1
-                self.message(f"{failure}; halving the step to {self.h * size / ticks:.4g} s")
+                self.message(f"{failure}; bisecting the step, to {self.h * size / ticks:.4g} s")
                 continue
             done += size
         self.level = max(self.level - 1, 0)
@@ -299,8 +299,8 @@ class ImplicitStepper(Stepper):
         residual, node = max(model.comm.allgather(worst))
         return (
             f"{self.when(problem.balance)}: no convergence after {report.newton} "
-            f"Newton iterations: {report.why}; residual {report.norm:.3g} N, asked {tolerance:.3g} N; worst at "
-            f'node {node} ({residual:.3g} N). Take a smaller time.step, or solver.linear = "mumps"'
+            f"Newton iterations: {report.why}; residual {report.norm:.3g} N, required {tolerance:.3g} N; worst at "
+            f'node {node} ({residual:.3g} N). Reduce time.step, or set solver.linear = "mumps"'
         )
 
 

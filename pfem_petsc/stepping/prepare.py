@@ -82,7 +82,7 @@ def make_plan(model, recorded: Mapping[str, Any] | None = None) -> Plan:
         frequency = Frequency(*recorded["frequency"])
     if not np.isfinite(frequency.upper):
         raise InputError(
-            f"{case.source}: material: the stiffness of the bars over their mass cannot be computed with: correct "
+            f"{case.source}: material: the stiffness of the bars over their mass overflows double precision: correct "
             "young_modulus, density and area (SI units)"
         )
     # mass-proportional damping: xi = c_m / (2 rho omega) is largest where c_m / rho is
@@ -109,7 +109,7 @@ def make_plan(model, recorded: Mapping[str, Any] | None = None) -> Plan:
         if step > certain * (1.0 + 1e-9):
             raise InputError(
                 f"{case.source}: time.step = {step:g} s is above the limit of {time.integrator}, which is unstable "
-                f'beyond {critical:.6g} s for this model; take a smaller step or time.step = "auto"'
+                f'beyond {critical:.6g} s for this model; reduce it, or use time.step = "auto"'
             )
         steps = _steps_to(time.end, step, case.source)
     asked = case.solver.linear, case.solver.operator
@@ -210,7 +210,10 @@ def _check_walls(model, plan: Plan) -> None:
     walls = model.case.wall
     if any(wall.mass is not None for wall in walls):
         if model.case.contact.treatment != "scheme":
-            raise InputError(f'{model.case.source}: wall.mass needs contact.treatment = "scheme": walls cannot jump')
+            raise InputError(
+                f'{model.case.source}: wall.mass needs contact.treatment = "scheme": other '
+                "treatments change velocities by jumps"
+            )
         model.contact.motion.free = FreeWalls(walls, plan.scheme, model.comm, tuple(model.external.gravity))
     if model.pairs is not None:
         model.pairs.check_scheme(plan.linear is None, model.case.contact.treatment)

@@ -66,6 +66,6 @@ class RedistributedStepper(Stepper):
         if not largest <= 1e-9 * model.length and self.fault is None:
             self.fault = SimulationFailure(
                 f"{self.when(balance)}: contact nodes without mass found no equilibrium (last move {largest:.3g} "
-                "m); take a smaller time.step or another contact.treatment"
+                "m); reduce time.step or use another contact.treatment"
             )
         u[nodes] = x[nodes] - balance.predictor[nodes]

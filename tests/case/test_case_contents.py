@@ -228,8 +228,8 @@ def test_given_tables_stay_as_they_are(case_text):
         ("time.=1", "expected KEY=VALUE"),
         ("wall[x].name=1", "expected KEY=VALUE"),
         ("wall[0]name=1", "expected KEY=VALUE"),
-        ("wall.3.name=a", "'3' is not one of the places of this list: 0 to 1"),
-        ("wall.first.name=a", "'first' is not one of the places"),
+        ("wall.3.name=a", "'3' is not an index of this list: 0 to 1"),
+        ("wall.first.name=a", "'first' is not an index of this list"),
         ("time.step.unit=s", "time.step is a value, not a table"),
     ],
 )

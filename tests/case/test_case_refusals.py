@@ -274,7 +274,7 @@ def test_mesh_file_takes_no_generator_keys(case_text):
 def test_parameter_of_another_scheme_is_refused_with_the_way_out():
     data = Case.load("rod_impact", ["time.integrator=newmark", "time.beta=0.25"]).to_dict()
     with pytest.raises(
-        InputError, match=r"time.beta: a key of chung_lee, newmark, not of houbolt, .*; --set time.beta= takes it out"
+        InputError, match=r"time.beta: a key of chung_lee, newmark, not of houbolt, .*; --set time.beta= removes it"
     ):
         Case.from_dict(data, overrides=["time.integrator=houbolt"])
     taken_out = ["time.integrator=houbolt", "time.beta=", "time.gamma="]

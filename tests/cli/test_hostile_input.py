@@ -9,7 +9,7 @@ import pytest
 from pfem_petsc import Case
 from pfem_petsc.cli.launcher import _message
 from pfem_petsc.cli.main import main
-from pfem_petsc.cli.petsc_options import without_effect
+from pfem_petsc.cli.petsc_options import PREFIXES, without_effect
 from pfem_petsc.errors import InputError, printable
 from pfem_petsc.restart.folder import _prepare
 
@@ -83,6 +83,10 @@ def test_an_options_file_that_is_not_there(capsys):
 
 def test_solver_options_without_effect_are_told():
     assert without_effect(["-pfem_snes_monitor", "-pfem_assembled_pc_gamg_threshold", "0.02", "-log_view"]) == []
+    table = (Path(__file__).parents[2] / "docs" / "linear_solvers.md").read_text()
+    examples = [row.split("`")[3] for row in table.splitlines() if row.startswith("| `pfem_")]
+    assert len(examples) == len(PREFIXES)
+    assert [line for example in examples for line in without_effect(example.split())] == []
     (line,) = without_effect(["-ksp_rtol", "1e-3"])
     assert "did you mean -pfem_ksp_rtol?" in line
     (line,) = without_effect(["-pfem_contct_snes_type", "nope"])

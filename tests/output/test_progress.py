@@ -211,7 +211,7 @@ def test_reader_of_stdout_that_leaves_does_not_stop_the_run(tmp_path):
     progress.message("one")
     progress.message("two")
     progress.close()
-    assert "nobody reads stdout" in log.read_text() and "two" in log.read_text()
+    assert "stdout is closed" in log.read_text() and "two" in log.read_text()
 
 
 class Terminal(io.StringIO):

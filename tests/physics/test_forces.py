@@ -86,4 +86,4 @@ def test_halving(shared_tmp_path, comm):
     # two iterations or fewer a part, and more than one part where the step was halved
     assert history["newton_iterations"].max() > 2
     if comm.rank == 0:
-        assert "halving the step" in (shared_tmp_path / "log.txt").read_text()
+        assert "bisecting the step" in (shared_tmp_path / "log.txt").read_text()

@@ -125,11 +125,11 @@ def test_bar_that_lies_along_two_others(comm, shared_tmp_path):
     simulation = Simulation(case_of(shared_tmp_path, comm, TRIANGLE, bars), comm, check_only=True)
     (text,) = warnings_before(simulation.case, simulation.model, simulation.plan)
     assert text.startswith(
-        "2 pairs of bars lie along each other, from a common node on: bar 0 (nodes 0 and 1) and bar 4 (nodes 2 and 0), "
+        "2 pairs of bars overlap from a common node on: bar 0 (nodes 0 and 1) and bar 4 (nodes 2 and 0), "
         "bar 1 (nodes 1 and 2) and bar 4 (nodes 2 and 0); "
     )
     last = simulation.inspect()[1][-1]
-    assert last.startswith("1 node lies on a bar that does not use it: node 1 on bar 4 (nodes 2 and 0); ")
+    assert last.startswith("1 node lies on a bar that it is not connected to: node 1 on bar 4 (nodes 2 and 0); ")
 
 
 def test_bars_that_meet_or_cross_at_an_angle_are_sound(comm, shared_tmp_path):
@@ -151,7 +151,7 @@ def test_overlaps_without_a_common_node(comm, shared_tmp_path):
     _, warnings = told(shared_tmp_path, comm, 50.0 + points @ q, bars)
     (text,) = [text for text in warnings if "lie on bars" in text]
     on = "node 1 on bar 0 (nodes 0 and 2), node 2 on bar 1 (nodes 1 and 3)"
-    assert text.startswith(f"2 nodes lie on bars that do not use them: {on}; ")
+    assert text.startswith(f"2 nodes lie on bars that they are not connected to: {on}; ")
     assert not any("along each other" in text for text in warnings)
 
 

@@ -80,7 +80,7 @@ def test_verb_without_steps_is_interrupted_at_once():
     )
     done = subprocess.run([*command(1)[:1], "-c", code], env=environment(), capture_output=True, text=True, timeout=200)
     assert done.returncode == 3
-    assert done.stderr == "stopped: interrupted, nothing was saved on this account\n"
+    assert done.stderr == "stopped: interrupted; no checkpoint was written\n"
 
 
 @pytest.fixture

@@ -48,7 +48,7 @@ def test_a_slow_impact_is_not_called_too_strong(comm, shared_tmp_path):
     assert "has gone through zero length" in message and "too strong" not in message
     assert "waves in it at 1.000 m/s" in message
     assert "nothing in the case is faster than 300.0 mm/s" in message
-    assert "take a smaller time.step" in message and 'contact.treatment = "stick"' in message
+    assert "reduce time.step" in message and 'contact.treatment = "stick"' in message
 
 
 def test_strong_but_bearable_impact_runs_on(comm, shared_tmp_path):
@@ -89,7 +89,7 @@ def test_truss_crushed_between_walls(scheme, comm, shared_tmp_path):
     }
     case = Case.from_dict(data, source="crush.toml", folder=shared_tmp_path)
     simulation = Simulation(case, comm, output=shared_tmp_path / "it", quiet=True)
-    with pytest.raises(SimulationFailure, match="the walls leave it no room|collapsed|zero length") as failure:
+    with pytest.raises(SimulationFailure, match="they are infeasible together|collapsed|zero length") as failure:
         simulation.run()
     assert 0.01 < simulation.state.time < 0.105
     assert comm.allgather(str(failure.value)) == [str(failure.value)] * comm.size
@@ -110,9 +110,9 @@ def test_no_convergence(comm, shared_tmp_path):
         "no convergence after 1 Newton iterations",
         "the limit of Newton iterations was reached [DIVERGED_MAX_IT]",
         "residual ",
-        "asked ",
+        "required ",
         "worst at node ",
-        "smaller time.step",
+        "Reduce time.step",
     ):
         assert part in message
     # the residual of the worst node is an error, not what the wall bears
@@ -130,4 +130,4 @@ def test_step_above_the_limit_of_the_deformed_model_is_told(comm, shared_tmp_pat
     keys += ["load=[{node_set='tip', force=[1.5, 0.0, 0.0]}]"]
     message, _ = failing(comm, shared_tmp_path / "it", *keys)
     assert "step" in message
-    assert "smaller time" in message
+    assert "reduce time.step" in message.lower()

@@ -59,8 +59,8 @@ def test_a_dome_is_not_turned_inside_out(step, comm, shared_tmp_path):
     assert row["elastic_energy"] == pytest.approx(small["elastic_energy"], rel=1e-5)
     place = [r["probe/apex/position"][0, 2] for r in (row, small)]
     assert place[0] == pytest.approx(place[1], abs=1e-8) and 0.0819 < place[0] < 0.0821
-    assert told and "halving the step" in told[0] and "solver.guard = false" in told[0]
-    assert any("energy from nowhere" in text or "too far from the state before" in text for text in told)
+    assert told and "bisecting the step" in told[0] and "solver.guard = false" in told[0]
+    assert any("energy without a source" in text or "too far from the previous state" in text for text in told)
 
 
 def test_without_the_guard_the_dome_turns(comm, shared_tmp_path):
@@ -80,7 +80,7 @@ def test_a_step_that_is_refused_leaves_the_state_as_it_was(comm, shared_tmp_path
     before = {name: getattr(state, name).copy() for name in ("x", "v", "a", "f", "external", "contact", "support")}
     held, ledger = stepper.held.copy(), simulation.outputs.history.ledger.sums.copy()
     monkeypatch.setattr(StepGuard, "check", lambda self, *rest: "the solution is suspicious")
-    with pytest.raises(NotConverged, match="step 4, .*suspicious.*guard = false.*halved 10 times") as failure:
+    with pytest.raises(NotConverged, match="step 4, .*suspicious.*guard = false.*bisected 10 times") as failure:
         stepper.step()
     assert isinstance(failure.value, SimulationFailure) and failure.value.exit_status == 3
     for name, array in before.items():

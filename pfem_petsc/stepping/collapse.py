@@ -47,13 +47,8 @@ def _cause(stepper, wave: float) -> str:
             f"at {engineering(fastest, 'm/s')} the impact is too strong for a truss model: take a lower speed, a "
             "stronger material, or a smaller time.step"
         )
-<<<<<<< HEAD
-    others = ["take a smaller time.step"]
-    touch = model.can_touch
-=======
     others = ["reduce time.step"]
-    touch = model.contact.any or model.pairs is not None
->>>>>>> docs
+    touch = model.can_touch
     if touch and case.contact.treatment == "scheme" and not stepper.scheme.explicit:
         grows = ", which gains energy in impacts" * any("gains energy in impacts" in text for text in model.warnings)
         others.append(

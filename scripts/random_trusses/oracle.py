@@ -63,8 +63,10 @@ def _walls(result: Loaded, case: Case, history: dict[str, np.ndarray]) -> Faults
     tolerance = (1e-6 if case.output.precision == "float32" else 1e-9) * max(size, float(np.abs(start).max()))
     rows = {int(step): row for row, step in enumerate(history["step"])}
     # supports that prescribe all components of a node carry it where they say: walls do not count
-    whole = [_members(case, support.node_set, result) for support in case.support if set(support.fix) == set("xyz")]
-    carried = np.concatenate([np.empty(0, dtype=np.int64), *whole])
+    fixed = np.zeros(start.shape, dtype=bool)
+    for support in case.support:
+        fixed[np.ix_(_members(case, support.node_set, result), ["xyz".index(c) for c in support.fix])] = True
+    carried = np.flatnonzero(fixed.all(axis=1))
     for wall in case.wall:
         members = np.setdiff1d(_members(case, wall.node_set, result), carried)
         moved = history.get(f"wall/{wall.name}/position")

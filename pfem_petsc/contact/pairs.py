@@ -67,6 +67,7 @@ class ContactPairs:
         self.free = np.zeros((*ends.shape, 3))
         self.free[self.mine] = np.where(fixed[self.local[self.mine]], 0.0, 1.0)
         mesh.comm.Allreduce(MPI.IN_PLACE, self.free)
+        self._along = np.einsum("epi,pi->ep", self.free, self.normals**2)  # how far ends give way to their pairs
         self._ends = self.local[self.mine]
         self.coupled = CoupledPairs(self, contact)
         self.release()
@@ -203,7 +204,7 @@ class ContactPairs:
 
     def reduced_mass(self, mass: np.ndarray) -> np.ndarray:
         """1/(1/m_1 + 1/m_2) (p,) [kg] along the directions, from those of owned nodes (owned,). Collective."""
-        gives = (np.einsum("epi,pi->ep", self.free, self.normals**2) / self.gather(mass)).sum(axis=0)
+        gives = (self._along / self.gather(mass)).sum(axis=0)
         return 1.0 / np.maximum(gives, 1e-300)
 
     def keep(self, values: np.ndarray, of_pairs: np.ndarray) -> None:
@@ -222,7 +223,7 @@ class ContactPairs:
         data[self.mine, :3] = x
         data[self.mine, 3] = 1.0 / stiffness[self._ends]
         self.sum(data)
-        soft = (data[:, :, 3] * np.einsum("epi,pi->ep", self.free, self.normals**2)).sum(axis=0)
+        soft = (data[:, :, 3] * self._along).sum(axis=0)
         usable = (soft > 0.0) & (least > -np.inf)
         short = np.where(usable, least, 0.0) - self.distances(data[:, :, :3])
         return np.where(usable, short / np.maximum(soft, 1e-300), 0.0)
@@ -233,6 +234,8 @@ class ContactPairs:
 
     def _pushes(self, force: np.ndarray) -> Iterator[tuple[int, np.ndarray, np.ndarray, np.ndarray]]:
         """Of both ends: end, (p,) pairs whose force acts on it here, nodes (k,), forces (k, 3) [N]."""
+        if not force.any():
+            return
         for end, sign in ((0, -1.0), (1, 1.0)):
             here = self.mine[end] & (force != 0.0)
             yield end, here, self.local[end, here], sign * force[here, None] * self.normals[here]

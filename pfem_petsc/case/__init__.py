@@ -1,1 +1,1 @@
-"""Case files: what a simulation is told, as checked models."""
+"""Case files as checked models."""

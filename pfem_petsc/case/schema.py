@@ -1,4 +1,4 @@
-"""A case: everything that a simulation is told, read from a TOML file and checked before any work is done."""
+"""A case: the complete input of a simulation, read from a TOML file and checked before any work is done."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Options for PETSc on the command line: started with them, and told where they would have no effect."""
+"""Options for PETSc on the command line; options without effect are reported."""
 
 from __future__ import annotations
 

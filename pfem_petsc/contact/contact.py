@@ -1,4 +1,4 @@
-"""Walls and the nodes they stop: who can touch what, and the forces that result."""
+"""Walls and the nodes that they stop: which nodes can touch which walls, and the contact forces."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The contact side of an implicit step: who may touch what, bounds, and re-solves until nothing unexpected is left.
+"""Contact in an implicit step: candidate nodes, bounds, and repeated solves until no wall is violated.
 
 A step is solved with bounds for the nodes that may reach a wall. Afterwards all walls are verified: nodes that were not
 expected at a wall, walls that found no place among three coordinates, curved walls whose tangent plane was that of

@@ -1,4 +1,4 @@
-"""The energies of the history, one line each: its name, its side of the balance, and who knows it."""
+"""The energies of the history, one line each: name, side of the balance, and source."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Results in one VTKHDF file, written by all ranks together and readable by ParaView, also while the run goes on."""
+"""Results in one VTKHDF file, written by all ranks together and readable by ParaView, also during the run."""
 
 from __future__ import annotations
 

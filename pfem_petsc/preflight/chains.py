@@ -1,4 +1,4 @@
-"""Chains of collinear bars: what a mesh generator makes of a truss whose lines it divides."""
+"""Chains of collinear bars, the result of a mesh generator that divides the lines of a truss."""
 
 from __future__ import annotations
 

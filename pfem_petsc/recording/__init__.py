@@ -1,1 +1,1 @@
-"""What a run writes of its steps: rows of the history, snapshots, checkpoints, progress."""
+"""Recording of steps: rows of the history, snapshots, checkpoints, progress."""

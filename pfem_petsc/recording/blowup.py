@@ -1,4 +1,4 @@
-"""Motions that blow up: found by the energy, told with the first bar and node."""
+"""Divergence of the motion: detected by the energy, reported with the fastest node."""
 
 from __future__ import annotations
 

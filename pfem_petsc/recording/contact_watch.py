@@ -1,4 +1,4 @@
-"""Energy that contact or an implicit scheme makes: watched while a run goes on, and told once."""
+"""Energy produced by contact or an implicit scheme: monitored during the run, and reported once."""
 
 from __future__ import annotations
 

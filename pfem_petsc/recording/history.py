@@ -1,4 +1,4 @@
-"""The rows of the history: energies booked step by step, rows written, and what they show of a run that goes wrong."""
+"""The rows of the history: energies accumulated step by step, rows written, and checked for divergence."""
 
 from __future__ import annotations
 

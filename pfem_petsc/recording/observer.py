@@ -1,4 +1,4 @@
-"""What looks at a run after its steps: when it is due, and what it needs."""
+"""Observers act after steps: each states when it is due and what it needs."""
 
 from __future__ import annotations
 

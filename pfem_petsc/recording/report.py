@@ -1,4 +1,4 @@
-"""Progress of a run, told after each step."""
+"""Progress of a run, reported after each step."""
 
 from __future__ import annotations
 

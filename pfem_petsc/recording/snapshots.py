@@ -1,4 +1,4 @@
-"""Snapshots of the fields, with a look at walls before each."""
+"""Snapshots of the fields; positions are checked against the walls before each."""
 
 from __future__ import annotations
 

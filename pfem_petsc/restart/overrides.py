@@ -1,4 +1,4 @@
-"""Which values set over those of the case file a restart goes on with: those of the run that it continues."""
+"""Values of --set that a restart keeps from the run that it continues."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""What a run has beside its physics: agreements of the ranks, requests to stop, results that are opened."""
+"""A run around its analysis: outputs, synchronisation of the ranks, requests to stop."""

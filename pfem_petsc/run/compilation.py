@@ -1,4 +1,4 @@
-"""What a run tells of the compilation of loops."""
+"""Messages of a run about the compilation of loops."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""All that a run writes and tells: opened at its start, served after its steps in a fixed order, closed at its end."""
+"""All outputs of a run: opened at its start, served after steps in a fixed order, closed at its end."""
 
 from __future__ import annotations
 

@@ -9,8 +9,8 @@ __all__ = ["linear_reason", "newton_reason"]
 _NEWTON = {
     "DIVERGED_FUNCTION_DOMAIN": "the positions left the domain of the model (a collapsed bar)",
     "DIVERGED_LINEAR_SOLVE": "a linear solve failed",
-    "DIVERGED_FNORM_NAN": "the residual is not a number (a bar collapsed or the motion blew up)",
-    "DIVERGED_FUNCTION_NANORINF": "the residual is not a number (a bar collapsed or the motion blew up)",
+    "DIVERGED_FNORM_NAN": "the residual is not a number (a bar collapsed or the motion diverged)",
+    "DIVERGED_FUNCTION_NANORINF": "the residual is not a number (a bar collapsed or the motion diverged)",
     "DIVERGED_MAX_IT": "the limit of Newton iterations was reached",
     "DIVERGED_LINE_SEARCH": "the line search found no decrease of the residual",
     "DIVERGED_LOCAL_MIN": "the residual has a local minimum that is not zero",

@@ -187,7 +187,8 @@ def on_ranks() -> Callable[..., subprocess.CompletedProcess]:
     """
 
     def run(ranks: int, *arguments: str | Path, timeout: float = 400.0, **options) -> subprocess.CompletedProcess:
-        environment = {name: value for name, value in os.environ.items() if not name.startswith(OF_A_LAUNCH)}
+        left = (*OF_A_LAUNCH, "PYTEST_XDIST_")
+        environment = {name: value for name, value in os.environ.items() if not name.startswith(left)}
         environment |= dict.fromkeys(
             ("OMPI_ALLOW_RUN_AS_ROOT", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM", "OMPI_MCA_rmaps_base_oversubscribe"), "1"
         )

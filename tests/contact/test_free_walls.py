@@ -118,7 +118,7 @@ def test_refused(comm, shared_tmp_path):
         )
     with pytest.raises(InputError, match="gravity = true needs the wall's mass"):
         simulation(lattice_case(planes([[0, 0, 1.0]], [-0.1], gravity=True)), comm, shared_tmp_path)
-    with pytest.raises(InputError, match="walls cannot jump"):
+    with pytest.raises(InputError, match="change velocities by jumps"):
         case = lattice_case(planes([[0, 0, 1.0]], [-0.1], mass=1.0), contact={"treatment": "stick"})
         simulation(case, comm, shared_tmp_path)
 

@@ -43,7 +43,8 @@ KINDS = {
 
 def environment() -> dict[str, str]:
     """That of a process which no launcher has started."""
-    left = ("PMIX_", "PMI_", "OMPI_COMM_", "OMPI_MCA_orte_", "OMPI_MCA_ess_", "OMPI_UNIVERSE_", "OPAL_", "ORTE_")
+    left = ("PMIX_", "PMI_", "OPAL_", "ORTE_", "OMPI_COMM_", "OMPI_APP_", "OMPI_UNIVERSE_", "OMPI_MCA_orte_")
+    left += ("OMPI_MCA_ess", "OMPI_MCA_pmix", "PYTEST_XDIST_")
     variables = {name: value for name, value in os.environ.items() if not name.startswith(left)}
     allowed = ("OMPI_ALLOW_RUN_AS_ROOT", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM", "OMPI_MCA_rmaps_base_oversubscribe")
     variables |= dict.fromkeys((*allowed, "OMPI_MCA_mpi_yield_when_idle", "OMP_NUM_THREADS"), "1")

@@ -112,6 +112,6 @@ def test_restart_from_two_ranks_on_one_and_three(tmp_path, scheme, on_ranks):
     assert done.returncode == 0, done.stderr
     for ranks in (1, 3):
         folder = shutil.copytree(tmp_path / "half", tmp_path / str(ranks))
-        done = on_ranks(ranks, *words, folder, "--restart")
+        done = on_ranks(ranks, *words, folder, "--restart", "--set", "time.end=0.8")
         assert done.returncode == 0, done.stderr
         assert_near(tmp_path / "alone", folder)

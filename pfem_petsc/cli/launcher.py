@@ -103,6 +103,7 @@ def collectively(function: Callable[[MPI.Comm], int], debug: bool) -> int:
         status = _print(error, debug) if comm.rank == 0 else None
         status = failures.bcast(status, root=0)
     failures.Free()
+    _let_go_of_closed_streams()
     return status
 
 
@@ -131,6 +132,20 @@ def _print(error: BaseException, debug: bool, who: str = "") -> int:
     except OSError:
         _to_nowhere(sys.stderr)
     return status
+
+
+def _let_go_of_closed_streams() -> None:
+    """Python flushes both streams at its end, and exits with 120 where that fails."""
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            number = stream.fileno()
+        except (OSError, ValueError):  # not a file: captured, or closed
+            continue
+        try:
+            stream.flush()
+            os.write(number, b"")  # a terminal that has gone refuses even nothing
+        except OSError:
+            _to_nowhere(stream)
 
 
 def _to_nowhere(stream: TextIO) -> None:

@@ -4,8 +4,7 @@ All ranks run the same tests in step. The outcome of each phase of a test (set-u
 failure on one rank is a failure everywhere, with that rank's report. A rank that waits for the others too long, as
 when one of them left a collective call early by an exception, says so and ends the run. Only rank 0 prints.
 
-On three ranks and more, which share two cores, tests with many sets of parameters run every third of them
-(``--all-sets``: all).
+On several ranks, which share two cores, tests with many sets of parameters run a part of them (``--all-sets``: all).
 """
 
 from __future__ import annotations
@@ -51,7 +50,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--all-sets",
         action="store_true",
-        help="on three ranks and more: all sets of parameters of each test, not every third",
+        help="on several ranks: all sets of parameters of each test, not every second or third",
     )
 
 
@@ -85,19 +84,20 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if AGREEMENT is None:
         return
     kept = [item for item in items if item.get_closest_marker("parallel") is not None]
-    if WORLD.size > 2 and not config.option.all_sets:
-        kept = thinned(kept)
+    if not config.option.all_sets:
+        kept = thinned(kept, WORLD.size)
     chosen = set(kept)
     config.hook.pytest_deselected(items=[item for item in items if item not in chosen])
     items[:] = kept
 
 
-def thinned(items: list[pytest.Item]) -> list[pytest.Item]:
-    """Every test function, of those with more than three sets of parameters every third set."""
+def thinned(items: list[pytest.Item], ranks: int) -> list[pytest.Item]:
+    """Every test function; of those with many sets of parameters every second on 2 ranks, every third on 3."""
     sets: dict[tuple[Path, str], list[pytest.Item]] = {}
     for item in items:
         sets.setdefault((item.path, getattr(item, "originalname", item.name)), []).append(item)
-    chosen = {item for group in sets.values() for item in (group if len(group) <= 3 else group[::3])}
+    stride = min(ranks, 3)
+    chosen = {item for group in sets.values() for item in (group if len(group) <= 3 else group[stride - 2 :: stride])}
     return [item for item in items if item in chosen]
 
 

@@ -49,7 +49,8 @@ CASES = {
     "conserving": ("rod_impact", (*SHORT, "time.integrator=newmark", "contact.treatment=conserving")),
     "mass redistribution": ("rod_impact", (*SHORT, "contact.treatment=mass_redistribution")),
     "pairs": ("rod_impact", (*SHORT, *TWO_RODS)),
-    "pairs, implicit": ("rod_impact", (*SHORT, *TWO_RODS, "time.integrator=generalized_alpha")),
+    # MUMPS, which small models take on several ranks, repeats to rounding only
+    "pairs, implicit": ("rod_impact", (*SHORT, *TWO_RODS, "time.integrator=generalized_alpha", "solver.linear=cg")),
     "wall with mass": ("rod_impact", (*SHORT, "wall.0.mass=0.5", "wall.0.velocity=[-0.1,0,0]")),
     "wall with mass, implicit": (
         "rod_impact",

@@ -97,7 +97,8 @@ def write_checkpoint(
     """
     require_parallel_hdf5(comm)
     path = Path(path)
-    slabs = {name: order.to_slab(np.asarray(array)) for name, (order, array) in arrays.items()}
+    # by name: what contact remembers may have come in another order on another rank
+    slabs = {name: arrays[name][0].to_slab(np.asarray(arrays[name][1])) for name in sorted(arrays)}
     shapes = {name: ((arrays[name][0].n_global, *slab.shape[1:]), slab.dtype) for name, slab in slabs.items()}
     n_bytes = sum(dtype.itemsize * int(np.prod(shape, dtype=np.int64)) for shape, dtype in shapes.values())
     require_room(comm, path, n_bytes, target=path.parent)

@@ -65,9 +65,13 @@ class RunState:
         """Name to (order, rows owned by this rank) of all arrays; the same names on all ranks."""
         own = self._node_arrays()
         # what a scheme or a treatment keeps may be on the ranks alone where something happened
-        names = sorted(set().union(*self.comm.allgather(set(own))))
-        nothing = np.zeros((self.model.mesh.n_owned, 3))
-        nodes = {name: (self.node_order, own.get(name, nothing)) for name in names}
+        kinds: dict[str, tuple[tuple[int, ...], str]] = {}
+        for other in self.comm.allgather({name: (array.shape[1:], array.dtype.str) for name, array in own.items()}):
+            kinds |= other
+        for name in kinds.keys() - own.keys():
+            shape, kind = kinds[name]
+            own[name] = np.zeros((self.model.mesh.n_owned, *shape), dtype=kind)
+        nodes = {name: (self.node_order, own[name]) for name in sorted(kinds)}
         bars = {name: (self.bar_order, array[self.counted]) for name, array in self._bar_arrays().items()}
         return {**nodes, **bars}
 

@@ -32,8 +32,7 @@ class ContactWatch:
 
     def __init__(self, model, tell: Callable[[str], None], explicit: bool) -> None:
         self.tell = tell
-        self.contact = model.can_touch
-        self.told = not self.contact and explicit
+        self.told = not model.can_touch and explicit
         self.steady = not explicit
         self.rounding = model.rounding * model.length  # of energies [J]: what is at rest has no other
         self.rows = 0

@@ -51,7 +51,19 @@ class TimeKeys(StrictModel):
             raise ValueError('expected a number of seconds in SI units without quotes and unit, or "auto"')
         if not (step > 0 and math.isfinite(step)):
             raise ValueError('expected a finite number of seconds > 0, or "auto"')
-        return float(step)
+        return _computable(float(step))
+
+    @field_validator("end")
+    @classmethod
+    def _end(cls, end: float) -> float:
+        return _computable(end)
+
+
+def _computable(seconds: float) -> float:
+    """Refuse times whose powers in the formulas of the schemes are beyond double precision."""
+    if not 1e-50 <= seconds <= 1e50:
+        raise ValueError("overflows double precision in the formulas of the schemes; give seconds from 1e-50 to 1e50")
+    return seconds
 
 
 class Time(TimeKeys):

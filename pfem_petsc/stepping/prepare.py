@@ -112,6 +112,11 @@ def make_plan(model, recorded: Mapping[str, Any] | None = None) -> Plan:
                 f'beyond {critical:.6g} s for this model; reduce it, or use time.step = "auto"'
             )
         steps = _steps_to(time.end, step, case.source)
+        if step > time.end * (1.0 + 1e-9):
+            model.warnings.append(
+                f"time.step = {step:g} s is longer than time.end = {time.end:g} s: the run makes one step, "
+                f"to t = {step:g} s"
+            )
     asked = case.solver.linear, case.solver.operator
     linear = None
     if not scheme.explicit or model.inertia.consistent:

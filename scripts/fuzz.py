@@ -18,7 +18,7 @@ import tempfile
 from collections import Counter
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "faults"))
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 
 BATCH = 250
 MEMORY = 6 << 30  # bytes that a check may take: what asks for more must be refused, not end the machine
@@ -68,7 +68,7 @@ def main() -> int:
 
 
 def _work(seed: int, count: int, folder: Path) -> int:
-    from mutations import small_cases, sound_meshes, try_one
+    from helpers.mutations import small_cases, sound_meshes, try_one
 
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     texts, meshes = small_cases(), sound_meshes(folder / "sound")

@@ -15,9 +15,9 @@ import tempfile
 from collections import Counter
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests" / "restart"))
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 
-from together import LATER, play, words  # noqa: E402
+from helpers.together import LATER, play, words  # noqa: E402
 
 from pfem_petsc.cli.main import main as program  # noqa: E402
 

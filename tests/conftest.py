@@ -21,13 +21,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from helpers.launch import OF_A_LAUNCH, environment
 from hypothesis import settings
 
-# What MPI leaves in the environment of a process that has started it, and that would confuse another launch.
-OF_A_LAUNCH = (
-    *("PMIX_", "PMI_", "OPAL_", "ORTE_", "OMPI_COMM_", "OMPI_APP_", "OMPI_UNIVERSE_"),
-    *("OMPI_MCA_orte_", "OMPI_MCA_ess", "OMPI_MCA_pmix"),
-)
 if "PYTEST_XDIST_WORKER" in os.environ:
     for _name in [name for name in os.environ if name.startswith(OF_A_LAUNCH)]:
         del os.environ[_name]
@@ -187,16 +183,10 @@ def on_ranks() -> Callable[..., subprocess.CompletedProcess]:
     """
 
     def run(ranks: int, *arguments: str | Path, timeout: float = 400.0, **options) -> subprocess.CompletedProcess:
-        left = (*OF_A_LAUNCH, "PYTEST_XDIST_")
-        environment = {name: value for name, value in os.environ.items() if not name.startswith(left)}
-        environment |= dict.fromkeys(
-            ("OMPI_ALLOW_RUN_AS_ROOT", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM", "OMPI_MCA_rmaps_base_oversubscribe"), "1"
-        )
-        environment |= {"OMP_NUM_THREADS": "1", "PRTE_MCA_rmaps_default_mapping_policy": ":oversubscribe"}
         command = ["mpirun", "-n", str(ranks), sys.executable, *map(str, arguments)]
         # timeout(1) ends mpirun politely, and mpirun its ranks; a killed mpirun would leave them behind.
         command = ["timeout", "--kill-after=10", str(timeout), *command]
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, **options)
+        done = subprocess.run(command, env=environment(), capture_output=True, text=True, **options)
         if done.returncode in (124, 137):
             raise TimeoutError(f"{' '.join(command)}\n{done.stdout}\n{done.stderr}")
         return done

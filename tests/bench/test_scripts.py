@@ -5,16 +5,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+import model as peers
 import numpy as np
 import pytest
+from scaling_study.model import Parts, step_time
+from scaling_study.points import Point, points_of, run_point
+from scaling_study.tables import rows_of
 
 SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
-sys.path[:0] = [str(SCRIPTS), str(SCRIPTS / "peers")]
-
-import model as peers  # noqa: E402
-from scaling_study.model import Parts, step_time  # noqa: E402
-from scaling_study.points import Point, points_of, run_point  # noqa: E402
-from scaling_study.tables import rows_of  # noqa: E402
 
 
 def driver(name, *options):

@@ -4,8 +4,8 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from bodies import two_lattices
-from lattices import box, planes, simulation
+from helpers.bodies import two_lattices
+from helpers.lattices import box, planes, simulation
 
 from pfem_petsc.contact.coupled import complementary
 from pfem_petsc.errors import InputError, SimulationFailure

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from lattices import box, lattice_case, planes, rotation, simulation
+from helpers.lattices import box, lattice_case, planes, rotation, simulation
 
 from pfem_petsc.integrators.base import Balance
 from pfem_petsc.solvers.linear import LinearChoice

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from lattices import lattice_case, planes, simulation
+from helpers.lattices import lattice_case, planes, simulation
 
 from pfem_petsc import Case, Simulation
 from pfem_petsc.errors import InputError

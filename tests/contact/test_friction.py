@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from lattices import lattice_case, simulation
+from helpers.lattices import lattice_case, simulation
 
 from pfem_petsc.errors import InputError
 

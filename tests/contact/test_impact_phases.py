@@ -1,8 +1,8 @@
 """Stability of contact over the phases of an impact: the small rod, the program itself, the warning and the page."""
 
-import sys
 from pathlib import Path
 
+import impact_phases as table
 import numpy as np
 import pytest
 from mpi4py import MPI
@@ -13,8 +13,6 @@ from pfem_petsc.registry import lookup
 from pfem_petsc.stepping.contact_check import BOUND, contact_gain, warn_of_gain
 
 ROOT = Path(__file__).parents[2]
-sys.path.insert(0, str(ROOT / "scripts"))
-import impact_phases as table  # noqa: E402
 
 TRAPEZOID = {"beta": 0.25, "gamma": 0.5}
 

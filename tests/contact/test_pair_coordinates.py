@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-from bodies import two_lattices
-from lattices import planes
+from helpers.bodies import two_lattices
+from helpers.lattices import planes
 
 from pfem_petsc import Case
 from pfem_petsc.contact.pair_coordinates import PairCoordinates

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from bodies import two_lattices
-from lattices import planes, rotation, simulation
-from turning import with_mesh_file
+from helpers.bodies import two_lattices
+from helpers.lattices import planes, rotation, simulation
+from helpers.turning import with_mesh_file
 
 from pfem_petsc.errors import InputError
 from pfem_petsc.solvers.linear import LinearChoice

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from lattices import lattice_case, planes, rotation, simulation
+from helpers.lattices import lattice_case, planes, rotation, simulation
+from helpers.turning import with_mesh_file
 from mpi4py import MPI
-from turning import with_mesh_file
 
 from pfem_petsc import Case, Simulation
 from pfem_petsc.errors import InputError

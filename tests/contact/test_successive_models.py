@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from lattices import lattice_case, planes, simulation
+from helpers.lattices import lattice_case, planes, simulation
 from petsc4py import PETSc
 
 from pfem_petsc import Case, Simulation

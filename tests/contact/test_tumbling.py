@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from lattices import box, lattice_case, simulation
+from helpers.lattices import box, lattice_case, simulation
 
 LOW, HIGH = np.array([-0.06, -0.05, -0.04]), np.array([0.18, 0.17, 0.19])
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from lattices import box, lattice_case, planes, simulation
+from helpers.lattices import box, lattice_case, planes, simulation
 
 from pfem_petsc import Case
 from pfem_petsc.contact.walls import cylinder, rectangle, sphere

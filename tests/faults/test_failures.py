@@ -2,15 +2,12 @@
 
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.launch import environment
 
 from pfem_petsc.output.result import open_result
-
-sys.path.insert(0, str(Path(__file__).parent.parent / "restart"))
-from kills import environment  # noqa: E402
 
 pytestmark = pytest.mark.slow
 

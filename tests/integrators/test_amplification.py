@@ -1,9 +1,9 @@
 """Each scheme on the linear oscillator, run through the program: order, damping, period, spectral radius, limits."""
 
 import numpy as np
-import oscillator
 import pytest
-from oscillator import OMEGA, SCHEMES, displacements, properties, roots, stepper
+from helpers import oscillator
+from helpers.oscillator import OMEGA, SCHEMES, displacements, properties, roots, stepper
 
 from pfem_petsc import Simulation
 from pfem_petsc.errors import InputError

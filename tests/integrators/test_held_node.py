@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from oscillator import roots, wilson
+from helpers.oscillator import roots, wilson
 
 from pfem_petsc.integrators.base import State
 from pfem_petsc.registry import lookup

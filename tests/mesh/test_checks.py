@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from gathered import slab_from
+from helpers.gathered import slab_from
 
 from pfem_petsc.errors import InputError
 from pfem_petsc.mesh.checks import check_mesh

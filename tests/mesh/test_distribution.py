@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from gathered import slab_from, whole
+from helpers.gathered import slab_from, whole
 
 from pfem_petsc.errors import InputError
 from pfem_petsc.mesh.distribution import distribute

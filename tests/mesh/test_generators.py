@@ -2,7 +2,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from gathered import stiffness_modes, whole
+from helpers.gathered import stiffness_modes, whole
 from pydantic import ValidationError
 
 from pfem_petsc.errors import InputError

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from helpers.samples import BARS, GMSH, POINTS, write_hdf5, write_vtk
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from mpi4py import MPI
-from samples import BARS, GMSH, POINTS, write_hdf5, write_vtk
 
 from pfem_petsc.errors import InputError
 from pfem_petsc.mesh.checks import check_mesh

@@ -8,8 +8,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from helpers.launch import environment
 from mpi4py import MPI
-from truss import alone
 
 from pfem_petsc.errors import InputError, SimulationFailure
 from pfem_petsc.output.checkpoint import newest_checkpoint, read_checkpoint, write_checkpoint
@@ -178,11 +178,13 @@ def test_checksum_sees_swaps_and_depends_on_values_only():
     assert parts % 2**64 == alone
 
 
+HERE = f"{Path(__file__).parent}:{Path(__file__).parents[1]}"
+
 WRITER = """
 import sys
 from pathlib import Path
 from mpi4py import MPI
-sys.path.insert(0, sys.argv[1])
+sys.path[:0] = sys.argv[1].split(':')
 from test_checkpoint import write
 step = 0
 while True:
@@ -196,10 +198,10 @@ def test_a_kill_leaves_a_complete_checkpoint(tmp_path):
     random = np.random.default_rng()
     for _ in range(6):
         writer = subprocess.Popen(
-            [sys.executable, "-c", WRITER, str(Path(__file__).parent), str(tmp_path)],
+            [sys.executable, "-c", WRITER, HERE, str(tmp_path)],
             stdout=subprocess.PIPE,
             text=True,
-            env=alone(),
+            env=environment(),
         )
         try:
             written = int(writer.stdout.readline())

@@ -2,23 +2,19 @@
 
 import random
 import shutil
-import sys
-from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
+from damage_test import damaged
+from helpers.truss import Truss, options, write
 from mpi4py import MPI
-from truss import Truss, options, write
 
 from pfem_petsc.errors import InputError
 from pfem_petsc.output.digests import damages
 from pfem_petsc.output.result import open_result
 from pfem_petsc.output.verify import examine
 from pfem_petsc.output.vtkhdf import ResultWriter
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "scripts"))
-from damage_test import damaged  # noqa: E402
 
 STEPS = 12
 

@@ -7,10 +7,11 @@ import sys
 import h5py
 import numpy as np
 import pytest
+from helpers.launch import environment
+from helpers.truss import Truss, options, write
 from mpi4py import MPI
 from test_interrupted import HERE, READER
 from test_vtkhdf import assert_history_is
-from truss import Truss, alone, options, write
 
 import pfem_petsc.output.vtkhdf as vtkhdf
 from pfem_petsc.output.hdf5 import OBJECTS
@@ -77,7 +78,7 @@ def test_killed_before_any_write_of_a_snapshot_that_grows_the_index_nothing_is_l
         [sys.executable, "-c", READER, str(HERE), *map(str, paths)],
         capture_output=True,
         text=True,
-        env=alone(),
+        env=environment(),
         timeout=300,
     )
     assert done.returncode == 0, done.stderr

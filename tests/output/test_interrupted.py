@@ -9,23 +9,25 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from helpers.launch import environment
+from helpers.truss import Truss, options, write
 from mpi4py import MPI
 from test_vtkhdf import assert_grid_is, assert_history_is, read_with_vtk
-from truss import Truss, alone, options, write
 
 from pfem_petsc.errors import InputError, SimulationFailure
 from pfem_petsc.output.repair import repair
 from pfem_petsc.output.result import open_result
 from pfem_petsc.output.vtkhdf import ResultWriter
 
-HERE = Path(__file__).parent
+HERE = f"{Path(__file__).parent}:{Path(__file__).parents[1]}"
 
 WRITER = """
 import sys
 import time
 from mpi4py import MPI
-sys.path.insert(0, sys.argv[1])
-from truss import Truss, alone, options, write
+sys.path[:0] = sys.argv[1].split(':')
+from helpers.launch import environment
+from helpers.truss import Truss, options, write
 from pfem_petsc.output.vtkhdf import ResultWriter
 truss = Truss(MPI.COMM_SELF, n_nodes=400, n_bars=900)
 writer = ResultWriter(sys.argv[2], MPI.COMM_SELF, truss.mesh, **options())
@@ -38,10 +40,10 @@ time.sleep(60.0)
 # VTK in a process of its own: what it cannot read might end it.
 READER = """
 import sys
-sys.path.insert(0, sys.argv[1])
+sys.path[:0] = sys.argv[1].split(':')
 from mpi4py import MPI
 from test_vtkhdf import assert_grid_is, read_with_vtk
-from truss import Truss
+from helpers.truss import Truss
 truss = Truss(MPI.COMM_SELF, n_nodes=400, n_bars=900)
 for path in sys.argv[2:]:
     _, n_steps = read_with_vtk(path, 0)
@@ -54,7 +56,7 @@ for path in sys.argv[2:]:
 def killed_writer(path, seconds):
     """Write a step at a time until killed."""
     command = [sys.executable, "-c", WRITER, str(HERE), str(path)]
-    writer = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=alone())
+    writer = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment())
     try:
         assert writer.stdout.readline() == "open\n"
         while not path.exists() or len(open_result(path).times) == 0:
@@ -77,7 +79,7 @@ def test_killed_at_any_moment_the_file_is_readable_and_can_be_continued(tmp_path
         [sys.executable, "-c", READER, str(HERE), *map(str, paths)],
         capture_output=True,
         text=True,
-        env=alone(),
+        env=environment(),
         timeout=300,
     )
     assert done.returncode == 0, done.stderr
@@ -224,8 +226,9 @@ def test_disk_full_stops_before_the_file_is_damaged(small_disk):
 FULL = """
 import sys
 from mpi4py import MPI
-sys.path.insert(0, sys.argv[1])
-from truss import Truss, alone, options, write
+sys.path[:0] = sys.argv[1].split(':')
+from helpers.launch import environment
+from helpers.truss import Truss, options, write
 from pfem_petsc.errors import SimulationFailure
 from pfem_petsc.output import vtkhdf
 vtkhdf.require_room = lambda *given, **named: None  # as where a quota, not the disk, is full
@@ -241,7 +244,7 @@ except SimulationFailure as error:
 def test_disk_full_inside_hdf5_is_a_failure_and_no_crash(small_disk):
     path = small_disk / "result.vtkhdf"
     done = subprocess.run(
-        [sys.executable, "-c", FULL, str(HERE), str(path)], capture_output=True, env=alone(), text=True
+        [sys.executable, "-c", FULL, str(HERE), str(path)], capture_output=True, env=environment(), text=True
     )
     assert done.returncode == 1, done.stderr
     assert "failed: " in done.stderr

@@ -4,8 +4,8 @@ import h5py
 import numpy as np
 import pytest
 import pyvista
+from helpers.truss import Truss, options, write
 from mpi4py import MPI
-from truss import Truss, options, write
 from vtkmodules.util.numpy_support import vtk_to_numpy
 from vtkmodules.vtkIOHDF import vtkHDFReader
 

@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 import re
-import sys
 from dataclasses import replace
 from pathlib import Path
 
+import integrator_tables
 import numpy as np
 import pytest
+from paper_reproduction import claims, document, figures, studies
+from paper_reproduction.claims_rod import rod_claims
+from paper_reproduction.exact import BAR, PLASTIC_BAR, ROD
+from paper_reproduction.measures import contact_episodes, measure_ring, measure_rod
+from paper_reproduction.running import read, run_all
+from paper_reproduction.schemes import LIKELY, LUMPED, PAPER, SCHEMES
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(ROOT / "scripts"))
-
-import integrator_tables  # noqa: E402
-from paper_reproduction import claims, document, figures, studies  # noqa: E402
-from paper_reproduction.claims_rod import rod_claims  # noqa: E402
-from paper_reproduction.exact import BAR, PLASTIC_BAR, ROD  # noqa: E402
-from paper_reproduction.measures import contact_episodes, measure_ring, measure_rod  # noqa: E402
-from paper_reproduction.running import read, run_all  # noqa: E402
-from paper_reproduction.schemes import LIKELY, LUMPED, PAPER, SCHEMES  # noqa: E402
 
 READINGS = (LIKELY, LUMPED)
 RODS = {(reading, scheme): studies.rod_key(scheme, reading) for reading in READINGS for scheme in PAPER}

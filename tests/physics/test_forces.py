@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from runs import imbalance, run
+from helpers.runs import imbalance, run
 
 from pfem_petsc import Case
 

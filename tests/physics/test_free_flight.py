@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from runs import energy, imbalance, run
+from helpers.runs import energy, imbalance, run
 
 from pfem_petsc import Case, Simulation
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from runs import run
+from helpers.runs import run
 
 from pfem_petsc import Case
 from pfem_petsc.output.energies import LOST, STORED, SUPPLIED

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from runs import episodes, imbalance, run_alone
+from helpers.runs import episodes, imbalance, run_alone
 
 from pfem_petsc import Case, Simulation
 from pfem_petsc.output.result import open_result

@@ -4,7 +4,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from runs import energy, episodes, force, imbalance, run_alone
+from helpers.runs import energy, episodes, force, imbalance, run_alone
 
 ELEMENTS, LENGTH, STEP = 20, 1.0, 0.01
 

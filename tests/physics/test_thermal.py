@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from runs import run
+from helpers.runs import run
 
 from pfem_petsc import Case, Simulation
 from pfem_petsc.output.result import open_result

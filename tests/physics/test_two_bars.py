@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from runs import episodes, force, imbalance, run_alone
+from helpers.runs import episodes, force, imbalance, run_alone
 
 YOUNG, DENSITY, LENGTH, AREA, SPEED = 207e9, 7844.0, 0.254, 645e-6, 5.136
 YIELD, HARDENING = 69e6, 6.9e9

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
+from helpers.runs import run
 from mpi4py import MPI
-from runs import run
 
 from pfem_petsc import Case
 from pfem_petsc.stepping.model import Model

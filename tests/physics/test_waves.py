@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from runs import run
+from helpers.runs import run
 
 from pfem_petsc import Case
 

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from synthetic import SyntheticResult, ring
+from helpers.synthetic import SyntheticResult, ring
 
 from pfem_petsc.errors import InputError
 from pfem_petsc.post.camera import aim

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from helpers.synthetic import SyntheticResult, ring, write_result
 from PIL import Image
-from synthetic import SyntheticResult, ring, write_result
 
 from pfem_petsc.errors import InputError
 from pfem_petsc.post.chart import thinned, window_mean

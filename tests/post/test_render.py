@@ -10,8 +10,8 @@ from types import SimpleNamespace
 import imageio_ffmpeg
 import numpy as np
 import pytest
+from helpers.synthetic import AT_REST, WALL, SyntheticResult, lattice, ring, rod, write_result
 from PIL import Image
-from synthetic import AT_REST, WALL, SyntheticResult, lattice, ring, rod, write_result
 
 from pfem_petsc.contact.walls.plane import Parameters
 from pfem_petsc.errors import InputError

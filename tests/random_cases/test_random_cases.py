@@ -3,23 +3,18 @@
 A case that fails: ``python scripts/random_cases.py --seeds SEED --keep DIR`` runs it again and keeps its file.
 """
 
-import sys
 import tomllib
-from pathlib import Path
 
 import numpy as np
 import pytest
 from mpi4py import MPI
+from random_trusses.draw import draw_case
+from random_trusses.oracle import check_result
+from random_trusses.running import case_text, run_case
+from random_trusses.work import check_case, judge_ranks
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
-
-from random_trusses.draw import draw_case  # noqa: E402
-from random_trusses.oracle import check_result  # noqa: E402
-from random_trusses.running import case_text, run_case  # noqa: E402
-from random_trusses.work import check_case, judge_ranks  # noqa: E402
-
-from pfem_petsc import Case  # noqa: E402
-from pfem_petsc.recording.snapshots import Snapshots  # noqa: E402
+from pfem_petsc import Case
+from pfem_petsc.recording.snapshots import Snapshots
 
 COUNTED = ("energy balance above 1e-9", "chaotic: ")
 """What is no fault: rounding, and motions that part whatever is done."""

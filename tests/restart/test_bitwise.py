@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from kills import differences
+from helpers.kills import differences
 from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation, open_result

@@ -14,7 +14,8 @@ import zlib
 import h5py
 import numpy as np
 import pytest
-from kills import KINDS, command, differences, environment, processes_of
+from helpers.kills import KINDS, command, differences, processes_of
+from helpers.launch import environment
 
 from pfem_petsc.cli.main import main
 from pfem_petsc.errors import InputError

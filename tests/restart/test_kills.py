@@ -3,7 +3,7 @@
 import random
 
 import pytest
-from kills import KINDS, VtkReader, assert_readable, differences, killed, run
+from helpers.kills import KINDS, VtkReader, assert_readable, differences, killed, run
 
 
 @pytest.mark.slow

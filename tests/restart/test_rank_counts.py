@@ -6,7 +6,8 @@ import sys
 
 import numpy as np
 import pytest
-from kills import command, differences, environment
+from helpers.kills import command, differences
+from helpers.launch import environment
 
 from pfem_petsc.cli.main import main
 from pfem_petsc.output.result import open_result

@@ -9,7 +9,8 @@ import time
 from pathlib import Path
 
 import pytest
-from kills import PATIENCE, command, environment, processes_of
+from helpers.kills import PATIENCE, command, processes_of
+from helpers.launch import environment
 
 from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.signals import SIGNALS

@@ -5,7 +5,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from kills import environment
+from helpers.launch import environment
 
 from pfem_petsc import Case, Simulation
 from pfem_petsc.cli.main import main

@@ -1,21 +1,17 @@
 """Residual and Hessian of a step against whole-mesh algebra and complex steps; supports and oblique wall frames."""
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers.bar_twins import STEP, Law, shaken, whole_truss
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "mechanics"))
-from bar_twins import STEP, Law, shaken, whole_truss  # noqa: E402
-
-from pfem_petsc import Case  # noqa: E402
-from pfem_petsc.contact.frames import build_frames  # noqa: E402
-from pfem_petsc.solvers.matrix_free import MatrixFreeHessian  # noqa: E402
-from pfem_petsc.stepping.model import Model  # noqa: E402
-from pfem_petsc.stepping.prepare import make_plan, make_stepper  # noqa: E402
-from pfem_petsc.stepping.problem import StepProblem  # noqa: E402
+from pfem_petsc import Case
+from pfem_petsc.contact.frames import build_frames
+from pfem_petsc.solvers.matrix_free import MatrixFreeHessian
+from pfem_petsc.stepping.model import Model
+from pfem_petsc.stepping.prepare import make_plan, make_stepper
+from pfem_petsc.stepping.problem import StepProblem
 
 pytestmark = pytest.mark.parallel
 

@@ -17,6 +17,8 @@ import numpy as np
 
 from pfem_petsc.output.result import open_result
 
+from .launch import environment
+
 PATIENCE = 600.0  # seconds that any single run may take, on a machine with other work
 
 
@@ -39,16 +41,6 @@ KINDS = {
     "implicit, plastic": Kind("bar_collision_plastic", ("time.integrator=wilson", "time.theta=1.5", "time.end=1.5e-4")),
 }
 """One to a few seconds of steps each."""
-
-
-def environment() -> dict[str, str]:
-    """That of a process which no launcher has started."""
-    left = ("PMIX_", "PMI_", "OPAL_", "ORTE_", "OMPI_COMM_", "OMPI_APP_", "OMPI_UNIVERSE_", "OMPI_MCA_orte_")
-    left += ("OMPI_MCA_ess", "OMPI_MCA_pmix", "PYTEST_XDIST_")
-    variables = {name: value for name, value in os.environ.items() if not name.startswith(left)}
-    allowed = ("OMPI_ALLOW_RUN_AS_ROOT", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM", "OMPI_MCA_rmaps_base_oversubscribe")
-    variables |= dict.fromkeys((*allowed, "OMPI_MCA_mpi_yield_when_idle", "OMP_NUM_THREADS"), "1")
-    return variables | {"PRTE_MCA_rmaps_default_mapping_policy": ":oversubscribe"}
 
 
 def command(ranks: int, *words: str | Path, python: str = sys.executable) -> list[str]:

@@ -11,10 +11,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from kills import differences
 
 from pfem_petsc.cli.main import main
 from pfem_petsc.output.result import open_result
+
+from .kills import differences
 
 CASE = "rod_impact"
 SHARED = ("mesh.elements=8", "time.step=0.02", "output.fields_every=100", "output.checkpoint_every=50")

@@ -7,15 +7,13 @@ import io
 import random
 import re
 import signal
-import sys
 from pathlib import Path
 
 import pfem_petsc
 from pfem_petsc.case.builtin import built_in_cases
 from pfem_petsc.cli.main import main
 
-sys.path.insert(0, str(Path(__file__).parent.parent / "mesh"))
-from samples import GMSH, write_hdf5, write_vtk  # noqa: E402
+from .samples import GMSH, write_hdf5, write_vtk
 
 # What a refusal names besides the file: of a case a key or a line, of a mesh a section, line, dataset, node or bar.
 OF_A_CASE = re.compile(

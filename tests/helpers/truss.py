@@ -1,6 +1,5 @@
 """A small distributed truss with the attributes of a DistributedMesh, and results for it that are known everywhere."""
 
-import os
 from types import SimpleNamespace
 
 import numpy as np
@@ -96,9 +95,3 @@ def write(writer, truss, steps, every=5):
         writer.append_history(truss.row(step) if truss.comm.rank == 0 else None)
         if step % every == 0:
             writer.write_snapshot(0.01 * step, step, *truss.snapshot(step))
-
-
-def alone():
-    """Environment for a process of one rank: without what the launcher of this one left for its ranks."""
-    left = ("OMPI_", "PMIX_", "PMI_", "ORTE_", "OPAL_")
-    return {name: value for name, value in os.environ.items() if not name.startswith(left)}

@@ -2,11 +2,12 @@
 
 import numpy as np
 import pyvista as pv
-from lattices import lattice_case
 from mpi4py import MPI
 
 from pfem_petsc import Case
 from pfem_petsc.mesh import load_slab
+
+from .lattices import lattice_case
 
 
 def two_lattices(

@@ -12,6 +12,7 @@ from bar_twins import STEP, Law, shaken, whole_truss  # noqa: E402
 
 from pfem_petsc import Case  # noqa: E402
 from pfem_petsc.contact.frames import build_frames  # noqa: E402
+from pfem_petsc.contact.transform import Transform  # noqa: E402
 from pfem_petsc.solvers.matrix_free import MatrixFreeHessian  # noqa: E402
 from pfem_petsc.stepping.model import Model  # noqa: E402
 from pfem_petsc.stepping.prepare import make_plan, make_stepper  # noqa: E402
@@ -60,7 +61,7 @@ class Twin:
         state.external = self.stepper._load(self.balance)
         self.basis = np.tile(np.eye(3), (n, 1, 1))
         frames = self._frames(walls) if walls else None
-        self.problem = StepProblem(self.model, state, self.balance, state.external, frames)
+        self.problem = StepProblem(self.model, state, self.balance, state.external, Transform(self.model, frames))
         self.fixed = np.zeros((n, 3), dtype=bool)
         if supports:
             self.fixed[np.abs(self.truss.points[:, 2]) < 0.1] = (True, False, True)

@@ -16,7 +16,7 @@ from .frames import MIN_VOLUME, NodalFrames, build_frames
 from .log import ContactLog
 from .motion import WallMotion
 from .search import near_planes
-from .tied import Ties
+from .tied import FreshTies, NoTies, Ties
 
 __all__ = ["Contact"]
 
@@ -66,7 +66,7 @@ class Contact:
         self.restitution = np.array([wall.restitution for wall in walls], dtype=np.float64)
         self.rebounds = False
         self.rough = bool(self.static_friction.any())
-        self.ties = Ties(self, walls)
+        self.ties = Ties(self, walls) if any(wall.tied for wall in walls) else NoTies(self, walls)
         self.flat = np.array([wall.flat for wall in self.walls], dtype=bool)
         self.partial = any(wall.partial for wall in self.walls)
         self.normals = np.zeros((len(walls), 3))
@@ -219,6 +219,19 @@ class Contact:
         """Sums of forces (m, w, 3) on nodes at (m, 3); ``friction``: energy that it takes in the step [J]."""
         moment = np.cross(x[:, None, :], force).sum(axis=0)
         return WallForces(force.sum(axis=0), touching.sum(axis=0), moment, nodes, touching, x, friction)
+
+    def record(self, walls: WallForces, time: float, h: float) -> FreshTies:
+        """Take note of a step of ``h`` [s] whose positions at ``time`` have these forces; what walls tied in it.
+
+        Collective where many steps have come together.
+        """
+        if self.any:
+            self.log.book(walls, h, self.mesh.comm)
+        return self.ties.take(walls.nodes, walls.touching, walls.places, time)
+
+    def calm(self, fresh: FreshTies, v: np.ndarray, time: float, h: float) -> None:
+        """See :meth:`~pfem_petsc.contact.tied.Ties.calm`; velocities (owned, 3), and what :meth:`record` gave."""
+        self.ties.calm(*fresh, v, self.motion.rates(time), h)
 
     def no_room(self, node: int, offsets: np.ndarray) -> str:
         """What to tell about a node (owned index) whose planes contradict each other."""

@@ -17,7 +17,7 @@ from mpi4py import MPI
 
 from ..integrators.base import Balance, Scheme, State
 
-__all__ = ["FreeWalls"]
+__all__ = ["FreeWalls", "NoFreeWalls"]
 
 _ITERATIONS = 200
 
@@ -128,6 +128,10 @@ class FreeWalls:
         # momentum is kept to rounding: the acceleration is that of the force, whatever the last digit of the place
         self._u = (-force - rest) / (balance.alpha * self.mass[:, None])
 
+    def step_changed(self, scheme: Scheme) -> None:
+        """Tell the scheme to forget what holds for steps of another size."""
+        scheme.step_changed(self.state)
+
     def kept(self) -> dict[str, Any]:
         """What a checkpoint must hold."""
         state = self.state
@@ -150,3 +154,40 @@ class FreeWalls:
         self._u = np.array(kept["increment"], dtype=float).reshape(shape)
         for name, array in kept["memory"].items():
             self.state.memory[name] = np.array(array, dtype=float).reshape(shape)
+
+
+class NoFreeWalls:
+    """Stands for :class:`FreeWalls` in a case whose walls have no mass; see there."""
+
+    def __init__(self) -> None:
+        self.at = np.empty(0, dtype=np.int64)
+        self.mass = np.zeros(0)
+        self.weight = self.balanced = np.zeros((0, 3))
+        self.state = State(*(np.zeros((0, 3)) for _ in range(7)))
+        self.kinetic = 0.0
+
+    def start(self, h: float) -> None:
+        """See :class:`FreeWalls`, here and below."""
+
+    def begin(self, time: float, h: float) -> None:
+        """Nothing moves."""
+
+    def finish(self, h: float) -> None:
+        """Nothing moves."""
+
+    def step_changed(self, scheme: Scheme) -> None:
+        """Nothing is remembered."""
+
+    def displacements(self, time: float) -> np.ndarray:
+        """None."""
+        return self.state.x
+
+    def solve(self, forces: Callable[[], Answer], tolerance: float) -> None:
+        """The forces are found once."""
+        forces()
+
+    def kept(self) -> None:
+        """Nothing."""
+
+    def put_back(self, kept: None) -> None:
+        """Nothing."""

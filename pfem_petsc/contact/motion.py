@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from ..mechanics.motion import motion_of
+from .free import FreeWalls, NoFreeWalls
 
 __all__ = ["WallMotion"]
 
@@ -17,55 +18,54 @@ class WallMotion:
     Attributes
     ----------
     moving : (w,) bool, walls that move at all
-    free : FreeWalls where some have mass, else None
+    bodies : FreeWalls, the walls with mass; NoFreeWalls where there are none
     """
 
     def __init__(self, walls) -> None:
         self._motions = [motion_of(wall) for wall in walls]
-        self.free = None
+        self.bodies: FreeWalls | NoFreeWalls = NoFreeWalls()
         self.moving = np.array(
             [wall.velocity is not None or wall.motion is not None or wall.mass is not None for wall in walls],
             dtype=bool,
         )
 
     @property
+    def free(self) -> FreeWalls | None:
+        """The walls with mass, None where there are none."""
+        return self.bodies if len(self.bodies.at) else None
+
+    @property
     def speeds(self) -> np.ndarray:
         """Velocities (f, 3) [m/s] of walls with mass; (0, 3) where there are none."""
-        return self.free.state.v if self.free is not None else np.zeros((0, 3))
+        return self.bodies.state.v
 
     def set_speeds(self, v: np.ndarray) -> None:
         """Give walls with mass the velocities (f, 3) [m/s]."""
-        if self.free is not None:
-            self.free.state.v = v
+        self.bodies.state.v = v
 
     def start(self, h: float) -> None:
         """Complete the state of walls with mass at the start of steps of ``h`` [s]."""
-        if self.free is not None:
-            self.free.start(h)
+        self.bodies.start(h)
 
     def begin(self, time: float, h: float) -> None:
         """Begin a step of ``h`` from ``time`` [s], with walls that have mass."""
-        if self.free is not None:
-            self.free.begin(time, h)
+        self.bodies.begin(time, h)
 
     def finish(self, h: float) -> None:
         """Complete the state of walls with mass after a step of ``h`` [s]."""
-        if self.free is not None:
-            self.free.finish(h)
+        self.bodies.finish(h)
 
     def step_changed(self, scheme) -> None:
         """Tell the scheme to forget of walls with mass what holds for steps of another size."""
-        if self.free is not None:
-            scheme.step_changed(self.free.state)
+        self.bodies.step_changed(scheme)
 
     def kept(self) -> dict[str, Any] | None:
         """What a checkpoint must hold, None where no wall has mass."""
-        return self.free.kept() if self.free is not None else None
+        return self.bodies.kept()
 
     def put_back(self, kept: dict[str, Any] | None) -> None:
         """Restore walls with mass from a checkpoint."""
-        if kept is not None:
-            self.free.put_back(kept)
+        self.bodies.put_back(kept)
 
     def shifts(self, time: float) -> np.ndarray:
         """Displacements (w, 3) [m] at a time [s]."""
@@ -73,8 +73,7 @@ class WallMotion:
         for k, motion in enumerate(self._motions):
             if motion is not None:
                 shifts[k] = motion.at(time)[0]
-        if self.free is not None:
-            shifts[self.free.at] = self.free.displacements(time)
+        shifts[self.bodies.at] = self.bodies.displacements(time)
         return shifts
 
     def rates(self, time: float, ahead: bool = False) -> np.ndarray:
@@ -83,8 +82,7 @@ class WallMotion:
         for k, motion in enumerate(self._motions):
             if motion is not None:
                 rates[k] = motion.at(time, ahead=ahead)[1]
-        if self.free is not None:
-            rates[self.free.at] = self.free.state.v
+        rates[self.bodies.at] = self.bodies.state.v
         return rates
 
     def accelerations(self, time: float) -> np.ndarray:

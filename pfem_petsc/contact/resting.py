@@ -55,8 +55,7 @@ def start_at_rest(model, state, accelerate: Callable[[np.ndarray], np.ndarray], 
     away = np.einsum("mwi,mwi->mw", normals, v[nodes][:, None, :] - rates)
     resting = concerned & (np.abs(gaps) <= slack) & (np.abs(away) <= _SLACK * model.wave_speed)
     resting[:, [wall.partial for wall in contact.walls]] = False  # beside it, its plane goes on
-    if contact.motion.free is not None:
-        resting[:, contact.motion.free.at] = False  # these give way
+    resting[:, contact.motion.bodies.at] = False  # these give way
     kept = resting.any(axis=1)
     nodes, normals, resting = nodes[kept], normals[kept], resting[kept]
     accelerations = contact.motion.accelerations(state.time)
@@ -64,22 +63,21 @@ def start_at_rest(model, state, accelerate: Callable[[np.ndarray], np.ndarray], 
     fixed = model.supports.fixed[nodes]
     share = 0.5 if model.inertia.consistent else 1.0
     weight = share * mass[nodes]
-    pairs = model.pairs
-    if pairs is not None:
-        closed = pairs.resting(x, v, slack, _SLACK * model.wave_speed)
-        held = np.zeros(contact.members.shape, dtype=bool)
-        held[nodes] = resting
+    links = model.links
+    closed = links.resting(x, v, slack, _SLACK * model.wave_speed)
+    held = np.zeros(contact.members.shape, dtype=bool)
+    held[nodes] = resting
 
     hold = np.zeros((len(nodes), 3))  # free components of the walls' forces
     strengths = np.zeros(resting.shape)
     drag = np.zeros(normals.shape)
-    between = np.zeros_like(load)  # the same of the pairs' forces
+    between = np.zeros_like(load)  # the same of the links' forces
     for _ in range(_ROUNDS if model.inertia.consistent else 1):
         apart = state.a - between / (share * mass[:, None])
         apart[nodes] -= hold / weight[:, None]
         earlier = between
-        if pairs is not None:  # first, as in a step: they know what the walls do
-            between = pairs.rest(apart, share * mass, closed, held)
+        # first, as in a step: they know what the walls do
+        between = links.rest(apart, share * mass, closed, held)
         free = apart[nodes] + between[nodes] / weight[:, None]
         moved = free.copy()
         project(moved, fixed, normals, planes, 0.0, strengths)
@@ -102,8 +100,7 @@ def start_at_rest(model, state, accelerate: Callable[[np.ndarray], np.ndarray], 
     force = strengths[:, :, None] * normals + drag
     state.contact = np.zeros_like(load)
     state.contact[nodes] = force.sum(axis=1)
-    if pairs is not None:
-        pairs.push(state.contact)
+    links.push(state.contact)
     return contact.sums(nodes, force, x[nodes], strengths > 0.0)
 
 

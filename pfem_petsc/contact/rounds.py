@@ -8,6 +8,8 @@ what was learnt.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from mpi4py import MPI
 
@@ -17,8 +19,9 @@ from ..solvers.newton import zero_tolerance
 from .forces import WallForces
 from .frames import MIN_VOLUME, NodalFrames
 from .implicit_friction import StepFriction
-from .pair_coordinates import PairCoordinates
+from .links import LinkCoordinates
 from .projection import project
+from .transform import Transform
 
 __all__ = ["ContactRounds"]
 
@@ -37,15 +40,15 @@ class ContactRounds:
     state : at the start of the step
     balance : of the step
     held : (owned,) bool, nodes held by walls in the last step
-    pairs : of the case
+    links : coordinates of all links of the case
 
     Attributes
     ----------
-    pairs : None as long as they are too far apart to meet
+    links : those whose rows may be met in this step
     """
 
     def __init__(
-        self, model, state: State, balance: Balance, held: np.ndarray, pairs: PairCoordinates | None = None
+        self, model, state: State, balance: Balance, held: np.ndarray, links: Sequence[LinkCoordinates] = ()
     ) -> None:
         self.contact = model.contact
         self.model = model
@@ -58,11 +61,9 @@ class ContactRounds:
         self._tied: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None  # in the frames, walls, places
         self.friction = StepFriction(model, state, balance) if self.contact.rough else None
         self.candidates = self._expected() if self.contact.any else None
-        self._all_pairs, self.pairs = pairs, None
-        if pairs is not None:
-            move = (balance.time - state.time) * state.v
-            if pairs.reached(state.position, move, state.contact, 1e-9 * model.length):
-                self.pairs = pairs
+        move, slack = (balance.time - state.time) * state.v, 1e-9 * model.length
+        self._all_links = links
+        self.links = [link for link in links if link.reached(state, move, slack)]
 
     def _expected(self) -> np.ndarray | None:
         """Owned nodes that may touch a wall in this step; None where no rank has any (free flight). Collective."""
@@ -90,8 +91,13 @@ class ContactRounds:
             within |= np.einsum("mwi,mi->mw", normals, place) - offsets < distance
         return within & concerned
 
-    def frames(self, x: np.ndarray) -> NodalFrames | None:
-        """Frames of the candidates from the planes at positions (owned, 3). Collective."""
+    @property
+    def walls_near(self) -> bool:
+        """Whether any node of any rank is a candidate for contact with a wall."""
+        return self._frames is not None
+
+    def transform(self, x: np.ndarray) -> Transform:
+        """Coordinates of the candidates and links at positions (owned, 3). Collective."""
         self._frames = None
         if self.candidates is not None:
             concerned = self._concerned
@@ -109,19 +115,19 @@ class ContactRounds:
                 self._tied = self.contact.ties.pin(self._frames, x, self.balance.time)
             if self.friction is not None:
                 self.friction.apply(self._frames, x)
-        if self.pairs is not None:
-            self.pairs.place(self._frames)
-        return self._frames
+        for link in self.links:
+            link.place(self._frames, self.balance, self.state, x)
+        return Transform(self.model, self._frames, self.links)
 
     def feasible(self, u: np.ndarray, stiffness: np.ndarray | None = None) -> np.ndarray:
-        """The increment (owned, 3) nearest to a guess that keeps the frames' planes and the pairs. Collective.
+        """The increment (owned, 3) nearest to a guess that keeps the frames' planes and the links. Collective.
 
-        ``stiffness`` (owned,): how hard nodes of pairs are to move [N/m]; default: as their masses.
+        ``stiffness`` (owned,): how hard nodes of links are to move [N/m]; default: as their masses.
         """
-        if self.pairs is not None:
+        if self.links:
             u = u.copy()
-            weight = self.model.inertia.mass if stiffness is None else stiffness
-            self.pairs.pairs.part(self.balance.predictor, u, weight)
+        for link in self.links:
+            link.feasible(self.balance.predictor, u, self.model.inertia.mass if stiffness is None else stiffness)
         frames = self._frames
         if frames is None or len(frames.nodes) == 0:
             return u
@@ -158,13 +164,13 @@ class ContactRounds:
         return self.friction is not None and self._frames is not None and self.friction.firm()
 
     def bounds(self, guess: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        """Bounds on w (owned, 3): those of the frames less B predictor, and of pairs; None in free flight. Collective.
+        """Bounds on w (owned, 3): those of the frames less B predictor, and of links; None in free flight. Collective.
 
         ``guess``, ``w`` (owned, 3): of u, with prescribed components as they will be, and the same as w.
         """
         self._bounds = None
         frames = self._frames
-        if frames is None and self.pairs is None:
+        if frames is None and not self.links:
             return None
         shape = (self.model.mesh.n_owned, 3)
         lower, upper = np.full(shape, -np.inf), np.full(shape, np.inf)
@@ -173,8 +179,8 @@ class ContactRounds:
             base = np.einsum("nij,nj->ni", frames.basis, self.balance.predictor[at])
             lower[at] = frames.lower - base
             upper[at] = frames.upper - base
-        if self.pairs is not None:
-            self.pairs.bound(self.balance.predictor + guess, w, lower)
+        for link in self.links:
+            link.bound(self.balance.predictor + guess, w, lower)
         self._bounds = lower, upper
         return self._bounds
 
@@ -192,7 +198,7 @@ class ContactRounds:
             w[near] = bound[near]
 
     def settled(self, w: np.ndarray, u: np.ndarray, g: np.ndarray, noise: float, tolerance: float) -> bool:
-        """Whether the solution keeps all walls and pairs; if not, the next round knows better. Collective.
+        """Whether the solution keeps all walls and links; if not, the next round knows better. Collective.
 
         Parameters
         ----------
@@ -204,12 +210,7 @@ class ContactRounds:
         contact = self.contact
         x = self.balance.predictor + u
         slack = 1e-12 * self.model.length
-        settled = True
-        if self.pairs is not None:
-            g = self._press(w, g, noise)
-            self._check_waiting(x, slack)
-        elif self._all_pairs is not None and self._all_pairs.broken(x, slack):
-            self.pairs, settled = self._all_pairs, False
+        settled, g = self._check_links(w, x, g, noise, slack)
         if not contact.any:
             return settled
         self.strengths = None
@@ -240,26 +241,32 @@ class ContactRounds:
         self._join(joined, broken, x)
         return False
 
-    def _press(self, w: np.ndarray, g: np.ndarray, noise: float) -> np.ndarray:
-        """Set the pairs' forces; what of the imbalance (owned, 3) walls must bear. Collective."""
-        turned, rest = g.copy(), g.copy()
-        if self._frames is not None:
-            at = self._frames.nodes
-            turned[at] = np.einsum("nji,nj->ni", self._frames.inverse, g[at])
-        self.pairs.press(w, turned, self._bounds[0], noise)
-        self.pairs.pairs.push(rest, -1.0)
-        return rest
+    def _check_links(
+        self, w: np.ndarray, x: np.ndarray, g: np.ndarray, noise: float, slack: float
+    ) -> tuple[bool, np.ndarray]:
+        """Whether links are kept at positions (owned, 3), and what of the imbalance walls must bear. Collective.
 
-    def _check_waiting(self, x: np.ndarray, slack: float) -> None:
-        """Pairs that found no coordinate beside the walls at both their nodes must not be broken. Collective."""
-        blocked = self.pairs.blocked(x, slack)
-        if len(blocked):
-            pairs = self.pairs.pairs
-            raise NotConverged(
-                f"step {self.state.step + 1}, t = {self.balance.time:.6g} s: walls take all directions in which nodes "
-                f"{pairs.first[blocked[0]]} and {pairs.second[blocked[0]]} of contact_pair "
-                f"{pairs.names[pairs.table[blocked[0]]]!r} can separate; use an explicit integrator"
-            )
+        Links that were not expected to be met, and were, are in the next solve.
+        """
+        settled, met = True, []
+        if self.links:
+            turned, g = g.copy(), g.copy()
+            if self._frames is not None:
+                at = self._frames.nodes
+                turned[at] = np.einsum("nji,nj->ni", self._frames.inverse, g[at])
+        for link in self._all_links:
+            if link not in self.links:
+                if link.broken(x, slack):
+                    met.append(link)
+                continue
+            link.solve_forces(w, turned, self._bounds[0], noise)
+            link.push(g, -1.0)
+            try:
+                settled &= link.kept(x, slack)
+            except NotConverged as failure:
+                raise NotConverged(f"step {self.state.step + 1}, t = {self.balance.time:.6g} s: {failure}") from failure
+        self.links = [link for link in self._all_links if link in self.links or link in met]
+        return settled and not met, g
 
     def _strengths(self, w: np.ndarray, g: np.ndarray, noise: float) -> np.ndarray:
         frames = self._frames
@@ -349,10 +356,10 @@ class ContactRounds:
     def forces(self, u: np.ndarray) -> tuple[np.ndarray, WallForces, np.ndarray]:
         """Contact forces (owned, 3) [N], sums per wall, and which owned nodes walls hold, at the solution."""
         total = np.zeros_like(u)
-        if self.pairs is not None:
-            self.pairs.pairs.push(total)
-        elif self._all_pairs is not None:
-            self._all_pairs.pairs.release()
+        for link in self._all_links:
+            if link not in self.links:
+                link.release()
+            link.push(total)
         held = np.zeros(len(u), dtype=bool)
         walls = self.contact.nothing
         if self._frames is not None:

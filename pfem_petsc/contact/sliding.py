@@ -58,6 +58,14 @@ class Sliding:
         self.maps = np.tile(np.eye(3), (len(self.nodes), 1, 1))
         self.stiffness = np.zeros((len(self.nodes), 3, 3))
 
+    @classmethod
+    def none(cls, walls: int) -> Sliding:
+        """No slipping nodes."""
+        zeros, rows = np.zeros((0, walls, 3)), np.zeros((0, walls), dtype=np.int8)
+        nodes, matrices = np.empty(0, dtype=np.int64), np.zeros((0, 3, 3))
+        signs, known = np.zeros((0, walls)), np.zeros((0, 3))
+        return cls(nodes, nodes, known, matrices, rows, signs, signs, zeros, zeros, zeros, np.zeros(0))
+
     def couple(self, x: np.ndarray, g: np.ndarray) -> np.ndarray:
         """The imbalance (m, 3) with drag from the one without, in the frames' coordinates, at positions (m, 3)."""
         slip = x[:, None, :] - self.origins

@@ -14,7 +14,10 @@ import numpy as np
 from ..errors import SimulationFailure
 from ..parallel.agreement import agreed
 
-__all__ = ["Ties"]
+__all__ = ["FreshTies", "NoTies", "Ties"]
+
+FreshTies = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Nodes (k,) tied in a step, their walls (k,), and the walls' normals there (k, 3)."""
 
 _SLACK = 1e-9  # of the model's length: how far beyond another wall a tied node may be carried
 
@@ -128,9 +131,7 @@ class Ties:
                 "apart, or name the nodes that they concern with 'node_set'"
             )
 
-    def take(
-        self, nodes: np.ndarray, touching: np.ndarray, places: np.ndarray, time: float
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def take(self, nodes: np.ndarray, touching: np.ndarray, places: np.ndarray, time: float) -> FreshTies:
         """Tie nodes (m,) at (m, 3) that touch (m, walls) walls that tie; of several the first.
 
         Gives the nodes that are now tied (k,), their walls (k,), and the walls' normals there (k, 3).
@@ -175,3 +176,18 @@ class Ties:
         if "tied_to" not in memory:
             memory["tied_to"], memory["tied_at"] = np.zeros(owned, dtype=np.int64), np.zeros((owned, 3))
         return memory["tied_to"], memory["tied_at"]
+
+
+class NoTies(Ties):
+    """Stands for :class:`Ties` where no wall ties: keeps nothing in the state."""
+
+    _NONE: FreshTies = (np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty((0, 3)))
+
+    def take(self, nodes: np.ndarray, touching: np.ndarray, places: np.ndarray, time: float) -> FreshTies:
+        """See :class:`Ties`."""
+        return self._NONE
+
+    def calm(
+        self, nodes: np.ndarray, walls: np.ndarray, normals: np.ndarray, v: np.ndarray, rates: np.ndarray, h: float
+    ) -> None:
+        """See :class:`Ties`."""

@@ -20,7 +20,7 @@ def warnings_before(case, model, plan) -> list[str]:
     texts = odd_numbers(case, model) + memory_warning(case, model, plan) + wall_gaps(model)[1]
     texts += jumping_motions(case, plan) + bars_larger_than_walls(case, model)
     count, nodes, first = count_parts(model.mesh)
-    if count > 1 and model.pairs is None:  # pairs are between bodies
+    if count > 1 and not model.links:  # which are between bodies
         texts.append(
             f"the truss is in {count} parts that no bar connects; the smallest has {nodes} nodes, node {first} among "
             "them"

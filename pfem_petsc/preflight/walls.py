@@ -22,15 +22,14 @@ def wall_gaps(model) -> tuple[dict[str, str], list[str]]:
     fastest = max(comm.allgather(float(np.abs(v).max(initial=0.0))))
     ahead = 1e-6 * model.length / fastest if fastest > 0.0 else 1e-9
     now, then = contact.gaps(points, 0.0), contact.gaps(points + ahead * v, ahead)
-    free = contact.motion.free
-    if free is not None:  # not under way yet: the nodes' way as these walls see it
-        for k, speed in zip(free.at, free.state.v, strict=True):
-            seen = contact.gap(k, points + ahead * (v - speed), contact.motion.shifts(0.0))
-            then[:, k] = np.where(contact.members[:, k], seen, np.inf)
+    bodies = contact.motion.bodies  # not under way yet: the nodes' way as these walls see it
+    for k, speed in zip(bodies.at, bodies.state.v, strict=True):
+        seen = contact.gap(k, points + ahead * (v - speed), contact.motion.shifts(0.0))
+        then[:, k] = np.where(contact.members[:, k], seen, np.inf)
     with np.errstate(invalid="ignore"):
         rate = (then - now) / ahead
-    # a wall that moves, or the other node of a pair, may push the truss against this one
-    pushed = model.external.active or contact.moving.any() or model.pairs is not None
+    # a wall that moves, or the other node of a link, may push the truss against this one
+    pushed = model.external.active or contact.moving.any() or bool(model.links)
     for k, name in enumerate(contact.names):
         at = int(np.argmin(now[:, k])) if len(now) else -1
         mine = (float(now[at, k]), int(mesh.node_ids[at])) if at >= 0 else (np.inf, -1)

@@ -55,8 +55,8 @@ class Recorder:
         )
         self.columns |= {name: shape for name, shape, _ in contact_columns(self.model.contact)}
         self.types |= {name: kind for name, _, kind in contact_columns(self.model.contact) if kind is not float}
-        for name in self.model.pair_names:
-            self.columns |= {f"pair/{name}/{what}": (3,) for what in ("force", *PAIR.sizes)}
+        for name in self.model.links.columns:
+            self.columns |= {f"{name}/{what}": (3,) for what in ("force", *PAIR.sizes)}
         self.probe_nodes: dict[str, np.ndarray] = {}
         self._probes: list[tuple[str, np.ndarray, np.ndarray]] = []
         for probe in case.output.probe:
@@ -70,11 +70,11 @@ class Recorder:
         self.layout = RowLayout(self.columns, self.types)
         self._contact = ContactColumns(self.model.contact)
         probed = sum(12 * len(nodes) for nodes in self.probe_nodes.values())
-        pairs = PAIR.width * len(self.model.pair_names)
-        # where the sums of walls, pairs and probes begin
-        self._starts = np.cumsum([HEAD.width, self._contact.size, pairs, probed])
+        links = PAIR.width * len(self.model.links.columns)
+        # where the sums of walls, links and probes begin
+        self._starts = np.cumsum([HEAD.width, self._contact.size, links, probed])
         self._sums = np.zeros(self._starts[-1])
-        # where the numbers of the head go in a row, and where walls, pairs and probes begin there
+        # where the numbers of the head go in a row, and where walls, links and probes begin there
         self._from = np.array([k for name in HEAD.sizes if name != "alarm" for k in range(HEAD.width)[HEAD[name]]])
         places = [self.layout.places[name][:2] for name in HEAD.sizes if name != "alarm"]
         self._to = np.concatenate([np.arange(*place) for place in places])
@@ -123,11 +123,10 @@ class Recorder:
         sums[: HEAD.width] = ledger.sums
         sums[_ELASTIC], sums[_HEAT], sums[_HARDENING] = energy[:3]
         sums[HEAD.first("active_contacts")], sums[HEAD.first("alarm")] = solution.contacts, alarm
-        walls, pairs, at, _ = self._starts
+        walls, links, at, _ = self._starts
         if self._contact.size:
-            self._contact.fill(sums[walls:pairs], solution.walls, ledger.impulses)
-        if at > pairs:
-            ledger.impulses.fill_pairs(sums[pairs:at].reshape(-1, PAIR.width))
+            self._contact.fill(sums[walls:links], solution.walls, ledger.impulses)
+        ledger.impulses.fill_links(sums[links:at].reshape(-1, PAIR.width))
         a = stepper.acceleration() if self._probes else state.a
         for name, local, place in self._probes:
             size = 12 * len(self.probe_nodes[name])
@@ -154,16 +153,15 @@ class Recorder:
         self.energy_scale = max(self.energy_scale, float(np.abs(energies).max()))
         vector[at["energy_imbalance"]] = held - self.start_energy
         self.iterations = [0, 0]
-        walls, pairs, probes, _ = self._starts
+        walls, links, probes, _ = self._starts
         begin = self._begin
         if self._contact.size:
-            self._contact.put(sums[walls:pairs], state.time, vector[begin : begin + self._contact.width])
+            self._contact.put(sums[walls:links], state.time, vector[begin : begin + self._contact.width])
             begin += self._contact.width
-        names = self.model.pair_names
-        if names:
-            columns = vector[begin : begin + (3 + PAIR.width) * len(names)].reshape(-1, 3 + PAIR.width)
-            columns[:, :3] = list(self.model.pairs.totals().values())
-            columns[:, 3:] = sums[pairs:probes].reshape(-1, PAIR.width)
-            begin += columns.size
+        width = 3 + PAIR.width
+        columns = vector[begin : begin + width * len(self.model.links.columns)].reshape(-1, width)
+        columns[:, :3] = self.model.links.totals()
+        columns[:, 3:] = sums[links:probes].reshape(-1, PAIR.width)
+        begin += columns.size
         vector[begin:] = sums[probes:]
         return vector

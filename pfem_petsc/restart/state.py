@@ -9,11 +9,12 @@ Where what decides is kept: positions, velocities, accelerations, forces and the
 treatment of impact changed are part of it): arrays of the state. Who touches walls, nodes held in the last step, place
 of the kept preconditioner: arrays of the stepper. Level of halving, part and smallest part of the step, counts of the
 kept preconditioner: its numbers. Plastic history, thermal strains, history of the kept preconditioner: arrays of the
-bars. Walls with mass: ``free_walls``, their last increment included. Forces of pairs: ``pairs``. Works and energies:
-``ranks``. Energy at the start, the largest energy, iterations since the last row: the recorder's. Rows seen, strange
-ones and energy put in: ``blow_up``. Contact times and impulses: the contact log's. Time step and linear solver:
-the plan in the attributes. Newton's method, Krylov methods, candidates for contact and friction begin anew each step.
-What goes with the clock (meetings, progress, wall time) begins anew with each run, and decides nothing of the results.
+bars. Walls with mass: ``free_walls``, their last increment included. Forces of links: by their keys, as ``pairs``.
+Works and energies: ``ranks``. Energy at the start, the largest energy, iterations since the last row: the recorder's.
+Rows seen, strange ones and energy put in: ``blow_up``. Contact times and impulses: the contact log's. Time step and
+linear solver: the plan in the attributes. Newton's method, Krylov methods, candidates for contact and friction begin
+anew each step. What goes with the clock (meetings, progress, wall time) begins anew with each run, and decides nothing
+of the results.
 """
 
 from __future__ import annotations
@@ -94,7 +95,7 @@ class RunState:
             "start_energy": recorder.start_energy,
             "energy_scale": recorder.energy_scale,
             "blow_up": blow_up.kept(),
-            "pairs": pairs.force.tolist() if (pairs := self.model.pairs) is not None else None,
+            **self.model.links.save(),
             "free_walls": self.model.contact.motion.kept(),
             "contact_times": self.model.contact.log.times(self.comm),
             "row": {name: float(row[name]) for name in ("energy_imbalance", "active_contacts", "step")},
@@ -144,8 +145,7 @@ class RunState:
         stepper.solution.walls = dataclasses.replace(walls, **sums)
         stepper.solution.contacts = int(mine["contacts"])
         self.model.contact.motion.put_back(scalars["free_walls"])
-        if scalars["pairs"] is not None:
-            self.model.pairs.force = np.array(scalars["pairs"], dtype=float)
+        self.model.links.restore(scalars)
         self.model.contact.log.put_back(mine["contact_log"], scalars["contact_times"], stepper.touching)
 
     def put_back_sums(self, checkpoint: Checkpoint, ledger, recorder, blow_up) -> dict[str, Any]:

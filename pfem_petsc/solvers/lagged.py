@@ -31,8 +31,8 @@ class LaggedPreconditioner:
     """The preconditioner, and when to make it anew.
 
     It is kept through the Newton iterations of a problem, and from step to step as long as temperatures are constant
-    and neither oblique walls nor pairs are in contact: it can then be made again after a restart from the place and the
-    plastic history it belongs to, which checkpoints hold.
+    and the unknowns are those of the nodes, neither oblique walls nor links in contact: it can then be made again after
+    a restart from the place and the plastic history it belongs to, which checkpoints hold.
 
     Options: prefix ``pfem_assembled_``.
 
@@ -98,7 +98,7 @@ class LaggedPreconditioner:
         balance = problem.balance
         wanted = [balance.alpha, balance.eta, balance.weight]
         due = beyond > _SET_UP.get(self.kind, 0)
-        own = problem.oblique or problem.pairs is not None or balance.from_start
+        own = not problem.transform.identity or balance.from_start
         usable = self.outlasts and not own
         self._kept = kept
         if problem is not self._problem:
@@ -148,17 +148,8 @@ class LaggedPreconditioner:
 
         def add(values: np.ndarray) -> None:
             problem.hessian_here(matrix, values, stored)
-            if problem.pairs is None and held.any():
-                matrix.hold(held, problem.scale, values)
 
-        matrix.fill(add)
-        if problem.pairs is not None:
-            matrix.change_coordinates()
-            first, owned = 3 * self.mesh.first_node, self.mesh.n_owned
-            rows = np.flatnonzero(held[:owned]) + first
-            matrix.bounded.setOption(PETSc.Mat.Option.KEEP_NONZERO_PATTERN, True)
-            matrix.bounded.zeroRowsColumns(rows.astype(PETSc.IntType), problem.scale)
-        final = matrix.mat if problem.pairs is None else matrix.bounded
+        final = matrix.fill_held(add, held, problem.scale, problem.transform)
         self._set_up(final, problem)
         if self._inner.getType() == "gamg" and self._fill() > _DENSE:
             # PETSc 3.18's independent sets hardly coarsen a body-centred lattice: a set-up and a step take 5 x as long

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import cached_property
 
 import numpy as np
@@ -130,7 +131,7 @@ class HessianMatrix:
     Attributes
     ----------
     mat : PETSc matrix
-    bounded : the matrix that steps with bounds take: ``mat``, or where pairs have coordinates T^T mat T
+    bounded : the matrix that steps with bounds take: ``mat``, or with coordinates of links T^T mat T
     """
 
     def __init__(self, mesh, fixed: np.ndarray, any_fixed: bool, symmetric: bool = True) -> None:
@@ -152,7 +153,7 @@ class HessianMatrix:
             self.mat.setPreallocationCSR((pointers, columns))
         self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
         self.bounded = self.mat
-        self._pairs: PETSc.Mat | None = None
+        self._chain: list[tuple[object, PETSc.Mat, PETSc.Mat]] = []  # coordinates, T, and what T makes
         self._symmetric = symmetric
         self.any_fixed = any_fixed
         if any_fixed:
@@ -176,26 +177,52 @@ class HessianMatrix:
             self.mat.assemble()
         return self.mat
 
-    def couple(self, pairs) -> None:
-        """Give steps with bounds the :class:`~pfem_petsc.contact.pair_coordinates.PairCoordinates`. Collective."""
-        self._coordinates, self._pairs = pairs, pairs.matrix()
-        self.fill(lambda values: None)
-        self.bounded = self.mat.ptap(self._pairs)
-        self.bounded.setOption(PETSc.Mat.Option.SYMMETRIC, self._symmetric)
+    def couple(self, links: Iterable) -> None:
+        """Give steps with bounds the coordinates of links (``contact.links.LinkCoordinates``). Collective."""
+        for link in links:
+            matrix = link.matrix()
+            if not self._chain:
+                self.fill(lambda values: None)
+            self.bounded = self.bounded.ptap(matrix)
+            self.bounded.setOption(PETSc.Mat.Option.SYMMETRIC, self._symmetric)
+            self._chain.append((link, matrix, self.bounded))
 
     def update(self, problem, w: np.ndarray) -> None:
         """Assemble the Hessian of a problem at ``w``. Collective."""
         self.fill(lambda values: problem.hessian(w, self, values))
-        if problem.pairs is not None:
-            self.change_coordinates()
-        elif self._pairs is not None and problem.frames is not None:
-            self.mat.copy(self.bounded, PETSc.Mat.Structure.DIFFERENT)
+        if problem.transform.bounded:
+            self._change_coordinates(problem.transform)
 
-    def change_coordinates(self) -> None:
+    def _change_coordinates(self, transform) -> None:
         """Make ``bounded`` from ``mat``. Collective."""
-        if self._coordinates.pairs.coupled.walled.any():
-            self._coordinates.refresh(self._pairs)
-        self.mat.ptap(self._pairs, self.bounded)
+        last = self.mat
+        for link, matrix, product in self._chain:
+            if link in transform.links:
+                if link.varies:
+                    link.refresh(matrix)
+                last.ptap(matrix, product)
+            else:
+                last.copy(product, PETSc.Mat.Structure.DIFFERENT)
+            last = product
+
+    def fill_held(self, add, held: np.ndarray, scale: float, transform) -> PETSc.Mat:
+        """Assemble in the coordinates of a transform, with rows and columns of components (local nodes, 3) of which
+        ``held`` is not zero replaced by ``scale`` on the diagonal. Collective."""
+        if not transform.links:
+
+            def add_held(values: np.ndarray) -> None:
+                add(values)
+                if held.any():
+                    self.hold(held, scale, values)
+
+            return self.fill(add_held)
+        self.fill(add)
+        self._change_coordinates(transform)
+        first, owned = 3 * self.mesh.first_node, self.mesh.n_owned
+        rows = np.flatnonzero(held[:owned]) + first
+        self.bounded.setOption(PETSc.Mat.Option.KEEP_NONZERO_PATTERN, True)
+        self.bounded.zeroRowsColumns(rows.astype(PETSc.IntType), scale)
+        return self.bounded
 
     def add_lumped(self, inertia: np.ndarray, values: np.ndarray) -> None:
         """Add a nodal inertia (owned,) to the diagonal."""
@@ -227,9 +254,9 @@ class HessianMatrix:
 
     def destroy(self) -> None:
         """Free the PETSc matrices."""
-        if self._pairs is not None:
-            self.bounded.destroy()
-            self._pairs.destroy()
+        for _, matrix, product in self._chain:
+            product.destroy()
+            matrix.destroy()
         self.mat.destroy()
 
 

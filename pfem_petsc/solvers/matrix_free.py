@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import atexit
 import weakref
+from collections.abc import Iterable
 
 import numpy as np
 from petsc4py import PETSc
@@ -193,8 +194,7 @@ class MatrixFreeHessian:
     def linearise(self, problem) -> None:
         """As :meth:`update`, at the positions where the problem is placed."""
         self._problem = problem
-        if problem.oblique:
-            self._left = problem.left()
+        self._left = problem.transform.left()
         self.model.bars.linearise(problem.x, problem.balance.weight, self.stored)
 
     def make_definite(self) -> None:
@@ -225,11 +225,7 @@ class MatrixFreeHessian:
         if fixed is not None:
             held = problem.scale * u[:owned][fixed]
             u[:owned][fixed] = 0.0
-        if problem.pairs is not None:
-            problem.pairs.increment(u)
-        if problem.oblique:
-            at = problem.frames.nodes
-            u[at] = np.einsum("nij,nj->ni", problem.frames.inverse, u[at])
+        problem.transform.forward(u)
         self.mesh.update_ghosts(u)
         inertia, bars = self.model.inertia, self.model.bars
         if inertia.consistent:
@@ -245,13 +241,7 @@ class MatrixFreeHessian:
                 out[moved.touched] += problem.balance.alpha * np.einsum("kij,kj->ki", moved.tensors, u[moved.touched])
         for block in bars.blocks:
             _product(block.sweep.heads, block.sweep.starts, bars.far, self.stored, u, out)
-        if problem.oblique:
-            if problem.sliding is not None:
-                slipping = problem.sliding.nodes
-                out[slipping] += np.einsum("nij,nj->ni", problem.sliding.stiffness, u[slipping])
-            out[at] = np.einsum("nij,nj->ni", self._left, out[at])
-        if problem.pairs is not None:
-            problem.pairs.gradient(out)
+        problem.transform.linear(self._left, u, out)
         if fixed is not None:
             out[:owned][fixed] = held
 
@@ -267,19 +257,7 @@ class MatrixFreeHessian:
         # consistent mass has two thirds of the lumped one on its diagonal
         nodal = problem.nodal * (2.0 / 3.0 if self.model.inertia.consistent else 1.0)
         diagonal = blocks[:owned][:, [0, 3, 5]] + nodal[:, None]
-        if problem.oblique:
-            full = self._blocks(blocks, nodal, problem.frames.nodes)
-            if problem.sliding is not None:
-                full[problem.sliding.at] += problem.sliding.stiffness
-            diagonal[problem.frames.nodes] = np.einsum("nij,njk,nki->ni", self._left, full, problem.frames.inverse)
-        if problem.pairs is not None:
-            carriers = problem.pairs.carriers
-            full = self._blocks(blocks, nodal, carriers)
-            if problem.oblique:
-                framed, at, place = np.intersect1d(carriers, problem.frames.nodes, return_indices=True)
-                inverse = problem.frames.inverse[place]
-                full[at] = inverse.transpose(0, 2, 1) @ full[at] @ inverse
-            problem.pairs.diagonal(full, diagonal)
+        problem.transform.diagonal(self._left, lambda nodes: self._blocks(blocks, nodal, nodes), diagonal)
         if self.model.supports.any:
             diagonal[self._fixed] = problem.scale
         return diagonal
@@ -290,8 +268,8 @@ class MatrixFreeHessian:
         full = stiffness[nodes][:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
         return full + nodal[nodes, None, None] * np.eye(3)
 
-    def couple(self, pairs) -> None:
-        """Nothing to prepare: pairs are applied with the bars."""
+    def couple(self, links: Iterable) -> None:
+        """Nothing to prepare: coordinates of links are applied with the bars."""
 
     def destroy(self) -> None:
         """Free the PETSc matrices."""

@@ -73,7 +73,7 @@ class Batch:
             and type(stepper) is ExplicitStepper
             and isinstance(stepper.scheme, CentralDifferences)
             and stepper.treatment is None
-            and model.pairs is None
+            and not model.links
             and len(model.bars.blocks) == 1
             and not model.temperatures.varying
             and not any(table is not None for _, _, table in model.external.loads)

@@ -61,17 +61,15 @@ class ExplicitStepper(Stepper):
             hold(supports.nodes, supports.components, positions, balance.predictor, stiffness, u, load)
         walls, held, tolerance = model.contact.nothing, self._nobody, 1e-13 * model.length
         try:
-            if model.pairs is not None:
-                state.contact = np.zeros_like(u)
-                model.pairs.explicit(balance.predictor, u, stiffness, state.contact, balance.time, tolerance)
-                held = model.pairs.pressed()[0]
+            state.contact = model.links.explicit(balance, state, u, stiffness, self.zero, tolerance)
             if model.contact.any:
                 nodes, force, walls = model.contact.explicit(balance.predictor, u, stiffness, balance.time, tolerance)
                 if len(nodes):
                     if state.contact is self.zero:
                         state.contact = np.zeros_like(u)
                     state.contact[nodes] += force
-                held = nodes if model.pairs is None else np.union1d(held, nodes)
+                held = nodes
+            held = model.links.held(held)
         except SimulationFailure as failure:
             if self.fault is None:
                 self.fault = SimulationFailure(f"{self.when(balance)}: {failure}")

@@ -11,7 +11,6 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from ..contact.pair_coordinates import PairCoordinates
 from ..contact.rounds import ContactRounds
 from ..errors import NotConverged, SimulationFailure
 from ..integrators.base import Balance
@@ -55,11 +54,10 @@ class ImplicitStepper(Stepper):
             self.lagged = LaggedPreconditioner(
                 model, choice.preconditioner, symmetric, scheme.symmetric, choice.matrix_free
             )
-        self.pairs = None if model.pairs is None else PairCoordinates(model.pairs)
-        if self.pairs is not None:
-            self.hessian.couple(self.pairs)
-            if self.lagged is not None:
-                self.lagged.matrix.couple(self.pairs)
+        self.links = [link.coordinates() for link in model.links]
+        self.hessian.couple(self.links)
+        if self.lagged is not None:
+            self.lagged.matrix.couple(self.links)
         bounded = choice if model.contact.symmetric else unsymmetric(choice)
         most = model.case.solver.max_newton
         self.newton = NewtonSolver(model.mesh, self.hessian, choice, bounded, most, model.length, self.lagged)
@@ -161,16 +159,15 @@ class ImplicitStepper(Stepper):
         return self._mass.solve(load)
 
     def solve(self, balance: Balance) -> Solution:
-        state, pairs = self.state, self.model.pairs
-        kept = state.contact, state.support, self.held, None if pairs is None else pairs.force.copy()
+        state, links = self.state, self.model.links
+        kept = state.contact, state.support, self.held, links.save()
         solution = self._with_walls(balance)
         # an explicit scheme with consistent mass has one solution only
         if self.guard is not None and balance.weight:
             reason = self._suspicion(balance, solution)
             if reason is not None:
-                state.contact, state.support, self.held, force = kept
-                if pairs is not None:
-                    pairs.force[:] = force
+                state.contact, state.support, self.held, forces = kept
+                links.restore(forces)
                 raise NotConverged(f"{self.when(balance)}: {reason}. {_WAY_OUT}")
         return solution
 
@@ -188,17 +185,15 @@ class ImplicitStepper(Stepper):
 
     def _with_walls(self, balance: Balance) -> Solution:
         """Solve a balance together with the motion of walls with mass. Collective."""
-        free = self.model.contact.motion.free
+        bodies = self.model.contact.motion.bodies
         guess = self._guess(balance)
-        if free is None:
-            return self._solve(balance, guess)
         found: list[Solution] = []
 
         def forces() -> tuple[np.ndarray, None]:
             found.append(self._solve(balance, found[-1].u if found else guess))
-            return found[-1].walls.force[free.at], None
+            return found[-1].walls.force[bodies.at], None
 
-        free.solve(forces, 1e-12 * self.model.length)
+        bodies.solve(forces, 1e-12 * self.model.length)
         newton, linear = sum(s.newton for s in found), sum(s.linear for s in found)
         return replace(found[-1], newton=newton, linear=linear)
 
@@ -207,21 +202,21 @@ class ImplicitStepper(Stepper):
         if model.temperatures.varying:
             model.temperatures.apply(balance.time)
         tolerance = self._tolerance(balance)
-        contacts = ContactRounds(model, self.state, balance, self.held, self.pairs)
+        contacts = ContactRounds(model, self.state, balance, self.held, self.links)
         newton = linear = 0
         while True:
             try:
-                frames = contacts.frames(balance.predictor + guess)
+                transform = contacts.transform(balance.predictor + guess)
             except SimulationFailure as failure:
                 raise SimulationFailure(f"{self.when(balance)}: {failure}") from failure
-            problem = StepProblem(model, state, balance, state.external, frames, contacts.pairs)
+            problem = StepProblem(model, state, balance, state.external, transform)
             near = contacts.feasible(guess)
             w = problem.coordinates(near)
             bounds = contacts.bounds(near, w)
             w = contacts.clipped(w)
             report = self.newton.solve(problem, w, tolerance, model.rounding, bounds)
             firm = not report.converged and contacts.firm()
-            if not report.converged and not firm and (problem.oblique or problem.pairs is not None):
+            if not report.converged and not firm and not transform.identity:
                 w = contacts.clipped(problem.coordinates(contacts.approach(problem, guess)))
                 report = report.then(self.newton.solve(problem, w, tolerance, model.rounding, bounds))
             newton += report.newton
@@ -237,12 +232,10 @@ class ImplicitStepper(Stepper):
             if contacts.settled(w, u, g, report.norm, tolerance):
                 break
             guess = u
-        if frames is None and not model.supports.any:
+        if not contacts.walls_near and not model.supports.any:
             self._keep_momentum(problem, u, g)
         state.contact, walls, self.held = contacts.forces(u)
-        held = np.flatnonzero(self.held)
-        if model.pairs is not None:
-            held = np.union1d(held, model.pairs.pressed()[0])
+        held = model.links.held(np.flatnonzero(self.held))
         state.support = np.zeros_like(u)
         fixed = model.supports.fixed
         state.support[fixed] = g[fixed] - state.contact[fixed]

@@ -59,11 +59,11 @@ class Impulses:
     def __init__(self, stepper) -> None:
         self.stepper = stepper
         model = stepper.model
-        self.pairs = model.pairs
+        self.links = model.links
         self.n_walls = len(model.contact.names)
-        self.n_pairs = len(model.pair_names)
-        self.jumps = WALLS + self.n_walls + self.n_pairs
-        rows = self.jumps + self.n_walls + self.n_pairs
+        self.n_links = len(model.links.columns)
+        self.jumps = WALLS + self.n_walls + self.n_links
+        rows = self.jumps + self.n_walls + self.n_links
         self.state = State(*(np.zeros((rows, 3)) for _ in range(7)))
         self.force = np.zeros((rows, 3))
         self._first = model.comm.rank == 0
@@ -71,26 +71,25 @@ class Impulses:
     def start(self, totals: np.ndarray) -> None:
         """Begin, from this rank's sums (3, 3) of support, external and damping force at the start [N]."""
         scheme, h = self.stepper.scheme, self.stepper.part
-        self.state.a = self.forces(totals, self.stepper.walls_at_start, self.stepper.pairs_at_start).copy()
+        self.state.a = self.forces(totals, self.stepper.walls_at_start, self.stepper.links_at_start).copy()
         scheme.start(self.state, h)
 
-    def forces(self, totals: np.ndarray, walls: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-        """Put forces into :attr:`force`: totals (3, 3), of walls (walls, 3), of pairs (pairs, 3) [N]."""
+    def forces(self, totals: np.ndarray, walls: np.ndarray, links: np.ndarray) -> np.ndarray:
+        """Put forces into :attr:`force`: totals (3, 3), of walls (walls, 3), of links' tables (tables, 3) [N]."""
         self.force[:WALLS] = totals
         self.force[WALLS : WALLS + self.n_walls] = walls
-        if self.n_pairs and self._first:
-            self.force[WALLS + self.n_walls : self.jumps] = pairs
+        if self._first:  # all ranks know them
+            self.force[WALLS + self.n_walls : self.jumps] = links
         return self.force
 
     def step(self, totals: np.ndarray) -> None:
         """Add the forces of the balance just solved, of which (3, 3) are support, external and damping [N]."""
         stepper, state = self.stepper, self.state
         walls = stepper.solution.walls.force
-        pairs = np.array(list(self.pairs.totals().values())) if self.n_pairs else np.zeros((0, 3))
         if stepper.step_changed:
             stepper.scheme.step_changed(state)
         balance = stepper.scheme.balance(state, stepper.part)
-        load = self.forces(totals, walls, pairs)
+        load = self.forces(totals, walls, self.links.totals())
         u = (load if balance.a_hat is None else load - balance.a_hat) / balance.alpha
         stepper.scheme.finish(state, balance, u, stepper.part)
         inertia, at = stepper.model.inertia, stepper.model.supports.at if stepper.support_change else None
@@ -119,13 +118,10 @@ class Impulses:
             shares = wall_shares(self.stepper, nodes, momentum)
             particles[first : first + self.n_walls] += shares.sum(axis=0)
             momentum = momentum - shares.sum(axis=1)
-        if self.n_pairs:
-            table = np.full(len(inertia.mass), -1)
-            second = self.pairs.mine[1] & (self.pairs.force > 0.0)
-            table[self.pairs.local[1, second]] = self.pairs.table[second]
-            for k in range(self.n_pairs):
-                particles[first + self.n_walls + k] += momentum[table[nodes] == k].sum(axis=0)
-        # pairs keep momentum, but for what supports at their nodes take
+        table = self.links.tables(len(inertia.mass))[nodes]
+        for k in range(self.n_links):
+            particles[first + self.n_walls + k] += momentum[table == k].sum(axis=0)
+        # links keep momentum, but for what supports at their nodes take
         particles[SUPPORT] += momentum.sum(axis=0)
 
     def fill(self, head: np.ndarray) -> None:
@@ -139,8 +135,8 @@ class Impulses:
         share[:, WALL["impulse"]] = self.state.v[WALLS : WALLS + self.n_walls]
         share[:, WALL["jump_impulse"]] = self.state.v[self.jumps : self.jumps + self.n_walls]
 
-    def fill_pairs(self, share: np.ndarray) -> None:
-        """The same of pairs, into (pairs, width of PAIR)."""
+    def fill_links(self, share: np.ndarray) -> None:
+        """The same of links, into (tables, width of PAIR)."""
         share[:, PAIR["impulse"]] = self.state.v[WALLS + self.n_walls : self.jumps]
         share[:, PAIR["jump_impulse"]] = self.state.v[self.jumps + self.n_walls :]
 

@@ -192,11 +192,9 @@ class Ledger:
         if change is not None:
             nodes = np.flatnonzero(change.any(axis=1))
             self._push += wall_shares(self.stepper, nodes, change[nodes]).sum(axis=0)
-        free = contact.motion.free
-        if free is not None:
-            self._free_a = free.state.a
-            self._free_kinetic = free.kinetic
-            self.sums[_AT["wall_kinetic_energy"]] = free.kinetic if self.model.comm.rank == 0 else 0.0
+        bodies = contact.motion.bodies
+        self._bodies_a, self._bodies_kinetic = bodies.state.a, bodies.kinetic
+        self.sums[_AT["wall_kinetic_energy"]] = bodies.kinetic if self.model.comm.rank == 0 else 0.0
 
     def _work_of_walls(self, before: Moment) -> tuple[float, float, float, float]:
         """Work on the truss of walls whose motion is prescribed and of walls with mass, work of the weight of these,
@@ -207,9 +205,8 @@ class Ledger:
         shifts, push, ends = self._shifts, self._push, stepper.scheme.at_ends
         force = stepper.solution.walls.force
         rule = 0.5 * (push + force) if ends else force
-        free = contact.motion.free
-        if free is not None:
-            accelerated, kinetic = self._free_a, self._free_kinetic
+        bodies = contact.motion.bodies
+        accelerated, kinetic = self._bodies_a, self._bodies_kinetic
         self._walls_before()
         way = self._shifts - shifts
         works = (rule * way).sum(axis=1)
@@ -218,16 +215,14 @@ class Ledger:
             momentum = self.model.inertia.mass[jump.nodes, None] * (stepper.state.v[jump.nodes] - jump.v)
             pushed = wall_shares(stepper, jump.nodes, momentum).sum(axis=0)
             works += (pushed * contact.motion.rates(stepper.state.time)).sum(axis=1)
-        if free is None:
-            return float(works.sum()), 0.0, 0.0, 0.0
-        given = float(works[free.at].sum())
+        given = float(works[bodies.at].sum())
         work = float(works.sum()) - given
         if self.model.comm.rank:
             return work, given, 0.0, 0.0
-        way = way[free.at]
-        a = 0.5 * (accelerated + free.state.a) if ends else free.balanced
-        lost = float((free.mass[:, None] * a * way).sum()) - (self._free_kinetic - kinetic)
-        return work, given, float((free.weight * way).sum()), lost
+        way = way[bodies.at]
+        a = 0.5 * (accelerated + bodies.state.a) if ends else bodies.balanced
+        lost = float((bodies.mass[:, None] * a * way).sum()) - (self._bodies_kinetic - kinetic)
+        return work, given, float((bodies.weight * way).sum()), lost
 
     def _book(self, present: Moment, first: Moment, second: Moment, start: np.ndarray) -> None:
         """Kinetic energy and totals of the present, and the works from positions ``start`` (owned, 3)."""

@@ -6,6 +6,8 @@ import numpy as np
 from mpi4py import MPI
 
 from ..contact.contact import Contact
+from ..contact.links import Links
+from ..contact.pair_link import PairLink
 from ..contact.pairs import ContactPairs
 from ..contact.start import adjust_start
 from ..errors import InputError
@@ -41,7 +43,7 @@ class Model:
     nodal_stiffness : (owned,) sum of E A/l0 of a node's bars [N/m]
     rounding : 2-norm of the residual that rounding of positions leaves [N]
     warnings : of the mesh
-    pair_names : of contact pairs, in the order of the case
+    links : what couples nodes to nodes, see :mod:`pfem_petsc.contact.links`
     can_touch : whether there is anything that nodes can touch: walls, or each other
     """
 
@@ -74,8 +76,8 @@ class Model:
         if case.contact_pair:
             self.pairs = ContactPairs(case, self.nodes, mesh, self.supports.fixed, self.contact)
 
-        self.pair_names = list(self.pairs.names) if self.pairs is not None else []
-        self.can_touch = self.contact.any or self.pairs is not None
+        self.links = Links([] if self.pairs is None else [PairLink(self.pairs)])
+        self.can_touch = self.contact.any or bool(self.links)
 
         points = mesh.points[: mesh.n_owned]
         low, high = points.min(axis=0, initial=np.inf), points.max(axis=0, initial=-np.inf)

@@ -209,9 +209,6 @@ def _warn_of_damping(model, plan: Plan) -> None:
 
 def _check_walls(model, plan: Plan) -> None:
     """Refuse what a wall asks for and the scheme cannot do."""
-    if model.pairs is not None and model.case.contact.treatment == "mass_redistribution":
-        key = f'{model.case.source}: contact.treatment = "mass_redistribution"'
-        raise InputError(f"{key}: only walls can take mass from nodes; take another treatment with contact_pair")
     walls = model.case.wall
     if any(wall.mass is not None for wall in walls):
         if model.case.contact.treatment != "scheme":
@@ -219,10 +216,8 @@ def _check_walls(model, plan: Plan) -> None:
                 f'{model.case.source}: wall.mass needs contact.treatment = "scheme": other '
                 "treatments change velocities by jumps"
             )
-        model.contact.motion.free = FreeWalls(walls, plan.scheme, model.comm, tuple(model.external.gravity))
-    if model.pairs is not None:
-        model.pairs.check_scheme(plan.linear is None, model.case.contact.treatment)
-        model.pairs.check_start(model.mesh.points[: model.mesh.n_owned], model.length, model.case.source)
+        model.contact.motion.bodies = FreeWalls(walls, plan.scheme, model.comm, tuple(model.external.gravity))
+    model.links.check(model, plan.linear is None)
     for k, name in enumerate(model.contact.names):
         key = f"{model.case.source}: wall {name!r}"
         if model.contact.restitution[k]:

@@ -62,7 +62,7 @@ class Stepper(ABC):
     totals_at_start, totals_solved : (3, 3) this rank's sums of support, external and damping force [N] at the start,
         and of the balance that was solved there by a scheme that leads; None after a restart
     velocity_solved : (owned, 3) of that balance, in which its damping force acts [m/s]
-    walls_at_start, pairs_at_start : (walls, 3), (pairs, 3) forces at the start [N]
+    walls_at_start, links_at_start : (walls, 3), (tables of links, 3) forces at the start [N]
     renews_forces : each evaluation of the state fills another array ``state.f``, so that the last one is kept
     kept_numbers, kept_arrays, kept_bars : names of attributes that, with the state, determine what comes: numbers,
         arrays with a row for each owned node, and for each local bar
@@ -105,7 +105,7 @@ class Stepper(ABC):
         self.totals_solved: np.ndarray | None = None
         self.velocity_solved = self.zero
         self.walls_at_start = np.zeros((len(model.contact.names), 3))
-        self.pairs_at_start = np.zeros((0, 3))
+        self.links_at_start = model.links.totals()
         self.solution = Solution(self.zero, self.state.f, model.contact.nothing)
 
     def start(self) -> None:
@@ -130,9 +130,7 @@ class Stepper(ABC):
         if model.can_touch and model.inertia.redistribution is None:
             walls = start_at_rest(model, state, self._acceleration, load)
             if walls is not None:
-                held = walls.nodes[walls.touching.any(axis=1)]
-                if model.pairs is not None:
-                    held = np.union1d(held, model.pairs.pressed()[0])
+                held = model.links.held(walls.nodes[walls.touching.any(axis=1)])
                 self.solution.walls, self.solution.contacts = walls, len(held)
         if self.massless is not None:
             state.contact, self.solution.walls = self.massless.press(state.position, load, 0.0)
@@ -143,8 +141,7 @@ class Stepper(ABC):
             state.support[supports.fixed] = (inertial - load - state.contact)[supports.fixed]
         self.totals_at_start = self._totals()
         self.walls_at_start = self.solution.walls.force
-        if model.pairs is not None:
-            self.pairs_at_start = np.array(list(model.pairs.totals().values()))
+        self.links_at_start = model.links.totals()
         self.scheme.start(state, self.h)
         motion = model.contact.motion
         motion.start(self.h)
@@ -224,21 +221,15 @@ class Stepper(ABC):
         self.model.contact.motion.begin(state.time, self.part)
         state.external = self._load(self.balance)
         self.solution = self.solve(self.balance)
-        ties = self.model.contact.ties
-        if self.model.contact.any:
-            walls = self.solution.walls
-            self.model.contact.log.book(walls, self.part, self.model.comm)
-            if ties.any:
-                fresh = ties.take(walls.nodes, walls.touching, walls.places, self.balance.time)
+        fresh = self.model.contact.record(self.solution.walls, self.balance.time, self.part)
         if not self.scheme.leads:
             self.before[:] = state.x
         self.scheme.finish(state, self.balance, self.solution.u, self.part)
         if self.scheme.leads and self.model.supports.moving:
             self._take_rates(state.time)
         self.model.contact.motion.finish(self.part)
-        if ties.any and self.scheme.turns_held and self.treatment is None:
-            rates = self.model.contact.motion.rates(self.balance.time)
-            ties.calm(*fresh, state.v, rates, self.part)
+        if self.scheme.turns_held and self.treatment is None:
+            self.model.contact.calm(fresh, state.v, self.balance.time, self.part)
 
     def _prescribe(self, balance: Balance) -> None:
         """Put what supports prescribe into a balance, whose increments are zero there: exact position, velocity and

@@ -7,6 +7,7 @@ from helpers.lattices import planes
 
 from pfem_petsc import Case
 from pfem_petsc.contact.pair_coordinates import PairCoordinates
+from pfem_petsc.contact.transform import Transform
 from pfem_petsc.solvers.matrix import HessianMatrix
 from pfem_petsc.solvers.matrix_free import MatrixFreeHessian
 from pfem_petsc.stepping.model import Model
@@ -135,12 +136,13 @@ def test_both_operators_are_the_congruent_matrix(model, comm, beside=False):
     stepper.start()
     state = stepper.state
     balance = stepper.scheme.balance(state, stepper.h)
-    pairs = stepper.pairs
+    (link,) = stepper.links
+    pairs = link.own
     rng = np.random.default_rng(2)
     u = 1e-3 * rng.normal(size=(model.mesh.n_nodes, 3))[model.mesh.node_ids[: model.mesh.n_owned]]
     frames = framed(model, pairs) if beside else None
-    plain = StepProblem(model, state, balance, state.external, frames)
-    coupled = StepProblem(model, state, balance, state.external, frames, pairs)
+    plain = StepProblem(model, state, balance, state.external, Transform(model, frames))
+    coupled = StepProblem(model, state, balance, state.external, Transform(model, frames, [link]))
     w = coupled.coordinates(u)
     np.testing.assert_allclose(coupled.increment(w), u, atol=1e-17)
     assembled, free = HessianMatrix(model.mesh, model.supports.fixed, model.supports.any), MatrixFreeHessian(model)
@@ -150,7 +152,7 @@ def test_both_operators_are_the_congruent_matrix(model, comm, beside=False):
     matrix = dense(mat, comm)
     mat.destroy()
     expected = matrix.T @ hessian @ matrix
-    assembled.couple(pairs)
+    assembled.couple([link])
     for operator in (assembled, free):
         operator.update(coupled, w)
         np.testing.assert_allclose(dense(operator.bounded, comm), expected, atol=1e-12 * np.abs(expected).max())

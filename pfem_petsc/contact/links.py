@@ -1,0 +1,228 @@
+"""What couples nodes to nodes: contact pairs and constraints, as one list in which nothing absent has a place.
+
+A *link* is a source of rows over several nodes, r(x) >= 0. Steps, the ledger, the history and checkpoints take the list
+and never ask what is in it. Explicit steps call :meth:`Links.explicit`; implicit steps take the
+:class:`LinkCoordinates` of each, in which its rows are bounds on unknowns (:mod:`pfem_petsc.contact.transform`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from functools import reduce
+from typing import Any, Protocol
+
+import numpy as np
+from petsc4py import PETSc
+
+from ..integrators.base import Balance, State
+from .frames import NodalFrames
+
+__all__ = ["Link", "LinkCoordinates", "Links"]
+
+
+class Link(Protocol):
+    """One source of rows over several nodes.
+
+    Attributes
+    ----------
+    key : under which checkpoints hold its forces
+    columns : of its tables in the history, like ``pair/NAME``
+    """
+
+    key: str
+    columns: list[str]
+
+    def explicit(self, balance: Balance, state: State, u, stiffness, contact, tolerance: float) -> None:
+        """Correct the increments ``u`` (owned, 3) of a step in which each node is solved on its own. Collective.
+
+        ``stiffness`` (owned,) is the force for a displacement of a node [N/m], ``contact`` (owned, 3) takes the forces
+        [N], ``tolerance`` [m] is the depth up to which a row counts as kept.
+
+        Raises
+        ------
+        SimulationFailure
+            On all ranks, where no positions keep all rows.
+        """
+
+    def coordinates(self) -> LinkCoordinates:
+        """The coordinates of implicit steps. Collective."""
+
+    def held(self) -> np.ndarray:
+        """Owned nodes (k,) on which rows press."""
+
+    def totals(self) -> np.ndarray:
+        """Forces (tables, 3) of the rows on their last nodes [N]; the same on all ranks."""
+
+    def tables(self, owned: int) -> np.ndarray:
+        """(owned,) the table whose rows press on an owned node as their last one, -1 for none."""
+
+    def check(self, model, on_its_own: bool) -> None:
+        """Refuse what it does not go with, and nodes that start beyond it. Collective.
+
+        ``on_its_own``: each node is solved on its own, by an explicit scheme with lumped mass.
+
+        Raises
+        ------
+        InputError
+            On all ranks.
+        """
+
+    def resting(self, x: np.ndarray, v: np.ndarray, slack: float, still: float) -> Any:
+        """Which rows are closed at the start within a slack [m], at rest within ``still`` [m/s]. Collective."""
+
+    def rest(self, a: np.ndarray, mass: np.ndarray, closed: Any, on_walls: np.ndarray) -> np.ndarray:
+        """Set the forces that closed rows need for accelerations (owned, 3); those on free components. Collective.
+
+        ``on_walls`` (owned, walls) bool: who rests on which wall.
+        """
+
+    def push(self, contact: np.ndarray) -> None:
+        """Add its forces to those on the nodes (owned, 3) [N]."""
+
+    def save(self) -> Any:
+        """Its forces, for :meth:`restore`: numbers and lists, as a checkpoint takes them. Collective."""
+
+    def restore(self, saved: Any) -> None:
+        """Take the forces back."""
+
+
+class LinkCoordinates(Protocol):
+    """Coordinates w of implicit steps in which each row of a link is a lower bound on one unknown.
+
+    They replace those of the frames of walls: y = T w, y (owned, 3).
+
+    Attributes
+    ----------
+    varies : whether T changes from solve to solve
+    """
+
+    varies: bool
+
+    def reached(self, state: State, move: np.ndarray, slack: float) -> bool:
+        """Whether rows may be met in a step in which nodes move by (owned, 3) [m]. Collective."""
+
+    def place(self, frames: NodalFrames | None, balance: Balance, state: State, x: np.ndarray) -> None:
+        """Take the frames of a solve, None for none, and the guess of positions (owned, 3). Collective."""
+
+    def feasible(self, predictor: np.ndarray, u: np.ndarray, stiffness: np.ndarray) -> None:
+        """Change increments (owned, 3), in place, so that the rows are kept. Collective."""
+
+    def forward(self, w: np.ndarray) -> None:
+        """W to y (owned, 3), in place. Collective."""
+
+    def inverse(self, y: np.ndarray) -> None:
+        """Y to w (owned, 3), in place. Collective."""
+
+    def adjoint(self, g: np.ndarray) -> None:
+        """A gradient by y to that by w (owned, 3), in place. Collective."""
+
+    def diagonal(self, blocks: BlocksOf, diagonal: np.ndarray) -> None:
+        """Put the diagonal (owned, 3) of T^T H T in place of that of H. Collective.
+
+        ``blocks`` gives the diagonal blocks (k, 3, 3) of H at owned nodes (k,).
+        """
+
+    def matrix(self) -> PETSc.Mat:
+        """T, with places for all that it may become; the caller destroys it. Collective."""
+
+    def refresh(self, matrix: PETSc.Mat) -> None:
+        """Bring T up to date. Collective."""
+
+    def bound(self, x: np.ndarray, w: np.ndarray, lower: np.ndarray) -> None:
+        """Write bounds on w into (owned, 3), from positions (owned, 3) and their w. Collective."""
+
+    def solve_forces(self, w: np.ndarray, g: np.ndarray, lower: np.ndarray, noise: float) -> None:
+        """Set the forces, from w, the residual by y, and the bounds (owned, 3); ``noise`` is none [N]. Collective."""
+
+    def push(self, contact: np.ndarray, factor: float = 1.0) -> None:
+        """Add its forces, times a factor, to those on the nodes (owned, 3) [N]."""
+
+    def kept(self, x: np.ndarray, slack: float) -> bool:
+        """Whether positions (owned, 3) keep the rows that were bounds, to a slack [m]. Collective.
+
+        Raises
+        ------
+        NotConverged
+            On all ranks, where a row that found no unknown is broken.
+        """
+
+    def broken(self, x: np.ndarray, slack: float) -> bool:
+        """Whether positions (owned, 3) break any row by more than a slack [m]. Collective."""
+
+    def release(self) -> None:
+        """No row presses."""
+
+
+class BlocksOf(Protocol):
+    """Diagonal blocks of a Hessian."""
+
+    def __call__(self, nodes: np.ndarray) -> np.ndarray:
+        """Blocks (k, 3, 3) at owned nodes (k,)."""
+
+
+class Links:
+    """All links of a model, in the order in which a step takes them; false where there are none."""
+
+    def __init__(self, members: Sequence[Link] = ()) -> None:
+        self.members = tuple(members)
+        self.columns = [name for link in self.members for name in link.columns]
+
+    def __bool__(self) -> bool:
+        return bool(self.members)
+
+    def __iter__(self) -> Iterator[Link]:
+        return iter(self.members)
+
+    def explicit(self, balance: Balance, state: State, u, stiffness, none: np.ndarray, tolerance: float) -> np.ndarray:
+        """See :meth:`Link.explicit`; the forces (owned, 3) [N], ``none`` where there are no links."""
+        contact = np.zeros_like(u) if self.members else none
+        for link in self.members:
+            link.explicit(balance, state, u, stiffness, contact, tolerance)
+        return contact
+
+    def held(self, nodes: np.ndarray) -> np.ndarray:
+        """Nodes (k,) that walls hold, with those that links hold."""
+        return reduce(np.union1d, (link.held() for link in self.members), nodes)
+
+    def totals(self) -> np.ndarray:
+        """Forces (tables, 3) of all tables on the last nodes of their rows [N]."""
+        return np.concatenate([np.zeros((0, 3)), *(link.totals() for link in self.members)])
+
+    def tables(self, owned: int) -> np.ndarray:
+        """(owned,) the table whose rows press on an owned node as their last one, -1 for none."""
+        tables, first = np.full(owned, -1), 0
+        for link in self.members:
+            own = link.tables(owned)
+            tables[own >= 0] = own[own >= 0] + first
+            first += len(link.columns)
+        return tables
+
+    def check(self, model, on_its_own: bool) -> None:
+        """See :meth:`Link.check`."""
+        for link in self.members:
+            link.check(model, on_its_own)
+
+    def resting(self, x: np.ndarray, v: np.ndarray, slack: float, still: float) -> list[Any]:
+        """See :meth:`Link.resting`."""
+        return [link.resting(x, v, slack, still) for link in self.members]
+
+    def rest(self, a: np.ndarray, mass: np.ndarray, closed: list[Any], on_walls: np.ndarray) -> np.ndarray:
+        """See :meth:`Link.rest`; the sum of all."""
+        total = np.zeros_like(a)
+        for link, own in zip(self.members, closed, strict=True):
+            total += link.rest(a, mass, own, on_walls)
+        return total
+
+    def push(self, contact: np.ndarray) -> None:
+        """See :meth:`Link.push`."""
+        for link in self.members:
+            link.push(contact)
+
+    def save(self) -> dict[str, Any]:
+        """Forces of all links by key. Collective."""
+        return {link.key: link.save() for link in self.members}
+
+    def restore(self, saved: dict[str, Any]) -> None:
+        """Take the forces back from what :meth:`save` gave."""
+        for link in self.members:
+            link.restore(saved[link.key])

@@ -1,0 +1,136 @@
+"""Contact pairs as a link: what steps ask of :mod:`pairs <pfem_petsc.contact.pairs>` and of their coordinates."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from petsc4py import PETSc
+
+from ..errors import InputError, NotConverged
+from ..integrators.base import Balance, State
+from .frames import NodalFrames
+from .links import BlocksOf
+from .pair_coordinates import PairCoordinates
+from .pairs import ContactPairs
+
+__all__ = ["PairLink", "PairLinkCoordinates"]
+
+
+class PairLink:
+    """The pairs of a case; see :class:`~pfem_petsc.contact.links.Link`."""
+
+    key = "pairs"
+
+    def __init__(self, pairs: ContactPairs) -> None:
+        self.pairs = pairs
+        self.columns = [f"pair/{name}" for name in pairs.names]
+
+    def explicit(self, balance: Balance, state: State, u, stiffness, contact, tolerance: float) -> None:
+        """See :class:`~pfem_petsc.contact.links.Link`, here and below."""
+        self.pairs.explicit(balance.predictor, u, stiffness, contact, balance.time, tolerance)
+
+    def coordinates(self) -> PairLinkCoordinates:
+        return PairLinkCoordinates(self.pairs)
+
+    def held(self) -> np.ndarray:
+        return self.pairs.pressed()[0]
+
+    def totals(self) -> np.ndarray:
+        return np.array(list(self.pairs.totals().values()))
+
+    def tables(self, owned: int) -> np.ndarray:
+        pairs, tables = self.pairs, np.full(owned, -1)
+        second = pairs.mine[1] & (pairs.force > 0.0)
+        tables[pairs.local[1, second]] = pairs.table[second]
+        return tables
+
+    def check(self, model, on_its_own: bool) -> None:
+        treatment = model.case.contact.treatment
+        if treatment == "mass_redistribution":
+            key = f'{model.case.source}: contact.treatment = "mass_redistribution"'
+            raise InputError(f"{key}: only walls can take mass from nodes; take another treatment with contact_pair")
+        self.pairs.check_scheme(on_its_own, treatment)
+        self.pairs.check_start(model.mesh.points[: model.mesh.n_owned], model.length, model.case.source)
+
+    def resting(self, x: np.ndarray, v: np.ndarray, slack: float, still: float) -> np.ndarray:
+        return self.pairs.resting(x, v, slack, still)
+
+    def rest(self, a: np.ndarray, mass: np.ndarray, closed: Any, on_walls: np.ndarray) -> np.ndarray:
+        return self.pairs.rest(a, mass, closed, on_walls)
+
+    def push(self, contact: np.ndarray) -> None:
+        self.pairs.push(contact)
+
+    def save(self) -> list[float]:
+        return self.pairs.force.tolist()
+
+    def restore(self, saved: list[float]) -> None:
+        self.pairs.force = np.array(saved, dtype=float)
+
+
+class PairLinkCoordinates:
+    """Their coordinates; see :class:`~pfem_petsc.contact.links.LinkCoordinates`."""
+
+    def __init__(self, pairs: ContactPairs) -> None:
+        self.pairs = pairs
+        self.own = PairCoordinates(pairs)
+
+    @property
+    def varies(self) -> bool:
+        """See :class:`~pfem_petsc.contact.links.LinkCoordinates`, here and below."""
+        return bool(self.pairs.coupled.walled.any())
+
+    def reached(self, state: State, move: np.ndarray, slack: float) -> bool:
+        return self.own.reached(state.position, move, state.contact, slack)
+
+    def place(self, frames: NodalFrames | None, balance: Balance, state: State, x: np.ndarray) -> None:
+        self.own.place(frames)
+
+    def feasible(self, predictor: np.ndarray, u: np.ndarray, stiffness: np.ndarray) -> None:
+        self.pairs.part(predictor, u, stiffness)
+
+    def forward(self, w: np.ndarray) -> None:
+        self.own.increment(w)
+
+    def inverse(self, y: np.ndarray) -> None:
+        self.own.coordinates(y)
+
+    def adjoint(self, g: np.ndarray) -> None:
+        self.own.gradient(g)
+
+    def diagonal(self, blocks: BlocksOf, diagonal: np.ndarray) -> None:
+        self.own.diagonal(blocks(self.own.carriers), diagonal)
+
+    def matrix(self) -> PETSc.Mat:
+        return self.own.matrix()
+
+    def refresh(self, matrix: PETSc.Mat) -> None:
+        self.own.refresh(matrix)
+
+    def bound(self, x: np.ndarray, w: np.ndarray, lower: np.ndarray) -> None:
+        self.own.bound(x, w, lower)
+
+    def solve_forces(self, w: np.ndarray, g: np.ndarray, lower: np.ndarray, noise: float) -> None:
+        self.own.press(w, g, lower, noise)
+
+    def push(self, contact: np.ndarray, factor: float = 1.0) -> None:
+        self.pairs.push(contact, factor)
+
+    def kept(self, x: np.ndarray, slack: float) -> bool:
+        """Pairs that found no coordinate beside the walls at both their nodes must not be broken."""
+        blocked = self.own.blocked(x, slack)
+        if len(blocked):
+            pairs = self.pairs
+            raise NotConverged(
+                f"walls take all directions in which nodes "
+                f"{pairs.first[blocked[0]]} and {pairs.second[blocked[0]]} of contact_pair "
+                f"{pairs.names[pairs.table[blocked[0]]]!r} can separate; use an explicit integrator"
+            )
+        return True
+
+    def broken(self, x: np.ndarray, slack: float) -> bool:
+        return self.own.broken(x, slack)
+
+    def release(self) -> None:
+        self.pairs.release()

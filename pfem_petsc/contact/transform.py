@@ -1,0 +1,155 @@
+"""The coordinates of one implicit solve, in which rows of contact are bounds on unknowns: u = T w.
+
+T is made of the frames of nodes near walls (:mod:`~pfem_petsc.contact.frames`), u = B^-1 y, and of the coordinates of
+links (:mod:`~pfem_petsc.contact.links`), y = T_1 ... T_n w. Drag by friction multiplies the residual from the left
+(:mod:`~pfem_petsc.contact.sliding`). Solvers see this object and nothing of what produced a row; without contact it is
+the identity.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..mechanics.compiled import kernel
+from .frames import NodalFrames
+from .links import BlocksOf, LinkCoordinates
+from .sliding import Sliding
+
+__all__ = ["Transform"]
+
+
+@kernel
+def _turn_blocks(ptr, local_columns, frame_of, left, inverse, values):
+    """H <- L H B^-1 on the rows and columns of nodes with a frame (index -1: none)."""
+    block = np.zeros((3, 3))
+    for row in range(len(ptr) - 1):
+        width = 3 * (ptr[row + 1] - ptr[row])
+        r = frame_of[row]
+        for k in range(ptr[row], ptr[row + 1]):
+            c = frame_of[local_columns[k]]
+            if r < 0 and c < 0:
+                continue
+            at = 6 * ptr[row] + 3 * k
+            for i in range(3):
+                for j in range(3):
+                    block[i, j] = values[at + i * width + j]
+            if r >= 0:
+                for j in range(3):
+                    x, y, z = block[0, j], block[1, j], block[2, j]
+                    for i in range(3):
+                        block[i, j] = left[r, i, 0] * x + left[r, i, 1] * y + left[r, i, 2] * z
+            if c >= 0:
+                for i in range(3):
+                    x, y, z = block[i, 0], block[i, 1], block[i, 2]
+                    for j in range(3):
+                        block[i, j] = x * inverse[c, 0, j] + y * inverse[c, 1, j] + z * inverse[c, 2, j]
+            for i in range(3):
+                for j in range(3):
+                    values[at + i * width + j] = block[i, j]
+
+
+class Transform:
+    """Coordinates of a solve. Construction is collective.
+
+    Parameters
+    ----------
+    model : Model
+    frames : of nodes near walls; None where no rank has any
+    links : coordinates of the links that a step may meet
+
+    Attributes
+    ----------
+    links : tuple of these
+    identity : whether w is u, and the residual as it is
+    bounded : whether the solve has bounds
+    """
+
+    def __init__(self, model, frames: NodalFrames | None = None, links: Sequence[LinkCoordinates] = ()) -> None:
+        self.mesh = model.mesh
+        self.links = tuple(links)
+        walls = model.contact.members.shape[1]
+        own = frames is not None and (frames.oblique or (frames.sliding is not None and len(frames.sliding.nodes) > 0))
+        self._oblique = frames is not None and model.comm.allreduce(int(own)) > 0
+        self.bounded = frames is not None or bool(self.links)
+        self.identity = not self._oblique and not self.links
+        # frames along the axes change no coordinates
+        self._frames = frames if self._oblique else NodalFrames(np.empty(0, dtype=np.int64), walls)
+        self._sliding = self._frames.sliding or Sliding.none(walls)
+        if self._oblique:
+            self._share_frames()
+
+    def _share_frames(self) -> None:
+        mesh, frames = self.mesh, self._frames
+        inverse = np.zeros((mesh.n_local, 10))
+        inverse[frames.nodes, 0] = 1.0
+        inverse[frames.nodes, 1:] = frames.inverse.reshape(-1, 9)
+        mesh.update_ghosts(inverse)
+        turned = np.flatnonzero(inverse[:, 0] > 0.0)
+        self._frame_of = np.full(mesh.n_local, -1, dtype=np.int32)
+        self._frame_of[turned] = np.arange(len(turned), dtype=np.int32)
+        self._inverse = np.ascontiguousarray(inverse[turned, 1:]).reshape(-1, 3, 3)
+
+    def forward(self, w: np.ndarray) -> None:
+        """Turn w (owned, 3) into u, in place. Collective."""
+        for link in reversed(self.links):
+            link.forward(w)
+        at = self._frames.nodes
+        w[at] = np.einsum("nij,nj->ni", self._frames.inverse, w[at])
+
+    def inverse(self, u: np.ndarray) -> None:
+        """Turn u (owned, 3) into w, in place. Collective."""
+        at = self._frames.nodes
+        u[at] = np.einsum("nij,nj->ni", self._frames.basis, u[at])
+        for link in self.links:
+            link.inverse(u)
+
+    def residual(self, predictor: np.ndarray, u: np.ndarray, g: np.ndarray) -> None:
+        """Turn the imbalance of forces (owned, 3) at predictor + u into the residual, in place. Collective."""
+        at, slipping = self._frames.nodes, self._sliding.nodes
+        g[at] = np.einsum("nji,nj->ni", self._frames.inverse, g[at])
+        g[slipping] = self._sliding.couple(predictor[slipping] + u[slipping], g[slipping])
+        for link in self.links:
+            link.adjoint(g)
+
+    def left(self) -> np.ndarray:
+        """What turns the imbalance of nodes with a frame into their residual (m, 3, 3), at the last evaluation."""
+        left = self._frames.inverse.transpose(0, 2, 1).copy()
+        at = self._sliding.at
+        left[at] = self._sliding.maps @ left[at]
+        return left
+
+    def linear(self, left: np.ndarray, u: np.ndarray, out: np.ndarray) -> None:
+        """Turn H u (local, 3), in place, into the derivative of the residual along u (local, 3). Collective.
+
+        ``left`` : of :meth:`left`, where H was taken.
+        """
+        at, slipping = self._frames.nodes, self._sliding.nodes
+        out[slipping] += np.einsum("nij,nj->ni", self._sliding.stiffness, u[slipping])
+        out[at] = np.einsum("nij,nj->ni", left, out[at])
+        for link in self.links:
+            link.adjoint(out)
+
+    def diagonal(self, left: np.ndarray, blocks: BlocksOf, diagonal: np.ndarray) -> None:
+        """Put the diagonal (owned, 3) of the residual's derivative in place of that of H. Collective."""
+        nodes = self._frames.nodes
+        full = blocks(nodes)
+        full[self._sliding.at] += self._sliding.stiffness
+        diagonal[nodes] = np.einsum("nij,njk,nki->ni", left, full, self._frames.inverse)
+        for link in self.links:
+            link.diagonal(lambda some: self._in_frames(some, blocks(some)), diagonal)
+
+    def _in_frames(self, nodes: np.ndarray, blocks: np.ndarray) -> np.ndarray:
+        _, at, place = np.intersect1d(nodes, self._frames.nodes, return_indices=True)
+        inverse = self._frames.inverse[place]
+        blocks[at] = inverse.transpose(0, 2, 1) @ blocks[at] @ inverse
+        return blocks
+
+    def turn(self, matrix, values: np.ndarray) -> None:
+        """Turn the values of an assembled Hessian into frames; links have no coordinates there. Collective."""
+        if not self._oblique:
+            return
+        matrix.add_blocks(self._sliding.nodes, self._sliding.stiffness, values)
+        left = self.left()
+        _turn_blocks(matrix.pattern.ptr, matrix.local_columns, self._frame_of, left, self._inverse, values)

@@ -1,10 +1,10 @@
-"""The table of impact phases in docs/contact.md: does contact gain energy, wherever in a step the impact falls?
+"""The tables of impact phases in docs/contact.md: does contact gain energy, wherever in a step the impact falls?
 
-    python scripts/impact_phases.py            # rewrites it, in two minutes
-    python scripts/impact_phases.py --program  # prints it from runs of the program itself, in half an hour
+    python scripts/impact_phases.py            # rewrites them, in four minutes
+    python scripts/impact_phases.py --program  # prints them from runs of the program itself, in an hour
 
 Every integrator, treatment and mass matrix runs the rod against the wall of `rod_impact` in 14 phases: equal rods, each
-a fourteenth of v h further from the wall than the one before. The table is that of the small linear rods that the
+a fourteenth of v h further from the wall than the one before; a second table has walls with restitution. Both are those of the small linear rods that the
 program itself judges by; in its own runs all rods are one mesh, so that one run does all phases, and the tests hold
 both against each other. The exact energy ratios and releases are 1.
 """
@@ -31,6 +31,8 @@ from pfem_petsc.stepping.prepare import CONSERVING, make_plan, make_stepper
 
 DOCS = Path(__file__).parent.parent / "docs"
 START, END = "<!-- table: scripts/impact_phases.py -->\n", "<!-- end of phases -->"
+START_REBOUNDS, END_REBOUNDS = "<!-- table: scripts/impact_phases.py, restitution -->\n", "<!-- end of rebounds -->"
+RESTITUTIONS = 0.2, 0.5, 0.8, 0.9, 1.0
 PHASES, ELEMENTS = 14, 20
 SPEED = 1e-4  # over the wave speed: small enough for linear rods also where large steps throw nodes about
 LIMIT = 1.0 / ELEMENTS  # explicit limit of the step with lumped mass, l/c [s]
@@ -193,7 +195,9 @@ def cell(found: Impacts | None) -> str:
     return f"{found.largest.max():.3f}, {found.last.max():.3f}, {max(releases, 0)}, {found.force.max():.2f}{star}"
 
 
-def judged(integrator: str, parameters: dict, treatment: str, mass: str, step: float) -> Impacts | None:
+def judged(
+    integrator: str, parameters: dict, treatment: str, mass: str, step: float, restitution: float = 0.0
+) -> Impacts | None:
     """As :func:`impacts`, of the small rods; ``step`` over the explicit limit."""
     module = lookup("pfem_petsc.integrators", integrator, "")
     known = module.Parameters(**parameters)
@@ -202,7 +206,7 @@ def judged(integrator: str, parameters: dict, treatment: str, mass: str, step: f
         return None
     if treatment == "mass_redistribution" and scheme.explicit and not scheme.leads:
         return None
-    asked = Asked(treatment, mass == "consistent", step)
+    asked = Asked(treatment, mass == "consistent", step, restitution)
     found = scan_impacts(scheme, asked)
     warned = contact_gain(integrator, known.model_dump_json(), asked) > BOUND or overshoots(integrator, step)
     return Impacts(found.largest, found.last, found.releases, found.force, warned)
@@ -221,16 +225,29 @@ def lines(of: Callable[..., Impacts | None]) -> Iterator[str]:
             yield f"| {label(integrator, parameters)} | {size:.3g} | " + " | ".join(map(cell, found)) + " |"
 
 
+def rebounds(of: Callable[..., Impacts | None]) -> Iterator[str]:
+    """The rows of the table of walls with restitution."""
+    yield "| integrator | step | " + " | ".join(f"e = {e:g}" for e in RESTITUTIONS) + " |"
+    yield "|---" * (2 + len(RESTITUTIONS)) + "|"
+    for integrator, parameters in SCHEMES:
+        for size in steps_of(integrator, parameters, "lumped"):
+            found = [of(integrator, parameters, "scheme", "lumped", size, e) for e in RESTITUTIONS]
+            yield f"| {label(integrator, parameters)} | {size:.3g} | " + " | ".join(map(cell, found)) + " |"
+
+
 def main() -> None:
-    """Run everything, and put the table between its marks in the document."""
+    """Run everything, and put the tables between their marks in the document."""
+    tables = ((lines, START, END), (rebounds, START_REBOUNDS, END_REBOUNDS))
     if "--program" in sys.argv[1:]:
-        for line in lines(impacts):
-            print(line, flush=True)
+        for table, _, _ in tables:
+            for line in table(impacts):
+                print(line, flush=True)
         return
-    rows = list(lines(judged))
-    document = DOCS / "contact.md"
-    before, rest = document.read_text().split(START)
-    document.write_text(before + START + "\n".join(rows) + "\n" + END + rest.split(END)[1])
+    for table, start, end in tables:
+        rows = list(table(judged))
+        document = DOCS / "contact.md"
+        before, rest = document.read_text().split(start)
+        document.write_text(before + start + "\n".join(rows) + "\n" + end + rest.split(end)[1])
 
 
 if __name__ == "__main__":

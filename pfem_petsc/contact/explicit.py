@@ -9,6 +9,7 @@ from .flat import press_planes
 from .forces import WallForces
 from .friction import add_friction
 from .projection import project
+from .rebound import impact_square, rebound_way
 
 __all__ = ["ExplicitContact"]
 
@@ -132,10 +133,12 @@ class ExplicitContact:
         free = x[nodes]
         concerned = self.contact.concerned(nodes, free, shifts)
         at = free
-        rebound = self._rebound(nodes)
+        rebounds = self._returning()[nodes] if self.contact.rebounds else np.zeros(len(nodes), dtype=bool)
+        pull = self._pull(nodes, free, time) if self.contact.rebounds else free
         for _ in range(_CURVED_ROUNDS):
             normals, offsets = self.contact.planes(concerned, at, shifts)
-            offsets += rebound
+            if rebounds.any():
+                offsets[rebounds] += self._rebound(nodes[rebounds], normals[rebounds], pull[rebounds])
             moved, multipliers = free.copy(), np.zeros(offsets.shape)
             stuck = project(moved, self.contact.fixed[nodes], normals, offsets, tolerance, multipliers)
             if stuck >= 0:
@@ -157,30 +160,46 @@ class ExplicitContact:
                 nodes, free, shifts, (normals, offsets), stiffness[nodes], moved, strength, time
             )
         if booked and self.contact.rebounds:
-            self._remember_approach(nodes, free, shifts, normals, strength)
+            self._remember_impacts(nodes, free, moved, pull, shifts, normals, strength)
         return nodes, moved, force, np.einsum("mwi,mwi->mw", force, normals) > 0.0, friction
 
     def _returning(self) -> np.ndarray:
         """(owned,) bool: nodes that hit a wall with restitution in the last step."""
-        rebound = self.contact.state.memory.get("rebound")
-        return (rebound > 0.0).any(axis=1) if rebound is not None else np.zeros(len(self.contact.members), dtype=bool)
+        squares = self.contact.state.memory.get("rebound")
+        return (squares > 0.0).any(axis=1) if squares is not None else np.zeros(len(self.contact.members), dtype=bool)
 
-    def _rebound(self, nodes: np.ndarray) -> np.ndarray:
-        """Distances (m, walls) [m] from walls that nodes get to in this step, having hit them in the last."""
-        rebound = self.contact.state.memory.get("rebound") if self.contact.rebounds else None
-        return rebound[nodes] if rebound is not None else np.zeros((len(nodes), len(self.contact.walls)))
-
-    def _remember_approach(self, nodes, free, shifts, normals, strength) -> None:
-        """Who hits a wall with restitution in this step, and how far it gets from it in the next [m]."""
+    def _pull(self, nodes: np.ndarray, free: np.ndarray, time: float) -> np.ndarray:
+        """What forces make (m, 3) of the ways of nodes to where they get without walls [m]."""
         state = self.contact.state
-        rebound = state.memory.setdefault("rebound", np.zeros((len(self.contact.members), len(self.contact.walls))))
+        as_before = state.memory["half_velocity"][nodes] * (time - state.time)
+        return free - state.position[nodes] - as_before
+
+    def _rebound(self, nodes: np.ndarray, normals: np.ndarray, pull: np.ndarray) -> np.ndarray:
+        """Distances (m, walls) [m] from walls that nodes get to in this step, having hit them in the last."""
+        memory = self.contact.state.memory
+        squares, arrivals = memory["rebound"][nodes], memory["arrival"][nodes]
+        towards = -np.einsum("mwi,mi->mw", normals, pull)
+        way = rebound_way(self.contact.restitution, squares, arrivals, towards) - 0.5 * towards
+        return np.where(squares > 0.0, np.maximum(way, 0.0), 0.0)
+
+    def _remember_impacts(self, nodes, free, moved, pull, shifts, normals, strength) -> None:
+        """Who hits a wall with restitution in this step, and how: see :mod:`~pfem_petsc.contact.rebound`."""
+        state = self.contact.state
+        shape = len(self.contact.members), len(self.contact.walls)
+        squares, arrivals = (state.memory.setdefault(name, np.zeros(shape)) for name in ("rebound", "arrival"))
         way = shifts - self.contact.motion.shifts(state.time)
+        unpushed = way.copy()
         if self.contact.motion.free is not None:  # how they would meet, not how the wall gives way
-            way[self.contact.motion.free.at] = self.contact.motion.free.unpushed() - self.contact.motion.free.state.x
-        approach = -np.einsum("mwi,mwi->mw", normals, (free - state.position[nodes])[:, None, :] - way)
-        fresh = (strength > 0.0) & ~self.contact.log.touching[nodes]
-        rebound[:] = 0.0
-        rebound[nodes] = np.where(fresh, self.contact.restitution * np.maximum(approach, 0.0), 0.0)
+            at = self.contact.motion.free.at
+            unpushed[at] = self.contact.motion.free.unpushed() - self.contact.motion.free.state.x
+        start = state.position[nodes]
+        approach = -np.einsum("mwi,mwi->mw", normals, (free - start)[:, None, :] - unpushed)
+        arrival = -np.einsum("mwi,mwi->mw", normals, (moved - start)[:, None, :] - way)
+        towards = -np.einsum("mwi,mi->mw", normals, pull)
+        fresh = (strength > 0.0) & ~self.contact.log.touching[nodes] & (self.contact.restitution > 0.0)
+        squares[:], arrivals[:] = 0.0, 0.0
+        squares[nodes] = np.where(fresh, impact_square(approach, arrival, towards), 0.0)
+        arrivals[nodes] = np.where(fresh, arrival, 0.0)
 
     def _rub(
         self, nodes, free, shifts, planes, stiffness, moved, strength, time

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..integrators.base import Balance, Scheme, State
+from .rebound import impact_square, rebound_way
 
 __all__ = ["KNOWN", "PHASES", "SWING", "Asked", "ImpactScan", "scan_impacts"]
 
@@ -110,9 +111,8 @@ class _Rods:
         self.strength = np.zeros(phases)
         self.change = np.zeros(phases)
         self.debt = np.zeros(phases)
-        self.rebound = np.zeros(
-            phases
-        )  # way off the wall in the step after an impact, where the next position is bound
+        # of rods that hit the wall in the last step, where the next position is bound: see rebound_way
+        self.square, self.arrival = np.zeros(phases), np.zeros(phases)
         self._inverse: tuple[float, np.ndarray] | None = None
         scheme.start(self.state, step)
         if scheme.leads:
@@ -135,7 +135,8 @@ class _Rods:
         state = self.state
         start = state.x[self.tips, 0].copy()
         before, touched = self.strength + self.change, self.touching
-        speed, free = state.v[self.tips, 0].copy(), self._free()
+        free = self._free()
+        speed, approach = state.v[self.tips, 0].copy(), self._approach(start, free)
         if self.scheme.leads:
             self.scheme.advance(state, self.h)
             state.time += self.h
@@ -150,13 +151,27 @@ class _Rods:
         elif self.treatment == "stick" or (self.restitution and not self.scheme.leads):
             self._set(self.touching, 0.0, 0.0)
             if self.restitution:
-                work = (free + self._free()) * np.maximum(state.x[self.tips, 0] - start, 0.0)
-                impact = np.where(speed > 0.0, np.sqrt(np.maximum(speed * speed + work, 0.0)), 0.0)
-                self._set(self.touching & ~touched, -self.restitution * impact, self._free())
+                way, after = np.maximum(state.x[self.tips, 0] - start, 0.0), self._free()
+                if approach is None:
+                    square = np.maximum(speed * speed + (free + after) * way, 0.0)
+                    away = np.where(speed > 0.0, self.restitution * np.sqrt(square), 0.0)
+                else:
+                    pull = self.h * self.h * after
+                    square = impact_square(approach, way, self.h * self.h * free)
+                    away = rebound_way(self.restitution, square, way, self.h * self.h * after) / self.h
+                self._set(self.touching & ~touched, -away, after)
             if self.scheme.at_ends and not self.scheme.leads:
                 self._let_go(touched & ~self.touching, start, before)
         elif self.treatment == "conserving":
             self._take_back(start, before)
+
+    def _approach(self, start: np.ndarray, free: np.ndarray) -> np.ndarray | None:
+        """(phases,) way of the last nodes in the next step without a wall, by an explicit scheme that does not lead."""
+        if not self.restitution or not self.scheme.explicit or self.scheme.leads:
+            return None
+        balance = self.scheme.balance(self.state, self.h)
+        known = 0.0 if balance.a_hat is None else balance.a_hat[self.tips, 0]
+        return balance.predictor[self.tips, 0] - start + (free - known) / balance.alpha
 
     def _solve(self) -> None:
         balance = self.scheme.balance(self.state, self.h)
@@ -175,18 +190,23 @@ class _Rods:
 
     def _bounded(self, hessian: np.ndarray, load: np.ndarray, predictor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Increments of a step in which the wall bounds the last node, and forces (phases,) of the wall, positive."""
-        wall = self.wall - self.rebound
+        wall = self.wall
         if self._inverse is None or self._inverse[0] != hessian[0, 0]:
             self._inverse = hessian[0, 0], np.linalg.inv(hessian)
         inverse = self._inverse[1]
         u = load @ inverse
+        if self.restitution and self.scheme.leads:
+            way = rebound_way(self.restitution, self.square, self.arrival, u[:, -1]) - 0.5 * u[:, -1]
+            wall = wall - np.where(self.square > 0.0, np.maximum(way, 0.0), 0.0)
         strength = (predictor[:, -1] + u[:, -1] - wall) / inverse[-1, -1]
         if not self.held:
             strength = np.maximum(strength, 0.0)
         if self.restitution and self.scheme.leads:
             approach = predictor[:, -1] + u[:, -1] - self.state.x[self.tips, 0]
             fresh = (strength > _CONTACT / self.h) & ~self.touching
-            self.rebound = np.where(fresh, self.restitution * np.maximum(approach, 0.0), 0.0)
+            way = self.wall - self.state.x[self.tips, 0]
+            self.arrival = np.where(fresh, way, 0.0)
+            self.square = np.where(fresh, impact_square(approach, way, u[:, -1]), 0.0)
         return u - strength[:, None] * inverse[-1], strength
 
     def _in_equilibrium(

@@ -5,7 +5,7 @@ wall becomes -e times that at the impact, and its acceleration the one without c
 happened within the step: with the velocity v towards the wall at its start, at a distance d, it had
 sqrt(v^2 + (a0 + a1) d), with the accelerations a0 and a1 that all but the wall give the node at both ends of the step.
 That is the work of these forces, so that it keeps the energy of a falling node whatever the step, and takes no energy
-from bars that they have not given. One that is pressed for longer has the wall's velocity and no acceleration, as with
+from bars that they have not given. With explicit schemes it is the speed of :mod:`~pfem_petsc.contact.rebound`. One that is pressed for longer has the wall's velocity and no acceleration, as with
 ``stick``. The energy that is lost, (1 - e^2) of that of the approach, is work of contact.
 
 This is the treatment of walls with restitution where the others are left to the scheme.
@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from .rebound import impact_square, rebound_way
 from .treatments.base import Treatment as Base
 
 __all__ = ["Treatment"]
@@ -51,7 +52,8 @@ class Treatment(Base):
         if not contact.restitution.any():
             return
         self._speed = state.v
-        self._free = self._without_contact(np.arange(len(state.v)))
+        if not scheme.explicit:
+            self._free = self._without_contact(np.arange(len(state.v)))
 
     def _without_contact(self, nodes: np.ndarray) -> np.ndarray:
         """Accelerations (m, 3) of nodes by all forces but those of contact [m/s2]."""
@@ -103,13 +105,32 @@ class Treatment(Base):
         contact = self.stepper.model.contact
         if not contact.restitution.any():
             return np.zeros(touching.shape)
-        moved = self._moved(nodes)
+        distance = np.maximum(-np.einsum("mwi,mwi->mw", normals, self._moved(nodes)), 0.0)
+        fresh = touching & ~self._touched[nodes]
+        if self.stepper.scheme.explicit:
+            return np.where(fresh, self._explicit_rebound(nodes, distance, normals), 0.0)
         speed = np.einsum("mwi,mwi->mw", normals, self._speed[nodes][:, None, :] - rates)
-        distance = np.maximum(-np.einsum("mwi,mwi->mw", normals, moved), 0.0)
         towards = -np.einsum("mwi,mi->mw", normals, self._free[nodes] + self._without_contact(nodes))
         impact = np.sqrt(np.maximum(speed * speed + towards * distance, 0.0))
-        fresh = touching & ~self._touched[nodes]
         return np.where(fresh & (speed < 0.0), contact.restitution * impact, 0.0)
+
+    def _explicit_rebound(self, nodes: np.ndarray, distance: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        """Velocities (m, w) at which nodes leave walls that they have met after a distance (m, w), see :meth:`leaving`.
+
+        The ways without walls follow from the balance of the step.
+        """
+        stepper, state, h = self.stepper, self.stepper.state, self.stepper.part
+        contact, balance, mass = stepper.model.contact, stepper.balance, stepper.model.inertia.mass[nodes, None]
+        push = state.contact[nodes] / mass
+        way = contact.motion.shifts(state.time) - contact.motion.shifts(self._time)
+        moved = (state.position[nodes] - self._place[nodes] - push / balance.alpha)[:, None, :] - way
+        known = 0.0 if balance.a_hat is None else balance.a_hat[nodes]
+        free = balance.alpha * stepper.solution.u[nodes] + known - push
+        approach, before, after = (
+            -np.einsum("mwi,mwi->mw", normals, array)
+            for array in (moved, h * h * free[:, None, :], h * h * self._without_contact(nodes)[:, None, :])
+        )
+        return rebound_way(contact.restitution, impact_square(approach, distance, before), distance, after) / h
 
     def sticking(self, nodes: np.ndarray, touching: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """See :class:`~pfem_petsc.contact.treatments.base.Treatment`."""

@@ -38,12 +38,12 @@ def bar(integrator, parameters, wall, *, velocity=0.0, gravity=G, step=1e-3, end
 
 
 @pytest.mark.parametrize(("restitution", "treatment"), [(0.5, "scheme"), (0.9, "stick"), (1.0, "scheme")])
-@pytest.mark.parametrize("integrator, parameters", SCHEMES)
+@pytest.mark.parametrize("integrator, parameters", [("central_differences", {}), *SCHEMES])
 def test_heights_of_bounces(integrator, parameters, restitution, treatment, comm, shared_tmp_path):
     """Dropped from h, a bar reaches e^(2n) h after n bounces: so its energy in flight says, to 1e-10."""
     height = 0.1
     case = bar(integrator, parameters, {"point": [0.0, 0.0, -height], "restitution": restitution})
-    case["contact"] = {"treatment": treatment}
+    case["contact"] = {"treatment": "scheme" if integrator == "central_differences" else treatment}
     run = simulation(case, comm, shared_tmp_path)
     rows = [step.row for step in run]
     mass = run.model.total_mass
@@ -55,8 +55,9 @@ def test_heights_of_bounces(integrator, parameters, restitution, treatment, comm
     time = fall
     for n in range(1, 5):
         flight = 2.0 * restitution**n * fall
-        # every bounce is late by less than a step
-        inside = [e for row, e in zip(rows, energies, strict=True) if time + n * 1e-3 < row["time"] < time + flight]
+        # every bounce is late by less than a step; velocities of central differences contain the step that follows
+        last = time + flight - (1e-3 if integrator == "central_differences" else 0.0)
+        inside = [e for row, e in zip(rows, energies, strict=True) if time + n * 1e-3 < row["time"] < last]
         time += flight
         if time > 0.8 or flight < 0.05:
             break

@@ -2,11 +2,13 @@
 
     .venv/bin/python scripts/crash_test.py --kills 200 --ranks 1,2
     .venv/bin/python scripts/crash_test.py --kills 200 --python .venv-petsc/bin/python
+    .venv/bin/python scripts/crash_test.py --kills 1000 --cases 0:400
 
 Explicit, implicit, plastic and multistep cases, with contact and without, take their turns on all numbers of ranks, so
-that each gets as many kills. A run is killed by SIGKILL, all ranks or one of them, also before its first checkpoint,
-and restarted, and often killed again, until it is done. After each kill the result file must open in VTK and in
-open_result; at the end all its values must equal those of the undisturbed run bit for bit. Status 0 when all did.
+that each gets as many kills; with --cases A:B they are the cases that scripts/random_cases.py draws by these numbers,
+without those that are refused or fail undisturbed. A run is killed by SIGKILL, all ranks or one of them, also before
+its first checkpoint, and restarted, and often killed again, until it is done. After each kill the result file must open
+in VTK and in open_result; at the end all its values must equal those of the undisturbed run bit for bit. Status 0 when all did.
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 
-from helpers.kills import KINDS, LEFT_OVER, VtkReader, assert_readable, differences, killed, run  # noqa: E402
+from helpers.kills import KINDS, LEFT_OVER, Kind, VtkReader, assert_readable, differences, killed, run  # noqa: E402
 
 EVERY = (7, 40, 1000)  # steps between checkpoints: many, some, none before the end
 MOST = 4  # kills of a run before it is let go on to its end
@@ -37,20 +39,30 @@ def main() -> int:
     parser.add_argument("--python", default=sys.executable, metavar="PATH", help="of the runs; default: this one")
     parser.add_argument("--seed", type=int, default=None, help="of the random moments")
     parser.add_argument("--folder", type=Path, default=None, help="where to work; default: a temporary folder")
+    parser.add_argument("--cases", default=None, metavar="A:B", help="random cases with these numbers")
     arguments = parser.parse_args()
     folder = arguments.folder or Path(tempfile.mkdtemp(prefix="crash-test-"))
     folder.mkdir(parents=True, exist_ok=True)
     chance = random.Random(arguments.seed)
     begin = time.monotonic()
-    counts = {(name, ranks): Counter() for ranks in arguments.ranks for name in KINDS}
+    kinds = KINDS if arguments.cases is None else _random_kinds(arguments.cases, folder)
+    # a random case runs on one number of ranks, on which in turn
+    several = [(name, ranks) for ranks in arguments.ranks for name in kinds]
+    single = list(zip(kinds, arguments.ranks * len(kinds)))
+    counts = {turn: Counter() for turn in (several if arguments.cases is None else single)}
     references: dict[tuple[str, int], tuple[Path, float]] = {}
     with VtkReader() as vtk:
         while (left := arguments.kills - sum(count["kills"] for count in counts.values())) > 0:
             # whose turn it is: the one with the fewest kills
             name, ranks = min(counts, key=lambda turn: counts[turn]["kills"])
             if (name, ranks) not in references:
-                references[name, ranks] = _reference(name, ranks, folder, arguments.python)
-            one = _one_run(name, ranks, references[name, ranks], folder, min(left, MOST), chance, vtk, arguments.python)
+                reference = _reference(name, kinds[name], ranks, folder, arguments.python, arguments.cases is None)
+                if reference is None:
+                    del counts[name, ranks]
+                    continue
+                references[name, ranks] = reference
+            kind, reference = kinds[name], references[name, ranks]
+            one = _one_run(name, kind, ranks, reference, folder, min(left, MOST), chance, vtk, arguments.python)
             counts[name, ranks].update(one)
             if one["failed"]:
                 kept = folder / f"failed-{sum(count['failed'] for count in counts.values())}"
@@ -67,8 +79,23 @@ def _numbers(text: str) -> list[int]:
     return [int(part) for part in text.split(",")]
 
 
+def _random_kinds(numbers: str, folder: Path) -> dict[str, Kind]:
+    """Cases that the generator draws by these numbers, as files."""
+    from random_trusses.draw import draw_case
+    from random_trusses.running import case_text
+
+    first, _, end = numbers.partition(":")
+    kinds = {}
+    for seed in range(int(first), int(end)):
+        path = folder / f"random-{seed}.toml"
+        path.write_text(case_text(draw_case(seed)))
+        kinds[f"random {seed}"] = Kind(str(path), ())
+    return kinds
+
+
 def _one_run(
     name: str,
+    kind: Kind,
     ranks: int,
     reference: tuple[Path, float],
     folder: Path,
@@ -84,7 +111,7 @@ def _one_run(
         shutil.rmtree(old)
     told, restart = [], []
     while count["kills"] < most:
-        how = killed(KINDS[name], ranks, work, every, reference[1], chance, *restart, python=python)
+        how = killed(kind, ranks, work, every, reference[1], chance, *restart, python=python)
         restart = ["--restart"]
         told.append(how)
         if how == "done before":
@@ -98,7 +125,7 @@ def _one_run(
             except Exception as error:  # noqa: BLE001 - every way to be unreadable counts
                 count["unreadable"] += 1
                 print(f"UNREADABLE {name} on {ranks}: {path}: {type(error).__name__}: {error}", flush=True)
-    done = run(KINDS[name], ranks, work, every, "--restart", python=python)
+    done = run(kind, ranks, work, every, "--restart", python=python)
     if done.returncode != 0:
         count["failed"] += 1
         print(f"FAILED {name} on {ranks} (every {every}): {told}\n{done.stderr}", flush=True)
@@ -108,14 +135,19 @@ def _one_run(
     return count
 
 
-def _reference(name: str, ranks: int, folder: Path, python: str) -> tuple[Path, float]:
-    """The undisturbed run: its result file, and how long its steps take [s]."""
+def _reference(
+    name: str, kind: Kind, ranks: int, folder: Path, python: str, must_run: bool
+) -> tuple[Path, float] | None:
+    """The undisturbed run: its result file, and how long its steps take [s]; None for a case that does not run."""
     place = folder / f"{name.replace(' ', '-').replace(',', '')}-{ranks}"
     shutil.rmtree(place, ignore_errors=True)
-    run(KINDS[name], ranks, place, 0, python=python)  # compiles what is to be compiled
-    shutil.rmtree(place, ignore_errors=True)
+    if must_run:
+        run(kind, ranks, place, 0, python=python)  # compiles what is to be compiled
+        shutil.rmtree(place, ignore_errors=True)
     begin = time.time()
-    done = run(KINDS[name], ranks, place, 0, python=python)
+    done = run(kind, ranks, place, 0, python=python)
+    if done.returncode in (2, 3) and not must_run:
+        return None
     if done.returncode != 0:
         raise SystemExit(f"{name} on {ranks} ranks fails undisturbed:\n{done.stderr}")
     # the log is opened just before the first step, after the model is set up
@@ -133,7 +165,8 @@ def _table(counts: dict[tuple[str, int], Counter], seconds: float) -> int:
     total = Counter()
     for (name, ranks), count in counts.items():
         total.update(count)
-        print(f"{name:{width}}  {ranks:5}  {'  '.join(f'{count[what]:{len(what)}}' for what in COUNTED)}")
+        if not name.startswith("random ") or count["unreadable"] + count["different"] + count["failed"]:
+            print(f"{name:{width}}  {ranks:5}  {'  '.join(f'{count[what]:{len(what)}}' for what in COUNTED)}")
     print(f"{'all':{width}}         {'  '.join(f'{total[what]:{len(what)}}' for what in COUNTED)}")
     print(f"{seconds:.0f} s; restarts that failed, results that differ or cannot be read: ", end="")
     bad = total["unreadable"] + total["different"] + total["failed"]

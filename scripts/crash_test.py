@@ -8,7 +8,8 @@ Explicit, implicit, plastic and multistep cases, with contact and without, take 
 that each gets as many kills; with --cases A:B they are the cases that scripts/random_cases.py draws by these numbers,
 without those that are refused or fail undisturbed. A run is killed by SIGKILL, all ranks or one of them, also before
 its first checkpoint, and restarted, and often killed again, until it is done. After each kill the result file must open
-in VTK and in open_result; at the end all its values must equal those of the undisturbed run bit for bit. Status 0 when all did.
+in VTK and in open_result; at the end all its values must equal those of the undisturbed run bit for bit.
+Status 0 when all did.
 """
 
 from __future__ import annotations

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import os
 import pickle
 import time
 import warnings
@@ -16,7 +17,7 @@ import numpy as np
 from numba.core import event
 from numba.core.caching import IndexDataCacheFile
 from numba.core.dispatcher import Dispatcher
-from numba.extending import register_jitable
+from numba.extending import _Intrinsic, register_jitable
 
 __all__ = ["Compilation", "code_digest", "inlined", "kernel"]
 
@@ -44,6 +45,7 @@ def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     if isinstance(file, IndexDataCacheFile):
         file.__class__ = _CacheFile
         file._function = function
+        file._variant = _variant(function)
     return compiled
 
 
@@ -51,6 +53,26 @@ def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
 def _warn_once(text: str) -> None:
     """There are some forty loops: what is wrong with the folder of one is wrong with that of all."""
     warnings.warn(text, stacklevel=3)
+
+
+def _variant(function: Callable[..., Any]) -> str:
+    """Names of the functions in modules that a loop was made with: ``elastic.response-strain.green``."""
+    found: list[str] = []
+    seen: set[int] = set()
+
+    def walk(inner: Any) -> None:
+        inner = getattr(inner, "py_func", inner)
+        if not isinstance(inner, FunctionType) or id(inner) in seen:
+            return
+        seen.add(id(inner))
+        if inner is not function and "<locals>" not in inner.__qualname__:
+            found.append(f"{inner.__module__.rpartition('.')[2]}.{inner.__name__}")
+            return
+        for cell in inner.__closure__ or ():
+            walk(cell.cell_contents)
+
+    walk(function)
+    return "-".join(sorted(found))
 
 
 def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -66,7 +88,24 @@ class _CacheFile(IndexDataCacheFile):
     """
 
     _function: Callable[..., Any]
+    _variant: str = ""
     _digest: str | None = None
+
+    @property
+    def _index_path(self) -> str:
+        # loops that one function makes, of every law and strain measure, would take each other's place
+        return os.path.join(self._cache_path, self._named(self._index_name))
+
+    @_index_path.setter
+    def _index_path(self, path: str) -> None:
+        """That of the loop as it is written."""
+
+    def _data_path(self, name: str) -> str:
+        return os.path.join(self._cache_path, self._named(name))
+
+    def _named(self, name: str) -> str:
+        first, _, rest = name.partition(".")
+        return f"{first}.{self._variant}.{rest}" if self._variant else name
 
     @property
     def _source_stamp(self) -> str:
@@ -123,6 +162,8 @@ class _Digest:
             self._add_code(thing)
         elif isinstance(thing, Dispatcher):
             self.add(thing.py_func)
+        elif isinstance(thing, _Intrinsic):
+            self.add(thing._defn)
         elif isinstance(thing, FunctionType):
             self._add_function(thing)
         elif isinstance(thing, np.ndarray):

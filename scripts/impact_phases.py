@@ -4,7 +4,8 @@
     python scripts/impact_phases.py --program  # prints them from runs of the program itself, in an hour
 
 Every integrator, treatment and mass matrix runs the rod against the wall of `rod_impact` in 14 phases: equal rods, each
-a fourteenth of v h further from the wall than the one before; a second table has walls with restitution. Both are those of the small linear rods that the
+a fourteenth of v h further from the wall than the one before; a second table has walls with restitution. Both are those
+of the small linear rods that the
 program itself judges by; in its own runs all rods are one mesh, so that one run does all phases, and the tests hold
 both against each other. The exact energy ratios and releases are 1.
 """

@@ -67,12 +67,14 @@ class Asked:
     consistent : mass matrix; else lumped
     step : over the explicit limit of the lumped rod, l/c
     restitution : of the wall
+    elements : bars along a rod
     """
 
     treatment: str
     consistent: bool
     step: float
     restitution: float = 0.0
+    elements: int = 20
 
 
 class _Rods:
@@ -81,11 +83,11 @@ class _Rods:
     The arrays of a state have a row for every node, rod after rod, and one column.
     """
 
-    def __init__(self, scheme: Scheme, asked: Asked, elements: int, phases: int, held: bool = False) -> None:
+    def __init__(self, scheme: Scheme, asked: Asked, phases: int, held: bool = False) -> None:
         self.scheme, self.treatment, self.h, self.held = scheme, asked.treatment, asked.step, held
         consistent, step = asked.consistent, asked.step
         self.restitution = 0.0 if held else asked.restitution
-        nodes = elements + 1
+        nodes = asked.elements + 1
         self.shape = (phases, nodes)
         k = 2.0 * np.eye(nodes) - np.eye(nodes, k=1) - np.eye(nodes, k=-1)
         k[0, 0] = k[-1, -1] = 1.0
@@ -156,7 +158,6 @@ class _Rods:
                     square = np.maximum(speed * speed + (free + after) * way, 0.0)
                     away = np.where(speed > 0.0, self.restitution * np.sqrt(square), 0.0)
                 else:
-                    pull = self.h * self.h * after
                     square = impact_square(approach, way, self.h * self.h * free)
                     away = rebound_way(self.restitution, square, way, self.h * self.h * after) / self.h
                 self._set(self.touching & ~touched, -away, after)
@@ -257,15 +258,15 @@ class _Rods:
 
 
 @np.errstate(all="ignore")
-def scan_impacts(scheme: Scheme, asked: Asked, elements: int = 20, phases: int = PHASES) -> ImpactScan:
+def scan_impacts(scheme: Scheme, asked: Asked, phases: int = PHASES) -> ImpactScan:
     """Let rods fly against a wall, impacts a fraction of a step apart, until the exact ones have left it.
 
-    ``elements``, ``phases`` : bars of a rod, and number of rods.
+    ``phases`` : number of rods.
     """
     # omega = 2 is the highest frequency of unit springs and masses, so h = 1 is the limit of central differences
-    steps = int(np.ceil(2.5 * elements / asked.step)) + 2 * _START + 2
-    swing = _swing(scheme, asked, elements, steps) if scheme.explicit else 1.0
-    rods = _Rods(scheme, asked, elements, phases)
+    steps = int(np.ceil(2.5 * asked.elements / asked.step)) + 2 * _START + 2
+    swing = _swing(scheme, asked, steps) if scheme.explicit else 1.0
+    rods = _Rods(scheme, asked, phases)
     largest, force, releases = np.ones(phases), np.zeros(phases), np.zeros(phases, dtype=int)
     for _ in range(steps):
         touched = rods.touching
@@ -279,9 +280,9 @@ def scan_impacts(scheme: Scheme, asked: Asked, elements: int = 20, phases: int =
     return ImpactScan(largest, energy, releases, force, swing)
 
 
-def _swing(scheme: Scheme, asked: Asked, elements: int, steps: int) -> float:
+def _swing(scheme: Scheme, asked: Asked, steps: int) -> float:
     """See :class:`ImpactScan`."""
-    rod = _Rods(scheme, replace(asked, treatment="scheme"), elements, 1, held=True)
+    rod = _Rods(scheme, replace(asked, treatment="scheme"), 1, held=True)
     swing = 1.0
     for _ in range(steps):
         rod.step()

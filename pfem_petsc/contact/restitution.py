@@ -5,8 +5,9 @@ wall becomes -e times that at the impact, and its acceleration the one without c
 happened within the step: with the velocity v towards the wall at its start, at a distance d, it had
 sqrt(v^2 + (a0 + a1) d), with the accelerations a0 and a1 that all but the wall give the node at both ends of the step.
 That is the work of these forces, so that it keeps the energy of a falling node whatever the step, and takes no energy
-from bars that they have not given. With explicit schemes it is the speed of :mod:`~pfem_petsc.contact.rebound`. One that is pressed for longer has the wall's velocity and no acceleration, as with
-``stick``. The energy that is lost, (1 - e^2) of that of the approach, is work of contact.
+from bars that they have not given. With explicit schemes, see :mod:`~pfem_petsc.contact.rebound`. One that
+is pressed for longer has the wall's velocity and no acceleration, as with ``stick``. The energy that is lost, (1 - e^2)
+of that of the approach, is work of contact.
 
 This is the treatment of walls with restitution where the others are left to the scheme.
 """

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 
+import numpy as np
+
 from ..contact.impact_phases import KNOWN, PHASES, Asked, scan_impacts
 from ..registry import lookup
 
@@ -13,6 +15,8 @@ __all__ = ["BOUND", "contact_gain", "overshoots", "warn_of_gain"]
 BOUND = 0.005
 """Part of the energy that impacts on the small rod may gain without a warning."""
 
+_RODS = 1, 20
+"""Fewest and most bars of the rods: a wave passes some trusses within a step, which longer rods do not show."""
 _STEPS = 0.1, 50.0  # over the explicit limit: smaller and larger ones do as these
 
 
@@ -40,19 +44,21 @@ def overshoots(integrator: str, step: float) -> bool:
     return integrator == "wilson" and step > 1.0
 
 
-def warn_of_gain(case, step: float) -> str:
+def warn_of_gain(case, step: float, across: float = np.inf) -> str:
     """What to tell of a case whose contact gains energy beyond :data:`BOUND`; empty for nothing, and for
     treatments that the small rods do not have.
 
-    ``step`` : over the limit of central differences with lumped mass.
+    ``step`` : over the limit of central differences with lumped mass; ``across`` : how many such limits a wave takes
+    through the truss.
     """
     if case.contact.treatment not in KNOWN:
         return ""
     time = case.time
     step = float(f"{step:.2g}")  # so that much the same cases are judged once
+    elements = int(np.clip(np.round(across), *_RODS))
     gains = {}
     for restitution in sorted({0.0, *(float(f"{wall.restitution:.2g}") for wall in case.wall)}):
-        asked = Asked(case.contact.treatment, time.mass == "consistent", step, restitution)
+        asked = Asked(case.contact.treatment, time.mass == "consistent", step, restitution, elements)
         gains[contact_gain(time.integrator, time.scheme.model_dump_json(), asked)] = asked
     gain = max(gains)
     asked = gains[gain]

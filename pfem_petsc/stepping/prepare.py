@@ -191,7 +191,8 @@ def make_stepper(model, plan: Plan) -> Stepper:
 def _warn_of_gain(model, plan: Plan) -> None:
     """Warn where contact gains energy with this scheme, treatment, mass and step."""
     fastest = plan.frequency.upper / (np.sqrt(3.0) if model.inertia.consistent else 1.0)
-    warning = warn_of_gain(model.case, 0.5 * fastest * plan.step)
+    across = 0.5 * fastest * model.length / model.wave_speed
+    warning = warn_of_gain(model.case, 0.5 * fastest * plan.step, across)
     if warning:
         model.warnings.append(warning)
 

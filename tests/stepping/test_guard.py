@@ -149,7 +149,7 @@ def test_a_snap_that_the_step_resolves_passes(integrator, comm, shared_tmp_path)
 
 
 def pushed_block(comm, folder, guard):
-    """Cells of the octet lattice that fly before a plane at 0.1 m/s, by the trapezoidal rule: at rest, but for rounding.
+    """Octet cells that fly before a plane at 0.1 m/s, by the trapezoidal rule.
 
     An iterative linear solver ends the fourth step in another of its solutions: cells are mirrored.
     """

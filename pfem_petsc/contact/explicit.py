@@ -8,6 +8,7 @@ from ..errors import SimulationFailure
 from .flat import press_planes
 from .forces import WallForces
 from .friction import add_friction
+from .jamming import jam
 from .projection import project
 from .rebound import impact_square, rebound_way
 
@@ -231,8 +232,9 @@ class ExplicitContact:
             )
             if unsettled >= 0:
                 raise SimulationFailure(
-                    f"the friction of node {contact.mesh.node_ids[nodes[unsettled]]} on "
-                    "several walls did not converge; reduce time.step"
+                    jam(contact, nodes[unsettled], normals[unsettled])
+                    or f"the friction of node {contact.mesh.node_ids[nodes[unsettled]]} on several walls did not "
+                    "converge; reduce time.step"
                 )
             if self.contact.flat.all():
                 break

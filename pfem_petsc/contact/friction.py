@@ -17,6 +17,7 @@ from ..mechanics.compiled import kernel
 __all__ = ["add_friction"]
 
 _SWEEPS = 2000
+_OVERSHOOT = 0.9  # of the drag over the normal force, from which on sweeps go a part of the way
 
 
 @kernel
@@ -56,10 +57,24 @@ def add_friction(x, before, way, fixed, normals, offsets, dynamic, static, stiff
         reach = stiffness[i] * (
             abs(x[i, 0]) + abs(x[i, 1]) + abs(x[i, 2])
         )  # what rounding of positions makes of forces
+        # where supports leave little of a normal, what a wall drags moves the node more than what it presses: r times,
+        # so that sweeps overshoot from r = 1 on unless they go a part of the way
+        part = 1.0
+        for k in range(w):
+            if offsets[i, k] > -math.inf and static[k] > 0.0:
+                length = 0.0
+                for c in range(3):
+                    if not fixed[i, c]:
+                        length += normals[i, k, c] * normals[i, k, c]
+                if length >= 1e-12:
+                    ratio = static[k] * math.sqrt(max(1.0 - length, 0.0) / length)
+                    if ratio > _OVERSHOOT:
+                        part = min(part, 1.0 / (1.0 + ratio))
         settled = False
         for _ in range(_SWEEPS):
             change = 0.0
             largest = 0.0
+            least = 1.0  # where supports leave little of a normal, rounding makes more of forces
             for k in range(w):
                 if offsets[i, k] == -math.inf:
                     continue
@@ -71,16 +86,19 @@ def add_friction(x, before, way, fixed, normals, offsets, dynamic, static, stiff
                         length += normals[i, k, c] * normals[i, k, c]
                 if length < 1e-12:
                     continue
+                least = min(least, length)
                 # normal
                 old = pressing[i, k]
                 new = max(0.0, old - gap * stiffness[i] / length)
                 if new == 0.0 and old == 0.0:
                     continue
+                change = max(change, abs(new - old))
+                if part < 1.0:
+                    new = old + part * (new - old)
                 for c in range(3):
                     if not fixed[i, c]:
                         x[i, c] += (new - old) * normals[i, k, c] * soft
                 pressing[i, k] = new
-                change = max(change, abs(new - old))
                 largest = max(largest, new)
                 # tangential: the force that would end the slip, and what the wall can give of it
                 if static[k] == 0.0:
@@ -100,11 +118,14 @@ def add_friction(x, before, way, fixed, normals, offsets, dynamic, static, stiff
                 for c in range(3):
                     force = factor * trial[c]
                     move = force - drag[i, k, c]
+                    change = max(change, abs(move))
+                    if part < 1.0:
+                        move *= part
+                        force = drag[i, k, c] + move
                     drag[i, k, c] = force
                     if not fixed[i, c]:
                         x[i, c] += move * soft
-                    change = max(change, abs(move))
-            if change <= 1e-15 * (largest + reach) or largest == 0.0:
+            if change <= 1e-15 * (largest + reach / least) or largest == 0.0:
                 settled = True
                 break
         if not settled and unsettled < 0:

@@ -19,6 +19,7 @@ from ..solvers.newton import zero_tolerance
 from .forces import WallForces
 from .frames import MIN_VOLUME, NodalFrames
 from .implicit_friction import StepFriction
+from .jamming import jam
 from .links import LinkCoordinates
 from .projection import project
 from .transform import Transform
@@ -232,14 +233,26 @@ class ContactRounds:
             return settled
         self.round += 1
         if self.round >= _ROUNDS:
-            names = self.model.comm.allgather(self.model.mesh.node_ids[left[:3]].tolist())
-            shown = ", ".join(str(node) for part in names for node in part)
-            raise NotConverged(
-                f"step {self.state.step + 1}, t = {self.balance.time:.6g} s: the active set of the walls did not "
-                f"converge in {_ROUNDS} solves{f' (nodes {shown})' if shown else ''}; reduce time.step"
-            )
+            raise NotConverged(f"step {self.state.step + 1}, t = {self.balance.time:.6g} s: {self._why(left, x)}")
         self._join(joined, broken, x)
         return False
+
+    def _why(self, left: np.ndarray, x: np.ndarray) -> str:
+        """Why solves of nodes (k,) at (owned, 3) come to no end, and what to do. Collective."""
+        comm = self.model.comm
+        jams = []
+        if self.friction is not None and len(left):
+            normals, _ = self.contact.planes(self.contact.members[left], x[left], self._shifts)
+            jams = [text for node, n in zip(left, normals, strict=True) if (text := jam(self.contact, node, n))]
+        jams = [text for part in comm.allgather(jams[:1]) for text in part]
+        if jams:
+            return jams[0]
+        names = comm.allgather(self.model.mesh.node_ids[left[:3]].tolist())
+        shown = ", ".join(str(node) for part in names for node in part)
+        return (
+            f"the active set of the walls did not converge in {_ROUNDS} solves"
+            f"{f' (nodes {shown})' if shown else ''}; reduce time.step"
+        )
 
     def _check_links(
         self, w: np.ndarray, x: np.ndarray, g: np.ndarray, noise: float, slack: float

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from helpers.lattices import lattice_case, simulation
 
-from pfem_petsc.errors import InputError
+from pfem_petsc.errors import InputError, SimulationFailure
 
 ANGLE, G = 0.4, 9.81
 SLOPE = np.array([np.cos(ANGLE), 0.0, -np.sin(ANGLE)])  # downhill
@@ -151,3 +151,47 @@ def test_bouncing(restitution, comm, shared_tmp_path):
 @pytest.mark.parallel
 def test_sliding_on_ranks(comm, shared_tmp_path):
     test_sliding_block("central_differences", 0.3, comm, shared_tmp_path)
+
+
+def guided(integrator, friction, wall, speed=0.0):
+    """A bar that is guided along z, and a slope at 60 degrees at one end."""
+    slope = {"point": [0.0, 0.0, -0.01053], "normal": [-np.sqrt(0.75), 0.0, 0.5], "friction": friction, **wall}
+    return {
+        "mesh": {"generator": "rod", "length": 0.2, "elements": 2},
+        "material": {"m": {"young_modulus": 1e6, "density": 1000.0}},
+        "section": {"s": {"area": 1e-4, "material": "m"}},
+        "node_set": {"all": {"all": True}, "start": {"group": "start"}},
+        "support": [{"node_set": "all", "fix": "xy"}],
+        "initial": {"velocity": [0.0, 0.0, speed]},
+        "wall": [{"type": "plane", "name": "slope", "node_set": "start", **slope}],
+        "time": {"integrator": integrator, "step": 1e-3, "end": 0.15},
+        "output": {"fields_every": 0},
+        "solver": {"linear": "mumps"},
+    }
+
+
+@pytest.mark.parametrize("integrator", ["central_differences", "newmark"])
+@pytest.mark.parametrize("friction", [0.3, 0.6, 1.5, 8.0])
+def test_guided_node_is_stopped_by_any_friction(integrator, friction, comm, shared_tmp_path):
+    """Falling on the slope, normal force and drag both push it up: their ratio is that of the law.
+
+    From cot 60 = 0.577 on the drag moves the node more than the normal force does, and sweeps over both overshoot.
+    """
+    rows = [step.row for step in simulation(guided(integrator, friction, {}, -0.1), comm, shared_tmp_path)]
+    x, _, z = next(row["wall/slope/force"] for row in rows if row["wall/slope/force"][2] > 0.0)
+    normal, slope = np.sqrt(0.75), 0.5
+    assert x / z == pytest.approx((friction * slope - normal) / (slope + friction * normal), rel=1e-6)
+    assert rows[-1]["friction_dissipation"] > 0.0
+    assert abs(rows[-1]["energy_imbalance"]) < 1e-12
+
+
+@pytest.mark.parametrize("integrator", ["central_differences", "newmark"])
+def test_wedge_that_locks_itself(integrator, comm, shared_tmp_path):
+    """The slope is driven under the node, and drags it down by its friction: it lifts it below cot 60 = 0.577 alone."""
+    wall = {"velocity": [-0.1, 0.0, 0.0], "point": [0.0, 0.0, -0.0003]}
+    run = simulation(guided(integrator, 0.4, wall), comm, shared_tmp_path, "lifts")
+    rows = [step.row for step in run]
+    assert rows[-1]["wall/slope/impulse"][2] > 0.0 and rows[-1]["friction_dissipation"] > 0.0
+    run = simulation(guided(integrator, 0.6, wall), comm, shared_tmp_path, "locks")
+    with pytest.raises(SimulationFailure, match=r"step \d+, .*jams node 0: .*'slope' .* of 0\.577 on, and has 0\.6;"):
+        list(run)

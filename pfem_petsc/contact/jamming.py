@@ -1,0 +1,40 @@
+"""Friction that jams nodes which supports guide: where a wall is to push them along, Coulomb's law has no solution.
+
+A node with prescribed components moves in what is left, along the free part f of a wall's normal, |f|^2 = a. The wall
+pushes it along f by a lambda, and the slip of this motion is dragged back by mu lambda sqrt(a (1 - a)). From
+mu = sqrt(a/(1 - a)) on, the cotangent of the angle between guide and normal, the wall cannot move the node however hard
+it presses: a wedge that locks itself.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+__all__ = ["jam"]
+
+_THIN = 1e-12  # squared length of a normal's free part below which supports alone decide
+
+
+def jam(contact, node: int, normals: np.ndarray) -> str:
+    """Why the friction of an owned node cannot be found, and the way out; empty where nothing jams it.
+
+    Parameters
+    ----------
+    contact : Contact
+    normals : (w, 3) of the walls at the node
+    """
+    fixed = contact.fixed[node]
+    if not fixed.any():
+        return ""
+    square = (np.where(fixed, 0.0, normals) ** 2).sum(axis=1)
+    least = np.sqrt(square / np.maximum(1.0 - square, 1e-300))
+    jams = contact.members[node] & (square > _THIN) & (contact.static_friction >= least)
+    if not jams.any():
+        return ""
+    wall = int(np.flatnonzero(jams)[0])
+    return (
+        f"friction jams node {contact.mesh.node_ids[node]}: its supports guide it at an angle at which wall "
+        f"{contact.names[wall]!r} cannot push it along from a coefficient of {least[wall]:.3g} on, and has "
+        f"{contact.static_friction[wall]:.3g}; lower the friction, free the node, or name the nodes that the wall "
+        "stops with 'node_set'"
+    )

@@ -84,7 +84,7 @@ class ConstraintLink:
         data[here] = np.hstack([normals.reshape(len(here), 3 * walls), np.maximum(offsets, -1e300)])
         data = self.rows.gather(data) if walls else np.zeros((len(self.rows.numbers), 0))
         offsets = data[:, 3 * walls :]
-        return data[:, : 3 * walls].reshape(-1, walls, 3), np.where(offsets <= -1e300, -np.inf, offsets)
+        return data[:, : 3 * walls].reshape(len(data), walls, 3), np.where(offsets <= -1e300, -np.inf, offsets)
 
     def coordinates(self) -> RowCoordinates:
         return RowCoordinates(self)
@@ -119,8 +119,8 @@ class ConstraintLink:
         special = walls.special & met
         if special.any():
             raise InputError(
-                f"{key}: wall {walls.names[int(special.argmax())]!r} stops constrained nodes: such a wall must be flat, "
-                "without mass, friction and restitution, and not tied; or give it a node_set without them"
+                f"{key}: wall {walls.names[int(special.argmax())]!r} stops constrained nodes: such a wall must be "
+                "flat, without mass, friction and restitution, and not tied; or give it a node_set without them"
             )
         points = rows.gather(model.mesh.points[: model.mesh.n_owned])
         values = rows.values(points)

@@ -2,7 +2,7 @@
 
 With y the coordinates of the nodes, those of their frames where walls are near (u = B^-1 y), a row is J y >= d in each
 solve. Of each group of rows that share nodes, pivots P are chosen, one free component for each row, by elimination with
-complete pivoting; with s the size of a row's pivot and N all other components,
+complete pivoting; with s the size of a row's gradient and N all other components,
 
     w_P = J y / s,   w_N = y_N,   and back   y_P = J_P^-1 (s w_P - J_N w_N),
 
@@ -83,7 +83,7 @@ class RowCoordinates:
             dense = group.dense(turned).reshape(len(group.rows), -1)
             row, column = _pivots(np.where(room[unknowns], dense, 0.0))
             pivots, every = dense[np.ix_(row, column)], np.eye(len(unknowns))
-            scale = np.abs(dense[row, column])
+            scale = np.linalg.norm(dense[row], axis=1)
             others = dense[row].copy()
             others[:, column] = 0.0
             transform = every.copy()

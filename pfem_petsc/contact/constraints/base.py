@@ -1,7 +1,7 @@
 """What every constraint is: rows r(x) >= 0 over a few nodes each, with their gradients.
 
-A module of this package is a kind of constraint: a class ``Parameters`` with the keys of a ``[[constraint]]`` table, and
-a class ``Constraint``. Explicit and implicit steps, history and checkpoints follow from the rows.
+A module of this package is a kind of constraint: a class ``Parameters`` with the keys of a ``[[constraint]]`` table,
+and a class ``Constraint``. Explicit and implicit steps, history and checkpoints follow from the rows.
 """
 
 from __future__ import annotations

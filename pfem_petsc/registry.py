@@ -20,6 +20,8 @@ def choices(package: str) -> list[str]:
 
 def nearest(name: str, known: list[str]) -> str:
     """Hint for a misspelt name: ``", did you mean 'x'?"``, or the known names where none is near."""
+    if not known:
+        return "; there is none"
     match = difflib.get_close_matches(str(name), known, n=1, cutoff=0.6)
     return f", did you mean '{match[0]}'?" if match else f"; known: {', '.join(known)}"
 

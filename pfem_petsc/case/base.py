@@ -11,8 +11,10 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
 __all__ = [
+    "ConstraintKeys",
     "Finite",
     "Name",
+    "NodeSetName",
     "NonNegativeFloat",
     "NonNegativeInt",
     "PositiveFloat",
@@ -60,6 +62,19 @@ Vector3 = Annotated[tuple[Finite, Finite, Finite], listed]
 PositiveInts3 = Annotated[tuple[PositiveInt, PositiveInt, PositiveInt], listed]
 Name = Annotated[str, Field(min_length=1, pattern=r"^[^/\x00-\x1f\x7f-\x9f]+$"), AfterValidator(_no_path_of_its_own)]
 """A name that ends up as part of a path inside the result file: not empty, no slash, no dot alone, which HDF5 skips."""
+
+
+NodeSetName = Annotated[str, Field(json_schema_extra={"refers_to": "node_set"})]
+"""A key of a constraint that names a node set of the case; that there is one is checked with the case."""
+
+
+class ConstraintKeys(StrictModel):
+    """The keys that every constraint has; a kind of constraint adds its own."""
+
+    name: Name
+    """Names the constraint in results and messages; unique. One without is called ``constraint1``, ..."""
+    kind: str
+    """The kind of constraint: a module of ``pfem_petsc.contact.constraints``."""
 
 
 class WallParameters(StrictModel):

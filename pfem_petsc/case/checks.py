@@ -41,10 +41,10 @@ def check_names(case: Mapping[str, Any], data: Mapping[str, Any], problems: Prob
     for i, entry in enumerate(on):
         _node_set(("initial", "on", i), entry, node_sets, problems)
     _distinct(("wall",), case["wall"], "wall", problems)
-    for i, pair in enumerate(case["contact_pair"]):
-        for key in ("first", "second"):
-            problems.refer(("contact_pair", i, key), getattr(pair, key), node_sets, "node set")
-    _distinct(("contact_pair",), case["contact_pair"], "contact pair", problems)
+    for table, what in (("contact_pair", "contact pair"), ("constraint", "constraint")):
+        for i, entry in enumerate(case[table]):
+            _node_sets((table, i), entry, node_sets, problems)
+        _distinct((table,), case[table], what, problems)
 
     output = case["output"]
     if output is not None:
@@ -67,6 +67,13 @@ def _names(data: Mapping[str, Any], key: str) -> list[str]:
 def _node_set(path: tuple[str | int, ...], entry: Any, known: list[str], problems: Problems) -> None:
     if entry.node_set is not None:
         problems.refer((*path, "node_set"), entry.node_set, known, "node set")
+
+
+def _node_sets(path: tuple[str | int, ...], entry: Any, known: list[str], problems: Problems) -> None:
+    """Names of node sets in the keys of type ``NodeSetName``."""
+    for key, field in type(entry).model_fields.items():
+        if (field.json_schema_extra or {}).get("refers_to") == "node_set" and getattr(entry, key) is not None:
+            problems.refer((*path, key), getattr(entry, key), known, "node set")
 
 
 def _distinct(path: tuple[str | int, ...], entries: Any, what: str, problems: Problems) -> None:

@@ -22,6 +22,7 @@ __all__ = ["KEYS", "parse_toml", "read_tables"]
 GENERATORS = "pfem_petsc.mesh.generators"
 INTEGRATORS = "pfem_petsc.integrators"
 WALLS = "pfem_petsc.contact.walls"
+CONSTRAINTS = "pfem_petsc.contact.constraints"
 
 M = TypeVar("M", bound=StrictModel)
 
@@ -31,7 +32,7 @@ _LONG_KEY = re.compile(r"""(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*)""" +
 
 KEYS = [
     *("title", "mesh", "node_set", "material", "section", "initial", "support"),
-    *("load", "gravity", "temperature", "wall", "contact_pair", "contact", "time", "output", "solver"),
+    *("load", "gravity", "temperature", "wall", "contact_pair", "constraint", "contact", "time", "output", "solver"),
 ]
 """Keys of a case file at its top."""
 
@@ -88,8 +89,11 @@ def read_tables(data: Mapping[str, Any], folder: Path, problems: Problems) -> di
         "load": _listed(t.Load, data.get("load"), ("load",), problems),
         "gravity": problems.read(t.Gravity, data["gravity"], ("gravity",)) if "gravity" in data else None,
         "temperature": _listed(t.Temperature, data.get("temperature"), ("temperature",), problems),
-        "wall": _walls(data.get("wall"), problems),
+        "wall": _kinds(data.get("wall"), "wall", "type", WALLS, "a wall of type", problems),
         "contact_pair": _pairs(data.get("contact_pair"), problems),
+        "constraint": _kinds(
+            data.get("constraint"), "constraint", "kind", CONSTRAINTS, "a constraint of kind", problems
+        ),
         "contact": problems.read(s.ContactSettings, data.get("contact", {}), ("contact",)),
         "time": _time(data, problems),
         "output": _output(data.get("output", {}), problems),
@@ -196,22 +200,23 @@ def _initial(data: Mapping[str, Any], problems: Problems) -> list[t.Initial]:
     return [entry for entry in entries if entry is not None]
 
 
-def _walls(data: Any, problems: Problems) -> list[StrictModel]:
-    walls = []
-    for i, row in enumerate(_rows(data, ("wall",), problems)):
-        path: KeyPath = ("wall", i)
+def _kinds(data: Any, table: str, key: str, package: str, what: str, problems: Problems) -> list[StrictModel]:
+    """A list of tables of which a key names the module that knows the others."""
+    found = []
+    for i, row in enumerate(_rows(data, (table,), problems)):
+        path: KeyPath = (table, i)
         if not isinstance(row, Mapping):
             problems.add(path, "expected a table", row)
             continue
-        if "type" not in row:
-            problems.add((*path, "type"), "this key is missing: the kind of wall")
+        if key not in row:
+            problems.add((*path, key), f"this key is missing: the kind of {table}")
             continue
-        model = _parameters_model(WALLS, row["type"], (*path, "type"), problems)
+        model = _parameters_model(package, row[key], (*path, key), problems)
         if model is not None:
-            named = {"name": f"wall{i + 1}", **row}
-            taker = f"a wall of type {row['type']}"
-            walls.append(problems.read(model, named, path, taker=taker, siblings=lambda: _siblings(WALLS)))
-    return [wall for wall in walls if wall is not None]
+            named = {"name": f"{table}{i + 1}", **row}
+            taker = f"{what} {row[key]}"
+            found.append(problems.read(model, named, path, taker=taker, siblings=lambda: _siblings(package)))
+    return [each for each in found if each is not None]
 
 
 def _supports(data: Any, folder: Path, problems: Problems) -> list[t.Support]:

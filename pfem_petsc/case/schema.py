@@ -32,7 +32,7 @@ class Case:
     overrides : texts that were set over its values
     mesh : :class:`~pfem_petsc.case.tables.Mesh`: generator with parameters, or file
     node_set, material, section : tables by name, in the file's order
-    initial, support, load, temperature, wall, contact_pair : lists of tables
+    initial, support, load, temperature, wall, contact_pair, constraint : lists of tables
     gravity : :class:`~pfem_petsc.case.tables.Gravity` or None
     contact, time, output, solver : tables of :mod:`~pfem_petsc.case.settings`
 
@@ -139,6 +139,7 @@ class Case:
             "temperature": [_table(entry) for entry in self.temperature],
             "wall": [_table(entry) for entry in self.wall],
             "contact_pair": [_table(entry) for entry in self.contact_pair],
+            "constraint": [_table(entry) for entry in self.constraint],
             "contact": _table(self.contact),
             "time": {**time, **_table(self.time.scheme)},
             "output": _table(self.output),

@@ -11,6 +11,7 @@ from pydantic import Field, InstanceOf, field_validator, model_validator
 from .base import (
     Finite,
     Name,
+    NodeSetName,
     NonNegativeFloat,
     NonNegativeInt,
     PositiveFloat,
@@ -226,9 +227,9 @@ class ContactPair(StrictModel):
 
     name: Name
     """names the pairs in results and messages; unique"""
-    first: str
+    first: NodeSetName
     """name of a node set"""
-    second: str
+    second: NodeSetName
     """name of a node set of as many nodes; each is paired with the first one nearest to it, seen along the direction"""
     direction: Vector3
     """points from the first nodes to the second"""

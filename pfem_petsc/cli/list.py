@@ -1,4 +1,4 @@
-"""List the built-in cases, integrators, mesh generators, walls and treatments of impact."""
+"""List the built-in cases, integrators, mesh generators, walls, constraints and treatments of impact."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ KINDS = {
     "integrators": "pfem_petsc.integrators",
     "mesh generators": "pfem_petsc.mesh.generators",
     "walls": "pfem_petsc.contact.walls",
+    "constraints": "pfem_petsc.contact.constraints",
     "treatments of impact": "pfem_petsc.contact.treatments",
 }
 
@@ -37,6 +38,8 @@ def run(arguments: argparse.Namespace) -> int:
         sections[kind] = {name: _first_line(f"{package}.{name}") for name in choices(package)}
     width = max(len(name) for lines in sections.values() for name in lines)
     for kind, lines in sections.items():
+        if not lines:
+            continue
         print(f"{kind}:")
         for name, text in lines.items():
             print(f"  {name:{width}}  {text}")

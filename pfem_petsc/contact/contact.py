@@ -80,6 +80,14 @@ class Contact:
         self.length = float(ends.sum(axis=0).max())
 
     @property
+    def special(self) -> np.ndarray:
+        """(walls,) bool: walls that are not just planes whose motion is given: curved, with mass, friction,
+        restitution, or tied."""
+        special = ~self.flat | (self.restitution > 0.0) | (self.static_friction > 0.0) | self.ties.tying
+        special[self.motion.bodies.at] = True
+        return special
+
+    @property
     def symmetric(self) -> bool:
         """Whether the Hessian of a step with these walls is symmetric: friction makes it unsymmetric."""
         return not self.rough

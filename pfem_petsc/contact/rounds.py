@@ -56,7 +56,7 @@ class ContactRounds:
         self.state = state
         self.balance = balance
         self.held = held
-        self.round = 0
+        self.round = self._link_rounds = 0
         self._frames: NodalFrames | None = None
         self._rank: np.ndarray | None = None
         self._tied: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None  # in the frames, walls, places
@@ -279,6 +279,13 @@ class ContactRounds:
             except NotConverged as failure:
                 raise NotConverged(f"step {self.state.step + 1}, t = {self.balance.time:.6g} s: {failure}") from failure
         self.links = [link for link in self._all_links if link in self.links or link in met]
+        if not settled:
+            self._link_rounds += 1
+            if self._link_rounds >= _ROUNDS:
+                raise NotConverged(
+                    f"step {self.state.step + 1}, t = {self.balance.time:.6g} s: constraints and positions did not "
+                    f"agree in {_ROUNDS} solves; reduce time.step"
+                )
         return settled and not met, g
 
     def _strengths(self, w: np.ndarray, g: np.ndarray, noise: float) -> np.ndarray:

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 from mpi4py import MPI
 
+from ..contact.constraint_link import ConstraintLink
 from ..contact.contact import Contact
-from ..contact.links import Links
+from ..contact.links import Link, Links
 from ..contact.pair_link import PairLink
 from ..contact.pairs import ContactPairs
 from ..contact.start import adjust_start
@@ -76,7 +77,10 @@ class Model:
         if case.contact_pair:
             self.pairs = ContactPairs(case, self.nodes, mesh, self.supports.fixed, self.contact)
 
-        self.links = Links([] if self.pairs is None else [PairLink(self.pairs)])
+        links: list[Link] = [] if self.pairs is None else [PairLink(self.pairs)]
+        if case.constraint:
+            links.append(ConstraintLink(case, self.nodes, mesh, self.supports.fixed, self.contact))
+        self.links = Links(links)
         self.can_touch = self.contact.any or bool(self.links)
 
         points = mesh.points[: mesh.n_owned]

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ..case.materials import law_name, law_of
 from ..contact.free import FreeWalls
 from ..contact.restitution import Treatment as Restitution
 from ..contact.treatments.mass_redistribution import redistribute
@@ -76,6 +77,7 @@ def make_plan(model, recorded: Mapping[str, Any] | None = None) -> Plan:
     case = model.case
     time = case.time
     scheme = lookup("pfem_petsc.integrators", time.integrator, f"{case.source}: time.integrator").Scheme(time.scheme)
+    _check_laws(case, scheme)
     if recorded is None:
         frequency = highest_frequency(model, model.mesh.points)
     else:
@@ -128,11 +130,21 @@ def make_plan(model, recorded: Mapping[str, Any] | None = None) -> Plan:
     return Plan(scheme, step, steps, critical, frequency, linear, asked)
 
 
+def _check_laws(case, scheme: Scheme) -> None:
+    """Refuse material laws that the scheme cannot have."""
+    for name, material in case.material.items():
+        reason = law_of(material).refuses(scheme)
+        if reason is not None:
+            raise InputError(
+                f'{case.source}: material.{name}.law = "{law_name(dict(material))}" does not go with time.integrator = '
+                f'"{case.time.integrator}": {reason}; take another integrator or law'
+            )
+
+
 def _linear(model, scheme: Scheme, over: float, steps: int) -> LinearChoice:
     """The choice for steps ``over`` times the limit of central differences."""
     case = model.case
-    yielding = any(material.yield_stress is not None for material in case.material.values())
-    impact = yielding or model.can_touch
+    impact = model.can_touch or not all(law_of(material).smooth for material in case.material.values())
     solver, unknowns = case.solver, 3 * model.mesh.n_nodes
     try:
         choice = choose_linear(solver.linear, unknowns, over, scheme.symmetric, solver.operator, steps, impact)

@@ -360,3 +360,8 @@ def test_treatment_stops_the_chatter_of_the_trapezoidal_rule(examples, comm, sha
     held = np.flatnonzero(history["wall/wall/contacts"])
     assert len(held) > 100
     assert v[held] == pytest.approx((x[held] - x[held - 1]) / 0.01, abs=1e-10)
+
+
+def test_treatment_states_what_it_goes_with(examples, comm, tmp_path):
+    with pytest.raises(InputError, match='friction needs contact.treatment = "scheme" or "stick"'):
+        Simulation(Case.load("polygon_spin", ["wall.0.friction=0.2"]), comm, output=tmp_path / "out", quiet=True)

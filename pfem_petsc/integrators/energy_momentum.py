@@ -22,6 +22,7 @@ class Scheme(Base):
     """Energy-momentum conserving scheme (implicit)."""
 
     at_ends = False
+    force_acts_once = True
     discrete_gradient = True
     symmetric = False
     dissipates = False

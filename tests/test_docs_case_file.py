@@ -9,6 +9,7 @@ import pytest
 from mpi4py import MPI
 
 from pfem_petsc.case import settings, tables
+from pfem_petsc.case.materials import LAWS
 from pfem_petsc.case.schema import Case
 from pfem_petsc.mesh.readers.gmsh import read
 from pfem_petsc.registry import choices, lookup
@@ -16,8 +17,9 @@ from pfem_petsc.registry import choices, lookup
 DOCS = Path(__file__).parents[1] / "docs"
 TEXT = (DOCS / "case_file.md").read_text()
 MODELS = [
-    *(tables.MeshKeys, tables.NodeSet, tables.Material, tables.Section, tables.Initial, tables.Support, tables.Load),
+    *(tables.MeshKeys, tables.NodeSet, tables.Section, tables.Initial, tables.Support, tables.Load),
     *(tables.Gravity, tables.Temperature, settings.TimeKeys, settings.OutputKeys, settings.Probe, settings.Solver),
+    *(lookup(LAWS, name, "").Parameters for name in choices(LAWS)),
     *(lookup("pfem_petsc.mesh.generators", name, "").Parameters for name in choices("pfem_petsc.mesh.generators")),
 ]
 

@@ -11,7 +11,7 @@ import pytest
 PACKAGE = Path(__file__).resolve().parent.parent / "pfem_petsc"
 
 FLOORS = (
-    ("errors", "signals"),
+    ("energies", "errors", "fields", "signals"),
     ("registry",),
     ("parallel",),
     ("case", "cases"),

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from ..fields import cell_fields, point_fields
 from ..registry import nearest
+from .materials import internal_variables
 from .problems import Problems
-from .settings import CELL_FIELDS, POINT_FIELDS
 
 __all__ = ["check_names"]
 
@@ -51,8 +52,8 @@ def check_names(case: Mapping[str, Any], data: Mapping[str, Any], problems: Prob
         for i, probe in enumerate(output.probe):
             _node_set(("output", "probe", i), probe, node_sets, problems)
         _distinct(("output", "probe"), output.probe, "probe", problems)
+        known = list(dict.fromkeys([*point_fields(), *cell_fields(), *internal_variables(case["material"])]))
         for i, name in enumerate(output.fields or ()):
-            known = [*POINT_FIELDS, *CELL_FIELDS]
             if name not in known:
                 problems.add(("output", "fields", i), f"there is no field of this name{nearest(name, known)}", name)
             elif name in output.fields[:i]:

@@ -13,6 +13,7 @@ from ..registry import choices, lookup, nearest
 from . import settings as s
 from . import tables as t
 from .base import StrictModel
+from .materials import read_materials
 from .problems import Path as KeyPath
 from .problems import Problems
 from .record import read_record
@@ -82,7 +83,7 @@ def read_tables(data: Mapping[str, Any], folder: Path, problems: Problems) -> di
         "title": title,
         "mesh": _mesh(data, folder, problems),
         "node_set": _named(t.NodeSet, data, "node_set", problems),
-        "material": _named(t.Material, data, "material", problems),
+        "material": read_materials(data, problems),
         "section": _named(t.Section, data, "section", problems),
         "initial": _initial(data, problems),
         "support": _supports(data.get("support"), folder, problems),

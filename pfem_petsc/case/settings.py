@@ -11,8 +11,6 @@ from ..registry import choices, nearest
 from .base import Name, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, StrictModel, listed
 
 __all__ = [
-    "CELL_FIELDS",
-    "POINT_FIELDS",
     "ContactSettings",
     "Output",
     "OutputKeys",
@@ -23,9 +21,6 @@ __all__ = [
 ]
 
 TREATMENTS = "pfem_petsc.contact.treatments"
-
-POINT_FIELDS = ("displacement", "velocity", "acceleration", "contact_force")
-CELL_FIELDS = ("strain", "stress", "axial_force", "plastic_strain", "temperature")
 
 
 class TimeKeys(StrictModel):

@@ -12,7 +12,6 @@ from .base import (
     Finite,
     Name,
     NodeSetName,
-    NonNegativeFloat,
     NonNegativeInt,
     PositiveFloat,
     StrictModel,
@@ -25,7 +24,6 @@ __all__ = [
     "Gravity",
     "Initial",
     "Load",
-    "Material",
     "Mesh",
     "MeshKeys",
     "NodeSet",
@@ -113,34 +111,6 @@ class NodeSet(StrictModel):
         if len(given) != 1:
             found = f"got {' and '.join(given)}" if given else "got none"
             raise ValueError(f"expected exactly one of the keys {', '.join(type(self).model_fields)}, {found}")
-        return self
-
-
-class Material(StrictModel):
-    """Elastic or elasto-plastic bar material with mixed linear hardening."""
-
-    young_modulus: PositiveFloat
-    """Young's modulus [Pa]"""
-    density: PositiveFloat
-    """mass density [kg/m3]"""
-    yield_stress: PositiveFloat | None = None
-    """yield stress [Pa]; none: elastic"""
-    isotropic_hardening: NonNegativeFloat = 0.0
-    """isotropic hardening modulus K [Pa]"""
-    kinematic_hardening: NonNegativeFloat = 0.0
-    """kinematic hardening modulus H [Pa]"""
-    thermal_expansion: Finite = 0.0
-    """coefficient of thermal expansion [1/K]"""
-    damping: NonNegativeFloat = 0.0
-    """damping c_m proportional to mass density [kg/(m3 s)]"""
-    strain: Literal["engineering", "green", "logarithmic"] = "engineering"
-    """strain measure"""
-
-    @model_validator(mode="after")
-    def _hardening_needs_yield(self) -> Material:
-        for key in ("isotropic_hardening", "kinematic_hardening"):
-            if self.yield_stress is None and getattr(self, key) > 0.0:
-                raise ValueError(f"{key} = {getattr(self, key)!r} needs a yield_stress [Pa]")
         return self
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from typing import TYPE_CHECKING
 
+from ..energies import LOST, STORED, SUPPLIED
 from ..errors import printable
-from ..output.energies import LOST, STORED, SUPPLIED
 from .parser import PROGRAM, add_result, surviving
 
 if TYPE_CHECKING:

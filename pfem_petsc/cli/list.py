@@ -21,6 +21,7 @@ example:
 KINDS = {
     "integrators": "pfem_petsc.integrators",
     "mesh generators": "pfem_petsc.mesh.generators",
+    "material laws": "pfem_petsc.mechanics.materials",
     "walls": "pfem_petsc.contact.walls",
     "constraints": "pfem_petsc.contact.constraints",
     "treatments of impact": "pfem_petsc.contact.treatments",

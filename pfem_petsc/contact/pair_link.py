@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from petsc4py import PETSc
 
-from ..errors import InputError, NotConverged
+from ..errors import NotConverged
 from ..integrators.base import Balance, State
 from .frames import NodalFrames
 from .links import BlocksOf
@@ -47,9 +47,6 @@ class PairLink:
 
     def check(self, model, on_its_own: bool) -> None:
         treatment = model.case.contact.treatment
-        if treatment == "mass_redistribution":
-            key = f'{model.case.source}: contact.treatment = "mass_redistribution"'
-            raise InputError(f"{key}: only walls can take mass from nodes; take another treatment with contact_pair")
         self.pairs.check_scheme(on_its_own, treatment)
         self.pairs.check_start(model.mesh.points[: model.mesh.n_owned], model.length, model.case.source)
 

@@ -93,6 +93,8 @@ class Scheme(ABC):
     at_ends : the balance holds at the ends of steps, so that works follow the trapezoidal rule; else the forces of the
         balance work over the whole step
     solves_end : the position solved for is x_{n+1}
+    discrete_gradient : the internal force of its balances is that of the step (``Balance.from_start``)
+    force_acts_once : the contact force of a step acts in that step alone once its acceleration is taken away
     symmetric : whether the Hessian is
     remembers : names of what it keeps of nodes in the state's memory, linear in motions
     dissipates : whether the scheme takes energy from high frequencies
@@ -105,6 +107,8 @@ class Scheme(ABC):
     leads = False
     at_ends = True
     solves_end = True
+    discrete_gradient = False
+    force_acts_once = False
     symmetric = True
     remembers: tuple[str, ...] = ()
     dissipates = True

@@ -22,6 +22,8 @@ class Scheme(Base):
     """Energy-momentum conserving scheme (implicit)."""
 
     at_ends = False
+    force_acts_once = True
+    discrete_gradient = True
     symmetric = False
     dissipates = False
     turns_held = True
@@ -36,7 +38,7 @@ class Scheme(Base):
             time=state.time + h,
             loads=((1.0, state.time + 0.5 * h),),
             weight=1.0,
-            from_start=True,
+            from_start=self.discrete_gradient,
         )
 
     def finish(self, state: State, balance: Balance, u: np.ndarray, h: float) -> None:

@@ -22,6 +22,7 @@ class Scheme(Base):
     """Houbolt's method (implicit)."""
 
     remembers = ("d0", "d1")
+    force_acts_once = True
 
     def step_changed(self, state: State) -> None:
         state.memory.pop("d0", None)

@@ -28,6 +28,8 @@ class Parameters(StrictModel):
 class Scheme(Base):
     """Newmark's method (implicit)."""
 
+    force_acts_once = True
+
     def __init__(self, parameters: StrictModel) -> None:
         super().__init__(parameters)
         self.dissipates = parameters.gamma > 0.5

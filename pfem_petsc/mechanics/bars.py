@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
 
+from ..case.materials import internal_variables, law_of
+from ..energies import BAR_ENERGIES
 from ..errors import InputError
+from ..registry import nearest
 from .compiled import kernel
 from .conserving import make_conserving_kernels
 from .kernels import make_kernels
-from .materials import elastic, elastoplastic
+from .materials.base import Law
 from .strain import MEASURES
 from .sweep import Sweep, make_sweep
 
@@ -20,19 +24,29 @@ __all__ = ["BarBlock", "Bars", "StrainEnergy", "first_inverted"]
 
 
 class StrainEnergy(NamedTuple):
-    """Sums over the bars counted on this rank [J], the first bar that collapsed (local index, -1: none), and
-    whether any is so short that it may have turned over."""
+    """Sums over the bars counted on this rank, in the order of :data:`~pfem_petsc.energies.BAR_ENERGIES` [J], the first
+    bar that collapsed (local index, -1: none), and whether any is so short that it may have turned over."""
 
-    elastic: float
-    plastic_heat: float
-    hardening: float
-    failed: int
+    energies: tuple[float, ...] = (0.0,) * len(BAR_ENERGIES)
+    failed: int = -1
     shortened: bool = False
+
+    def of(self, name: str) -> float:
+        """The energy of a name [J]."""
+        return self.energies[BAR_ENERGIES.index(name)]
+
+    @property
+    def total(self) -> float:
+        """Stored and dissipated energy [J]."""
+        return sum(self.energies)
 
 
 @dataclass(frozen=True)
 class BarBlock:
-    """Local bars [start, stop) of one section, of which [start, counted) are counted on this rank."""
+    """Local bars [start, stop) of one section, of which [start, counted) are counted on this rank.
+
+    ``modulus`` is the largest that the law can have [Pa]; ``history`` (rows, stop - start) holds ``law.rows``.
+    """
 
     section: str
     start: int
@@ -42,15 +56,22 @@ class BarBlock:
     density: float
     damping: float
     thermal_expansion: float
+    law: Law
     parameters: tuple[float, ...]
+    modulus: float
     history: np.ndarray
     sweep: Sweep
     kernels: SimpleNamespace
-    conserving: SimpleNamespace
+    conserving: SimpleNamespace | None
+
+    def variables(self) -> Iterator[tuple[str, str, np.ndarray]]:
+        """Name, unit and values (stop - start,) of all that is kept of a bar from step to step."""
+        for (name, unit), values in zip(self.law.rows, self.history, strict=True):
+            yield name, unit, values
 
 
 @kernel
-def _rest_lengths(points, bars, rest):
+def _lengths(points, bars, rest):
     for k in range(len(bars)):
         a = bars[k, 0]
         b = bars[k, 1]
@@ -86,8 +107,11 @@ class Bars:
     ends : (b, 2) int32, local node indices of each bar
     far : (b,) uint32, that end of each bar whose index is larger
     rest : (b,) float64, rest lengths [m]
-    thermal : (b,) thermal strains, or (0,) where no temperature acts
-    thermal_at_start : thermal strains at the start of the step, where they vary
+    heat : (2, b) thermal strains and temperatures [K], or (2, 0) where no temperature acts
+    heat_at_start : the same at the start of the step, where they vary
+    step : from the start of the step to the positions that are evaluated [s]; 0 at the start of a run
+    internal : name and unit of the internal variables of all laws of the case
+    kept_names : names of all that laws keep of a bar from step to step, the same on all ranks
     blocks : bars by section
     """
 
@@ -95,9 +119,13 @@ class Bars:
         self.mesh = mesh
         self.ends = mesh.bars
         self.rest = np.empty(len(mesh.bars))
-        _rest_lengths(mesh.points, mesh.bars, self.rest)
-        self.thermal = np.empty(0)
-        self.thermal_at_start = self.thermal
+        _lengths(mesh.points, mesh.bars, self.rest)
+        self.heat = np.empty((2, 0))
+        self.heat_at_start = self.heat
+        self.step = 0.0
+        self.internal = internal_variables(case.material)
+        laws = {section.material: law_of(case.material[section.material]) for section in case.section.values()}
+        self.kept_names = list(dict.fromkeys(name for law in laws.values() for name, _ in law.rows))
         self.far = np.maximum(
             mesh.bars[:, 0], mesh.bars[:, 1], out=np.empty(len(mesh.bars), dtype=np.uint32), casting="unsafe"
         )
@@ -106,8 +134,7 @@ class Bars:
         for block in mesh.blocks:
             section = case.section[names[block.section]]
             material = case.material[section.material]
-            law = elastic if material.yield_stress is None else elastoplastic
-            count = block.stop - block.start
+            law, measure = laws[section.material], MEASURES[material.strain]
             self.blocks.append(
                 BarBlock(
                     section=names[block.section],
@@ -118,43 +145,35 @@ class Bars:
                     density=material.density,
                     damping=material.damping,
                     thermal_expansion=material.thermal_expansion,
-                    parameters=law.pack(material),
-                    history=np.zeros((2, count if law.REMEMBERS else 0)),
+                    law=law,
+                    parameters=material.pack(),
+                    modulus=material.largest_modulus(),
+                    history=np.zeros((len(law.rows), block.stop - block.start)),
                     sweep=make_sweep(mesh.bars, block.start, block.counted, block.stop),
-                    kernels=make_kernels(law.response, law.REMEMBERS, MEASURES[material.strain]),
-                    conserving=make_conserving_kernels(law.response, law.REMEMBERS, MEASURES[material.strain]),
+                    kernels=make_kernels(law, measure),
+                    conserving=None if law.mean_stress is None else make_conserving_kernels(law, measure),
                 )
             )
 
     def _arguments(self, x: np.ndarray, block: BarBlock) -> tuple:
-        return (x, self.ends, self.rest, self.thermal, block.parameters, block.area, block.history)
+        law = (block.parameters, block.area, self.step, block.history)
+        return (x, self.ends, self.rest, self.heat, *law)
 
     def forces(self, x: np.ndarray, f: np.ndarray, commit: bool) -> StrainEnergy:
-        """Internal forces ``f`` (local nodes, 3) [N] at positions ``x``; valid for owned nodes. Keeps the plastic state
-        reached only where ``commit``."""
+        """Internal forces ``f`` (local nodes, 3) [N] at positions ``x``; valid for owned nodes. Keeps the internal
+        variables reached only where ``commit``."""
         f[:] = 0.0
-        elastic_energy = heat = hardening = 0.0
+        energies = np.zeros(len(BAR_ENERGIES))
         failed, shortened = -1, False
         for block in self.blocks:
-            u, q, w, at, short = block.kernels.forces(
-                x,
-                *block.sweep,
-                self.far,
-                self.rest,
-                self.thermal,
-                block.parameters,
-                block.area,
-                block.history,
-                commit,
-                f,
-            )
-            elastic_energy += u
-            heat += q
-            hardening += w
+            law = (block.parameters, block.area, self.step, block.history)
+            part = np.zeros(len(BAR_ENERGIES))
+            at, short = block.kernels.forces(x, *block.sweep, self.far, self.rest, self.heat, *law, commit, f, part)
+            energies += part
             shortened |= short
             if failed < 0:
                 failed = at
-        return StrainEnergy(elastic_energy, heat, hardening, failed, shortened)
+        return StrainEnergy(tuple(energies.tolist()), failed, shortened)
 
     def first_inverted(self, x: np.ndarray, before: np.ndarray) -> int:
         """First local bar that went through zero length from positions ``before`` to ``x``, or -1.
@@ -180,12 +199,12 @@ class Bars:
         f[:] = 0.0
         for block in self.blocks:
             arguments = self._arguments(x, block)
-            block.conserving.forces(x0, self.thermal_at_start, *arguments, block.start, block.stop, f)
+            block.conserving.forces(x0, self.heat_at_start, *arguments, block.start, block.stop, f)
 
     def step_tangents(self, x0, x, weight: float, inertia: list[float], pattern, values: np.ndarray) -> None:
         """As :meth:`tangents`, for :meth:`step_forces`."""
         for block, m in zip(self.blocks, inertia, strict=True):
-            arguments = (x0, self.thermal_at_start, *self._arguments(x, block), block.start, block.stop)
+            arguments = (x0, self.heat_at_start, *self._arguments(x, block), block.start, block.stop)
             block.conserving.tangents(*arguments, m, weight, pattern.ptr, pattern.slots, values)
 
     def product(self, x: np.ndarray, u: np.ndarray, out: np.ndarray) -> None:
@@ -194,41 +213,39 @@ class Bars:
         for block in self.blocks:
             block.kernels.product(*self._arguments(x, block), block.start, block.stop, u, out)
 
+    def lengths(self, x: np.ndarray) -> np.ndarray:
+        """Length (b,) of each local bar [m]."""
+        lengths = np.empty_like(self.rest)
+        _lengths(x, self.ends, lengths)
+        return lengths
+
     def fields(self, x: np.ndarray) -> dict[str, np.ndarray]:
-        """Per local bar: ``strain``, ``stress`` [Pa], ``axial_force`` [N], ``plastic_strain``."""
+        """Per local bar: ``strain``, ``stress`` [Pa], ``axial_force`` [N], ``plastic_strain``, and the internal
+        variables of the case's laws; zero where a bar has no such variable. At the end of the last step."""
         out = {name: np.empty(len(self.ends)) for name in ("strain", "stress", "axial_force")}
-        out["plastic_strain"] = np.zeros(len(self.ends))
+        out |= {name: np.zeros(len(self.ends)) for name in ("plastic_strain", *self.internal)}
         for block in self.blocks:
-            block.kernels.fields(
-                *self._arguments(x, block),
-                block.start,
-                block.stop,
-                out["strain"],
-                out["stress"],
-                out["axial_force"],
-            )
-            if block.history.size:
-                out["plastic_strain"][block.start : block.stop] = block.history[0]
+            arguments = (*self._arguments(x, block), block.start, block.stop)
+            block.kernels.fields(*arguments, out["strain"], out["stress"], out["axial_force"])
+            for name, _, values in block.variables():
+                if name in out:
+                    out[name][block.start : block.stop] = values
         return out
 
     def history(self) -> np.ndarray:
-        """Plastic history (b, 2) of all local bars, zero where a bar cannot yield."""
-        history = np.zeros((len(self.ends), 2))
+        """What laws keep of all local bars (b, names), a column for each of :attr:`kept_names`; zero where a bar does
+        not have it."""
+        history = np.zeros((len(self.ends), len(self.kept_names)))
         for block in self.blocks:
-            if block.history.size:
-                history[block.start : block.stop] = block.history.T
+            for name, _, values in block.variables():
+                history[block.start : block.stop, self.kept_names.index(name)] = values
         return history
 
     def put_history(self, history: np.ndarray) -> None:
         """Set what :meth:`history` gives."""
         for block in self.blocks:
-            if block.history.size:
-                block.history[:] = history[block.start : block.stop].T
-
-    @property
-    def plastic(self) -> bool:
-        """Whether any bar of this rank can yield."""
-        return any(block.history.size for block in self.blocks)
+            for name, _, values in block.variables():
+                values[:] = history[block.start : block.stop, self.kept_names.index(name)]
 
 
 def section_of_bars(case, slab) -> np.ndarray:
@@ -239,8 +256,6 @@ def section_of_bars(case, slab) -> np.ndarray:
     InputError
         Where a section names a group that the mesh lacks, or a bar has two sections or none.
     """
-    from ..registry import nearest
-
     chosen = np.full(len(slab.bars), -1, dtype=np.int32)
     for index, (name, section) in enumerate(case.section.items()):
         if section.bars is None:

@@ -6,14 +6,9 @@ from e0 to e1 in one direction. Its work over the step is exactly A l0 S (e1 - e
 are kept. For engineering strain R = 2/(L (l0 + l1)), for Green's 1/L^2, for the logarithmic
 ln(l1/l0)/((l1^2 - l0^2)/2).
 
-For an elastic bar S = (s0 + s1)/2, and the work is the change of its energy. A bar that yields at the part q of the
-strain's change before the end follows the line of modulus E to its yield stress and that of modulus Et from there:
-
-    S = (s0 + s1)/2 + E de_p (1 - q)/2,   q = E de_p/((E - Et)(e1 - e0)),   dS/de1 = (Et + (E - Et)(1 - q)^2)/2,
-
-with the plastic strain de_p of the step. The law's energies are functions of state on that path, so that the work is
-the change of elastic energy and the plastic dissipation, which is not negative. (s0 + s1)/2 would work less than is
-dissipated: such a step gains energy. Where temperature changes, e is the strain less the thermal strain.
+The law of a material gives S (``mean_stress`` of :class:`~pfem_petsc.mechanics.materials.base.Law`): (s0 + s1)/2 for an
+elastic bar, so that the work is the change of its energy. Where temperature changes, e is the strain less the thermal
+strain.
 """
 
 from __future__ import annotations
@@ -23,14 +18,15 @@ from collections.abc import Callable
 from functools import cache
 from types import SimpleNamespace
 
-import numpy as np
 from numba.extending import register_jitable
 
 from .compiled import kernel
-from .kernels import COLLAPSED_STRETCH
+from .kernels import COLLAPSED_STRETCH, last_row, no_variables
+from .materials.base import Law
+from .rows import take
 from .strain import engineering, green, logarithmic
 
-__all__ = ["make_conserving_kernels", "mean_stress_of_flow"]
+__all__ = ["make_conserving_kernels"]
 
 
 @register_jitable
@@ -63,14 +59,21 @@ _RATIOS = {engineering: _engineering_ratio, green: _green_ratio, logarithmic: _l
 
 
 @cache
-def make_conserving_kernels(response: Callable, remembers: bool, measure: Callable) -> SimpleNamespace:
+def make_conserving_kernels(law: Law, measure: Callable) -> SimpleNamespace:
     """Kernels ``forces`` and ``tangents`` of a material law; arguments as in :mod:`~pfem_petsc.mechanics.kernels`, with
-    positions and thermal strains at the start (``x0``, ``cold``) and end (``x``, ``thermal``) of the step."""
-
+    positions, and thermal strains and temperatures, at the start (``x0``, ``cold``) and end (``x``, ``heat``) of the
+    step."""
+    response, mean_stress, like, by_rate, last = (
+        law.response,
+        law.mean_stress,
+        no_variables(law),
+        law.rate,
+        last_row(law),
+    )
     ratio = _RATIOS[measure]
 
     @register_jitable
-    def pair(ox, oy, oz, dx, dy, dz, rest, shift0, shift, p, area, plastic, accumulated):
+    def pair(ox, oy, oz, dx, dy, dz, rest, shift0, shift, warmth0, warmth, p, area, step, kept, q):
         """Coefficient c = A l0 S R [N/m], dc/dl1 [N/m2] and 1/l1; c is NaN for a collapsed bar."""
         length = math.sqrt(dx * dx + dy * dy + dz * dz)
         s0 = math.sqrt(ox * ox + oy * oy + oz * oz) / rest
@@ -79,39 +82,39 @@ def make_conserving_kernels(response: Callable, remembers: bool, measure: Callab
             return math.nan, 0.0, 0.0
         e0, _, _ = measure(s0)
         e1, slope, _ = measure(s1)
-        stress0, _, _, _, _, _, _ = response(e0 - shift0, p, plastic, accumulated)
-        stress1, modulus, flowed, _, _, _, _ = response(e1 - shift, p, plastic, accumulated)
-        mean = 0.5 * (stress0 + stress1)
-        if remembers and flowed != plastic:
-            young, change = p[0], (e1 - shift) - (e0 - shift0)
-            lost = young - modulus
-            q = young * (flowed - plastic) / (lost * change) if change != 0.0 else 1.0
-            q = min(max(q, 0.0), 1.0)  # beyond by rounding only: the start is not outside of the yield surface
-            mean += 0.5 * young * (flowed - plastic) * (1.0 - q)
-            modulus += lost * (1.0 - q) * (1.0 - q)
+        rate = 0.0
+        if by_rate:
+            stress0 = kept
+            if step > 0.0:
+                rate = ((e1 - shift) - (e0 - shift0)) / step
+        else:
+            stress0, _, _, _ = response(e0 - shift0, 0.0, 0.0, warmth0, p, q)
+        mean, modulus = mean_stress(stress0, e0 - shift0, e1 - shift, rate, step, warmth, p, q)
         r, dr = ratio(s0, s1)
         c = area * mean * r / rest
-        dc = area * (0.5 * modulus * slope * r + mean * dr) / (rest * rest)
+        dc = area * (modulus * slope * r + mean * dr) / (rest * rest)
         return c, dc, 1.0 / length
 
     @kernel
-    def forces(x0, cold, x, bars, rest, thermal, p, area, history, start, stop, f):
+    def forces(x0, cold, x, bars, rest, heat, p, area, step, history, start, stop, f):
         """Add the step's internal forces to ``f``."""
-        warm = len(thermal) > 0
+        warm = heat.shape[1] > 0
         for k in range(start, stop):
             a = bars[k, 0]
             b = bars[k, 1]
-            shift0 = cold[k] if warm else 0.0
-            shift = thermal[k] if warm else 0.0
-            plastic = history[0, k - start] if remembers else 0.0
-            accumulated = history[1, k - start] if remembers else 0.0
+            shift0 = cold[0, k] if warm else 0.0
+            shift = heat[0, k] if warm else 0.0
+            warmth0 = cold[1, k] if warm else 0.0
+            warmth = heat[1, k] if warm else 0.0
+            q = take(history, k - start, like)
+            kept = history[last + 1, k - start] if by_rate else 0.0
             ox = x0[b, 0] - x0[a, 0]
             oy = x0[b, 1] - x0[a, 1]
             oz = x0[b, 2] - x0[a, 2]
             dx = x[b, 0] - x[a, 0]
             dy = x[b, 1] - x[a, 1]
             dz = x[b, 2] - x[a, 2]
-            c, _, _ = pair(ox, oy, oz, dx, dy, dz, rest[k], shift0, shift, p, area, plastic, accumulated)
+            c, _, _ = pair(ox, oy, oz, dx, dy, dz, rest[k], shift0, shift, warmth0, warmth, p, area, step, kept, q)
             dx, dy, dz = 0.5 * (ox + dx), 0.5 * (oy + dy), 0.5 * (oz + dz)
             f[a, 0] -= c * dx
             f[a, 1] -= c * dy
@@ -121,23 +124,29 @@ def make_conserving_kernels(response: Callable, remembers: bool, measure: Callab
             f[b, 2] += c * dz
 
     @kernel
-    def tangents(x0, cold, x, bars, rest, thermal, p, area, history, start, stop, inertia, weight, ptr, slots, values):
+    def tangents(
+        x0, cold, x, bars, rest, heat, p, area, step, history, start, stop, inertia, weight, ptr, slots, values
+    ):
         """Add ``weight`` df/dx1 = c/2 I + dc/dl1 d n1^T (not symmetric) and the consistent inertia."""
-        warm = len(thermal) > 0
+        warm = heat.shape[1] > 0
         for k in range(start, stop):
             a = bars[k, 0]
             b = bars[k, 1]
-            shift0 = cold[k] if warm else 0.0
-            shift = thermal[k] if warm else 0.0
-            plastic = history[0, k - start] if remembers else 0.0
-            accumulated = history[1, k - start] if remembers else 0.0
+            shift0 = cold[0, k] if warm else 0.0
+            shift = heat[0, k] if warm else 0.0
+            warmth0 = cold[1, k] if warm else 0.0
+            warmth = heat[1, k] if warm else 0.0
+            q = take(history, k - start, like)
+            kept = history[last + 1, k - start] if by_rate else 0.0
             ox = x0[b, 0] - x0[a, 0]
             oy = x0[b, 1] - x0[a, 1]
             oz = x0[b, 2] - x0[a, 2]
             dx = x[b, 0] - x[a, 0]
             dy = x[b, 1] - x[a, 1]
             dz = x[b, 2] - x[a, 2]
-            c, dc, inverse = pair(ox, oy, oz, dx, dy, dz, rest[k], shift0, shift, p, area, plastic, accumulated)
+            c, dc, inverse = pair(
+                ox, oy, oz, dx, dy, dz, rest[k], shift0, shift, warmth0, warmth, p, area, step, kept, q
+            )
             d = (0.5 * (ox + dx), 0.5 * (oy + dy), 0.5 * (oz + dz))
             n = (dx * inverse, dy * inverse, dz * inverse)
             mass = inertia * rest[k]
@@ -156,15 +165,3 @@ def make_conserving_kernels(response: Callable, remembers: bool, measure: Callab
                     values[at + i * wide + i] += sign * 0.5 * c + m
 
     return SimpleNamespace(forces=forces, tangents=tangents)
-
-
-def mean_stress_of_flow(parameters: tuple[float, ...], stress: np.ndarray, flow: np.ndarray) -> np.ndarray:
-    """What yielding adds to the mean stress (s0 + s1)/2 of a step: E de_p (1 - q)/2 [Pa].
-
-    ``parameters`` of the elastoplastic law; ``stress`` s1 - s0 [Pa] and ``flow`` de_p of each bar.
-    """
-    young, *_, inverse = parameters
-    change = stress / young + flow
-    with np.errstate(divide="ignore", invalid="ignore"):
-        q = np.where(flow != 0.0, flow / (young * inverse * change), 1.0)
-    return 0.5 * young * flow * (1.0 - np.clip(np.nan_to_num(q, nan=1.0, posinf=1.0, neginf=1.0), 0.0, 1.0))

@@ -15,44 +15,61 @@ from types import SimpleNamespace
 import numpy as np
 from numba.extending import register_jitable
 
+from ..energies import BAR_ENERGIES
 from .compiled import inlined, kernel
+from .materials.base import Law
+from .rows import accumulate, differ, put, take
 from .sweep import CHUNK
 
-__all__ = ["COLLAPSED_STRETCH", "SHORTENED_STRETCH", "make_kernels"]
+__all__ = ["COLLAPSED_STRETCH", "SHORTENED_STRETCH", "last_row", "make_kernels", "no_variables"]
 
 COLLAPSED_STRETCH = 1e-3  # a bar below this fraction of its rest length has been crushed: no truss model holds there
 SHORTENED_STRETCH = math.sqrt(0.8)  # only a bar shorter than this is looked at for having jumped through zero length
 
 
+def no_variables(law: Law) -> tuple[float, ...]:
+    """As many numbers as a law has internal variables."""
+    return (0.0,) * len(law.internal)
+
+
+def last_row(law: Law) -> int:
+    """Row of the history that has the strain at the end of the last step; the stress is in the next."""
+    return len(law.internal)
+
+
 @cache
-def make_kernels(response: Callable, remembers: bool, measure: Callable) -> SimpleNamespace:
+def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
     """Kernels of a material law and strain measure: ``forces``, ``tangents``, ``product``, ``linearise``, ``fields``.
 
-    Common arguments: ``x`` (local nodes, 3) [m]; ``bars`` (b, 2) local ends; ``rest`` (b,) rest lengths [m];
-    ``thermal`` (b,) thermal strains, or (0,) for none; ``p`` the law's parameters; ``area`` [m2]; ``history`` (2, n) of
-    the bars of this block: plastic and accumulated plastic strain of bar ``k`` in column ``k - start``; (2, 0) where
-    the law does not remember. No array goes into an inner function: counting its references costs more than the bar.
+    Common arguments: ``x`` (local nodes, 3) [m]; ``bars`` (b, 2) local ends; ``rest`` (b,) rest lengths [m]; ``heat``
+    (2, b) thermal strains and temperatures [K], or (2, 0) for none; ``p`` the law's parameters; ``area`` [m2]; ``step``
+    from the start of the step to ``x`` [s]; ``history`` (rows, n) of the bars of this block: ``law.rows`` of bar ``k``
+    in column ``k - start``. No array goes into an inner function: counting its references costs more than the bar.
     """
+    response, like, by_rate, last, n_rows = law.response, no_variables(law), law.rate, last_row(law), len(law.rows)
+    places = tuple(BAR_ENERGIES.index(name) for name in law.energies)
+    n_energies = len(places)
+    first_new = 4 + n_energies
 
     @inlined
-    def sweep_forces(x, heads, starts, chunks, counted, far, rest, thermal, p, area, history, commit, f):
-        """Add internal forces to ``f``; sums over counted bars: elastic, heat, hardening [J]; first failed or -1;
-        whether any bar is so short that it may have turned over.
+    def sweep_forces(x, heads, starts, chunks, counted, far, rest, heat, p, area, step, history, commit, f, energies):
+        """Add internal forces to ``f``, and sums over counted bars to ``energies``, see
+        :data:`~pfem_petsc.energies.BAR_ENERGIES` [J]; gives the first failed bar or -1, and whether any is so short
+        that it may have turned over.
 
         ``heads``, ``starts``, ``chunks``, ``counted``: a :class:`~pfem_petsc.mechanics.sweep.Sweep`; ``far`` (b,) the
         other end of each bar. Sums are kept for each place of a chunk: vector instructions need not reorder any then.
         """
-        elastic = 0.0
-        heat = 0.0
-        hardening = 0.0
         failed = -1
         shortened = False
-        warm = len(thermal) > 0
+        warm = heat.shape[1] > 0
         origin = starts[0]
-        work = np.zeros((9, CHUNK))  # end differences, force over length, three energies, new history
+        # end differences, force over length, energies, new history
+        work = np.zeros((4 + n_energies + n_rows, CHUNK))
         for chunk in range(len(chunks) - 1):
             if chunk == counted:  # what follows is counted elsewhere
-                elastic, heat, hardening = work[4].sum(), work[5].sum(), work[6].sum()
+                for j in range(n_energies):
+                    energies[places[j]] += work[4 + j].sum()
             first = starts[chunks[chunk]]
             stop = starts[chunks[chunk + 1]]
             n = stop - first
@@ -72,34 +89,37 @@ def make_kernels(response: Callable, remembers: bool, measure: Callable) -> Simp
                     work[2, i] = dz
                     work[3, i] = dx * dx + dy * dy + dz * dz
             rests = rest[first:stop]
-            shifts = thermal[first:stop]
-            old_plastic = history[0][first - origin : stop - origin]
-            old_accumulated = history[1][first - origin : stop - origin]
+            shifts = heat[0][first:stop]
+            warmths = heat[1][first:stop]
+            begin = first - origin  # column of the history
             short = 0
-            flowed = 0
+            changed = 0
             for i in range(n):
                 length = math.sqrt(work[3, i])
                 stretch = length / rests[i]
                 short += 0 if stretch >= SHORTENED_STRETCH else 1  # NaN counts
                 strain, slope, _ = measure(stretch)
+                warmth = 0.0
                 if warm:
                     strain -= shifts[i]
-                plastic = old_plastic[i] if remembers else 0.0
-                accumulated = old_accumulated[i] if remembers else 0.0
-                stress, _, plastic, new, u, q, w = response(strain, p, plastic, accumulated)
-                volume = area * rests[i]
-                work[4, i] += volume * u
-                if remembers:
-                    work[5, i] += volume * q
-                    work[6, i] += volume * w
-                    work[7, i] = plastic
-                    work[8, i] = new
-                    flowed += 0 if new == accumulated else 1
+                    warmth = warmths[i]
+                q = take(history, begin + i, like)
+                rate = 0.0
+                if by_rate and step > 0.0:
+                    rate = (strain - history[last, begin + i]) / step
+                stress, _, new, densities = response(strain, rate, step, warmth, p, q)
+                accumulate(work, 4, i, area * rests[i], densities)
+                if n_rows > 0:
+                    put(work, first_new, i, new)
+                    changed += 1 if by_rate or differ(new, q) else 0
+                if by_rate:
+                    work[first_new + last, i] = strain
+                    work[first_new + last + 1, i] = stress
                 work[3, i] = area * stress * slope / length
-            if remembers and commit and flowed > 0:
-                for i in range(n):
-                    old_plastic[i] = work[7, i]
-                    old_accumulated[i] = work[8, i]
+            if n_rows > 0 and commit and changed > 0:
+                for j in range(n_rows):
+                    for i in range(n):
+                        history[j, begin + i] = work[first_new + j, i]
             if short > 0:
                 for i in range(n):
                     length = math.sqrt(work[0, i] ** 2 + work[1, i] ** 2 + work[2, i] ** 2)
@@ -133,38 +153,43 @@ def make_kernels(response: Callable, remembers: bool, measure: Callable) -> Simp
                 f[a, 1] -= fy
                 f[a, 2] -= fz
         if counted == len(chunks) - 1:
-            elastic, heat, hardening = work[4].sum(), work[5].sum(), work[6].sum()
-        return elastic, heat, hardening, failed, shortened
+            for j in range(n_energies):
+                energies[places[j]] += work[4 + j].sum()
+        return failed, shortened
 
     forces = kernel(sweep_forces)
 
     @register_jitable
-    def stiffness(dx, dy, dz, rest, shift, p, area, plastic, accumulated):
+    def stiffness(dx, dy, dz, rest, shift, warmth, p, area, step, before, q):
         """dN/dl [N/m], N/l [N/m] and 1/l of one bar."""
         length = math.sqrt(dx * dx + dy * dy + dz * dz)
         strain, slope, curvature = measure(length / rest)
-        stress, modulus, _, _, _, _, _ = response(strain - shift, p, plastic, accumulated)
+        rate = 0.0
+        if by_rate and step > 0.0:
+            rate = (strain - shift - before) / step
+        stress, modulus, _, _ = response(strain - shift, rate, step, warmth, p, q)
         axial = area * (modulus * slope * slope + stress * curvature) / rest
         return axial, area * stress * slope / length, 1.0 / length
 
     @kernel
-    def tangents(x, bars, rest, thermal, p, area, history, start, stop, inertia, weight, ptr, slots, values):
+    def tangents(x, bars, rest, heat, p, area, step, history, start, stop, inertia, weight, ptr, slots, values):
         """Add ``weight`` K_t, and ``inertia`` l0 (2 on the diagonal, 1 beside it), to the block rows of owned nodes.
 
         ``slots`` (b, 4): index among all blocks of (a, a), (a, b), (b, b), (b, a), -1 where the row is not owned;
         ``ptr`` (owned + 1,) first block of a row; ``values``: the matrix in scalar compressed rows.
         """
-        warm = len(thermal) > 0
+        warm = heat.shape[1] > 0
         for k in range(start, stop):
             a = bars[k, 0]
             b = bars[k, 1]
-            shift = thermal[k] if warm else 0.0
+            shift = heat[0, k] if warm else 0.0
+            warmth = heat[1, k] if warm else 0.0
             nx = x[b, 0] - x[a, 0]
             ny = x[b, 1] - x[a, 1]
             nz = x[b, 2] - x[a, 2]
-            plastic = history[0, k - start] if remembers else 0.0
-            accumulated = history[1, k - start] if remembers else 0.0
-            axial, geometric, inverse = stiffness(nx, ny, nz, rest[k], shift, p, area, plastic, accumulated)
+            q = take(history, k - start, like)
+            before = history[last, k - start] if by_rate else 0.0
+            axial, geometric, inverse = stiffness(nx, ny, nz, rest[k], shift, warmth, p, area, step, before, q)
             nx *= inverse
             ny *= inverse
             nz *= inverse
@@ -195,19 +220,20 @@ def make_kernels(response: Callable, remembers: bool, measure: Callable) -> Simp
                 values[at + 2] += c * nz * nz + d
 
     @kernel
-    def product(x, bars, rest, thermal, p, area, history, start, stop, u, out):
+    def product(x, bars, rest, heat, p, area, step, history, start, stop, u, out):
         """Add K_t u to ``out``; both (local nodes, 3), ``u`` with ghosts."""
-        warm = len(thermal) > 0
+        warm = heat.shape[1] > 0
         for k in range(start, stop):
             a = bars[k, 0]
             b = bars[k, 1]
-            shift = thermal[k] if warm else 0.0
+            shift = heat[0, k] if warm else 0.0
+            warmth = heat[1, k] if warm else 0.0
             nx = x[b, 0] - x[a, 0]
             ny = x[b, 1] - x[a, 1]
             nz = x[b, 2] - x[a, 2]
-            plastic = history[0, k - start] if remembers else 0.0
-            accumulated = history[1, k - start] if remembers else 0.0
-            axial, geometric, inverse = stiffness(nx, ny, nz, rest[k], shift, p, area, plastic, accumulated)
+            q = take(history, k - start, like)
+            before = history[last, k - start] if by_rate else 0.0
+            axial, geometric, inverse = stiffness(nx, ny, nz, rest[k], shift, warmth, p, area, step, before, q)
             nx *= inverse
             ny *= inverse
             nz *= inverse
@@ -226,19 +252,20 @@ def make_kernels(response: Callable, remembers: bool, measure: Callable) -> Simp
             out[b, 2] += fz
 
     @kernel
-    def linearise(x, bars, rest, thermal, p, area, history, start, stop, weight, stored):
+    def linearise(x, bars, rest, heat, p, area, step, history, start, stop, weight, stored):
         """What a product with ``weight`` K_t needs of each bar: n, dN/dl - N/l and N/l, to ``stored`` (b, 5)."""
-        warm = len(thermal) > 0
+        warm = heat.shape[1] > 0
         for k in range(start, stop):
             a = bars[k, 0]
             b = bars[k, 1]
-            shift = thermal[k] if warm else 0.0
+            shift = heat[0, k] if warm else 0.0
+            warmth = heat[1, k] if warm else 0.0
             dx = x[b, 0] - x[a, 0]
             dy = x[b, 1] - x[a, 1]
             dz = x[b, 2] - x[a, 2]
-            plastic = history[0, k - start] if remembers else 0.0
-            accumulated = history[1, k - start] if remembers else 0.0
-            axial, geometric, inverse = stiffness(dx, dy, dz, rest[k], shift, p, area, plastic, accumulated)
+            q = take(history, k - start, like)
+            before = history[last, k - start] if by_rate else 0.0
+            axial, geometric, inverse = stiffness(dx, dy, dz, rest[k], shift, warmth, p, area, step, before, q)
             stored[k, 0] = dx * inverse
             stored[k, 1] = dy * inverse
             stored[k, 2] = dz * inverse
@@ -246,9 +273,9 @@ def make_kernels(response: Callable, remembers: bool, measure: Callable) -> Simp
             stored[k, 4] = weight * geometric
 
     @kernel
-    def fields(x, bars, rest, thermal, p, area, history, start, stop, strain_out, stress_out, force_out):
-        """Total strain, stress [Pa] and axial force [N] of each bar."""
-        warm = len(thermal) > 0
+    def fields(x, bars, rest, heat, p, area, step, history, start, stop, strain_out, stress_out, force_out):
+        """Total strain, stress [Pa] and axial force [N] of each bar at the end of the last step."""
+        warm = heat.shape[1] > 0
         for k in range(start, stop):
             a = bars[k, 0]
             b = bars[k, 1]
@@ -256,10 +283,13 @@ def make_kernels(response: Callable, remembers: bool, measure: Callable) -> Simp
             dy = x[b, 1] - x[a, 1]
             dz = x[b, 2] - x[a, 2]
             strain, slope, _ = measure(math.sqrt(dx * dx + dy * dy + dz * dz) / rest[k])
-            shift = thermal[k] if warm else 0.0
-            plastic = history[0, k - start] if remembers else 0.0
-            accumulated = history[1, k - start] if remembers else 0.0
-            stress, _, _, _, _, _, _ = response(strain - shift, p, plastic, accumulated)
+            shift = heat[0, k] if warm else 0.0
+            warmth = heat[1, k] if warm else 0.0
+            q = take(history, k - start, like)
+            if by_rate:
+                stress = history[last + 1, k - start]
+            else:
+                stress, _, _, _ = response(strain - shift, 0.0, 0.0, warmth, p, q)
             strain_out[k] = strain
             stress_out[k] = stress
             force_out[k] = area * stress * slope

@@ -16,6 +16,7 @@ class Temperatures:
 
     Attributes
     ----------
+    values : (b,) temperatures [K], or (0,)
     any : whether the case has temperatures
     varying : whether any of them changes over time
     """
@@ -36,11 +37,12 @@ class Temperatures:
                     )
                 members = mesh.bar_groups[entry.bars]
             self._entries.append((members, entry.value, Table(entry.table) if entry.table is not None else None))
-        self.values = np.zeros(len(mesh.bars) if self.any else 0)
         if self.any:
-            bars.thermal = np.zeros(len(mesh.bars))
+            bars.heat = np.zeros((2, len(mesh.bars)))
+        self.values = bars.heat[1]
+        if self.any:
             self.apply(0.0)
-            bars.thermal_at_start = bars.thermal.copy()
+            bars.heat_at_start = bars.heat.copy()
 
     def apply(self, time: float) -> None:
         """Give the bars their thermal strains at a time [s]; later entries of the case override earlier ones."""
@@ -48,4 +50,4 @@ class Temperatures:
             self.values[members] = value if table is None else table(time)[0]
         for block in self._bars.blocks:
             part = slice(block.start, block.stop)
-            self._bars.thermal[part] = block.thermal_expansion * self.values[part]
+            self._bars.heat[0, part] = block.thermal_expansion * self.values[part]

@@ -16,7 +16,6 @@ from mpi4py import MPI
 
 from ..errors import InputError, SimulationFailure
 from ..parallel.agreement import agreed, on_root
-from .units import unit_of
 
 __all__ = [
     "HDF5_ERRORS",
@@ -212,9 +211,9 @@ def set_text(group: h5py.Group, name: str, text: str) -> None:
     group.create_dataset(name, data=np.array(raw, dtype=h5py.string_dtype("utf-8", max(1, len(raw)))))
 
 
-def set_unit(dataset: h5py.Dataset, name: str) -> None:
+def set_unit(dataset: h5py.Dataset, unit: str) -> None:
     """The attribute ``unit`` of a field or history column: "m/s", or "1" for a pure number. Collective."""
-    raw = (unit_of(name) or "1").encode()
+    raw = (unit or "1").encode()
     dataset.attrs.create("unit", raw, dtype=h5py.string_dtype("utf-8", len(raw)))
 
 

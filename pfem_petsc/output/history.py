@@ -14,6 +14,7 @@ from ..errors import InputError
 from .digests import CHECKS, row_digests
 from .hdf5 import create_growing, dataset_names, grow, set_unit, write_rows, writing
 from .row import RowLayout
+from .units import unit_of
 
 __all__ = ["HistoryWriter", "check_columns", "create_history"]
 
@@ -33,7 +34,7 @@ def create_history(file: h5py.File, columns: Mapping[str, tuple[int, ...]], type
         dtype = np.dtype(types.get(name, np.float64))
         per_chunk = CHUNK_BYTES // max(1, dtype.itemsize * int(np.prod(shape, dtype=np.int64)))
         made = create_growing(group, name, tuple(shape), dtype, max(1, min(ROWS_PER_CHUNK, per_chunk)))
-        set_unit(made, name)
+        set_unit(made, unit_of(name))
 
 
 def check_columns(file: h5py.File, path: Path, columns: Mapping[str, tuple[int, ...]]) -> None:

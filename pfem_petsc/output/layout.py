@@ -12,6 +12,7 @@ from .digests import CHECKS
 from .hdf5 import chunk_rows, create_growing, dataset_names, set_unit
 from .history import ROWS_PER_CHUNK, create_history
 from .provenance import write_case
+from .units import field_unit
 
 __all__ = [
     "PER_STEP",
@@ -86,7 +87,7 @@ def create_field(vtk: h5py.Group, kind: str, name: str, row_shape: tuple[int, ..
     n_rows = int(vtk["NumberOfPoints" if kind == "PointData" else "NumberOfCells"][0])
     row_bytes = dtype.itemsize * int(np.prod(row_shape, dtype=np.int64))
     dataset = create_growing(vtk[kind], name, row_shape, dtype, chunk_rows(n_rows, row_bytes))
-    set_unit(dataset, name)
+    set_unit(dataset, field_unit(name))
     vtk["Steps"][kind + "Offsets"][name] = vtk["Steps"]["PointOffsets" if kind == "PointData" else "CellDataRows"]
     return dataset
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from .energies import ENERGIES
+from ..energies import ENERGIES
 
 __all__ = ["HEAD", "PAIR", "WALL", "Places"]
 

@@ -3,26 +3,26 @@
 from __future__ import annotations
 
 import math
+from functools import cache
 
-__all__ = ["PREFIXES", "duration", "engineering", "prefix_for", "unit_of"]
+from ..case.materials import LAWS
+from ..fields import FIELDS
+from ..registry import choices, lookup
+
+__all__ = ["PREFIXES", "duration", "engineering", "field_unit", "prefix_for", "unit_of"]
 
 PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G", 12: "T"}
 
 _UNITS = {
     "time": "s",
     "step_size": "s",
-    "displacement": "m",
     "position": "m",
     "centre_of_mass": "m",
     "velocity": "m/s",
     "acceleration": "m/s²",
-    "contact_force": "N",
     "force": "N",
     "reaction": "N",
     "support_force": "N",
-    "axial_force": "N",
-    "stress": "Pa",
-    "temperature": "K",
     "plastic_heat": "J",
     "energy_imbalance": "J",
     "impulse": "N s",
@@ -32,11 +32,22 @@ _UNITS = {
 
 
 def unit_of(name: str) -> str:
-    """SI unit of a field or history column (``"wall/floor/force"`` -> ``"N"``); empty for pure numbers."""
+    """SI unit of a history column (``"wall/floor/force"`` -> ``"N"``); empty for pure numbers."""
     last = name.rsplit("/", 1)[-1]
     if last.endswith("_impulse"):
         return "N s"
     return "J" if last.endswith(("_energy", "_dissipation", "_work")) else _UNITS.get(last, "")
+
+
+def field_unit(name: str) -> str:
+    """SI unit of a field, or of an internal variable of a material law; empty for pure numbers."""
+    units = {field.name: field.unit for field in FIELDS}
+    return units[name] if name in units else _units_of_variables().get(name, "")
+
+
+@cache
+def _units_of_variables() -> dict[str, str]:
+    return dict(variable for law in choices(LAWS) for variable in lookup(LAWS, law, "").LAW.internal)
 
 
 def prefix_for(magnitude: float, unit: str) -> tuple[float, str]:

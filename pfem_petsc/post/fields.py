@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
-from ..output.units import prefix_for, unit_of
+from ..output.units import field_unit, prefix_for
 from ..registry import nearest
 
 __all__ = ["ColourField", "ColourScale"]
@@ -41,7 +41,7 @@ class ColourField:
         point, cell = list(result.point_fields), list(result.cell_fields)
         if name not in point and name not in cell:
             raise InputError(f"render: the result holds no field '{name}'{nearest(name, point + cell)}")
-        self.name, self.unit = name, unit_of(name)
+        self.name, self.unit = name, field_unit(name)
         self.on_nodes = name in point
         vector = np.ndim(result.field(name, 0)) == 2
         if component is not None and (not vector or component not in _COMPONENTS):

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from ..energies import LOST, STORED, SUPPLIED
 from ..errors import InputError
-from ..output.energies import LOST, STORED, SUPPLIED
 from ..output.units import engineering, unit_of
 from ..registry import nearest
 from .chart import COLOURS, STYLE, Chart, window_mean

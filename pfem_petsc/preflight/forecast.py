@@ -54,8 +54,7 @@ def result_bytes(case, mesh, steps: int, point_fields, cell_fields, columns, typ
 
 def checkpoint_bytes(model) -> float:
     """Size of a checkpoint [B]."""
-    plastic = any(material.yield_stress is not None for material in model.case.material.values())
-    return 1e4 + model.mesh.n_nodes * 24.0 * 8 + (16.0 * model.mesh.n_bars if plastic else 0.0)
+    return 1e4 + model.mesh.n_nodes * 24.0 * 8 + 8.0 * len(model.bars.kept_names) * model.mesh.n_bars
 
 
 def memory_warning(case, model, plan) -> list[str]:

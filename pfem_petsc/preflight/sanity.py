@@ -31,16 +31,7 @@ def _materials(case) -> Iterator[str]:
                 f"{key}.young_modulus = {material.young_modulus:g} Pa gives a wave speed of "
                 f"{engineering(speed, 'm/s')}: that of steel is 5 km/s, of rubber 30 m/s; {_HINT}"
             )
-        if material.yield_stress is not None and material.yield_stress > 0.2 * material.young_modulus:
-            yield (
-                f"{key}.yield_stress = {material.yield_stress:g} Pa is reached at a strain of "
-                f"{material.yield_stress / material.young_modulus:.3g}; {_HINT}"
-            )
-        if material.yield_stress is not None and material.isotropic_hardening + material.kinematic_hardening == 0.0:
-            yield (
-                f"{key} yields without hardening: one bar of a row takes all plastic strain, the more the shorter it "
-                "is, so results depend on the mesh; give isotropic_hardening or kinematic_hardening"
-            )
+        yield from material.suspicions(key, _HINT)
 
 
 def _sections(case) -> Iterator[str]:

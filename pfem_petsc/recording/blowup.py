@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from ..energies import SUPPLIED
 from ..errors import SimulationFailure
-from ..output.energies import SUPPLIED
 
 __all__ = ["BlowUp"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from ..output.energies import STORED, SUPPLIED
+from ..energies import STORED, SUPPLIED
 
 __all__ = ["ContactWatch"]
 

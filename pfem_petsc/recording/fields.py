@@ -3,12 +3,39 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 
 import numpy as np
 
-from ..case.settings import CELL_FIELDS, POINT_FIELDS
+from ..fields import FIELDS, Field, cell_fields
 
-__all__ = ["CELL_FIELDS", "POINT_FIELDS", "Fields"]
+__all__ = ["Fields", "Snapshot"]
+
+
+class Snapshot:
+    """What the values of fields are taken from.
+
+    Attributes
+    ----------
+    model : Model
+    state : State
+    start : (owned, 3) positions in the mesh [m]
+    acceleration : gives the acceleration to record (owned, 3) [m/s2]; collective where the mass is consistent
+    """
+
+    def __init__(self, model, state, acceleration: Callable[[], np.ndarray] | None = None) -> None:
+        self.model, self.state, self.acceleration = model, state, acceleration
+        self.start = model.mesh.points[: model.mesh.n_owned]
+
+    @cached_property
+    def bars(self) -> dict[str, np.ndarray]:
+        """Name to (local bars,): strain, stress, axial force, internal variables."""
+        return self.model.bars.fields(self.state.x)
+
+    def temperature(self) -> np.ndarray:
+        """(local bars,) above reference [K], zero where the case has none."""
+        temperatures = self.model.temperatures
+        return temperatures.values if temperatures.any else 0.0 * self.bars["strain"]
 
 
 class Fields:
@@ -16,34 +43,28 @@ class Fields:
 
     Attributes
     ----------
-    points, cells : names of the fields that the case asks for; by default all, temperatures where there are any
+    points, cells : names of the fields that the case asks for; by default all that it has, internal variables of
+        material laws other than the plastic strain aside
     """
 
     def __init__(self, model) -> None:
         self.model = model
-        wanted, heated = model.case.output.fields, model.temperatures.any
-        self.points = [name for name in POINT_FIELDS if wanted is None or name in wanted]
-        self.cells = [
-            name for name in CELL_FIELDS if (name in wanted if wanted is not None else name != "temperature" or heated)
-        ]
+        wanted = model.case.output.fields
+        taken = [field for field in FIELDS if (field.default(model) if wanted is None else field.name in wanted)]
+        self._points = [field for field in taken if field.place == "nodes"]
+        self._cells = [field for field in taken if field.place == "bars"]
+        for name, unit in model.bars.internal.items():
+            if wanted is not None and name in wanted and name not in cell_fields():
+                self._cells.append(Field(name, "bars", unit, lambda now, name=name: now.bars[name]))
+        self.points = [field.name for field in self._points]
+        self.cells = [field.name for field in self._cells]
 
     def at_nodes(self, state, acceleration: Callable[[], np.ndarray]) -> dict[str, np.ndarray]:
         """Name to (owned, 3). Collective where ``acceleration`` is."""
-        owned = self.model.mesh.n_owned
-        values = {
-            "displacement": lambda: state.position - self.model.mesh.points[:owned],
-            "velocity": lambda: state.v,
-            "acceleration": acceleration,
-            "contact_force": lambda: state.contact,
-        }
-        return {name: values[name]() for name in self.points}
+        now = Snapshot(self.model, state, acceleration)
+        return {field.name: field.value(now) for field in self._points}
 
     def at_bars(self, state) -> dict[str, np.ndarray]:
         """Name to (local bars,)."""
-        if not self.cells:
-            return {}
-        bars = self.model.bars.fields(state.x)
-        if "temperature" in self.cells:
-            temperatures = self.model.temperatures
-            bars["temperature"] = temperatures.values if temperatures.any else 0.0 * bars["strain"]
-        return {name: bars[name] for name in self.cells}
+        now = Snapshot(self.model, state)
+        return {field.name: field.value(now) for field in self._cells}

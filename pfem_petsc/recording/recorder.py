@@ -8,19 +8,20 @@ import numpy as np
 from mpi4py import MPI
 
 from ..contact.history import ContactColumns, contact_columns
-from ..output.energies import ENERGIES
+from ..energies import BAR_ENERGIES, ENERGIES
 from ..output.row import Row, RowLayout
 from ..output.sums import HEAD, PAIR
 from ..stepping.ledger import Ledger
 
 __all__ = ["Recorder"]
 
-_ELASTIC, _HEAT, _HARDENING = (HEAD.first(name) for name in ("elastic_energy", "plastic_heat", "hardening_energy"))
+_BARS = [HEAD.first(name) for name in BAR_ENERGIES]
+_DERIVED = [energy for energy in ENERGIES if energy.source == "derived"]
+_STATE = [energy for energy in ENERGIES if energy.value is not None]
 _SUMMED = [energy for energy in ENERGIES if energy.source != "derived"]
 _ENERGIES = [HEAD.first(energy.name) for energy in _SUMMED]
-_SIGNS = np.array(
-    [-1.0 if energy.side == "supplied" else 1.0 for energy in _SUMMED]
-)  # parts of derived ones count here
+_SIDES = {energy.name: energy.side for energy in ENERGIES} | {p: e.side for e in ENERGIES for p in e.parts}
+_SIGNS = np.array([{"supplied": -1.0, "part": 0.0}.get(_SIDES[energy.name], 1.0) for energy in _SUMMED])
 _PROBED = ("position", "velocity", "acceleration", "reaction")
 
 
@@ -121,7 +122,9 @@ class Recorder:
         stepper, state, ledger = self.stepper, self.stepper.state, self.ledger
         energy, solution = stepper.energy, stepper.solution
         sums[: HEAD.width] = ledger.sums
-        sums[_ELASTIC], sums[_HEAT], sums[_HARDENING] = energy[:3]
+        sums[_BARS] = energy.energies
+        for term in _STATE:
+            sums[HEAD.first(term.name)] = term.value(stepper)
         sums[HEAD.first("active_contacts")], sums[HEAD.first("alarm")] = solution.contacts, alarm
         walls, links, at, _ = self._starts
         if self._contact.size:
@@ -143,7 +146,8 @@ class Recorder:
         vector[self._to] = sums[self._from]
         vector[at["time"]], vector[at["step"]], vector[at["step_size"]] = state.time, state.step, stepper.smallest
         vector[at["newton_iterations"]], vector[at["linear_iterations"]] = self.iterations
-        vector[at["plastic_dissipation"]] = sums[_HEAT] + sums[_HARDENING]
+        for term in _DERIVED:
+            vector[at[term.name]] = sum(sums[HEAD.first(name)] for name in term.parts)
         total = at["centre_of_mass"]
         vector[total : total + 3] /= self.model.total_mass
         energies = sums[_ENERGIES]

@@ -1,14 +1,15 @@
 """Everything that determines the future of a run, as arrays and numbers that a checkpoint holds.
 
-Nodal arrays are those of the state, of the scheme's memory and of the stepper; bar arrays are the plastic history and
-the thermal strains. Internal forces and energies are saved rather than computed again: of a bar that yields the second
-evaluation may differ from the first in the last digit. Sums that each rank has for itself (works, energies, wall
-forces) are saved rank by rank, and given back so on as many ranks; on others the total goes to rank 0.
+Nodal arrays are those of the state, of the scheme's memory and of the stepper; bar arrays are what the material laws
+keep, each variable under its name, and the thermal strains. Internal forces and energies are saved rather than computed
+again: of a bar that yields the second evaluation may differ from the first in the last digit. Sums that each rank has
+for itself (works, energies, wall forces) are saved rank by rank, and given back so on as many ranks; on others the
+total goes to rank 0.
 
 Where what decides is kept: positions, velocities, accelerations, forces and the scheme's memory (tied nodes and what a
 treatment of impact changed are part of it): arrays of the state. Who touches walls, nodes held in the last step, place
 of the kept preconditioner: arrays of the stepper. Level of halving, part and smallest part of the step, counts of the
-kept preconditioner: its numbers. Plastic history, thermal strains, history of the kept preconditioner: arrays of the
+kept preconditioner: its numbers. What laws keep, thermal strains, history of the kept preconditioner: arrays of the
 bars. Walls with mass: ``free_walls``, their last increment included. Forces of links: by their keys, as ``pairs``.
 Works and energies: ``ranks``. Energy at the start, the largest energy, iterations since the last row: the recorder's.
 Rows seen, strange ones and energy put in: ``blow_up``. Contact times and impulses: the contact log's. Time step and
@@ -23,7 +24,6 @@ import dataclasses
 from typing import Any
 
 import numpy as np
-from mpi4py import MPI
 
 from ..mechanics.bars import StrainEnergy
 from ..mesh.exchange import Router
@@ -33,11 +33,12 @@ from ..parallel.natural import NaturalOrder
 
 __all__ = ["STATE_VERSION", "RunState"]
 
-STATE_VERSION = 3
+STATE_VERSION = 4
 """Changed with the meaning of what is saved."""
 
 _MEMORY = "memory."
 _KEPT = "stepper."
+_LAW = "law."
 
 
 class RunState:
@@ -55,7 +56,6 @@ class RunState:
         self.comm = comm
         self.counted = mesh.counted
         self.node_order = mesh.node_order
-        self._columns = comm.allreduce(2 * any(b.history.size for b in self.model.bars.blocks), op=MPI.MAX)
 
     @property
     def bar_order(self) -> NaturalOrder:
@@ -81,7 +81,7 @@ class RunState:
         stepper, energy, walls = self.stepper, self.stepper.energy, self.stepper.solution.walls
         mine = {
             "ledger": ledger.kept(),
-            "energy": list(energy[:3]),
+            "energy": list(energy.energies),
             "walls": {name: getattr(walls, name).tolist() for name in walls.sums},
             "contact_log": self.model.contact.log.share(),
             "contacts": int(stepper.solution.contacts),
@@ -138,7 +138,7 @@ class RunState:
         for name, value in scalars["stepper"].items():
             setattr(stepper, name, value)
         mine = self._share(scalars["ranks"])
-        stepper.energy = StrainEnergy(*mine["energy"], -1)
+        stepper.energy = StrainEnergy(tuple(float(value) for value in mine["energy"]))
         walls = stepper.solution.walls
         like = {name: getattr(walls, name) for name in mine["walls"]}
         sums = {n: np.array(mine["walls"][n], dtype=a.dtype).reshape(a.shape) for n, a in like.items()}
@@ -182,10 +182,10 @@ class RunState:
         """Rows of all local bars, by name."""
         bars = self.model.bars
         found = {}
-        if self._columns:
-            found["history"] = bars.history()
+        if bars.kept_names:
+            found |= {_LAW + name: values for name, values in zip(bars.kept_names, bars.history().T, strict=True)}
         if self.model.temperatures.any:
-            found |= {"thermal_strain": bars.thermal, "temperature": self.model.temperatures.values}
+            found |= {"thermal_strain": bars.heat[0], "temperature": self.model.temperatures.values}
         kept = {_KEPT + name: getattr(self.stepper, name) for name in self.stepper.kept_bars}
         return found | {name: array for name, array in kept.items() if array.shape[1]}
 
@@ -194,15 +194,17 @@ class RunState:
         mesh, bars = self.model.mesh, self.model.bars
         asking = Router(self.comm, slab_of(mesh.bar_ids, mesh.n_bars, self.comm.size))
         asked = asking.send(mesh.bar_ids) - self.bar_order.first
+        history = bars.history()
         for name in checkpoint.scalars["bar_arrays"]:
             values = asking.reply(checkpoint.arrays[name][asked])
-            if name == "history":
-                bars.put_history(values)
+            if name.startswith(_LAW):
+                history[:, bars.kept_names.index(name.removeprefix(_LAW))] = values
             elif name.startswith(_KEPT):
                 setattr(self.stepper, name.removeprefix(_KEPT), values)
             else:
-                target = bars.thermal if name == "thermal_strain" else self.model.temperatures.values
+                target = bars.heat[0] if name == "thermal_strain" else self.model.temperatures.values
                 target[:] = values
+        bars.put_history(history)
 
 
 def _summed(shares: list[Any], factor: float = 1.0) -> Any:

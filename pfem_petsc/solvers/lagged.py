@@ -32,7 +32,7 @@ class LaggedPreconditioner:
 
     It is kept through the Newton iterations of a problem, and from step to step as long as temperatures are constant
     and the unknowns are those of the nodes, neither oblique walls nor links in contact: it can then be made again after
-    a restart from the place and the plastic history it belongs to, which checkpoints hold.
+    a restart from the place and the history of the bars it belongs to, which checkpoints hold.
 
     Options: prefix ``pfem_assembled_``.
 
@@ -49,7 +49,7 @@ class LaggedPreconditioner:
     ----------
     place : (owned, 6) positions where the Hessian was taken [m] and whether walls held a component; (owned, 0) where
         the next problem needs a new one
-    history : (b, 2) plastic history there, (b, 0) where no bar can yield
+    history : (b, names) what material laws kept there, see ``Bars.history``; (b, 0) where they keep nothing
     count : what else decides when it is made anew: the Hessian's coefficients, iterations of the first solve with it,
         iterations of later solves beyond that, and those of the last solve
     carried : whether it was made for an earlier problem
@@ -64,7 +64,7 @@ class LaggedPreconditioner:
         self._smooth = matrix_free and kind == "gamg"
         self.matrix = HessianMatrix(mesh, model.supports.fixed, model.supports.any, symmetric)
         self.bars = model.bars
-        self.plastic = model.comm.allreduce(int(model.bars.plastic)) > 0
+        self.remembers = len(model.bars.kept_names) > 0
         self.outlasts = not model.temperatures.varying
         self.place = np.zeros((mesh.n_owned, 0))
         self.history = np.zeros((len(mesh.bars), 0))
@@ -115,7 +115,7 @@ class LaggedPreconditioner:
             first = beyond = 0.0
             owned = self.mesh.n_owned
             self.place = np.hstack([problem.x[:owned], held[:owned]]) if usable else np.zeros((owned, 0))
-            if self.plastic and usable:
+            if self.remembers and usable:
                 self.history = self.bars.history()
         self.carried &= not due
         self._problem = problem
@@ -127,12 +127,12 @@ class LaggedPreconditioner:
         held = np.zeros((self.mesh.n_local, 3))
         problem.x[:owned], held[:owned] = self.place[:, :3], self.place[:, 3:]
         self.mesh.update_ghosts(problem.x)
-        if self.plastic:
+        if self.remembers:
             history = self.bars.history()
             self.bars.put_history(self.history)
         self._make(problem, held)
         problem.x[:] = here
-        if self.plastic:
+        if self.remembers:
             self.bars.put_history(history)
 
     def _make(self, problem, held: np.ndarray) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..contact.forces import WallForces
+from ..energies import ENERGIES
 from ..errors import SimulationFailure
 from ..integrators.central_differences import Scheme as CentralDifferences
 from ..mechanics.bars import StrainEnergy
@@ -40,7 +41,7 @@ class Batch:
         block = model.bars.blocks[0]
         self._march = make_march(block.kernels.sweep_forces)
         bars = model.bars
-        law = (bars.far, bars.rest, bars.thermal, block.parameters, block.area, block.history)
+        law = (bars.far, bars.rest, bars.heat, block.parameters, block.area, block.history)
         self._bars = BarArrays(bars.ends, tuple(block.sweep), *law)
         supports, inertia, contact = model.supports, model.inertia, model.contact
         nothing = np.empty((0, 3))
@@ -75,6 +76,7 @@ class Batch:
             and stepper.treatment is None
             and not model.links
             and len(model.bars.blocks) == 1
+            and all(energy.value is None for energy in ENERGIES)
             and not model.temperatures.varying
             and not any(table is not None for _, _, table in model.external.loads)
             and not model.supports.moving
@@ -97,12 +99,12 @@ class Batch:
         buffers = Buffers(
             state.f, stepper.other_force, last[0], a_next, last[1], v_next, support, support_next, contact, contact_next
         )
-        energies = (ledger.kinetic, *(float(part) for part in stepper.energy[:3]))
+        energies = np.array(stepper.energy.energies)
         half = state.memory["half_velocity"]
         pushed = ledger.impulses.state
         impulses = ImpulseArrays(pushed.memory["half_velocity"], pushed.a, pushed.v)
         ledger.take_pending()
-        done, failed, turned, stuck, offsets, after, energies, u, touched, log.last, met = self._march(
+        done, failed, turned, stuck, offsets, after, kinetic, u, touched, log.last, met = self._march(
             count,
             stepper.h,
             state.x,
@@ -117,6 +119,7 @@ class Batch:
             ledger.impacts.met,
             ledger.sums,
             impulses,
+            ledger.kinetic,
             energies,
             self.sums,
         )
@@ -126,7 +129,7 @@ class Batch:
         self._spare = [a_next, v_next, support_next, contact_next]
         state.support = support if self.model.supports.any else stepper.zero
         state.contact = contact if len(touched[3]) else stepper.zero
-        stepper.energy = StrainEnergy(*energies[1:], failed)
+        stepper.energy = StrainEnergy(tuple(energies.tolist()), failed)
         nothing = self.model.contact.nothing
         stepper.solution = Solution(u, state.f, WallForces(*touched) if walls else nothing, contacts=len(touched[3]))
         state.step, state.time = begin + done - 1, (begin + done) * stepper.h
@@ -138,7 +141,7 @@ class Batch:
             stepper.fault = SimulationFailure(f"{stepper.when(stepper.balance)}: {text}")
         state.step += 1
         ledger.impacts.met = met
-        ledger.resume(energies[0])
+        ledger.resume(kinetic)
         share = self.sums[:done, HEAD.width + 1 : HEAD.width + 1 + WALL.width * walls]
         flags = share.reshape(done, walls, WALL.width)[:, :, WALL.first("contacts")] > 0.0
         return done, flags

@@ -112,7 +112,7 @@ class StepGuard:
         return _Worst(float(values[k]), int(mesh.bar_ids[k]), nodes, float(change[k] / rest[k]), float(turn))
 
     def _barrier(self, before: np.ndarray, after: np.ndarray, energy: float) -> str | None:
-        """Energies of the bars at both ends and half way, all from the plastic strains at the start. Collective."""
+        """Energies of the bars at both ends and half way, all from the internal variables at the start. Collective."""
         middle = self._middle
         np.add(before, after, out=middle)
         middle *= 0.5
@@ -138,5 +138,4 @@ class StepGuard:
     def _stored(self, x: np.ndarray) -> float:
         """Energy of this rank's bars, what yielding takes included [J]; infinite where a bar has no length."""
         found = self.model.bars.forces(x, self._force, commit=False)
-        total = found.elastic + found.plastic_heat + found.hardening
-        return total if np.isfinite(total) else np.inf
+        return found.total if np.isfinite(found.total) else np.inf

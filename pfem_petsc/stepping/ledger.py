@@ -22,9 +22,8 @@ from typing import Any
 import numpy as np
 
 from ..contact.impact import Impacts
+from ..energies import ENERGIES
 from ..mechanics.bars import StrainEnergy
-from ..mechanics.conserving import mean_stress_of_flow
-from ..output.energies import ENERGIES
 from ..output.sums import HEAD
 from .impulses import Impulses, wall_shares
 from .node_loops import WORKS, book_nodes
@@ -55,7 +54,7 @@ class Moment:
     support: np.ndarray
     contact: np.ndarray
     kinetic: float = 0.0
-    energy: StrainEnergy = StrainEnergy(0.0, 0.0, 0.0, -1)
+    energy: StrainEnergy = StrainEnergy()
 
 
 class Ledger:
@@ -114,7 +113,7 @@ class Ledger:
         self.impulses.fill(self.sums)
         stepper.step_changed = False
         impact, friction = self._dissipated(before)
-        stored = present.kinetic - jumped - before.kinetic + sum(present.energy[:3]) - sum(before.energy[:3])
+        stored = present.kinetic - jumped - before.kinetic + present.energy.total - before.energy.total
         heating = self._heating()
         external, contact, damping, inertial, internal = self._works.tolist()
         work, given, weight, lost = self._work_of_walls(before)
@@ -350,25 +349,27 @@ class Ledger:
 
     def _thermal_before(self) -> None:
         if self.model.temperatures.varying:
-            fields = self.model.bars.fields(self.stepper.state.x)
-            self._stress, self._plastic = fields["stress"], fields["plastic_strain"]
-            self._thermal = self.model.bars.thermal.copy()
+            bars = self.model.bars
+            self._stress = bars.fields(self.stepper.state.x)["stress"]
+            self._variables = [block.history[: len(block.law.internal)].copy() for block in bars.blocks]
+            self._thermal = bars.heat[0].copy()
 
     def _heating(self) -> float:
         """Work that a changing temperature does on the counted bars: -A l0 S (change of thermal strain), with the mean
-        stress S of :mod:`~pfem_petsc.mechanics.conserving`, (s0 + s1)/2 where a bar does not yield."""
+        stress S of :mod:`~pfem_petsc.mechanics.conserving`, (s0 + s1)/2 with the law's correction."""
         model = self.model
         if not model.temperatures.varying:
             return 0.0
-        stress, plastic, thermal = self._stress, self._plastic, self._thermal
+        stress, variables, thermal = self._stress, self._variables, self._thermal
         self._thermal_before()
         total = 0.0
-        for block in model.bars.blocks:
+        for block, before, after in zip(model.bars.blocks, variables, self._variables, strict=True):
             part = slice(block.start, block.counted)
             mean = 0.5 * (stress[part] + self._stress[part])
-            if block.history.size:
-                flow = self._plastic[part] - plastic[part]
-                mean += mean_stress_of_flow(block.parameters, self._stress[part] - stress[part], flow)
+            if block.law.mean_correction is not None:
+                counted = slice(block.counted - block.start)
+                change = self._stress[part] - stress[part]
+                mean += block.law.mean_correction(block.parameters, change, before[:, counted], after[:, counted])
             change = self._thermal[part] - thermal[part]
             total -= block.area * float((model.bars.rest[part] * mean * change).sum())
         return total

@@ -16,6 +16,7 @@ import numpy as np
 from ..contact.flat import press_planes
 from ..contact.impact import join_nodes, plane_gaps, stop_nodes, unpressed
 from ..contact.log import compare_contacts
+from ..energies import BAR_ENERGIES
 from ..integrators.central_differences import drift, kick
 from ..mechanics.bars import first_inverted
 from ..mechanics.compiled import kernel
@@ -28,8 +29,7 @@ __all__ = ["BarArrays", "Buffers", "ImpulseArrays", "NodeArrays", "ProbeArrays",
 
 # places of sums and works: constants of the machine code
 _HEAD, _WALL = HEAD.width, WALL.width
-_KINETIC, _ELASTIC = HEAD.first("kinetic_energy"), HEAD.first("elastic_energy")
-_HEAT, _HARDENING = HEAD.first("plastic_heat"), HEAD.first("hardening_energy")
+_KINETIC, _BARS = HEAD.first("kinetic_energy"), tuple(HEAD.first(name) for name in BAR_ENERGIES)
 _EXTERNAL, _DAMPING = HEAD.first("external_work"), HEAD.first("damping_dissipation")
 _IMPACT, _NUMERICAL = HEAD.first("impact_dissipation"), HEAD.first("numerical_dissipation")
 _TOTALS, _CONTACTS, _ALARM = HEAD.first("momentum"), HEAD.first("active_contacts"), HEAD.first("alarm")
@@ -47,7 +47,7 @@ class BarArrays(NamedTuple):
     sweep: tuple
     far: np.ndarray
     rest: np.ndarray
-    thermal: np.ndarray
+    heat: np.ndarray
     parameters: tuple
     area: float
     history: np.ndarray
@@ -121,23 +121,39 @@ def make_march(forces: Callable) -> Callable:
 
     Its arguments: most steps; step [s]; positions, those of the step before, velocities at half steps (n, 3); arrays of
     bars, nodes, walls, probes and buffers; nodes (m,) that touch walls; nodes (k,) that have met walls; the
-    ledger's sums; its particles; kinetic, elastic, heat and
-    hardening energy [J]; and ``sums`` (count, width), which takes what a row of the history sums up, of each step.
+    ledger's sums; its particles; the kinetic energy, and those of
+    the bars [J]; and ``sums`` (count, width), which takes what a row of the history sums up, of each step.
 
     It gives the number of steps made; of the last of them the first bar that collapsed and the first that went through
-    zero length, or -1, and the node that found no room, or -1, with the offsets of its planes; the buffers; the four
-    energies; increments (n, 3); what :func:`~pfem_petsc.contact.flat.press_planes` tells of nodes and walls; and the
-    nodes that touch walls, and that have met them.
+    zero length, or -1, and the node that found no room, or -1, with the offsets of its planes; the buffers; the
+    kinetic energy; increments (n, 3); what :func:`~pfem_petsc.contact.flat.press_planes` tells of nodes and walls; and
+    the nodes that touch walls, and that have met them.
     """
 
     @kernel
     def march(
-        count, h, x, before, half, bars, nodes, walls, probes, buffers, touched, met, ledger, impulses, energies, sums
+        count,
+        h,
+        x,
+        before,
+        half,
+        bars,
+        nodes,
+        walls,
+        probes,
+        buffers,
+        touched,
+        met,
+        ledger,
+        impulses,
+        kinetic,
+        energies,
+        sums,
     ):
         n = len(x)
         n_walls = len(walls.offsets)
         f, f1, a, a1, v, v1, support, support1, contact, contact1 = buffers
-        kinetic, elastic, heat, hardening = energies
+        energies1 = np.empty_like(energies)
         alpha = 1.0 / (h * h)
         eta = 0.5 / h
         nothing = np.empty((0, 3))
@@ -165,8 +181,20 @@ def make_march(forces: Callable) -> Callable:
             drift(flat_x, h, flat_half, flat_x)
             f, f1 = f1, f
             f[:] = 0.0
-            elastic1, heat1, hardening1, failed, shortened = forces(
-                x, *bars.sweep, bars.far, bars.rest, bars.thermal, bars.parameters, bars.area, bars.history, True, f
+            energies1[:] = 0.0
+            failed, shortened = forces(
+                x,
+                *bars.sweep,
+                bars.far,
+                bars.rest,
+                bars.heat,
+                bars.parameters,
+                bars.area,
+                h,
+                bars.history,
+                True,
+                f,
+                energies1,
             )
             turned = -1
             if failed < 0 and shortened:
@@ -276,8 +304,13 @@ def make_march(forces: Callable) -> Callable:
                 impulses.a.reshape(-1),
                 impulses.v.reshape(-1),
             )
-            stored = kinetic1 - kinetic + (elastic1 + heat1 + hardening1) - (elastic + heat + hardening)
-            kinetic, elastic, heat, hardening = kinetic1, elastic1, heat1, hardening1
+            held, held1 = 0.0, 0.0
+            for k in range(len(energies)):
+                held += energies[k]
+                held1 += energies1[k]
+            energies[:] = energies1
+            stored = kinetic1 - kinetic + held1 - held
+            kinetic = kinetic1
             ledger[_EXTERNAL] += works[_BY_EXTERNAL]
             ledger[_DAMPING] += works[_BY_DAMPING]
             ledger[_IMPACT] += impact
@@ -292,7 +325,8 @@ def make_march(forces: Callable) -> Callable:
             ledger[_KINETIC] = kinetic
             row = sums[step]
             row[:_HEAD] = ledger
-            row[_ELASTIC], row[_HEAT], row[_HARDENING] = elastic, heat, hardening
+            for k in range(len(energies)):
+                row[_BARS[k]] = energies[k]
             row[_CONTACTS], row[_ALARM] = len(near), 0.0
             at = _HEAD
             if n_walls > 0:
@@ -315,7 +349,7 @@ def make_march(forces: Callable) -> Callable:
                         row[at + 3 * (3 * size + j) + c] = contact[i, c] + (support[i, c] if supported else 0.0)
                 at += 12 * size
             done += 1
-            if failed >= 0 or turned >= 0 or stuck >= 0 or not np.isfinite(kinetic + elastic):
+            if failed >= 0 or turned >= 0 or stuck >= 0 or not np.isfinite(kinetic + held1):
                 break
         after = (f, f1, a, a1, v, v1, support, support1, contact, contact1)
         return (
@@ -325,7 +359,7 @@ def make_march(forces: Callable) -> Callable:
             stuck,
             stuck_offsets,
             after,
-            (kinetic, elastic, heat, hardening),
+            kinetic,
             u,
             (force, contacts, moment, near, touching, places),
             touched,

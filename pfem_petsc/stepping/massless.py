@@ -105,7 +105,7 @@ class MasslessNodes:
         way = x[b] - x[a]
         length = np.linalg.norm(way, axis=1)
         axial = np.concatenate(
-            [np.full(k.stop - k.start, k.area * k.parameters[0]) for k in model.bars.blocks] or [np.zeros(0)]
+            [np.full(k.stop - k.start, k.area * k.modulus) for k in model.bars.blocks] or [np.zeros(0)]
         )
         for end in (a, b):
             along = np.einsum("bi,bi->b", way, normal[end]) / length

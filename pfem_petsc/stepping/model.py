@@ -92,14 +92,14 @@ class Model:
         self.reach = float(max(np.abs(low).max(), np.abs(high).max()))
         stiffness = np.zeros(mesh.n_local)
         for block in self.bars.blocks:
-            axial = block.area * block.parameters[0]
+            axial = block.area * block.modulus
             _node_stiffness(mesh.bars, self.bars.rest, block.start, block.stop, axial, stiffness)
         self.nodal_stiffness = stiffness[: mesh.n_owned].copy()
         with np.errstate(over="ignore"):  # what is too stiff to be computed with is refused by the plan
             squares = comm.allreduce(float((self.nodal_stiffness**2).sum()))
         self.rounding = 4.0 * np.finfo(float).eps * self.reach * np.sqrt(squares)
         self.total_mass = comm.allreduce(float(self.inertia.mass.sum()))
-        speeds = [np.sqrt(m.young_modulus / m.density) for m in case.material.values()]
+        speeds = [np.sqrt(m.largest_modulus() / m.density) for m in case.material.values()]
         self.wave_speed = max(speeds)
 
     def initial_velocity(self) -> np.ndarray:

@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from ..case.materials import law_name, law_of
 from ..contact.free import FreeWalls
 from ..contact.restitution import Treatment as Restitution
-from ..contact.treatments.mass_redistribution import redistribute
+from ..contact.treatments.base import Treatment
 from ..errors import InputError
 from ..integrators.base import Scheme
-from ..registry import lookup
+from ..registry import choices, lookup
 from ..solvers.linear import LinearChoice, choose_linear
 from .contact_check import warn_of_gain
 from .explicit import ExplicitStepper
@@ -27,8 +28,7 @@ __all__ = ["Plan", "make_plan", "make_stepper"]
 _DAMPED = 0.2  # of a step: the time in which damping alone takes a velocity to 1/e, inverted
 _MOST_STEPS = 2.0**53  # beyond, the time of a step is not a number of its own
 
-CONSERVING = ("newmark", "houbolt", "energy_momentum")
-"""Schemes whose contact force of a step acts in that step alone once its acceleration is taken away."""
+TREATMENTS = "pfem_petsc.contact.treatments"
 
 
 @dataclass(frozen=True)
@@ -76,6 +76,7 @@ def make_plan(model, recorded: Mapping[str, Any] | None = None) -> Plan:
     case = model.case
     time = case.time
     scheme = lookup("pfem_petsc.integrators", time.integrator, f"{case.source}: time.integrator").Scheme(time.scheme)
+    _check_laws(case, scheme)
     if recorded is None:
         frequency = highest_frequency(model, model.mesh.points)
     else:
@@ -128,11 +129,21 @@ def make_plan(model, recorded: Mapping[str, Any] | None = None) -> Plan:
     return Plan(scheme, step, steps, critical, frequency, linear, asked)
 
 
+def _check_laws(case, scheme: Scheme) -> None:
+    """Refuse material laws that the scheme cannot have."""
+    for name, material in case.material.items():
+        reason = law_of(material).refuses(scheme)
+        if reason is not None:
+            raise InputError(
+                f'{case.source}: material.{name}.law = "{law_name(dict(material))}" does not go with time.integrator = '
+                f'"{case.time.integrator}": {reason}; take another integrator or law'
+            )
+
+
 def _linear(model, scheme: Scheme, over: float, steps: int) -> LinearChoice:
     """The choice for steps ``over`` times the limit of central differences."""
     case = model.case
-    yielding = any(material.yield_stress is not None for material in case.material.values())
-    impact = yielding or model.can_touch
+    impact = model.can_touch or not all(law_of(material).smooth for material in case.material.values())
     solver, unknowns = case.solver, 3 * model.mesh.n_nodes
     try:
         choice = choose_linear(solver.linear, unknowns, over, scheme.symmetric, solver.operator, steps, impact)
@@ -160,32 +171,34 @@ def make_stepper(model, plan: Plan) -> Stepper:
     InputError
         On all ranks, where the scheme does not go with the treatment.
     """
-    _check_walls(model, plan)
+    treatment = _treatment(model, plan)
+    _check_walls(model, plan, treatment)
     _warn_of_damping(model, plan)
+    if treatment is not None:
+        treatment.prepare(model)
+    stepper = _stepper(model, plan)
+    if treatment is not None:
+        stepper.treatment = treatment(stepper)
+    elif model.contact.restitution.any() and not model.contact.rebounds:
+        stepper.treatment = Restitution(stepper)
+    if model.can_touch:
+        _warn_of_gain(model, plan)
+    return stepper
+
+
+def _treatment(model, plan: Plan) -> type[Treatment] | None:
+    """What the case asks for; None for the formulas of the scheme, and where nothing can touch."""
     name = model.case.contact.treatment
-    touch = model.can_touch
-    if name == "scheme" or not touch:
-        stepper = _stepper(model, plan, ExplicitStepper)
-        if model.contact.restitution.any() and not model.contact.rebounds:
-            stepper.treatment = Restitution(stepper)
-        if touch:
-            _warn_of_gain(model, plan)
-        return stepper
+    if name == "scheme" or not model.can_touch:
+        return None
+    treatment = lookup(TREATMENTS, name, "contact.treatment").Treatment
     key = f'{model.case.source}: contact.treatment = "{name}"'
     if model.inertia.consistent:
         raise InputError(f'{key}: needs time.mass = "lumped"')
-    if name == "conserving" and model.case.time.integrator not in CONSERVING:
-        raise InputError(f"{key}: goes with the integrators {', '.join(CONSERVING)}")
-    explicit: type[Stepper] = ExplicitStepper
-    if name == "mass_redistribution":
-        if plan.scheme.explicit and not plan.scheme.leads:
-            raise InputError(f"{key}: of the explicit schemes only central_differences can have nodes without mass")
-        model.inertia.redistribution = redistribute(model)
-        explicit = RedistributedStepper
-    stepper = _stepper(model, plan, explicit)
-    stepper.treatment = lookup("pfem_petsc.contact.treatments", name, "contact.treatment").Treatment(stepper)
-    _warn_of_gain(model, plan)
-    return stepper
+    reason = treatment.refuses(plan.scheme)
+    if reason is not None:
+        raise InputError(f"{key}: {reason}")
+    return treatment
 
 
 def _warn_of_gain(model, plan: Plan) -> None:
@@ -208,11 +221,11 @@ def _warn_of_damping(model, plan: Plan) -> None:
         )
 
 
-def _check_walls(model, plan: Plan) -> None:
+def _check_walls(model, plan: Plan, treatment: type[Treatment] | None) -> None:
     """Refuse what a wall asks for and the scheme cannot do."""
     walls = model.case.wall
     if any(wall.mass is not None for wall in walls):
-        if model.case.contact.treatment != "scheme":
+        if treatment is not None:
             raise InputError(
                 f'{model.case.source}: wall.mass needs contact.treatment = "scheme": other '
                 "treatments change velocities by jumps"
@@ -222,24 +235,31 @@ def _check_walls(model, plan: Plan) -> None:
     for k, name in enumerate(model.contact.names):
         key = f"{model.case.source}: wall {name!r}"
         if model.contact.restitution[k]:
-            _check_restitution(model, plan, k, key)
-        if model.contact.ties.tying[k] and model.case.contact.treatment not in ("scheme", "stick"):
-            raise InputError(f'{key}: tied needs contact.treatment = "scheme" or "stick"')
-        if model.contact.static_friction[k] and model.case.contact.treatment not in ("scheme", "stick"):
-            raise InputError(f'{key}: friction needs contact.treatment = "scheme" or "stick"')
+            _check_restitution(model, plan, treatment, k, key)
+        if model.contact.ties.tying[k]:
+            _check_serves(treatment, "tied", key)
+        if model.contact.static_friction[k]:
+            _check_serves(treatment, "friction", key)
 
 
-def _check_restitution(model, plan: Plan, k: int, key: str) -> None:
-    treatment = model.case.contact.treatment
+def _check_serves(treatment: type[Treatment] | None, what: str, key: str) -> None:
+    """Refuse a key of walls that the treatment does not go with."""
+    if treatment is None or what in treatment.serves:
+        return
+    known = {name: lookup(TREATMENTS, name, "").Treatment for name in choices(TREATMENTS)}
+    served = ['"scheme"', *(f'"{name}"' for name, other in known.items() if what in other.serves)]
+    raise InputError(f"{key}: {what} needs contact.treatment = {' or '.join(served)}")
+
+
+def _check_restitution(model, plan: Plan, treatment: type[Treatment] | None, k: int, key: str) -> None:
     if model.inertia.consistent:
         raise InputError(f'{key}: restitution needs time.mass = "lumped": one node\'s velocity jumps')
     if plan.scheme.leads:
         model.contact.rebounds = True
-        if treatment != "scheme":
+        if treatment is not None:
             raise InputError(f'{key}: with {model.case.time.integrator} restitution needs contact.treatment = "scheme"')
         return
-    if treatment not in ("scheme", "stick"):
-        raise InputError(f'{key}: restitution needs contact.treatment = "scheme" or "stick"')
+    _check_serves(treatment, "restitution", key)
     # the jump has an impulse of its own, which neither drags nor pushes a wall
     if model.contact.static_friction[k]:
         raise InputError(f"{key}: restitution together with friction needs central_differences")
@@ -247,7 +267,8 @@ def _check_restitution(model, plan: Plan, k: int, key: str) -> None:
         raise InputError(f"{key}: restitution of a wall with mass needs central_differences")
 
 
-def _stepper(model, plan: Plan, explicit: type[Stepper]) -> Stepper:
-    if plan.linear is None:
-        return explicit(model, plan.scheme, plan.step)
-    return ImplicitStepper(model, plan.scheme, plan.step, plan.linear)
+def _stepper(model, plan: Plan) -> Stepper:
+    if plan.linear is not None:
+        return ImplicitStepper(model, plan.scheme, plan.step, plan.linear)
+    explicit = ExplicitStepper if model.inertia.redistribution is None else RedistributedStepper
+    return explicit(model, plan.scheme, plan.step)

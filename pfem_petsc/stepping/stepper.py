@@ -81,7 +81,7 @@ class Stepper(ABC):
         self.booking: Callable[[], None] = lambda: None
         mesh = model.mesh
         owned = mesh.n_owned
-        self.energy = StrainEnergy(0.0, 0.0, 0.0, -1)
+        self.energy = StrainEnergy()
         self.fault: SimulationFailure | None = None
         self.balance: Balance | None = None
         self.zero = np.zeros((owned, 3))  # stands for forces that do not act: never written
@@ -187,7 +187,7 @@ class Stepper(ABC):
     def _make_part(self, end: float) -> None:
         """Advance by ``part``, to the time ``end``."""
         if self.model.temperatures.varying:
-            self.model.bars.thermal_at_start[:] = self.model.bars.thermal
+            self.model.bars.heat_at_start[:] = self.model.bars.heat
         if self.treatment is not None:
             self.treatment.before()
         if self.scheme.leads:
@@ -208,6 +208,7 @@ class Stepper(ABC):
         self.booking()
 
     def _arrive(self, end: float) -> None:
+        self.model.bars.step = self.part
         self.state.time = end
         if self.model.temperatures.varying:
             self.model.temperatures.apply(end)
@@ -220,6 +221,7 @@ class Stepper(ABC):
             self._prescribe(self.balance)
         self.model.contact.motion.begin(state.time, self.part)
         state.external = self._load(self.balance)
+        self.model.bars.step = self.balance.time - state.time
         self.solution = self.solve(self.balance)
         fresh = self.model.contact.record(self.solution.walls, self.balance.time, self.part)
         if not self.scheme.leads:

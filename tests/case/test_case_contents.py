@@ -23,7 +23,7 @@ def test_values_and_defaults(case_file):
     assert case.node_set["tip"].nearest == (1.0, 0.0, 0.0)
     assert case.node_set["base"].indices == (0,)
     steel = case.material["steel"]
-    assert (steel.young_modulus, steel.yield_stress, steel.damping, steel.strain) == (210e9, None, 0.0, "engineering")
+    assert (steel.young_modulus, steel.law, steel.damping, steel.strain) == (210e9, None, 0.0, "engineering")
     assert (case.section["strut"].area, case.section["strut"].bars) == (1e-4, None)
     assert case.initial == [] and case.temperature == [] and case.gravity is None
     assert (case.support[0].fix, case.support[0].motion, case.support[0].velocity) == ("yz", None, None)

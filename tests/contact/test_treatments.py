@@ -178,7 +178,7 @@ def test_mass_redistribution_without_a_matrix(comm, shared_tmp_path):
 @pytest.mark.parametrize(
     "tables, message",
     [
-        ({"contact": {"treatment": "conserving"}}, "goes with the integrators newmark"),
+        ({"contact": {"treatment": "conserving"}}, "goes with the integrators energy_momentum, houbolt, newmark"),
         (
             {"contact": {"treatment": "mass_redistribution"}},
             "must be a plane, not curved nor a rectangle, and name a node_set",

@@ -7,10 +7,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pfem_petsc.mechanics.materials.elastoplastic import pack
+from pfem_petsc.mechanics.materials.elastoplastic import Parameters
 from pfem_petsc.mechanics.materials.elastoplastic import response as law
 
 YOUNG = 200e9
+
+
+def pack(material):
+    return Parameters(density=1.0, **vars(material)).pack()
+
+
 moduli = st.sampled_from([0.0, 1e9, 20e9, 300e9])
 yields = st.floats(50e6, 500e6)
 paths = st.lists(st.floats(-0.01, 0.01), min_size=1, max_size=5)
@@ -24,9 +30,9 @@ materials = st.builds(
 
 def response(strain, p, history, k, commit):
     """The law on row k of a history array, as the bars' loops use it."""
-    stress, tangent, plastic, accumulated, elastic, heat, hardening = law(strain, p, *history[k])
+    stress, tangent, variables, (elastic, heat, hardening) = law(strain, 0.0, 0.0, 0.0, p, tuple(history[k]))
     if commit:
-        history[k] = plastic, accumulated
+        history[k] = variables
     return stress, tangent, elastic, heat, hardening
 
 

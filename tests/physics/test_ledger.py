@@ -7,7 +7,7 @@ import pytest
 from helpers.runs import run
 
 from pfem_petsc import Case
-from pfem_petsc.output.energies import LOST, STORED, SUPPLIED
+from pfem_petsc.energies import LOST, STORED, SUPPLIED
 
 SCHEMES = [
     "central_differences",

@@ -10,6 +10,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ...integrators.base import Scheme
+
 __all__ = ["Jump", "Treatment"]
 
 
@@ -39,9 +41,26 @@ class Treatment(ABC):
     ----------
     jump : of the part of a step just made, None where nothing jumped
     elastic : whether impact loses nothing
+    serves : keys of walls that it goes with, of ``tied``, ``friction`` and ``restitution``
     """
 
     elastic = False
+    serves: tuple[str, ...] = ()
+
+    @classmethod
+    def refuses(cls, scheme: Scheme) -> str | None:
+        """Why a scheme cannot have the treatment, None where it can."""
+        return None
+
+    @classmethod
+    def prepare(cls, model) -> None:
+        """Change the model before the stepper is made; nothing by default. Collective.
+
+        Raises
+        ------
+        InputError
+            On all ranks, for models that cannot have the treatment.
+        """
 
     def __init__(self, stepper) -> None:
         self.stepper = stepper

@@ -11,15 +11,27 @@ from __future__ import annotations
 
 import numpy as np
 
+from ...integrators.base import Scheme
+from ...registry import choices, lookup
 from .base import Treatment as Base
 
 __all__ = ["Treatment"]
+
+INTEGRATORS = "pfem_petsc.integrators"
 
 
 class Treatment(Base):
     """Velocity of held nodes such that contact does no work."""
 
     elastic = True
+
+    @classmethod
+    def refuses(cls, scheme: Scheme) -> str | None:
+        """See :class:`~pfem_petsc.contact.treatments.base.Treatment`."""
+        if scheme.force_acts_once:
+            return None
+        schemes = {name: lookup(INTEGRATORS, name, "").Scheme for name in choices(INTEGRATORS)}
+        return f"goes with the integrators {', '.join(name for name, one in schemes.items() if one.force_acts_once)}"
 
     def before(self) -> None:
         """Keep where nodes start, and the forces there."""

@@ -15,6 +15,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...errors import InputError
+from ...integrators.base import Scheme
 from ...parallel.agreement import agreed
 from .base import Jump
 from .base import Treatment as Base
@@ -140,6 +141,23 @@ class Treatment(Base):
     """No mass on contact nodes along the walls' normals."""
 
     elastic = True
+
+    @classmethod
+    def refuses(cls, scheme: Scheme) -> str | None:
+        """See :class:`~pfem_petsc.contact.treatments.base.Treatment`."""
+        if scheme.explicit and not scheme.leads:
+            return "of the explicit schemes only central_differences can have nodes without mass"
+        return None
+
+    @classmethod
+    def prepare(cls, model) -> None:
+        """Take the mass from the nodes. Collective."""
+        if model.links:
+            raise InputError(
+                f'{model.case.source}: contact.treatment = "mass_redistribution": only walls can take mass from nodes; '
+                "take another treatment with contact_pair"
+            )
+        model.inertia.redistribution = redistribute(model)
 
     def before(self) -> None:
         """Keep where nodes start."""

@@ -23,6 +23,7 @@ class Treatment(Restitution):
     """Velocity and acceleration of held nodes as those of the wall."""
 
     everywhere = True
+    serves = ("tied", "friction", "restitution")
 
     def before(self) -> None:
         """Keep how pressed pairs stand and what presses them, as well."""

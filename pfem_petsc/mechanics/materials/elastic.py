@@ -4,19 +4,23 @@ from __future__ import annotations
 
 from numba.extending import register_jitable
 
-__all__ = ["REMEMBERS", "pack", "response"]
+from .base import Law
+from .base import MaterialKeys as Parameters
 
-REMEMBERS = False
-
-
-def pack(material) -> tuple[float, ...]:
-    """Parameters as the response reads them: (E,) [Pa]."""
-    return (float(material.young_modulus),)
+__all__ = ["LAW", "Parameters"]
 
 
 @register_jitable
-def response(strain, p, plastic, accumulated):
-    """Stress [Pa], tangent modulus [Pa], the two history variables, and energy densities [J/m3]: elastic, heat,
-    hardening."""
+def response(strain, rate, step, temperature, p, q):
+    """See :class:`~pfem_petsc.mechanics.materials.base.Law`; p = (E,)."""
     stress = p[0] * strain
-    return stress, p[0], plastic, accumulated, 0.5 * stress * strain, 0.0, 0.0
+    return stress, p[0], q, (0.5 * stress * strain,)
+
+
+@register_jitable
+def mean_stress(stress0, strain0, strain, rate, step, temperature, p, q):
+    """(s0 + s1)/2, whose work is the change of the elastic energy."""
+    return 0.5 * (stress0 + p[0] * strain), 0.5 * p[0]
+
+
+LAW = Law(response, smooth=True, mean_stress=mean_stress)

@@ -3,41 +3,113 @@
 Yield function f = |s - H e_p| - (s_Y + K a) with the accumulated plastic strain a. The return mapping of a linear law
 is closed: da = f_trial / (E + H + K). On the yield surface s = sign (s_Y + K a) + H e_p, so the plastic work is the
 function of state s_Y a + K a^2/2 + H e_p^2/2: its first term is heat, the rest is stored by the hardening.
+
+In a step that yields at the part q of the strain's change before its end, the stress follows the line of modulus E to
+the yield stress and that of modulus Et from there. With the plastic strain de_p of the step its mean is
+
+    S = (s0 + s1)/2 + E de_p (1 - q)/2,   q = E de_p/((E - Et)(e1 - e0)),   dS/de1 = (Et + (E - Et)(1 - q)^2)/2.
+
+The energies are functions of state on that path, so that the work S (e1 - e0) is the change of elastic energy and the
+plastic dissipation, which is not negative. (s0 + s1)/2 would work less than is dissipated.
 """
 
 from __future__ import annotations
 
+import numpy as np
 from numba.extending import register_jitable
 
-__all__ = ["REMEMBERS", "pack", "response"]
+from ...case.base import NonNegativeFloat, PositiveFloat
+from .base import Law, MaterialKeys
 
-REMEMBERS = True
+__all__ = ["LAW", "Parameters", "mean_correction", "response"]
 
 
-def pack(material) -> tuple[float, ...]:
-    """Parameters as the response reads them: (E, s_Y, K, H) [Pa] and 1/(E + H + K) [1/Pa]."""
-    young, isotropic, kinematic = material.young_modulus, material.isotropic_hardening, material.kinematic_hardening
-    inverse = 1.0 / (young + kinematic + isotropic)
-    return float(young), float(material.yield_stress), float(isotropic), float(kinematic), float(inverse)
+class Parameters(MaterialKeys):
+    """Keys of an elastoplastic material."""
+
+    yield_stress: PositiveFloat
+    """yield stress [Pa]"""
+    isotropic_hardening: NonNegativeFloat = 0.0
+    """isotropic hardening modulus K [Pa]"""
+    kinematic_hardening: NonNegativeFloat = 0.0
+    """kinematic hardening modulus H [Pa]"""
+
+    def pack(self) -> tuple[float, ...]:
+        """(E, s_Y, K, H) [Pa] and 1/(E + H + K) [1/Pa]."""
+        young, isotropic, kinematic = self.young_modulus, self.isotropic_hardening, self.kinematic_hardening
+        inverse = 1.0 / (young + kinematic + isotropic)
+        return float(young), float(self.yield_stress), float(isotropic), float(kinematic), float(inverse)
+
+    def suspicions(self, key: str, hint: str) -> list[str]:
+        """Strains at yield that no material has, and yielding without hardening."""
+        texts = []
+        if self.yield_stress > 0.2 * self.young_modulus:
+            texts.append(
+                f"{key}.yield_stress = {self.yield_stress:g} Pa is reached at a strain of "
+                f"{self.yield_stress / self.young_modulus:.3g}; {hint}"
+            )
+        if self.isotropic_hardening + self.kinematic_hardening == 0.0:
+            texts.append(
+                f"{key} yields without hardening: one bar of a row takes all plastic strain, the more the shorter it "
+                "is, so results depend on the mesh; give isotropic_hardening or kinematic_hardening"
+            )
+        return texts
 
 
 @register_jitable
-def response(strain, p, plastic, accumulated):
-    """Stress [Pa], tangent modulus [Pa], the new plastic and accumulated plastic strain, and energy densities [J/m3]:
-    elastic, heat, hardening."""
+def response(strain, rate, step, temperature, p, q):
+    """See :class:`~pfem_petsc.mechanics.materials.base.Law`; q = (plastic strain, accumulated plastic strain)."""
     young, yield_stress, isotropic, kinematic, inverse = p
+    plastic, accumulated = q
     stress = young * (strain - plastic)
     tangent = young
     relative = stress - kinematic * plastic
     excess = abs(relative) - (yield_stress + isotropic * accumulated)
     if excess > 0.0:
-        step = excess * inverse
-        accumulated += step
+        flow = excess * inverse
+        accumulated += flow
         if relative < 0.0:
-            step = -step
-        plastic += step
-        stress -= young * step
+            flow = -flow
+        plastic += flow
+        stress -= young * flow
         tangent = young * (isotropic + kinematic) * inverse
     hardening = 0.5 * (isotropic * accumulated * accumulated + kinematic * plastic * plastic)
     elastic = 0.5 * stress * (strain - plastic)
-    return stress, tangent, plastic, accumulated, elastic, yield_stress * accumulated, hardening
+    return stress, tangent, (plastic, accumulated), (elastic, yield_stress * accumulated, hardening)
+
+
+@register_jitable
+def mean_stress(stress0, strain0, strain, rate, step, temperature, p, q):
+    """Mean stress of the step and its derivative, see the module."""
+    stress, modulus, (flowed, _), _ = response(strain, rate, step, temperature, p, q)
+    mean = 0.5 * (stress0 + stress)
+    if flowed != q[0]:
+        young, change = p[0], strain - strain0
+        lost = young - modulus
+        part = young * (flowed - q[0]) / (lost * change) if change != 0.0 else 1.0
+        part = min(max(part, 0.0), 1.0)  # beyond by rounding only: the start is not outside of the yield surface
+        mean += 0.5 * young * (flowed - q[0]) * (1.0 - part)
+        modulus += lost * (1.0 - part) * (1.0 - part)
+    return mean, 0.5 * modulus
+
+
+def mean_correction(p: tuple[float, ...], stress: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """What yielding adds to the mean stress (s0 + s1)/2 of a step: E de_p (1 - q)/2 [Pa].
+
+    ``stress`` s1 - s0 [Pa], internal variables (2, bars) ``before`` and ``after`` the step.
+    """
+    young, *_, inverse = p
+    flow = after[0] - before[0]
+    change = stress / young + flow
+    with np.errstate(divide="ignore", invalid="ignore"):
+        q = np.where(flow != 0.0, flow / (young * inverse * change), 1.0)
+    return 0.5 * young * flow * (1.0 - np.clip(np.nan_to_num(q, nan=1.0, posinf=1.0, neginf=1.0), 0.0, 1.0))
+
+
+LAW = Law(
+    response,
+    internal=(("plastic_strain", ""), ("accumulated_plastic_strain", "")),
+    energies=("elastic_energy", "plastic_heat", "hardening_energy"),
+    mean_stress=mean_stress,
+    mean_correction=mean_correction,
+)

@@ -1,0 +1,59 @@
+"""The fields of snapshots, one entry each: name, where its values are, unit, and how they are found.
+
+Internal variables of a case's material laws can be asked for as well; the laws name them, and nothing here does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+__all__ = ["FIELDS", "Field", "cell_fields", "point_fields"]
+
+
+def _always(model: Any) -> bool:
+    return True
+
+
+class Field(NamedTuple):
+    """One field.
+
+    Attributes
+    ----------
+    place : ``nodes``, values (owned, 3), or ``bars``, values (local bars,)
+    unit : SI unit, empty for a pure number
+    value : its values, from a :class:`~pfem_petsc.recording.fields.Snapshot`; called by all ranks
+    default : whether it is written where a case does not name fields, from a :class:`~pfem_petsc.stepping.model.Model`
+    """
+
+    name: str
+    place: str
+    unit: str
+    value: Callable[[Any], np.ndarray]
+    default: Callable[[Any], bool] = _always
+
+
+# one more field is one more entry here
+FIELDS = [
+    Field("displacement", "nodes", "m", lambda now: now.state.position - now.start),
+    Field("velocity", "nodes", "m/s", lambda now: now.state.v),
+    Field("acceleration", "nodes", "m/s²", lambda now: now.acceleration()),
+    Field("contact_force", "nodes", "N", lambda now: now.state.contact),
+    Field("strain", "bars", "", lambda now: now.bars["strain"]),
+    Field("stress", "bars", "Pa", lambda now: now.bars["stress"]),
+    Field("axial_force", "bars", "N", lambda now: now.bars["axial_force"]),
+    Field("plastic_strain", "bars", "", lambda now: now.bars["plastic_strain"]),
+    Field("temperature", "bars", "K", lambda now: now.temperature(), lambda model: model.temperatures.any),
+]
+
+
+def point_fields() -> list[str]:
+    """Names of the fields of nodes."""
+    return [field.name for field in FIELDS if field.place == "nodes"]
+
+
+def cell_fields() -> list[str]:
+    """Names of the fields of bars."""
+    return [field.name for field in FIELDS if field.place == "bars"]

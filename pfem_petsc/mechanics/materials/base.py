@@ -1,0 +1,104 @@
+"""What every material law is made of: the keys of its table, and a :class:`Law` for the loops over bars.
+
+A module of this package is a law. It has ``Parameters``, a :class:`MaterialKeys` whose :meth:`~MaterialKeys.pack` gives
+the numbers that the law reads, and ``LAW``, a :class:`Law`. The compiled loops of explicit steps, alone and fused, of
+implicit steps, assembled and matrix-free, and of the energy-momentum scheme are made from it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from ...case.base import Finite, NonNegativeFloat, PositiveFloat, StrictModel
+from ...energies import BAR_ENERGIES
+
+__all__ = ["Law", "MaterialKeys"]
+
+
+class MaterialKeys(StrictModel):
+    """Keys of every material, whatever its law."""
+
+    law: str | None = None
+    """name of a material law; default: "elastoplastic" with a yield_stress, else "elastic\""""
+    young_modulus: PositiveFloat
+    """Young's modulus [Pa]"""
+    density: PositiveFloat
+    """mass density [kg/m3]"""
+    thermal_expansion: Finite = 0.0
+    """coefficient of thermal expansion [1/K]"""
+    damping: NonNegativeFloat = 0.0
+    """damping c_m proportional to mass density [kg/(m3 s)]"""
+    strain: Literal["engineering", "green", "logarithmic"] = "engineering"
+    """strain measure"""
+
+    def pack(self) -> tuple[float, ...]:
+        """The numbers that the law's response reads as ``p``; at least one."""
+        return (float(self.young_modulus),)
+
+    def largest_modulus(self) -> float:
+        """Largest tangent modulus that a bar can have [Pa]: of wave speeds and of the rounding of forces."""
+        return float(self.young_modulus)
+
+    def suspicions(self, key: str, hint: str) -> list[str]:
+        """Texts about values that look wrong, for the check before a run.
+
+        Parameters
+        ----------
+        key : of the table, ``material.NAME``
+        hint : what to say of a value that may be in a wrong unit
+        """
+        return []
+
+
+@dataclass(frozen=True)
+class Law:
+    """A material law.
+
+    Attributes
+    ----------
+    response : compiled (``register_jitable``) function of (strain, rate, step, temperature, p, q): strain less the
+        thermal strain; its rate over the step [1/s]; the step [s], 0 at the start of a run; temperature above reference
+        [K]; the packed parameters; and the internal variables at the start of the step, a tuple. It gives (stress [Pa],
+        tangent [Pa], internal variables at the end of the step, energy densities [J/m3]). The tangent is the whole
+        derivative of the stress by the strain at the end, that of the rate (1/step) included
+    internal : name and unit of each internal variable of a bar, zero at the start; a unit of ``""`` is a pure number.
+        They are fields of the snapshots where a case asks for them, and arrays of the checkpoints
+    energies : names of the energy densities, of :data:`~pfem_petsc.energies.BAR_ENERGIES`: functions of strain and
+        internal variables. A law whose dissipation is not one keeps it as another internal variable
+    rate : whether the law depends on the rate or on the step: strain and stress at the end of the last step are then
+        kept as well. Without it, rate and step are zero
+    smooth : whether the tangent is constant, so that Newton's method has nothing to follow
+    mean_stress : compiled function of (stress0, strain0, strain, rate, step, temperature, p, q): mean stress [Pa] over
+        the step from stress0 and strain0 to strain, whose work is the change of energies, and its derivative by strain.
+        The energy-momentum scheme needs it; None: it is refused
+    mean_correction : what ``mean_stress`` has beyond the mean of both ends [Pa], from p, the change of stress and the
+        internal variables before and after, (variables, bars), for the work of changing temperatures; None for nothing
+    """
+
+    response: Callable[..., Any]
+    internal: tuple[tuple[str, str], ...] = ()
+    energies: tuple[str, ...] = ("elastic_energy",)
+    rate: bool = False
+    smooth: bool = False
+    mean_stress: Callable[..., Any] | None = None
+    mean_correction: Callable[[tuple[float, ...], np.ndarray, np.ndarray, np.ndarray], np.ndarray] | None = None
+
+    def __post_init__(self) -> None:
+        for name in self.energies:
+            if name not in BAR_ENERGIES:
+                raise ValueError(f"a law gives {name!r}, which is none of {', '.join(BAR_ENERGIES)} (energies.py)")
+
+    @property
+    def rows(self) -> tuple[tuple[str, str], ...]:
+        """Name and unit of all that is kept of a bar from step to step: internal variables first."""
+        return (*self.internal, ("last_strain", ""), ("last_stress", "Pa")) if self.rate else self.internal
+
+    def refuses(self, scheme: Any) -> str | None:
+        """Why a :class:`~pfem_petsc.integrators.base.Scheme` cannot have the law, None where it can."""
+        if scheme.discrete_gradient and self.mean_stress is None:
+            return "it has no mean stress over a step (mean_stress), which this scheme needs"
+        return None

@@ -1,0 +1,80 @@
+"""Columns of a two-dimensional array as tuples, in compiled loops: any number of rows, known when they are compiled.
+
+Machine code for each row, with nothing to count references of: an array that is handed to an inner function costs more
+than a bar, and a loop over a handful of rows cannot be laid side by side for several bars.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from numba.core import cgutils, types
+from numba.extending import intrinsic
+
+__all__ = ["accumulate", "differ", "put", "take"]
+
+
+def _places(context: Any, builder: Any, signature: Any, args: Any, first: int, column: int, count: int) -> list[Any]:
+    """Pointers to ``count`` rows of a column: ``first`` and ``column`` are places of arguments, ``first`` -1 for 0."""
+    array_type = signature.args[0]
+    array = context.make_array(array_type)(context, builder, args[0])
+    at = context.cast(builder, args[column], signature.args[column], types.intp)
+    begin = context.get_constant(types.intp, 0)
+    if first >= 0:
+        begin = context.cast(builder, args[first], signature.args[first], types.intp)
+    rows = (builder.add(begin, context.get_constant(types.intp, j)) for j in range(count))
+    return [cgutils.get_item_pointer(context, builder, array_type, array, [row, at]) for row in rows]
+
+
+@intrinsic
+def take(typingctx, rows, column, like):  # noqa: ANN001, ANN201 - Numba's types
+    """Numbers ``rows[0, column]``, ``rows[1, column]``, ... as many as the tuple ``like`` has."""
+    count = len(like)
+
+    def generate(context, builder, signature, args):  # noqa: ANN001, ANN202
+        places = _places(context, builder, signature, args, -1, 1, count)
+        return context.make_tuple(builder, signature.return_type, [builder.load(place) for place in places])
+
+    return like(rows, column, like), generate
+
+
+@intrinsic
+def put(typingctx, rows, first, column, values):  # noqa: ANN001, ANN201
+    """Write a tuple to ``rows[first, column]`` and the rows after it."""
+    count = len(values)
+
+    def generate(context, builder, signature, args):  # noqa: ANN001, ANN202
+        for j, place in enumerate(_places(context, builder, signature, args, 1, 2, count)):
+            builder.store(builder.extract_value(args[3], j), place)
+        return context.get_dummy_value()
+
+    return types.void(rows, first, column, values), generate
+
+
+@intrinsic
+def accumulate(typingctx, rows, first, column, factor, values):  # noqa: ANN001, ANN201
+    """Add ``factor`` times a tuple to ``rows[first, column]`` and the rows after it."""
+    count = len(values)
+
+    def generate(context, builder, signature, args):  # noqa: ANN001, ANN202
+        for j, place in enumerate(_places(context, builder, signature, args, 1, 2, count)):
+            more = builder.fmul(args[3], builder.extract_value(args[4], j))
+            builder.store(builder.fadd(builder.load(place), more), place)
+        return context.get_dummy_value()
+
+    return types.void(rows, first, column, factor, values), generate
+
+
+@intrinsic
+def differ(typingctx, one, other):  # noqa: ANN001, ANN201
+    """Whether two tuples of as many numbers differ, or hold NaN."""
+    count = len(one)
+
+    def generate(context, builder, signature, args):  # noqa: ANN001, ANN202
+        found = cgutils.false_bit
+        for j in range(count):
+            pair = (builder.extract_value(value, j) for value in args)
+            found = builder.or_(found, builder.fcmp_unordered("!=", *pair))
+        return found
+
+    return types.boolean(one, other), generate

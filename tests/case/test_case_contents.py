@@ -130,6 +130,7 @@ def test_tables_read_back_equal(table):
 
 
 POSITIVE = st.floats(min_value=0.0, exclude_min=True, allow_infinity=False)
+SECONDS = st.floats(1e-50, 1e50)
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
 VECTORS = st.lists(FINITE, min_size=3, max_size=3)
 KEYS = st.text(st.characters(exclude_categories=["Cs"]), min_size=1, max_size=8)
@@ -163,7 +164,7 @@ def cases(draw):
         "section": {"s": {"area": draw(POSITIVE), "material": draw(st.sampled_from(list(materials)))}},
         "initial": {"velocity": draw(VECTORS), "on": draw(st.lists(start, max_size=2))},
         "load": draw(st.lists(load, max_size=2)),
-        "time": {"integrator": "newmark", "step": draw(POSITIVE), "end": draw(POSITIVE)},
+        "time": {"integrator": "newmark", "step": draw(SECONDS), "end": draw(SECONDS)},
         "output": draw(st.fixed_dictionaries({}, optional={"fields": st.just([]) | st.just(["strain", "velocity"])})),
     }
 

@@ -465,10 +465,11 @@ def test_tether_between_bodies(integrator, keys, examples, comm, shared_tmp_path
 @pytest.mark.parametrize("integrator", ["central_differences", "newmark"])
 def test_tether_restarts_to_the_last_bit(integrator, examples, comm, shared_tmp_path):
     whole, parts, rope = shared_tmp_path / "whole", shared_tmp_path / "parts", tether("tip", "other", 0.2)
-    run(two_rods(integrator, rope), comm, whole)
+    keys = rope, "solver.linear=cg"  # MUMPS, which small models take on several ranks, repeats to rounding only
+    run(two_rods(integrator, *keys), comm, whole)
     pulls = np.flatnonzero(history_of(whole)["constraint/rope/force"].any(axis=1))
-    run(two_rods(integrator, rope, f"time.end={0.02 * pulls[1]!r}"), comm, parts)
-    run(two_rods(integrator, rope), comm, parts, restart=True)
+    run(two_rods(integrator, *keys, f"time.end={0.02 * pulls[1]!r}"), comm, parts)
+    run(two_rods(integrator, *keys), comm, parts, restart=True)
     one, other = history_of(whole), history_of(parts)
     assert list(one) == list(other)
     for name in one:
@@ -502,7 +503,7 @@ def chain(integrator: str, *keys: str) -> Case:
 
 
 @pytest.mark.parallel
-@pytest.mark.parametrize("integrator, mass", [("central_differences", "lumped"), ("newmark", "lumped")])
+@pytest.mark.parametrize("integrator, mass", [("central_differences", "lumped"), ("newmark", "consistent")])
 def test_chain_of_tethers_hangs_at_rest(integrator, mass, examples, comm, shared_tmp_path):
     """Each tether bears the weight below it, from the first row of the history on."""
     run(chain(integrator, f"time.mass={mass}"), comm, shared_tmp_path / "run")
@@ -539,10 +540,7 @@ def test_chain_of_tethers_falls_on_a_floor(integrator, examples, comm, shared_tm
         ((tether("tip", "other", 0.05),), r"constraint 'rope': nodes 3, 4 start 0.05 m beyond it"),
         ((tether("tip", "tip", 0.2),), r"constraint 'rope': node 3 is constrained with itself"),
         ((tether("tip", "right", 0.2),), r"constraint 'rope': first has 1 nodes and second 4"),
-        (
-            (tether("tip", "nowhere", 0.2),),
-            r"constraint\[0\].second = \"nowhere\" .*: there is no node set of this name",
-        ),
+        ((tether("tip", "nowhere", 0.2),), r"constraint\[0\].second = \"nowhere\" .*: there is no node set"),
         (
             (tether("tip", "other", 0.2).replace("tether", "rope"),),
             r"kind = \"rope\": unknown value, did you mean|known: tether",

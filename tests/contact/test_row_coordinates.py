@@ -1,0 +1,141 @@
+"""The coordinates that make rows over several nodes bounds: their matrix, adjoint and inverse, and both operators."""
+
+from __future__ import annotations
+
+import importlib
+
+import numpy as np
+import pytest
+
+from pfem_petsc import Case
+from pfem_petsc.contact.constraints.base import Constraint
+from pfem_petsc.contact.constraints.base import ConstraintKeys as Parameters
+from pfem_petsc.contact.row_coordinates import _pivots
+from pfem_petsc.contact.transform import Transform
+from pfem_petsc.solvers.matrix import HessianMatrix
+from pfem_petsc.solvers.matrix_free import MatrixFreeHessian
+from pfem_petsc.stepping.model import Model
+from pfem_petsc.stepping.prepare import make_plan, make_stepper
+from pfem_petsc.stepping.problem import StepProblem
+
+
+class Distances(Constraint):
+    """Distances of nodes 0-1-2-3 of a chain, and the area of triangle 4-5-6 over a length: rows of two widths."""
+
+    def __init__(self, parameters, nodes_of) -> None:
+        self.nodes = np.array([[0, 1], [1, 2], [2, 3]]) if parameters.name == "chain" else np.array([[4, 5, 6]])
+
+    def values(self, x):
+        return 10.0 - np.linalg.norm(np.diff(x, axis=1), axis=2).sum(axis=1)
+
+    def gradients(self, x):
+        arms = np.diff(x, axis=1)
+        along = arms / np.linalg.norm(arms, axis=2)[:, :, None]
+        nothing = np.zeros_like(along[:, :1])
+        return np.concatenate([along, nothing], axis=1) - np.concatenate([nothing, along], axis=1)
+
+
+@pytest.fixture
+def model(comm, monkeypatch):
+    module = type("module", (), {"Parameters": Parameters, "Constraint": Distances})
+    for place in ("case.reading", "contact.constraint_link"):
+        found = importlib.import_module(f"pfem_petsc.{place}")
+        lookup = found.lookup
+        monkeypatch.setattr(
+            found,
+            "lookup",
+            lambda package, name, where, own=lookup: module if name == "d" else own(package, name, where),
+        )
+    keys = [
+        "mesh.cells=[1, 1, 1]",
+        "node_set.corner.nearest=[0, 0, 0]",
+        "wall=[]",
+        "time.integrator=newmark",
+        "time.step=1e-3",
+    ]
+    keys += ['constraint=[{name="chain", kind="d"}, {name="three", kind="d"}]', "solver.linear=cg", "contact={}"]
+    keys += ["node_set.low.indices=[2]", 'support=[{node_set="low", fix="xz"}]']
+    return Model(Case.load("tumbling_lattice", keys), comm)
+
+
+def whole(apply, model, comm) -> np.ndarray:
+    """The matrix of a linear map of (owned, 3)."""
+    owned, n = model.mesh.n_owned, 3 * model.mesh.n_nodes
+    matrix = np.zeros((n, n))
+    first = 3 * model.mesh.first_node
+    for k in range(n):
+        unit = np.zeros(3 * owned)
+        if first <= k < first + 3 * owned:
+            unit[k - first] = 1.0
+        array = unit.reshape(owned, 3)
+        apply(array)
+        matrix[first : first + 3 * owned, k] = array.ravel()
+    return comm.allreduce(matrix)
+
+
+def dense(mat, comm) -> np.ndarray:
+    """A PETSc matrix of a few rows, by products."""
+    right, left = mat.createVecs()
+    n = mat.getSize()[0]
+    matrix = np.zeros((n, n))
+    first, last = mat.getOwnershipRange()
+    for k in range(n):
+        right.set(0.0)
+        if first <= k < last:
+            right.array[k - first] = 1.0
+        mat.mult(right, left)
+        matrix[first:last, k] = left.array
+    return comm.allreduce(matrix)
+
+
+@pytest.mark.parallel
+def test_matrix_adjoint_inverse_and_both_operators(model, comm):
+    stepper = make_stepper(model, make_plan(model))
+    stepper.start()
+    state, owned = stepper.state, model.mesh.n_owned
+    balance = stepper.scheme.balance(state, stepper.h)
+    (link,) = stepper.links
+    rng = np.random.default_rng(5)
+    u = 1e-2 * rng.normal(size=(model.mesh.n_nodes, 3))[model.mesh.node_ids[:owned]]
+    u[model.supports.fixed] = 0.0
+    link.place(None, balance, state, balance.predictor + u)
+    mat = link.matrix()
+    matrix = dense(mat, comm)
+    mat.destroy()
+    np.testing.assert_allclose(whole(link.forward, model, comm), matrix, atol=1e-13)
+    np.testing.assert_allclose(whole(link.adjoint, model, comm), matrix.T, atol=1e-13)
+    np.testing.assert_allclose(whole(link.inverse, model, comm), np.linalg.inv(matrix), atol=1e-12)
+    plain = StepProblem(model, state, balance, state.external, Transform(model))
+    coupled = StepProblem(model, state, balance, state.external, Transform(model, None, [link]))
+    # the row of each bound is the row of the constraints, per the size of its gradient
+    w, lower = coupled.coordinates(u), np.full((owned, 3), -np.inf)
+    link.bound(balance.predictor + u, w, lower)
+    assert comm.allreduce(int(np.isfinite(lower).sum())) == 4
+    slack = np.sort(comm.allreduce((w - lower)[np.isfinite(lower)].tolist()))
+    rows = link.rows
+    values, jacobian = (
+        rows.values(rows.gather(balance.predictor + u)),
+        rows.gradients(rows.gather(balance.predictor + u)),
+    )
+    size = np.sqrt(rows.along(jacobian**2, rows.free))
+    np.testing.assert_allclose(slack, np.sort(values / size), rtol=1e-12)
+    assembled, free = HessianMatrix(model.mesh, model.supports.fixed, model.supports.any), MatrixFreeHessian(model)
+    assembled.update(plain, plain.coordinates(u))
+    expected = matrix.T @ dense(assembled.mat, comm) @ matrix
+    assembled.couple([link])
+    for operator in (assembled, free):
+        operator.update(coupled, w)
+        np.testing.assert_allclose(dense(operator.bounded, comm), expected, atol=1e-12 * np.abs(expected).max())
+    assembled.destroy()
+    free.destroy()
+    stepper.destroy()
+
+
+def test_pivots_leave_an_invertible_part():
+    rng = np.random.default_rng(1)
+    matrix = rng.normal(size=(4, 9))
+    rows, columns = _pivots(matrix)
+    assert sorted(rows) == [0, 1, 2, 3] and np.linalg.cond(matrix[np.ix_(rows, columns)]) < 50.0
+    matrix[3] = matrix[0] - matrix[1]  # says nothing new
+    rows, columns = _pivots(matrix)
+    assert len(rows) == 3 and np.linalg.cond(matrix[np.ix_(rows, columns)]) < 50.0

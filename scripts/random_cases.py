@@ -6,7 +6,8 @@
 Cases are drawn over all documented keys and their combinations, one a seed. Each is run on one rank and on three, in
 one process for many cases; every third one is also stopped in the middle and continued. Checked are: status 0, 2 or 3,
 with a message where it is not 0; no node beyond a wall, finite results, the balance of energy, its growth,
-dissipations, momentum, ranks against each other to 1e-9 and, bit for bit, the continued run. A case that crashes or
+dissipations, momentum, ranks against each other to 1e-9 and, bit for bit, the continued run; with `--schemes-every`
+also that an explicit and an implicit scheme tend to the same motion as steps shrink. A case that crashes or
 hangs is found and left behind. Status 0 when nothing is wrong.
 """
 
@@ -43,6 +44,7 @@ def main() -> int:
     parser.add_argument("--cases", type=Path, nargs="+", default=[], metavar="FILE", help="case files instead")
     parser.add_argument("--ranks", type=int, default=3, metavar="N", help="beside one (default: 3; 1: none)")
     parser.add_argument("--restart-every", type=int, default=3, metavar="N", help="continue every N-th; 0: none")
+    parser.add_argument("--schemes-every", type=int, default=0, metavar="N", help="both kinds of schemes; 0: none")
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes at a time (default: 1)")
     parser.add_argument("--patience", type=float, default=60.0, metavar="S", help="longest time of a case [s]")
     parser.add_argument("--keep", type=Path, metavar="DIR", help="where the cases with a fault are put, as TOML files")
@@ -113,6 +115,13 @@ class Study:
             for seed, told in self._work("judge", both, 1).items():
                 for cause, detail in told["faults"]:
                     self._fault(seed, cause, detail)
+        if self.arguments.schemes_every > 0:
+            chosen = [seed for seed in ended if seed % self.arguments.schemes_every == 0]
+            for seed, told in self._work("schemes", chosen, 1).items():
+                with self._lock:
+                    self.statuses[f"schemes: {told.get('verdict', 'no answer')}"] += 1
+                for cause, detail in told["faults"]:
+                    self._fault(seed, cause, detail)
         for seed in seeds:
             shutil.rmtree(self.folder / str(seed), ignore_errors=True)
         with self._lock:
@@ -158,7 +167,7 @@ class Study:
                 raise SystemExit(f"the workers do not start: {ending}")
             # where it ended between two cases, the one before
             culprit = at if at is not None else max(set(left) & set(told), key=left.index)
-            if mode == "judge":
+            if mode in ("judge", "schemes"):
                 told[culprit] = {"faults": [("comparison ends", ending)]}
             else:
                 cause = "hangs" if ending.startswith("no answer") else "process ends"

@@ -207,11 +207,22 @@ class Impacts:
         if load is None:
             balance = self.stepper.balance
             damping = inertia.damping if inertia.damped else np.empty(0)
-            return unpressed(nodes, v, a, state.contact, inertia.mass, damping, balance.alpha, balance.eta)
-        v, load = v[nodes], load[nodes]
+            return self._guided(
+                nodes,
+                motion,
+                *unpressed(nodes, v, a, state.contact, inertia.mass, damping, balance.alpha, balance.eta),
+            )
+        free_v, load = v[nodes], load[nodes]
         if inertia.damped:
-            load = load - inertia.damping[nodes, None] * v
-        return v, load / inertia.mass[nodes, None]
+            load = load - inertia.damping[nodes, None] * free_v
+        return self._guided(nodes, motion, free_v, load / inertia.mass[nodes, None])
+
+    def _guided(self, nodes: np.ndarray, motion: tuple[np.ndarray, np.ndarray], v: np.ndarray, a: np.ndarray) -> tuple:
+        """Velocities and accelerations (m, 3) with what supports prescribe in its place."""
+        fixed = self.model.supports.fixed[nodes]
+        if not fixed.any():
+            return v, a
+        return np.where(fixed, motion[0][nodes], v), np.where(fixed, motion[1][nodes], a)
 
     def _on_walls(self, x, motion, load, time: float, shifts: np.ndarray) -> float:
         contact, log = self.model.contact, self.model.contact.log

@@ -57,11 +57,12 @@ class Treatment(Base):
             self._free = self._without_contact(np.arange(len(state.v)))
 
     def _without_contact(self, nodes: np.ndarray) -> np.ndarray:
-        """Accelerations (m, 3) of nodes by all forces but those of contact [m/s2]."""
+        """Accelerations (m, 3) of nodes by all forces but those of contact, none where supports hold them [m/s2]."""
         state, inertia = self.stepper.state, self.stepper.model.inertia
         load = state.external[nodes] - state.f[nodes]
         if inertia.damped:
             load -= inertia.damping[nodes, None] * state.v[nodes]
+        load[self.stepper.model.supports.fixed[nodes]] = 0.0
         return load / inertia.mass[nodes, None]
 
     def after(self) -> None:
@@ -122,7 +123,7 @@ class Treatment(Base):
         """
         stepper, state, h = self.stepper, self.stepper.state, self.stepper.part
         contact, balance, mass = stepper.model.contact, stepper.balance, stepper.model.inertia.mass[nodes, None]
-        push = state.contact[nodes] / mass
+        push = np.where(stepper.model.supports.fixed[nodes], 0.0, state.contact[nodes]) / mass
         way = contact.motion.shifts(state.time) - contact.motion.shifts(self._time)
         moved = (state.position[nodes] - self._place[nodes] - push / balance.alpha)[:, None, :] - way
         known = 0.0 if balance.a_hat is None else balance.a_hat[nodes]

@@ -15,6 +15,7 @@ from pfem_petsc import open_result
 from .compare import bitwise, distance
 from .oracle import check_result
 from .running import case_text, clear, run_case, run_in_two_parts
+from .schemes import judge_schemes
 
 __all__ = ["check_case", "amplification", "judge_ranks", "work"]
 
@@ -80,7 +81,8 @@ def amplification(text: str, whole: Path, folder: Path, source: str) -> float:
 def work(mode: str, seeds: Iterable[int], folder: Path, every_restart: int, sources: dict[int, str]) -> None:
     """The cases of a worker process. Collective.
 
-    ``mode``: "check" runs and checks, "run" only runs, "judge" compares the results of both and takes them away.
+    ``mode``: "check" runs and checks, "run" only runs, "judge" compares the results of both and takes them away,
+    "schemes" compares explicit and implicit schemes.
     """
     comm = MPI.COMM_WORLD
     from .draw import draw_case
@@ -97,6 +99,9 @@ def work(mode: str, seeds: Iterable[int], folder: Path, every_restart: int, sour
         if mode == "check":
             restart = every_restart > 0 and seed % every_restart == 0
             told = check_case(text, comm, place / "1", source, restart)
+        elif mode == "schemes":
+            verdict, faults = judge_schemes(table or _table(text), seed, place, source)
+            told = {"verdict": verdict, "faults": faults}
         elif mode == "run":
             told = check_case(text, comm, place / "n", source, False)
         else:

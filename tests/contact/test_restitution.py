@@ -166,3 +166,43 @@ def test_any_number_of_ranks(integrator, comm, shared_tmp_path):
         assert np.abs(alone.gather(alone.state.position) - x).max() < 1e-10 * 0.2
         assert row["wall/wall1/releases"] == found["one"]["wall/wall1/releases"]
     comm.Barrier()
+
+
+@pytest.mark.parametrize(
+    ("integrator", "parameters", "treatment", "restitution"),
+    [
+        *((name, {}, "scheme", e) for name in ("central_differences", "chung_lee") for e in (0.5, 1.0)),
+        ("central_differences", {}, "scheme", 0.0),
+        ("chung_lee", {}, "stick", 0.0),
+        *((name, {}, "stick", e) for name in ("energy_momentum", "houbolt", "generalized_alpha") for e in (0.0, 0.5)),
+        ("newmark", {"beta": 0.25, "gamma": 0.5}, "stick", 0.0),
+        ("newmark", {"beta": 0.25, "gamma": 0.5}, "conserving", 0.0),
+    ],
+)
+def test_guided_node_on_an_oblique_wall(integrator, parameters, treatment, restitution, comm, shared_tmp_path):
+    """An end of a bar, free along y and z, hits a wall with normal (0.6, 0, 0.8), which stops its motion along z.
+
+    What leaves is e times that; the energy of it, m (1 - e^2)/2, is that of the impact. Supports take the rest.
+    """
+    case = {
+        "mesh": {"generator": "rod", "length": 0.2, "elements": 1},
+        "material": {"m": {"young_modulus": 1e3, "density": 1000.0}},
+        "section": {"s": {"area": 1e-5, "material": "m"}},
+        "node_set": {"all": {"all": True}, "start": {"group": "start"}},
+        "support": [{"node_set": "all", "fix": "x"}],
+        "initial": {"velocity": [0.0, 0.3, -1.0]},
+        "wall": [{"type": "plane", "name": "slope", "node_set": "start", "point": [0.0, 0.0, -0.0103]}],
+        "contact": {"treatment": treatment},
+        "time": {"integrator": integrator, "step": 1e-3, "end": 0.015, **parameters},
+        "output": {"fields_every": 0, "probe": [{"name": "end", "node_set": "start"}]},
+        "solver": {"linear": "mumps", "rtol": 1e-12},
+    }
+    case["wall"][0] |= {"normal": [0.6, 0.0, 0.8], "restitution": restitution}
+    run = simulation(case, comm, shared_tmp_path)
+    last = [step.row for step in run][-1]
+    leaves = 1.0 if treatment == "conserving" else restitution
+    np.testing.assert_allclose(last["probe/end/velocity"], [[0.0, 0.3, leaves]], atol=2e-3)
+    mass = 0.5 * run.model.total_mass
+    assert last["impact_dissipation"] == pytest.approx(0.5 * mass * (1.0 - leaves**2), abs=1e-12)
+    assert abs(last["numerical_dissipation"]) < 2e-6 * mass
+    assert abs(last["energy_imbalance"]) < 1e-15

@@ -11,6 +11,7 @@ from mpi4py import MPI
 from random_trusses.draw import draw_case
 from random_trusses.oracle import check_result
 from random_trusses.running import case_text, run_case
+from random_trusses.schemes import EXACT, MARGIN, _compare, judge_schemes
 from random_trusses.work import check_case, judge_ranks
 
 from pfem_petsc import Case
@@ -162,3 +163,28 @@ def test_an_exception_is_found_and_told(monkeypatch, tmp_path):
     outcome = run_case(FALLING, MPI.COMM_SELF, tmp_path)
     assert outcome.status == 1
     assert outcome.faults[0][0] == "internal error"
+
+
+@pytest.mark.parametrize("seed", [8, 9, 10, 14, 22, 24, 28, 35])
+def test_explicit_and_implicit_schemes_agree(seed, tmp_path):
+    """At small steps they are apart by no more than halving the step changes, with contact, plasticity and supports."""
+    verdict, faults = judge_schemes(draw_case(seed), seed, tmp_path, f"random-{seed}.toml")
+    assert verdict == "agree", (verdict, faults)
+
+
+def test_schemes_that_tend_to_other_motions_are_found():
+    """The bound is made of what halving the steps changes, and shrinks with it."""
+
+    def measures(at, energy=0.5):
+        return {"positions": np.full((4, 3), at), "energies": np.array([energy]), "way": np.ones((4, 3))}
+
+    runs = {("explicit", 1): 1e-3, ("explicit", 2): 5e-4, ("implicit", 1): -1e-3, ("implicit", 2): -5e-4}
+    agree = {key: measures(at) for key, at in runs.items()}
+    assert _compare(agree, "both") == ("agree", [])
+    other = agree | {("implicit", part): measures(at + 1e-2) for part, at in ((1, -1e-3), (2, -5e-4))}
+    verdict, faults = _compare(other, "both")
+    assert verdict == "differ" and "positions 0.009 apart" in faults[0][1] and MARGIN * 1e-3 + EXACT < 9e-3
+    energies = agree | {("implicit", part): measures(at, 0.6) for part, at in ((1, -1e-3), (2, -5e-4))}
+    assert _compare(energies, "both")[0] == "differ"
+    chaotic = agree | {("explicit", 1): measures(0.5)}
+    assert _compare(chaotic, "both") == ("vague", [])

@@ -14,6 +14,8 @@ from ...integrators.base import Scheme
 
 __all__ = ["Jump", "Treatment"]
 
+_THIN = 1e-12  # squared length of a normal's free part below which supports alone decide
+
 
 @dataclass
 class Jump:
@@ -78,6 +80,9 @@ class Treatment(ABC):
 
         These are the walls' own, and :meth:`leaving` away from them. Of nodes that walls hold for good or by friction
         the projection is on all directions. ``concerned`` (walls,) bool: of which walls; default: all.
+
+        Components that supports prescribe are not changed: projections P are along the others, P v = F^+ N v with the
+        normals N and their free parts F, so that v - P v has no part along the normals.
         """
         stepper = self.stepper
         contact, walls = stepper.model.contact, stepper.solution.walls
@@ -88,7 +93,9 @@ class Treatment(ABC):
         normals, _ = contact.planes(touching, stepper.state.position[nodes], shifts)
         normals = np.where(touching[:, :, None], normals, 0.0)
         # the normals' pseudo-inverse serves any number of walls at a node, parallel ones too
-        inverse = np.linalg.pinv(normals, rcond=1e-8) if len(nodes) else np.zeros((0, 3, normals.shape[1]))
+        free = np.where(stepper.model.supports.fixed[nodes][:, None, :], 0.0, normals)
+        free[(free * free).sum(axis=2) <= _THIN] = 0.0
+        inverse = np.linalg.pinv(free, rcond=1e-8) if len(nodes) else np.zeros((0, 3, normals.shape[1]))
         rates = contact.motion.rates(stepper.state.time)
         away = np.einsum("mwi,wi->mw", normals, rates) + self.leaving(nodes, touching, normals, rates)
         speeds = np.einsum("miw,mw->mi", inverse, away)

@@ -65,6 +65,7 @@ class Treatment(Base):
         state = self.stepper.state
         force = (state.external - state.f[: len(state.a)])[nodes]
         free = force / self.stepper.model.inertia.mass[nodes, None]
+        free = np.where(self.stepper.model.supports.fixed[nodes], state.a[nodes], free)
         return state.a[nodes] + np.einsum("mij,mj->mi", normal, free - state.a[nodes])
 
     def _off_walls(self, debt: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

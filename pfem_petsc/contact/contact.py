@@ -131,6 +131,11 @@ class Contact:
         normals, offsets = self.walls[k].planes(x - shifts[k])
         return np.einsum("ij,ij->i", normals, x - shifts[k]) - offsets
 
+    @property
+    def steady(self) -> bool:
+        """Whether there are no walls, or flat ones at rest without further features alone."""
+        return not self.any or (self.plain and not self.moving.any())
+
     def plane_offsets(self, time: float) -> np.ndarray:
         """Offsets (w,) [m] of the planes n . x = d of flat walls at a time [s]."""
         if not self.moving.any():

@@ -12,6 +12,7 @@ accelerations are second differences of positions over h^2, and would lose those
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -95,6 +96,8 @@ class Scheme(ABC):
     solves_end : the position solved for is x_{n+1}
     discrete_gradient : the internal force of its balances is that of the step (``Balance.from_start``)
     force_acts_once : the contact force of a step acts in that step alone once its acceleration is taken away
+    loops : ``inlined`` functions that move nodes and finish a step, for the loop over many steps
+        (``stepping/march.py``); None: steps are made one by one
     symmetric : whether the Hessian is
     remembers : names of what it keeps of nodes in the state's memory, linear in motions
     dissipates : whether the scheme takes energy from high frequencies
@@ -109,6 +112,7 @@ class Scheme(ABC):
     solves_end = True
     discrete_gradient = False
     force_acts_once = False
+    loops: tuple[Callable, Callable] | None = None
     symmetric = True
     remembers: tuple[str, ...] = ()
     dissipates = True

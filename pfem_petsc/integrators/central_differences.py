@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..mechanics.compiled import kernel
+from ..mechanics.compiled import inlined, kernel
 from .base import Balance, ExplicitScheme, NoParameters, State
 
 __all__ = ["Parameters", "Scheme", "drift", "kick"]
@@ -21,15 +21,15 @@ Parameters = NoParameters
 # the loops run over arrays (3 n,): vector instructions take several numbers at once
 
 
-@kernel
-def drift(x, h, half, moved):
+@inlined
+def move(x, h, half, moved):
     """``moved`` = x + h half."""
     for i in range(len(half)):
         moved[i] = x[i] + h * half[i]
 
 
-@kernel
-def kick(u, alpha, eta, h, half, a, v):
+@inlined
+def finish(u, alpha, eta, h, half, a, v):
     """Acceleration and velocity of the balance, and ``half`` half a step later."""
     for i in range(len(u)):
         a[i] = alpha * u[i]
@@ -37,10 +37,14 @@ def kick(u, alpha, eta, h, half, a, v):
         half[i] += u[i] / h
 
 
+drift, kick = kernel(move), kernel(finish)
+
+
 class Scheme(ExplicitScheme):
     """Central differences (explicit)."""
 
     leads = True
+    loops = (move, finish)
     remembers = ("half_velocity",)
     dissipates = False
 

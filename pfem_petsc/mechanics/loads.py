@@ -26,6 +26,7 @@ class ExternalForce:
     Attributes
     ----------
     active : whether anything acts at all (on any rank, at any time)
+    steady : whether the forces are constant
     """
 
     def __init__(self, case, nodes: dict[str, np.ndarray], inertia) -> None:
@@ -37,6 +38,7 @@ class ExternalForce:
         self.gravity = np.array(gravity, dtype=np.float64)
         self.inertia = inertia
         self.active = bool(case.load) or bool(self.gravity.any())
+        self.steady = not any(table is not None for _, _, table in self.loads)
 
     def at(self, time: float, out: np.ndarray) -> np.ndarray:
         """``out`` (owned, 3) [N] at a time [s]."""

@@ -7,11 +7,10 @@ import numpy as np
 from ..contact.forces import WallForces
 from ..energies import ENERGIES
 from ..errors import SimulationFailure
-from ..integrators.central_differences import Scheme as CentralDifferences
 from ..mechanics.bars import StrainEnergy
 from ..output.sums import HEAD, WALL
-from .explicit import ExplicitStepper
-from .march import BarArrays, Buffers, ImpulseArrays, NodeArrays, ProbeArrays, WallArrays, make_march
+from .march import make_march
+from .march_arrays import BarArrays, Buffers, ImpulseArrays, NodeArrays, ProbeArrays, WallArrays
 from .stepper import Solution
 
 __all__ = ["MOST", "WORTH", "Batch", "Batches"]
@@ -39,7 +38,7 @@ class Batch:
         model = stepper.model
         self.model = model
         block = model.bars.blocks[0]
-        self._march = make_march(block.kernels.sweep_forces)
+        self._march = make_march(block.kernels.sweep_forces, *stepper.scheme.loops)
         bars = model.bars
         law = (bars.far, bars.rest, bars.heat, block.parameters, block.area, block.history)
         self._bars = BarArrays(bars.ends, tuple(block.sweep), *law)
@@ -65,23 +64,17 @@ class Batch:
         from petsc4py import PETSc
 
         model = stepper.model
-        contact = model.contact
-        plain = (
+        return (
             # what is logged are the methods of single steps
             not PETSc.Log.isActive()
             and model.comm.size == 1
             and model.mesh.n_nodes <= _NODES
-            and type(stepper) is ExplicitStepper
-            and isinstance(stepper.scheme, CentralDifferences)
+            and stepper.steady
+            and stepper.scheme.loops is not None
             and stepper.treatment is None
-            and not model.links
-            and len(model.bars.blocks) == 1
+            and model.steady
             and all(energy.value is None for energy in ENERGIES)
-            and not model.temperatures.varying
-            and not any(table is not None for _, _, table in model.external.loads)
-            and not model.supports.moving
         )
-        return plain and (not contact.any or (contact.plain and not contact.moving.any()))
 
     def make(self, count: int) -> tuple[int, np.ndarray]:
         """Make up to ``count`` steps; the number made, and who touched walls in each (steps, walls) bool.

@@ -21,6 +21,7 @@ class ExplicitStepper(Stepper):
     """
 
     renews_forces = True
+    steady = True
 
     def __init__(self, model, scheme, h: float) -> None:
         super().__init__(model, scheme, h)

@@ -19,11 +19,26 @@ from typing import Any
 import numpy as np
 
 from ..integrators.base import State
+from ..mechanics.compiled import kernel
 from ..output.sums import HEAD, PAIR, WALL
 
-__all__ = ["DAMPING", "EXTERNAL", "SUPPORT", "WALLS", "Impulses", "wall_shares"]
+__all__ = ["DAMPING", "EXTERNAL", "SUPPORT", "WALLS", "Impulses", "fill_impulses", "wall_shares"]
 
 SUPPORT, EXTERNAL, DAMPING, WALLS = 0, 1, 2, 3
+
+_SUPPORT, _EXTERNAL = HEAD.first("support_impulse"), HEAD.first("external_impulse")
+_DAMPING = HEAD.first("damping_impulse")
+
+
+@kernel
+def fill_impulses(sums, v) -> None:
+    """Impulses of supports, external forces and damping, from the velocities of their particles (rows, 3)."""
+    for c in range(3):
+        sums[_SUPPORT + c] = v[SUPPORT, c]
+        sums[_EXTERNAL + c] = v[EXTERNAL, c]
+        sums[_DAMPING + c] = v[DAMPING, c]
+
+
 """Rows of the particles: three in the order of the totals of :mod:`~pfem_petsc.stepping.node_loops`, then walls and
 pairs, then the jumps of walls and pairs."""
 
@@ -92,8 +107,8 @@ class Impulses:
         load = self.forces(totals, walls, self.links.totals())
         u = (load if balance.a_hat is None else load - balance.a_hat) / balance.alpha
         stepper.scheme.finish(state, balance, u, stepper.part)
-        inertia, at = stepper.model.inertia, stepper.model.supports.at if stepper.support_change else None
-        for name, change in stepper.support_change.items():
+        inertia, at = stepper.model.inertia, stepper.model.supports.at if stepper.prescribed.change else None
+        for name, change in stepper.prescribed.change.items():
             every = np.zeros((len(inertia.mass), 3))
             every[at] = change
             particles = getattr(state, name) if name in ("v", "a") else state.memory[name]
@@ -126,9 +141,7 @@ class Impulses:
 
     def fill(self, head: np.ndarray) -> None:
         """Put the impulses of the truss's own forces into the sums of a row."""
-        head[HEAD["external_impulse"]] = self.state.v[EXTERNAL]
-        head[HEAD["support_impulse"]] = self.state.v[SUPPORT]
-        head[HEAD["damping_impulse"]] = self.state.v[DAMPING]
+        fill_impulses(head, self.state.v)
 
     def fill_walls(self, share: np.ndarray) -> None:
         """The same of walls, into (walls, width of WALL)."""

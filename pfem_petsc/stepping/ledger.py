@@ -16,45 +16,25 @@ dissipation. Walls with mass are part of the balance: their kinetic energy, and 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from ..contact.impact import Impacts
 from ..energies import ENERGIES
-from ..mechanics.bars import StrainEnergy
 from ..output.sums import HEAD
+from .heating import Heating
 from .impulses import Impulses, wall_shares
+from .moment import Moment, balanced, moment_of
 from .node_loops import WORKS, book_nodes
+from .sum_loops import add_totals, add_works
 
-__all__ = ["Ledger", "Moment"]
+__all__ = ["Ledger"]
 
 _NOTHING = np.empty((0, 3))
 _AT = {energy.name: HEAD.first(energy.name) for energy in ENERGIES if energy.source != "derived"}
 _TOTALS = slice(HEAD.first("momentum"), HEAD["support_force"].stop)
-
-
-@dataclass
-class Moment:
-    """What the ledger needs of a moment; arrays (owned, 3).
-
-    Where the mass is lumped, ``momentum``, ``a`` and ``v`` are velocity, acceleration and velocity; where it is
-    consistent, M v [kg m/s], M a and C v [N].
-    ``velocity`` and ``acceleration`` are these in any case.
-    """
-
-    momentum: np.ndarray
-    velocity: np.ndarray
-    acceleration: np.ndarray
-    a: np.ndarray
-    v: np.ndarray
-    internal: np.ndarray
-    external: np.ndarray
-    support: np.ndarray
-    contact: np.ndarray
-    kinetic: float = 0.0
-    energy: StrainEnergy = StrainEnergy()
 
 
 class Ledger:
@@ -80,9 +60,9 @@ class Ledger:
         self._damping = self._damping if inertia.damped else np.empty(0)
         self._works = np.zeros(len(WORKS))
         self._totals = np.zeros((6, 3))
-        self._before = self._moment()
+        self._before = moment_of(self.stepper)
         self._book(self._before, self._before, self._before, self.stepper.state.position)
-        self._thermal_before()
+        self._heating = Heating(stepper)
         self._walls_before()
         self.impacts, self.impulses = Impacts(stepper), Impulses(stepper)
         self._pending = [0.0, 0.0]  # what impact and friction take in the step that a scheme has solved in advance
@@ -98,14 +78,14 @@ class Ledger:
 
     def update(self) -> None:
         """Book the step just made."""
-        stepper, owned, at = self.stepper, self.model.mesh.n_owned, _AT
-        present = after = self._moment()
+        stepper, owned = self.stepper, self.model.mesh.n_owned
+        present = after = moment_of(self.stepper)
         before, self._before = self._before, after
         jumped = 0.0
         jump = stepper.treatment.jump if stepper.treatment is not None else None
         if jump is not None and not self.model.inertia.products:  # where nodes lack mass, none of it jumps
             after, jumped = self._before_jump(after)
-        first, second = (before, after) if stepper.scheme.at_ends else 2 * (self._balanced(before),)
+        first, second = (before, after) if stepper.scheme.at_ends else 2 * (balanced(stepper, before),)
         self._book(present, first, second, stepper.before[:owned])
         self.impulses.step(self._totals[3:])
         if jump is not None:
@@ -114,22 +94,14 @@ class Ledger:
         stepper.step_changed = False
         impact, friction = self._dissipated(before)
         stored = present.kinetic - jumped - before.kinetic + present.energy.total - before.energy.total
-        heating = self._heating()
-        external, contact, damping, inertial, internal = self._works.tolist()
+        heating = self._heating.work()
         work, given, weight, lost = self._work_of_walls(before)
-        if self.model.inertia.damped and not stepper.scheme.at_ends:
-            inertial += damping
-            damping = self._damped()
-            inertial -= damping
-        self.sums[at["external_work"]] += external + weight
-        self.sums[at["contact_work"]] += work
-        self.sums[at["damping_dissipation"]] += damping
-        self.sums[at["thermal_work"]] += heating
-        self.sums[at["friction_dissipation"]] += friction
-        self.sums[at["impact_dissipation"]] += impact
-        # what contact did to nodes beyond the work of walls and the losses of friction and impact
-        left = contact + jumped - work - given + friction
-        self.sums[at["numerical_dissipation"]] += inertial + internal + heating - stored - left - impact + lost
+        damping = self._damped() if self.model.inertia.damped and not stepper.scheme.at_ends else None
+        if damping is not None:
+            of, by = WORKS.index("inertial"), WORKS.index("damping")
+            self._works[of] = self._works[of] + self._works[by] - damping
+            self._works[by] = damping
+        add_works(self.sums, self._works, stored, heating, impact, friction, work, given, weight, lost, jumped)
 
     def _damped(self) -> float:
         """What damping takes in the step just made, C dx . dx / h [J]: never negative.
@@ -248,7 +220,7 @@ class Ledger:
             self._works,
         )
         self.sums[_AT["kinetic_energy"]] = present.kinetic
-        self.sums[_TOTALS] = self._totals[:4].ravel()
+        add_totals(self.sums, self._totals)
 
     def _pair(self, first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Two arrays, or what stands for two of zeros."""
@@ -264,7 +236,7 @@ class Ledger:
 
     def resume(self, kinetic: float) -> None:
         """Go on from the present state, with its kinetic energy [J], after steps that others booked in :attr:`sums`."""
-        self._before = self._moment()
+        self._before = moment_of(self.stepper)
         self._before.kinetic = kinetic
 
     def take_pending(self) -> None:
@@ -292,84 +264,3 @@ class Ledger:
     def kinetic(self) -> float:
         """Kinetic energy of this rank's nodes [J]."""
         return self._before.kinetic
-
-    def _moment(self) -> Moment:
-        state, inertia = self.stepper.state, self.model.inertia
-        owned = self.model.mesh.n_owned
-        a, v, momentum = state.a, state.v, state.v
-        contact = state.contact
-        if "contact_change" in state.memory:  # what a treatment of impact made of the accelerations
-            contact = contact + state.memory["contact_change"]
-        if inertia.products:
-            momentum = inertia.mass_times(state.v, np.empty_like(state.v))
-            a = inertia.mass_times(state.a, np.empty_like(state.a))
-            v = inertia.damping_times(state.v, np.empty_like(state.v))
-        internal = state.f[:owned]
-        return Moment(
-            momentum=momentum,
-            velocity=state.v,
-            acceleration=state.a,
-            a=a,
-            v=v,
-            internal=internal if self.stepper.renews_forces else internal.copy(),
-            external=state.external,
-            support=state.support,
-            contact=contact,
-            energy=self.stepper.energy,
-        )
-
-    def _balanced(self, before: Moment) -> Moment:
-        """The forces of the last balance, where it does not hold at the ends of steps."""
-        stepper, inertia, balance = self.stepper, self.model.inertia, self.stepper.balance
-        state, u = stepper.state, stepper.solution.u
-        owned = self.model.mesh.n_owned
-        a = balance.alpha * u
-        if balance.a_hat is not None:
-            a += balance.a_hat
-        v = balance.eta * u + balance.v_hat if inertia.damped else u
-        if inertia.products:
-            a = inertia.mass_times(a, np.empty_like(a))
-            v = inertia.damping_times(v, np.empty_like(v))
-        internal = before.internal
-        if balance.weight == 1.0:
-            internal = stepper.solution.internal[:owned]
-        elif balance.weight:
-            internal = (1.0 - balance.weight) * internal + balance.weight * stepper.solution.internal[:owned]
-        return Moment(
-            before.momentum,
-            before.velocity,
-            before.acceleration,
-            a,
-            v,
-            internal,
-            state.external,
-            state.support,
-            state.contact,
-        )
-
-    def _thermal_before(self) -> None:
-        if self.model.temperatures.varying:
-            bars = self.model.bars
-            self._stress = bars.fields(self.stepper.state.x)["stress"]
-            self._variables = [block.history[: len(block.law.internal)].copy() for block in bars.blocks]
-            self._thermal = bars.heat[0].copy()
-
-    def _heating(self) -> float:
-        """Work that a changing temperature does on the counted bars: -A l0 S (change of thermal strain), with the mean
-        stress S of :mod:`~pfem_petsc.mechanics.conserving`, (s0 + s1)/2 with the law's correction."""
-        model = self.model
-        if not model.temperatures.varying:
-            return 0.0
-        stress, variables, thermal = self._stress, self._variables, self._thermal
-        self._thermal_before()
-        total = 0.0
-        for block, before, after in zip(model.bars.blocks, variables, self._variables, strict=True):
-            part = slice(block.start, block.counted)
-            mean = 0.5 * (stress[part] + self._stress[part])
-            if block.law.mean_correction is not None:
-                counted = slice(block.counted - block.start)
-                change = self._stress[part] - stress[part]
-                mean += block.law.mean_correction(block.parameters, change, before[:, counted], after[:, counted])
-            change = self._thermal[part] - thermal[part]
-            total -= block.area * float((model.bars.rest[part] * mean * change).sum())
-        return total

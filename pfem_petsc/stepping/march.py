@@ -9,115 +9,29 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cache
-from typing import NamedTuple
 
 import numpy as np
 
 from ..contact.flat import press_planes
 from ..contact.impact import join_nodes, plane_gaps, stop_nodes, unpressed
 from ..contact.log import compare_contacts
-from ..energies import BAR_ENERGIES
-from ..integrators.central_differences import drift, kick
 from ..mechanics.bars import first_inverted
 from ..mechanics.compiled import kernel
-from ..output.sums import HEAD, WALL
-from .impulses import WALLS
+from ..output.sums import HEAD
+from .impulses import WALLS, fill_impulses
 from .node_loops import WORKS, book_nodes, explicit_increments, hold, react
+from .sum_loops import add_totals, add_works, fill_bars, fill_probes, fill_walls
 
-__all__ = ["BarArrays", "Buffers", "ImpulseArrays", "NodeArrays", "ProbeArrays", "WallArrays", "make_march"]
-
-
-# places of sums and works: constants of the machine code
-_HEAD, _WALL = HEAD.width, WALL.width
-_KINETIC, _BARS = HEAD.first("kinetic_energy"), tuple(HEAD.first(name) for name in BAR_ENERGIES)
-_EXTERNAL, _DAMPING = HEAD.first("external_work"), HEAD.first("damping_dissipation")
-_IMPACT, _NUMERICAL = HEAD.first("impact_dissipation"), HEAD.first("numerical_dissipation")
-_TOTALS, _CONTACTS, _ALARM = HEAD.first("momentum"), HEAD.first("active_contacts"), HEAD.first("alarm")
-_SUPPORT_IMPULSE, _EXTERNAL_IMPULSE = HEAD.first("support_impulse"), HEAD.first("external_impulse")
-_DAMPING_IMPULSE = HEAD.first("damping_impulse")
-_FORCE, _MOMENT, _IMPULSE = WALL.first("force"), WALL.first("moment"), WALL.first("impulse")
-_TOUCHED, _RELEASES = WALL.first("contacts"), WALL.first("releases")
-_BY_EXTERNAL, _BY_CONTACT, _BY_DAMPING, _BY_INERTIA, _BY_BARS = range(len(WORKS))
+__all__ = ["make_march"]
 
 
-class BarArrays(NamedTuple):
-    """Arguments of a law's loop over the bars; see :mod:`~pfem_petsc.mechanics.kernels`."""
-
-    ends: np.ndarray
-    sweep: tuple
-    far: np.ndarray
-    rest: np.ndarray
-    heat: np.ndarray
-    parameters: tuple
-    area: float
-    history: np.ndarray
-
-
-class NodeArrays(NamedTuple):
-    """What stays as it is at the nodes; ``damping`` (0,) and ``external`` (0, 3) for none."""
-
-    mass: np.ndarray
-    damping: np.ndarray
-    external: np.ndarray
-    support_nodes: np.ndarray
-    support_components: np.ndarray
-    support_positions: np.ndarray
-
-
-class WallArrays(NamedTuple):
-    """Flat walls and their log; see :mod:`~pfem_petsc.contact.flat` and :mod:`~pfem_petsc.contact.log`."""
-
-    fixed: np.ndarray
-    normals: np.ndarray
-    offsets: np.ndarray
-    everyone: np.ndarray
-    members: np.ndarray
-    tolerance: float
-    room: np.ndarray
-    touching: np.ndarray
-    present: np.ndarray
-    releases: np.ndarray
-    closed: np.ndarray
-    restitution: np.ndarray
-    slack: float
-
-
-class ImpulseArrays(NamedTuple):
-    """Particles (rows, 3) of :mod:`~pfem_petsc.stepping.impulses`: what they remember, and their state."""
-
-    half: np.ndarray
-    a: np.ndarray
-    v: np.ndarray
-
-
-class ProbeArrays(NamedTuple):
-    """Nodes (m,) of all probes, one after the other, and where each probe starts (probes + 1,)."""
-
-    nodes: np.ndarray
-    starts: np.ndarray
-
-
-class Buffers(NamedTuple):
-    """Arrays (n, 3) that are filled in turn: of the last step, and to be filled by the next.
-
-    Those for the forces of walls hold zeros, but for what the last step has put into the first of them.
-    """
-
-    f: np.ndarray
-    f_next: np.ndarray
-    a: np.ndarray
-    a_next: np.ndarray
-    v: np.ndarray
-    v_next: np.ndarray
-    support: np.ndarray
-    support_next: np.ndarray
-    contact: np.ndarray
-    contact_next: np.ndarray
+_HEAD, _KINETIC = HEAD.width, HEAD.first("kinetic_energy")  # constants of the machine code
+_CONTACTS, _ALARM = HEAD.first("active_contacts"), HEAD.first("alarm")
 
 
 @cache
-def make_march(forces: Callable) -> Callable:
-    """The loop over steps for the bars' loop ``forces`` of a law and strain measure.
+def make_march(forces: Callable, drift: Callable, kick: Callable) -> Callable:
+    """The loop over steps for the bars' loop ``forces`` of a law and strain measure, and the loops of a scheme.
 
     Its arguments: most steps; step [s]; positions, those of the step before, velocities at half steps (n, 3); arrays of
     bars, nodes, walls, probes and buffers; nodes (m,) that touch walls; nodes (k,) that have met walls; the
@@ -311,43 +225,20 @@ def make_march(forces: Callable) -> Callable:
             energies[:] = energies1
             stored = kinetic1 - kinetic + held1 - held
             kinetic = kinetic1
-            ledger[_EXTERNAL] += works[_BY_EXTERNAL]
-            ledger[_DAMPING] += works[_BY_DAMPING]
-            ledger[_IMPACT] += impact
-            ledger[_NUMERICAL] += works[_BY_INERTIA] + works[_BY_BARS] - stored - works[_BY_CONTACT] - impact
-            for k in range(4):
-                for c in range(3):
-                    ledger[_TOTALS + 3 * k + c] = totals[k, c]
-            for c in range(3):
-                ledger[_SUPPORT_IMPULSE + c] = impulses.v[0, c]
-                ledger[_EXTERNAL_IMPULSE + c] = impulses.v[1, c]
-                ledger[_DAMPING_IMPULSE + c] = impulses.v[2, c]
+            add_works(ledger, works, stored, 0.0, impact, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+            add_totals(ledger, totals)
+            fill_impulses(ledger, impulses.v)
             ledger[_KINETIC] = kinetic
             row = sums[step]
             row[:_HEAD] = ledger
-            for k in range(len(energies)):
-                row[_BARS[k]] = energies[k]
+            fill_bars(row, energies)
             row[_CONTACTS], row[_ALARM] = len(near), 0.0
             at = _HEAD
             if n_walls > 0:
                 row[at] = changes
-                at += 1
-                for k in range(n_walls):
-                    row[at + _FORCE : at + _FORCE + 3] = force[k]
-                    row[at + _MOMENT : at + _MOMENT + 3] = moment[k]
-                    row[at + _IMPULSE : at + _IMPULSE + 3] = impulses.v[WALLS + k]
-                    row[at + _TOUCHED], row[at + _RELEASES] = contacts[k], walls.releases[k]
-                    at += _WALL
-            for p in range(len(probes.starts) - 1):
-                first, size = probes.starts[p], probes.starts[p + 1] - probes.starts[p]
-                for j in range(size):
-                    i = probes.nodes[first + j]
-                    for c in range(3):
-                        row[at + 3 * j + c] = x[i, c]
-                        row[at + 3 * (size + j) + c] = v[i, c]
-                        row[at + 3 * (2 * size + j) + c] = a[i, c]
-                        row[at + 3 * (3 * size + j) + c] = contact[i, c] + (support[i, c] if supported else 0.0)
-                at += 12 * size
+                at = fill_walls(row, at + 1, force, moment, impulses.v, contacts, walls.releases)
+            reaction = support if supported else nothing
+            fill_probes(row, at, probes.nodes, probes.starts, x, v, a, contact, reaction)
             done += 1
             if failed >= 0 or turned >= 0 or stuck >= 0 or not np.isfinite(kinetic + held1):
                 break

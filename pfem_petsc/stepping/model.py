@@ -102,6 +102,12 @@ class Model:
         speeds = [np.sqrt(m.largest_modulus() / m.density) for m in case.material.values()]
         self.wave_speed = max(speeds)
 
+    @property
+    def steady(self) -> bool:
+        """Whether nothing in it changes over time, and bars and contact are those of the loop over many steps."""
+        moving = self.supports.moving or self.temperatures.varying or bool(self.links)
+        return not moving and len(self.bars.blocks) == 1 and self.external.steady and self.contact.steady
+
     def initial_velocity(self) -> np.ndarray:
         """(owned, 3) [m/s] from the case's ``[initial]`` tables; later tables override earlier ones. Collective."""
         mesh, comm = self.mesh, self.comm

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from ..integrators.base import Balance, Scheme, State
 from ..mechanics.bars import StrainEnergy
 from .collapse import tell_collapse
 from .massless import MasslessNodes
+from .prescribed import PrescribedMotion
 
 __all__ = ["Solution", "Stepper"]
 
@@ -56,14 +57,14 @@ class Stepper(ABC):
     before : (local, 3) positions at the start of the last part, with ghosts [m]
     massless : MasslessNodes where contact nodes have no mass along their walls' normals, else None
     closed : (owned, walls) bool, nodes that have met a wall and not left it since
-    support_change : what motions of supports have put in place of the scheme's velocity, acceleration and memory of
-        their components (k,) in the last step, by name; empty without such motions
+    prescribed : PrescribedMotion of supports
     step_changed : whether the scheme was told to forget what holds for another step, since the last booking
     totals_at_start, totals_solved : (3, 3) this rank's sums of support, external and damping force [N] at the start,
         and of the balance that was solved there by a scheme that leads; None after a restart
     velocity_solved : (owned, 3) of that balance, in which its damping force acts [m/s]
     walls_at_start, links_at_start : (walls, 3), (tables of links, 3) forces at the start [N]
     renews_forces : each evaluation of the state fills another array ``state.f``, so that the last one is kept
+    steady : the loop over many steps (``stepping/march.py``) makes the same steps, where all else allows it
     kept_numbers, kept_arrays, kept_bars : names of attributes that, with the state, determine what comes: numbers,
         arrays with a row for each owned node, and for each local bar
     """
@@ -72,6 +73,7 @@ class Stepper(ABC):
     kept_arrays: tuple[str, ...] = ("touching", "closed")
     kept_bars: tuple[str, ...] = ()
     renews_forces = False
+    steady = False
 
     def __init__(self, model, scheme: Scheme, h: float) -> None:
         self.model = model
@@ -100,7 +102,7 @@ class Stepper(ABC):
         self.massless = MasslessNodes(model) if model.inertia.redistribution is not None else None
         self.closed = np.zeros_like(self.touching)
         self.step_changed = False
-        self.support_change: dict[str, np.ndarray] = {}
+        self.prescribed = PrescribedMotion(self)
         self.totals_at_start: np.ndarray | None = None
         self.totals_solved: np.ndarray | None = None
         self.velocity_solved = self.zero
@@ -193,15 +195,14 @@ class Stepper(ABC):
         if self.scheme.leads:
             self.before[:] = self.state.x
             self.scheme.advance(self.state, self.part)
-            if self.model.supports.moving:
-                self.state.position[self.model.supports.at] = self.model.supports.positions(end)
+            self.prescribed.place(end)
             self._arrive(end)
             self._solve_and_finish()
         else:
             self._solve_and_finish()
-            if self.model.supports.moving:
-                self.state.position[self.model.supports.at] = self.model.supports.positions(end)
-                self._take_rates(end)
+            if self.prescribed.moving:
+                self.prescribed.place(end)
+                self.prescribed.take_rates(end)
             self._arrive(end)
         if self.treatment is not None:
             self.treatment.after()
@@ -217,8 +218,8 @@ class Stepper(ABC):
     def _solve_and_finish(self) -> None:
         state = self.state
         self.balance = self.scheme.balance(state, self.part)
-        if self.model.supports.moving:
-            self._prescribe(self.balance)
+        if self.prescribed.moving:
+            self.prescribed.prescribe(self.balance)
         self.model.contact.motion.begin(state.time, self.part)
         state.external = self._load(self.balance)
         self.model.bars.step = self.balance.time - state.time
@@ -227,56 +228,11 @@ class Stepper(ABC):
         if not self.scheme.leads:
             self.before[:] = state.x
         self.scheme.finish(state, self.balance, self.solution.u, self.part)
-        if self.scheme.leads and self.model.supports.moving:
-            self._take_rates(state.time)
+        if self.scheme.leads and self.prescribed.moving:
+            self.prescribed.take_rates(state.time)
         self.model.contact.motion.finish(self.part)
         if self.scheme.turns_held and self.treatment is None:
             self.model.contact.calm(fresh, state.v, self.balance.time, self.part)
-
-    def _prescribe(self, balance: Balance) -> None:
-        """Put what supports prescribe into a balance, whose increments are zero there: exact position, velocity and
-        acceleration, where the scheme's formulas would make velocity and acceleration of positions, and ring."""
-        supports = self.model.supports
-        forces_hold = sum(weight * time for weight, time in balance.loads)
-        v, a = supports.rates(forces_hold, self.part)
-        self._ruled = self._by_rule(balance, a)
-        balance.predictor = balance.predictor.copy()
-        balance.predictor[supports.at] = supports.positions(balance.time)
-        balance.v_hat = np.zeros_like(self.state.v) if balance.v_hat is None else balance.v_hat.copy()
-        balance.v_hat[supports.at] = v
-        balance.a_hat = np.zeros_like(self.state.v) if balance.a_hat is None else balance.a_hat.copy()
-        balance.a_hat[supports.at] = a
-
-    def _by_rule(self, balance: Balance, a: np.ndarray) -> State:
-        """What the scheme would make of prescribed components (k, 1) by the acceleration (k,) of their balance.
-
-        That is the rule by which forces become impulses.
-        """
-        supports, state = self.model.supports, self.state
-
-        def pick(array: np.ndarray | None) -> np.ndarray | None:
-            return None if array is None else array[supports.at][:, None]
-
-        memory = {name: pick(state.memory[name]) for name in self.scheme.remembers if name in state.memory}
-        fields = (pick(array) for array in (state.position, state.v, state.a))
-        ruled = State(*fields, *(np.zeros((len(a), 1)) for _ in range(4)), memory=memory)
-        known = {name: pick(getattr(balance, name)) for name in ("predictor", "v_hat", "a_hat")}
-        own = replace(balance, **known)
-        u = (a[:, None] if own.a_hat is None else a[:, None] - own.a_hat) / own.alpha
-        self.scheme.finish(ruled, own, u, self.part)
-        return ruled
-
-    def _take_rates(self, time: float) -> None:
-        """Velocity and acceleration of prescribed components at a time, and what the scheme remembers of them."""
-        supports, state = self.model.supports, self.state
-        state.v[supports.at], state.a[supports.at] = supports.rates(time, self.part)
-        self.scheme.restart(state, supports.at, self.part)
-        if self.scheme.leads:
-            way = supports.positions(self.balance.time) - state.position[supports.at]
-            state.memory["half_velocity"][supports.at] = way / self.part
-        ruled, given = self._ruled, {"v": state.v, "a": state.a, **state.memory}
-        made = {"v": ruled.v, "a": ruled.a, **ruled.memory}
-        self.support_change = {name: given[name][supports.at] - array[:, 0] for name, array in made.items()}
 
     def _acceleration(self, load: np.ndarray) -> np.ndarray:
         """Acceleration (owned, 3) with M a = load [N] on free components, on others as prescribed. Collective."""

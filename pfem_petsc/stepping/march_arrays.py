@@ -1,0 +1,84 @@
+"""Arrays that the loop over steps reads and writes, by name."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+__all__ = ["BarArrays", "Buffers", "ImpulseArrays", "NodeArrays", "ProbeArrays", "WallArrays"]
+
+
+class BarArrays(NamedTuple):
+    """Arguments of a law's loop over the bars; see :mod:`~pfem_petsc.mechanics.kernels`."""
+
+    ends: np.ndarray
+    sweep: tuple
+    far: np.ndarray
+    rest: np.ndarray
+    heat: np.ndarray
+    parameters: tuple
+    area: float
+    history: np.ndarray
+
+
+class NodeArrays(NamedTuple):
+    """What stays as it is at the nodes; ``damping`` (0,) and ``external`` (0, 3) for none."""
+
+    mass: np.ndarray
+    damping: np.ndarray
+    external: np.ndarray
+    support_nodes: np.ndarray
+    support_components: np.ndarray
+    support_positions: np.ndarray
+
+
+class WallArrays(NamedTuple):
+    """Flat walls and their log; see :mod:`~pfem_petsc.contact.flat` and :mod:`~pfem_petsc.contact.log`."""
+
+    fixed: np.ndarray
+    normals: np.ndarray
+    offsets: np.ndarray
+    everyone: np.ndarray
+    members: np.ndarray
+    tolerance: float
+    room: np.ndarray
+    touching: np.ndarray
+    present: np.ndarray
+    releases: np.ndarray
+    closed: np.ndarray
+    restitution: np.ndarray
+    slack: float
+
+
+class ImpulseArrays(NamedTuple):
+    """Particles (rows, 3) of :mod:`~pfem_petsc.stepping.impulses`: what they remember, and their state."""
+
+    half: np.ndarray
+    a: np.ndarray
+    v: np.ndarray
+
+
+class ProbeArrays(NamedTuple):
+    """Nodes (m,) of all probes, one after the other, and where each probe starts (probes + 1,)."""
+
+    nodes: np.ndarray
+    starts: np.ndarray
+
+
+class Buffers(NamedTuple):
+    """Arrays (n, 3) that are filled in turn: of the last step, and to be filled by the next.
+
+    Those for the forces of walls hold zeros, but for what the last step has put into the first of them.
+    """
+
+    f: np.ndarray
+    f_next: np.ndarray
+    a: np.ndarray
+    a_next: np.ndarray
+    v: np.ndarray
+    v_next: np.ndarray
+    support: np.ndarray
+    support_next: np.ndarray
+    contact: np.ndarray
+    contact_next: np.ndarray

@@ -1,0 +1,76 @@
+"""Motion of supports in steps: exactly the positions, velocities and accelerations of their tables."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ..integrators.base import Balance, State
+
+__all__ = ["PrescribedMotion"]
+
+
+class PrescribedMotion:
+    """Puts what supports prescribe into balances and states of a stepper.
+
+    Attributes
+    ----------
+    change : what motions of supports have put in place of the scheme's velocity, acceleration and memory of their
+        components (k,) in the last step, by name; empty without such motions
+    """
+
+    def __init__(self, stepper) -> None:
+        self.stepper, self.supports = stepper, stepper.model.supports
+        self.moving = self.supports.moving
+        self.change: dict[str, np.ndarray] = {}
+
+    def place(self, end: float) -> None:
+        """Put prescribed components where they are at a time [s]."""
+        if self.moving:
+            self.stepper.state.position[self.supports.at] = self.supports.positions(end)
+
+    def prescribe(self, balance: Balance) -> None:
+        """Put what supports prescribe into a balance, whose increments are zero there: exact position, velocity and
+        acceleration, where the scheme's formulas would make velocity and acceleration of positions, and ring."""
+        supports = self.supports
+        forces_hold = sum(weight * time for weight, time in balance.loads)
+        v, a = supports.rates(forces_hold, self.stepper.part)
+        self._ruled = self._by_rule(balance, a)
+        balance.predictor = balance.predictor.copy()
+        balance.predictor[supports.at] = supports.positions(balance.time)
+        balance.v_hat = np.zeros_like(self.stepper.state.v) if balance.v_hat is None else balance.v_hat.copy()
+        balance.v_hat[supports.at] = v
+        balance.a_hat = np.zeros_like(self.stepper.state.v) if balance.a_hat is None else balance.a_hat.copy()
+        balance.a_hat[supports.at] = a
+
+    def _by_rule(self, balance: Balance, a: np.ndarray) -> State:
+        """What the scheme would make of prescribed components (k, 1) by the acceleration (k,) of their balance.
+
+        That is the rule by which forces become impulses.
+        """
+        supports, state = self.supports, self.stepper.state
+
+        def pick(array: np.ndarray | None) -> np.ndarray | None:
+            return None if array is None else array[supports.at][:, None]
+
+        memory = {name: pick(state.memory[name]) for name in self.stepper.scheme.remembers if name in state.memory}
+        fields = (pick(array) for array in (state.position, state.v, state.a))
+        ruled = State(*fields, *(np.zeros((len(a), 1)) for _ in range(4)), memory=memory)
+        known = {name: pick(getattr(balance, name)) for name in ("predictor", "v_hat", "a_hat")}
+        own = replace(balance, **known)
+        u = (a[:, None] if own.a_hat is None else a[:, None] - own.a_hat) / own.alpha
+        self.stepper.scheme.finish(ruled, own, u, self.stepper.part)
+        return ruled
+
+    def take_rates(self, time: float) -> None:
+        """Velocity and acceleration of prescribed components at a time, and what the scheme remembers of them."""
+        supports, state = self.supports, self.stepper.state
+        state.v[supports.at], state.a[supports.at] = supports.rates(time, self.stepper.part)
+        self.stepper.scheme.restart(state, supports.at, self.stepper.part)
+        if self.stepper.scheme.leads:
+            way = supports.positions(self.stepper.balance.time) - state.position[supports.at]
+            state.memory["half_velocity"][supports.at] = way / self.stepper.part
+        ruled, given = self._ruled, {"v": state.v, "a": state.a, **state.memory}
+        made = {"v": ruled.v, "a": ruled.a, **ruled.memory}
+        self.change = {name: given[name][supports.at] - array[:, 0] for name, array in made.items()}

@@ -1,0 +1,95 @@
+"""What a step adds to the sums of a history row: the same compiled formulas for single steps and for many in one call.
+
+Places of the sums are those of :mod:`~pfem_petsc.output.sums`: integers at module level, constants of the machine code.
+"""
+
+from __future__ import annotations
+
+from ..energies import BAR_ENERGIES
+from ..mechanics.compiled import kernel
+from ..output.sums import HEAD, WALL
+from .impulses import WALLS
+from .node_loops import WORKS
+
+__all__ = ["add_totals", "add_works", "fill_bars", "fill_probes", "fill_walls"]
+
+_BARS = tuple(HEAD.first(name) for name in BAR_ENERGIES)
+_EXTERNAL, _CONTACT = HEAD.first("external_work"), HEAD.first("contact_work")
+_DAMPING, _THERMAL = HEAD.first("damping_dissipation"), HEAD.first("thermal_work")
+_FRICTION, _IMPACT = HEAD.first("friction_dissipation"), HEAD.first("impact_dissipation")
+_NUMERICAL, _TOTALS = HEAD.first("numerical_dissipation"), HEAD.first("momentum")
+_WALL = WALL.width
+_FORCE, _MOMENT, _IMPULSE = WALL.first("force"), WALL.first("moment"), WALL.first("impulse")
+_TOUCHED, _RELEASES = WALL.first("contacts"), WALL.first("releases")
+_BY_EXTERNAL, _BY_CONTACT, _BY_DAMPING, _BY_INERTIA, _BY_BARS = range(len(WORKS))
+
+
+@kernel
+def add_works(sums, works, stored, heating, impact, friction, work, given, weight, lost, jumped) -> None:
+    """Add the works and dissipations of a step to the sums of a row [J].
+
+    Parameters
+    ----------
+    sums : (HEAD.width,) in the layout of :data:`~pfem_petsc.output.sums.HEAD`
+    works : (5,) see :data:`~pfem_petsc.stepping.node_loops.WORKS`
+    stored : change of the energies of nodes and bars; heating : work of changing temperatures
+    impact, friction : what they take
+    work, given, weight, lost : of walls: work on the truss of those that move as prescribed and of those with mass, of
+        the weight of these, and their numerical dissipation
+    jumped : energy that a treatment of impact gave to nodes
+    """
+    sums[_EXTERNAL] += works[_BY_EXTERNAL] + weight
+    sums[_CONTACT] += work
+    sums[_DAMPING] += works[_BY_DAMPING]
+    sums[_THERMAL] += heating
+    sums[_FRICTION] += friction
+    sums[_IMPACT] += impact
+    # what contact did to nodes beyond the work of walls and the losses of friction and impact
+    left = works[_BY_CONTACT] + jumped - work - given + friction
+    sums[_NUMERICAL] += works[_BY_INERTIA] + works[_BY_BARS] + heating - stored - left - impact + lost
+
+
+@kernel
+def add_totals(sums, totals) -> None:
+    """Momenta, mass times position and forces of supports of the present (6, 3), see ``TOTALS`` of ``node_loops``."""
+    for k in range(4):
+        for c in range(3):
+            sums[_TOTALS + 3 * k + c] = totals[k, c]
+
+
+@kernel
+def fill_bars(row, energies) -> None:
+    """Energies of the bars, in the order of ``BAR_ENERGIES``."""
+    for k in range(len(energies)):
+        row[_BARS[k]] = energies[k]
+
+
+@kernel
+def fill_walls(row, at, force, moment, v, contacts, releases) -> int:
+    """Sums of walls, from place ``at`` of a row; gives the place after them. ``v`` of the particles of all impulses."""
+    for k in range(len(force)):
+        row[at + _FORCE : at + _FORCE + 3] = force[k]
+        row[at + _MOMENT : at + _MOMENT + 3] = moment[k]
+        row[at + _IMPULSE : at + _IMPULSE + 3] = v[WALLS + k]
+        row[at + _TOUCHED], row[at + _RELEASES] = contacts[k], releases[k]
+        at += _WALL
+    return at
+
+
+@kernel
+def fill_probes(row, at, nodes, starts, x, v, a, contact, support) -> None:
+    """Positions, velocities, accelerations and reactions of probed nodes, from place ``at`` of a row.
+
+    ``nodes`` (m,) of all probes, which start at ``starts`` (probes + 1,); ``support`` (0, 3) for no supports.
+    """
+    supported = len(support) > 0
+    for p in range(len(starts) - 1):
+        first, size = starts[p], starts[p + 1] - starts[p]
+        for j in range(size):
+            i = nodes[first + j]
+            for c in range(3):
+                row[at + 3 * j + c] = x[i, c]
+                row[at + 3 * (size + j) + c] = v[i, c]
+                row[at + 3 * (2 * size + j) + c] = a[i, c]
+                row[at + 3 * (3 * size + j) + c] = contact[i, c] + (support[i, c] if supported else 0.0)
+        at += 12 * size

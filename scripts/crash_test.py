@@ -44,7 +44,9 @@ def main() -> int:
     arguments = parser.parse_args()
     folder = arguments.folder or Path(tempfile.mkdtemp(prefix="crash-test-"))
     folder.mkdir(parents=True, exist_ok=True)
-    chance = random.Random(arguments.seed)
+    seed = random.SystemRandom().randrange(10**6) if arguments.seed is None else arguments.seed
+    print(f"seed {seed}", flush=True)
+    chance = random.Random(seed)
     begin = time.monotonic()
     kinds = KINDS if arguments.cases is None else _random_kinds(arguments.cases, folder)
     # a random case runs on one number of ranks, on which in turn

@@ -29,7 +29,9 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=None, help="of the moments of the starts")
     parser.add_argument("--folder", type=Path, default=None, help="where to work; default: a temporary folder")
     arguments = parser.parse_args()
-    chance = random.Random(arguments.seed)
+    seed = random.SystemRandom().randrange(10**6) if arguments.seed is None else arguments.seed
+    print(f"seed {seed}", flush=True)
+    chance = random.Random(seed)
     folder = arguments.folder or Path(tempfile.mkdtemp(prefix="together-"))
     starts, restarts, failed = Counter(), Counter(), 0
     program(words(folder / "alone", LATER))

@@ -20,6 +20,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 from helpers.launch import OF_A_LAUNCH, environment
 from hypothesis import settings
@@ -192,3 +193,11 @@ def on_ranks() -> Callable[..., subprocess.CompletedProcess]:
         return done
 
     return run
+
+
+@pytest.fixture
+def chance() -> np.random.Generator:
+    """Random numbers that differ from run to run; the seed is printed with a failure, and taken from TEST_SEED."""
+    seed = int(os.environ.get("TEST_SEED") or np.random.SeedSequence().entropy % 10**9)
+    print(f"TEST_SEED={seed}")
+    return np.random.default_rng(seed)

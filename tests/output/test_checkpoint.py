@@ -194,8 +194,7 @@ while True:
 """
 
 
-def test_a_kill_leaves_a_complete_checkpoint(tmp_path):
-    random = np.random.default_rng()
+def test_a_kill_leaves_a_complete_checkpoint(tmp_path, chance):
     for _ in range(6):
         writer = subprocess.Popen(
             [sys.executable, "-c", WRITER, HERE, str(tmp_path)],
@@ -205,7 +204,7 @@ def test_a_kill_leaves_a_complete_checkpoint(tmp_path):
         )
         try:
             written = int(writer.stdout.readline())
-            for _more in range(int(random.integers(1, 5))):
+            for _more in range(int(chance.integers(1, 5))):
                 written = int(writer.stdout.readline())
         finally:
             writer.kill()

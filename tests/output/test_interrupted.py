@@ -69,12 +69,11 @@ def killed_writer(path, seconds):
 
 
 @pytest.mark.slow
-def test_killed_at_any_moment_the_file_is_readable_and_can_be_continued(tmp_path):
-    random = np.random.default_rng()
+def test_killed_at_any_moment_the_file_is_readable_and_can_be_continued(tmp_path, chance):
     truss = Truss(MPI.COMM_SELF, n_nodes=400, n_bars=900)
     paths = [tmp_path / f"{i}.vtkhdf" for i in range(12)]
     for path in paths:
-        killed_writer(path, random.uniform(0.0, 0.2))
+        killed_writer(path, chance.uniform(0.0, 0.2))
     done = subprocess.run(
         [sys.executable, "-c", READER, str(HERE), *map(str, paths)],
         capture_output=True,

@@ -15,10 +15,11 @@ from __future__ import annotations
 import numpy as np
 
 from .friction import add_friction
+from .jamming import jam
 from .projection import project
 from .sliding import Sliding
 
-__all__ = ["StepFriction"]
+__all__ = ["NoStepFriction", "StepFriction"]
 
 # Weight of the known direction in one that is solved for, ten times as much each time that this fails: 0.01 saves a
 # fifth of the solves at first, but fails where nodes slip by micrometres.
@@ -36,8 +37,8 @@ class StepFriction:
 
     Attributes
     ----------
-    drag : (m, walls, 3) forces of friction on the nodes of the frames, after :meth:`settle` [N]
-    unsettled : owned nodes whose solution did not keep the law in :meth:`settle`
+    drag : (m, walls, 3) forces of friction on the nodes of the frames, after :meth:`check` [N]
+    unsettled : owned nodes whose solution did not keep the law in :meth:`check`
     """
 
     def __init__(self, model, state, balance) -> None:
@@ -66,6 +67,11 @@ class StepFriction:
         slip = (x - self.state.position[nodes])[:, None, :] - self._way
         return -float((self.drag * slip).sum())
 
+    def add(self, force: np.ndarray, nodes: np.ndarray, x: np.ndarray) -> float:
+        """Add friction to the forces (m, walls, 3) on nodes (m,) at (m, 3) [N]; the energy that it takes [J]."""
+        force += self.drag
+        return self.dissipated(nodes, x)
+
     def apply(self, frames, x: np.ndarray) -> None:
         """Hold the sticking nodes of the frames and drag the slipping ones, for a guess of positions (owned, 3)."""
         nodes = frames.nodes
@@ -83,7 +89,7 @@ class StepFriction:
         moving = rough & (self._sticks[nodes] < 0) & (self._directions[nodes] != 0.0).any(axis=(1, 2))
         frames.sliding = self._slide(frames, np.flatnonzero(moving))
 
-    def settle(
+    def check(
         self, frames, x: np.ndarray, reaction: np.ndarray, strengths: np.ndarray, noise: float, tolerance: float
     ) -> np.ndarray:
         """Find the nodes whose solution does not keep the law; normal forces (m, walls) of all nodes of the frames [N].
@@ -119,7 +125,7 @@ class StepFriction:
         strengths[at], self.drag[at] = pressing, drag
         return strengths
 
-    def firm(self) -> bool:
+    def relax(self) -> bool:
         """Solve for less in the next solve, the last one having failed; whether there was less to ask. Collective.
 
         First for no directions, then not even for what normal forces make of the drag.
@@ -132,6 +138,11 @@ class StepFriction:
             return True
         lagged, self._lagged = self._lagged, True
         return moving and not lagged
+
+    def jams(self, nodes: np.ndarray, x: np.ndarray, shifts: np.ndarray) -> list[str]:
+        """What to tell of nodes (k,) at (owned, 3) that walls and their friction hold in a wedge that locks itself."""
+        normals, _ = self.contact.planes(self.contact.members[nodes], x[nodes], shifts)
+        return [text for node, n in zip(nodes, normals, strict=True) if (text := jam(self.contact, node, n))]
 
     def _rough(self, frames) -> np.ndarray:
         """(m,) bool: frames with a wall that has friction."""
@@ -248,3 +259,31 @@ class StepFriction:
             start,
             np.where(slips, self._stiffness[nodes], 0.0),
         )
+
+
+class NoStepFriction:
+    """Stands for :class:`StepFriction` where no wall has friction; see there."""
+
+    def __init__(self, model, state, balance) -> None:
+        self.unsettled = np.empty(0, dtype=np.int64)
+
+    def apply(self, frames, x: np.ndarray) -> None:
+        """Nothing sticks or slips."""
+
+    def check(
+        self, frames, x: np.ndarray, reaction: np.ndarray, strengths: np.ndarray, noise: float, tolerance: float
+    ) -> np.ndarray:
+        """Normal forces as they are."""
+        return strengths
+
+    def jams(self, nodes: np.ndarray, x: np.ndarray, shifts: np.ndarray) -> list[str]:
+        """Nothing jams."""
+        return []
+
+    def relax(self) -> bool:
+        """There is nothing to ask less of."""
+        return False
+
+    def add(self, force: np.ndarray, nodes: np.ndarray, x: np.ndarray) -> float:
+        """No energy."""
+        return 0.0

@@ -29,7 +29,10 @@ class Ties:
     ----------
     any : whether the case has walls that tie
     tying : (walls,) bool
+    nobody : no nodes, no walls, and vectors of none of them
     """
+
+    nobody: FreshTies = (np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty((0, 3)))
 
     def __init__(self, contact, walls) -> None:
         self.contact = contact
@@ -181,11 +184,23 @@ class Ties:
 class NoTies(Ties):
     """Stands for :class:`Ties` where no wall ties: keeps nothing in the state."""
 
-    _NONE: FreshTies = (np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty((0, 3)))
+    def __init__(self, contact, walls) -> None:
+        super().__init__(contact, walls)
+        self._nowhere = np.zeros(contact.mesh.n_owned, dtype=bool)
+        self._nowhere.flags.writeable = False
+
+    @property
+    def held(self) -> np.ndarray:
+        """See :class:`Ties`."""
+        return self._nowhere
+
+    def pin(self, frames, x: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """See :class:`Ties`; not collective."""
+        return self.nobody
 
     def take(self, nodes: np.ndarray, touching: np.ndarray, places: np.ndarray, time: float) -> FreshTies:
         """See :class:`Ties`."""
-        return self._NONE
+        return self.nobody
 
     def calm(
         self, nodes: np.ndarray, walls: np.ndarray, normals: np.ndarray, v: np.ndarray, rates: np.ndarray, h: float

@@ -62,6 +62,7 @@ class Transform:
     Attributes
     ----------
     links : tuple of these
+    sliding : drag of slipping nodes, of no nodes without friction
     identity : whether w is u, and the residual as it is
     bounded : whether the solve has bounds
     """
@@ -76,7 +77,7 @@ class Transform:
         self.identity = not self._oblique and not self.links
         # frames along the axes change no coordinates
         self._frames = frames if self._oblique else NodalFrames(np.empty(0, dtype=np.int64), walls)
-        self._sliding = self._frames.sliding or Sliding.none(walls)
+        self.sliding = self._frames.sliding or Sliding.none(walls)
         if self._oblique:
             self._share_frames()
 
@@ -107,17 +108,17 @@ class Transform:
 
     def residual(self, predictor: np.ndarray, u: np.ndarray, g: np.ndarray) -> None:
         """Turn the imbalance of forces (owned, 3) at predictor + u into the residual, in place. Collective."""
-        at, slipping = self._frames.nodes, self._sliding.nodes
+        at, slipping = self._frames.nodes, self.sliding.nodes
         g[at] = np.einsum("nji,nj->ni", self._frames.inverse, g[at])
-        g[slipping] = self._sliding.couple(predictor[slipping] + u[slipping], g[slipping])
+        g[slipping] = self.sliding.couple(predictor[slipping] + u[slipping], g[slipping])
         for link in self.links:
             link.adjoint(g)
 
     def left(self) -> np.ndarray:
         """What turns the imbalance of nodes with a frame into their residual (m, 3, 3), at the last evaluation."""
         left = self._frames.inverse.transpose(0, 2, 1).copy()
-        at = self._sliding.at
-        left[at] = self._sliding.maps @ left[at]
+        at = self.sliding.at
+        left[at] = self.sliding.maps @ left[at]
         return left
 
     def linear(self, left: np.ndarray, u: np.ndarray, out: np.ndarray) -> None:
@@ -125,8 +126,8 @@ class Transform:
 
         ``left`` : of :meth:`left`, where H was taken.
         """
-        at, slipping = self._frames.nodes, self._sliding.nodes
-        out[slipping] += np.einsum("nij,nj->ni", self._sliding.stiffness, u[slipping])
+        at, slipping = self._frames.nodes, self.sliding.nodes
+        out[slipping] += np.einsum("nij,nj->ni", self.sliding.stiffness, u[slipping])
         out[at] = np.einsum("nij,nj->ni", left, out[at])
         for link in self.links:
             link.adjoint(out)
@@ -135,7 +136,7 @@ class Transform:
         """Put the diagonal (owned, 3) of the residual's derivative in place of that of H. Collective."""
         nodes = self._frames.nodes
         full = blocks(nodes)
-        full[self._sliding.at] += self._sliding.stiffness
+        full[self.sliding.at] += self.sliding.stiffness
         diagonal[nodes] = np.einsum("nij,njk,nki->ni", left, full, self._frames.inverse)
         for link in self.links:
             link.diagonal(lambda some: self._in_frames(some, blocks(some)), diagonal)
@@ -150,6 +151,6 @@ class Transform:
         """Turn the values of an assembled Hessian into frames; links have no coordinates there. Collective."""
         if not self._oblique:
             return
-        matrix.add_blocks(self._sliding.nodes, self._sliding.stiffness, values)
+        matrix.add_blocks(self.sliding.nodes, self.sliding.stiffness, values)
         left = self.left()
         _turn_blocks(matrix.pattern.ptr, matrix.local_columns, self._frame_of, left, self._inverse, values)

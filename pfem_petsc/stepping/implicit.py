@@ -11,7 +11,7 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from ..contact.rounds import ContactRounds
+from ..contact.active_set import ActiveSet
 from ..errors import NotConverged, SimulationFailure
 from ..integrators.base import Balance
 from ..solvers.lagged import LaggedPreconditioner
@@ -19,7 +19,7 @@ from ..solvers.linear import LinearChoice, unsymmetric
 from ..solvers.mass import MassSolver
 from ..solvers.matrix import HessianMatrix
 from ..solvers.matrix_free import MatrixFreeHessian
-from ..solvers.newton import NewtonReport, NewtonSolver
+from ..solvers.newton import NewtonReport, NewtonSolver, zero_tolerance
 from .guard import StepGuard
 from .problem import StepProblem
 from .stepper import Solution, Stepper
@@ -202,39 +202,41 @@ class ImplicitStepper(Stepper):
         if model.temperatures.varying:
             model.temperatures.apply(balance.time)
         tolerance = self._tolerance(balance)
-        contacts = ContactRounds(model, self.state, balance, self.held, self.links)
+        active_set = ActiveSet(model, self.state, balance, self.held, self.links)
+        candidates, links = active_set.candidates, active_set.links
         newton = linear = 0
         while True:
             try:
-                transform = contacts.transform(balance.predictor + guess)
+                trial = active_set.place(candidates, links, balance.predictor + guess)
             except SimulationFailure as failure:
                 raise SimulationFailure(f"{self.when(balance)}: {failure}") from failure
-            problem = StepProblem(model, state, balance, state.external, transform)
-            near = contacts.feasible(guess)
+            problem = StepProblem(model, state, balance, state.external, trial.transform)
+            near = active_set.feasible(trial, guess)
             w = problem.coordinates(near)
-            bounds = contacts.bounds(near, w)
-            w = contacts.clipped(w)
-            report = self.newton.solve(problem, w, tolerance, model.rounding, bounds)
-            firm = not report.converged and contacts.firm()
-            if not report.converged and not firm and not transform.identity:
-                w = contacts.clipped(problem.coordinates(contacts.approach(problem, guess)))
-                report = report.then(self.newton.solve(problem, w, tolerance, model.rounding, bounds))
+            bounds = active_set.bounds(trial, near, w)
+            w = bounds.clip(w)
+            report = self.newton.solve(problem, w, tolerance, model.rounding, bounds.arrays)
+            relaxed = not report.converged and active_set.relax(trial)
+            if not report.converged and not relaxed and not trial.transform.identity:
+                w = bounds.clip(problem.coordinates(active_set.approach(trial, problem, guess)))
+                report = report.then(self.newton.solve(problem, w, tolerance, model.rounding, bounds.arrays))
             newton += report.newton
             linear += report.linear
-            if firm:
+            if relaxed:
                 continue
             if not report.converged:
-                raise NotConverged(self._failure(problem, w, bounds, report, tolerance))
-            contacts.snap(w)
+                raise NotConverged(self._failure(problem, w, bounds.arrays, report, tolerance))
+            bounds.project(w, 2.0 * zero_tolerance(model.length))
             u = problem.increment(w).copy()
             g = np.empty_like(u)
             problem.imbalance(u, g)
-            if contacts.settled(w, u, g, report.norm, tolerance):
+            outcome = active_set.check(trial, bounds, w, u, g, report.norm, tolerance)
+            if outcome.settled:
                 break
-            guess = u
-        if not contacts.walls_near and not model.supports.any:
+            candidates, links, guess = outcome.candidates, outcome.links, u
+        if not trial.candidates.anywhere and not model.supports.any:
             self._keep_momentum(problem, u, g)
-        state.contact, walls, self.held = contacts.forces(u)
+        state.contact, walls, self.held = active_set.forces(outcome, u)
         held = model.links.held(np.flatnonzero(self.held))
         state.support = np.zeros_like(u)
         fixed = model.supports.fixed

@@ -293,8 +293,8 @@ def test_derivative_of_the_drag(name, operator, comm, shared_tmp_path):
     random = np.random.default_rng(1)
 
     def compare(problem, w, *others):
-        slips = problem.sliding is not None and (problem.sliding.weight > 0.0).any()
-        if slips and (len(checked) < 5 or (problem.sliding.friction > 0.0).sum(axis=1).max() > 1):
+        slips = (problem.transform.sliding.weight > 0.0).any()
+        if slips and (len(checked) < 5 or (problem.transform.sliding.friction > 0.0).sum(axis=1).max() > 1):
             at = w + 1e-6 * random.normal(size=w.shape)
             way = random.normal(size=w.shape)
             found, less, more = np.empty_like(w), np.empty_like(w), np.empty_like(w)
@@ -306,7 +306,7 @@ def test_derivative_of_the_drag(name, operator, comm, shared_tmp_path):
             x.array[:] = way.ravel()
             run.stepper.hessian.mat.mult(x, y)
             derivative = (more - less) / 2e-9
-            difference = np.abs(y.array.reshape(w.shape) - derivative)[problem.sliding.nodes].max()
+            difference = np.abs(y.array.reshape(w.shape) - derivative)[problem.transform.sliding.nodes].max()
             checked.append(difference / np.abs(derivative).max())
         return solve(problem, w, *others)
 

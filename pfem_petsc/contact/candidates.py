@@ -1,0 +1,98 @@
+"""Candidates for contact with walls in an implicit step: nodes, the walls that may stop them, and their order."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from mpi4py import MPI
+
+from ..integrators.base import Balance, State
+
+__all__ = ["Candidates", "expected_candidates"]
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Nodes that are solved with bounds.
+
+    Attributes
+    ----------
+    nodes : (m,) owned local indices, ascending; applicable : (m, walls) bool, walls that may stop them
+    priority : (m, walls) in which order walls are taken, lowest first; None: by distance
+    anywhere : whether any rank has candidates
+    """
+
+    nodes: np.ndarray
+    applicable: np.ndarray
+    priority: np.ndarray | None = None
+    anywhere: bool = True
+
+    def join(
+        self,
+        contact,
+        shifts: np.ndarray,
+        joined: np.ndarray,
+        broken: np.ndarray,
+        x: np.ndarray,
+        strengths: np.ndarray,
+        largest_rank: float,
+    ) -> Candidates:
+        """The candidates of the next solve: broken walls first, then pressing ones, then by distance.
+
+        Parameters
+        ----------
+        contact : Contact
+        shifts : (walls, 3) of walls [m]
+        joined, broken : (k,) nodes beyond walls, and which walls these are (k, walls)
+        x : (owned, 3) positions [m]
+        strengths : (m, walls) normal forces on the present candidates [N]
+        largest_rank : what puts a pressing wall before all that are apart [m]
+        """
+        nodes = np.union1d(self.nodes, joined)
+        applicable = np.zeros((len(nodes), len(contact.walls)), dtype=bool)
+        applicable[np.searchsorted(nodes, joined)] = broken
+        place = np.searchsorted(nodes, self.nodes)
+        applicable[place] |= self.applicable
+        normals, offsets = contact.planes(applicable, x[nodes], shifts)
+        priority = np.einsum("iwk,ik->iw", normals, x[nodes]) - offsets
+        pressing = strengths > 0.0
+        largest = max(float(strengths.max(initial=0.0)), 1e-300)
+        held = priority[place]
+        held[pressing] = -largest_rank * (1.0 + strengths[pressing] / largest)
+        priority[place] = held
+        return Candidates(nodes, applicable, priority)
+
+    def without(self, held: np.ndarray) -> Candidates:
+        """The same where no wall is applicable to nodes that are ``held`` (owned,) bool for good."""
+        return replace(self, applicable=self.applicable & ~held[self.nodes][:, None])
+
+
+def expected_candidates(model, state: State, balance: Balance, held: np.ndarray, shifts: np.ndarray) -> Candidates:
+    """Owned nodes that may touch a wall in a step, ``held`` (owned,) by walls before among them. Collective.
+
+    ``shifts`` (walls, 3) : of the walls where the balance holds [m]
+    """
+    contact, walls = model.contact, len(model.contact.walls)
+    nobody = Candidates(np.empty(0, dtype=np.int64), np.zeros((0, walls), dtype=bool), anywhere=False)
+    if not contact.any:
+        return nobody
+    move = (balance.time - state.time) * state.v
+    reach = 0.5 * np.linalg.norm(move, axis=1) + 1e-9 * model.length
+    near = held | contact.near(state.position + move, shifts, reach) | contact.ties.held
+    if model.comm.allreduce(int(near.any()), op=MPI.MAX) == 0:
+        return nobody
+    nodes = np.flatnonzero(near)
+    return Candidates(nodes, _within_reach(model, state, nodes, (state.position + move)[nodes], shifts, reach[nodes]))
+
+
+def _within_reach(model, state: State, nodes, x, shifts, reach) -> np.ndarray:
+    """(m, walls) bool: walls that nodes (m,) on their way to (m, 3) come within reach (m,) [m] of, or are at."""
+    contact = model.contact
+    concerned = contact.concerned(nodes, x, shifts)
+    within = np.zeros_like(concerned)
+    starts = state.position[nodes], contact.motion.shifts(state.time), 1e-9 * model.length
+    for place, there, distance in ((x, shifts, reach[:, None]), starts):
+        normals, offsets = contact.planes(concerned, place, there)
+        within |= np.einsum("mwi,mi->mw", normals, place) - offsets < distance
+    return within & concerned

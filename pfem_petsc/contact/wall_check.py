@@ -1,0 +1,77 @@
+"""Checks of the solution of an implicit solve against all walls."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .candidates import Candidates
+from .frames import NodalFrames
+
+__all__ = ["broken_walls", "is_misaligned", "is_off_surface"]
+
+
+def broken_walls(
+    contact, shifts: np.ndarray, candidates: Candidates, frames: NodalFrames, x: np.ndarray, tolerance: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Nodes (k,) beyond walls that no bound on them stands for, and which walls these are (k, walls).
+
+    Parameters
+    ----------
+    contact : Contact
+    shifts : (walls, 3) of walls [m]
+    candidates, frames : of the solve
+    x : (owned, 3) solution [m]
+    tolerance : depth that counts as none [m]
+    """
+    beyond = np.flatnonzero(contact.near(x, shifts, np.array([-tolerance])))
+    concerned = contact.concerned(beyond, x[beyond], shifts)
+    normals, offsets = contact.planes(concerned, x[beyond], shifts)
+    gaps = np.einsum("iwk,ik->iw", normals, x[beyond]) - offsets
+    broken = gaps < -tolerance
+    place = np.searchsorted(candidates.nodes, beyond)
+    known = place < len(candidates.nodes)
+    known[known] = candidates.nodes[place[known]] == beyond[known]
+    # what a bound of its own keeps is kept to rounding of the coordinates; supports decide over walls
+    place = place[known]
+    broken[known] &= (frames.rows[place] < 0) | frames.shared[place]
+    broken &= ~contact.ties.held[beyond][:, None]
+    degenerate = (np.where(contact.fixed[beyond][:, None, :], 0.0, normals) ** 2).sum(axis=2) <= 1e-12
+    broken &= ~degenerate
+    met = broken.any(axis=1)
+    return beyond[met], broken[met]
+
+
+def is_misaligned(frames: NodalFrames, strengths: np.ndarray) -> bool:
+    """Whether a wall presses on the row of an almost parallel one that does not: the force is off its normal."""
+    pressing = strengths > 0.0
+    astray = pressing & frames.shared
+    for node, wall in np.argwhere(astray):
+        own = (frames.rows[node] == frames.rows[node, wall]) & ~frames.shared[node]
+        turn = np.abs(
+            frames.normals[node, wall] - frames.signs[node, wall] * frames.basis[node, frames.rows[node, wall]]
+        )
+        if turn.max() > 1e-12 and not (pressing[node] & own).any():
+            return True
+    return False
+
+
+def is_off_surface(
+    contact, shifts: np.ndarray, frames: NodalFrames, strengths: np.ndarray, x: np.ndarray, tolerance: float
+) -> bool:
+    """Whether a node pressed on a curved wall is off its surface, or was held by the plane of another point.
+
+    One that the wall does not press may keep the plane of another point and be beyond the wall for all that.
+    """
+    at = frames.nodes
+    for k in np.flatnonzero(~contact.flat):
+        pressed = strengths[:, k] > 0.0
+        passed = ~pressed & (frames.rows[:, k] >= 0)
+        if passed.any() and (contact.gap(k, x[at[passed]], shifts) < -tolerance).any():
+            return True
+        if pressed.any():
+            place = x[at[pressed]] - shifts[k]
+            normals, offsets = contact.walls[k].planes(place)
+            gap = np.einsum("ij,ij->i", normals, place) - offsets
+            if np.abs(gap).max() > tolerance or np.abs(normals - frames.normals[pressed, k]).max() > 1e-12:
+                return True
+    return False

@@ -96,7 +96,8 @@ class ConstraintLink:
 
     def totals(self) -> np.ndarray:
         totals = np.zeros((len(self.names), 3))
-        np.add.at(totals, self.rows.source, self.force[:, None] * self.jacobian[self.rows.last])
+        if self.rows.mesh.comm.rank == 0:  # all ranks know them
+            np.add.at(totals, self.rows.source, self.force[:, None] * self.jacobian[self.rows.last])
         return totals
 
     def tables(self, owned: int) -> np.ndarray:
@@ -158,6 +159,12 @@ class ConstraintLink:
 
     def save(self) -> dict[str, list]:
         return {"force": self.force.tolist(), "jacobian": self.jacobian.tolist()}
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        return {}
+
+    def put_back(self, name: str, values: np.ndarray) -> None:
+        """There are no arrays."""
 
     def restore(self, saved: dict[str, list]) -> None:
         self.force = np.array(saved["force"], dtype=float)

@@ -6,42 +6,67 @@ rows of N the gradients of these constraints, its multipliers solve
 
     0 <= lambda   complementary to   N K^-1 N^T lambda + (values at the free positions) >= 0,
 
-found by the dual active-set method of Goldfarb and Idnani. All ranks know all nodes of pairs and solve the same
-problems. Only the pairs' forces are taken from them: the projection onto walls, which follows, finds the walls' own.
+found by the dual active-set method of Goldfarb and Idnani (:mod:`~pfem_petsc.contact.complementarity`). All ranks that
+own a node of a group have the whole group and solve the same problem. Only the pairs' forces are taken from it: the
+projection onto walls, which follows, finds the walls' own.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from mpi4py import MPI
 
 from ..errors import SimulationFailure
+from .complementarity import complementary, solve_groups
+from .pair_loops import broken_pairs
 from .projection import project
+from .search import near_planes
 
 __all__ = ["CoupledPairs", "complementary"]
 
-_THIN = 1e-12  # squared length of a constraint's free part below which supports alone decide
+_ZERO = np.zeros(1)
 
 
 class CoupledPairs:
-    """The pairs of a case, and who shares nodes with whom.
+    """The pairs of a rank, and who shares nodes with whom.
 
     Attributes
     ----------
-    any : whether pairs share nodes, or walls stop some: else each pair is on its own
-    here : (m,) owned nodes that are in pairs, ascending
+    any : whether any pairs of the model share nodes, or walls stop some: else each pair is on its own
+    any_walled : whether walls stop any node of the model's pairs
+    shared_node, coupled_node : lowest mesh number of a node in several pairs, and of one of these or a walled one; None
+    numbers : (n,) mesh numbers of the nodes of this rank's pairs, ascending
+    shared : (n,) bool, which are in several pairs
     """
 
-    def __init__(self, pairs, contact) -> None:
+    def __init__(self, pairs, contact) -> None:  # noqa: ANN001
         self.pairs = pairs
         self.contact = contact
         ends = np.stack([pairs.first, pairs.second])
-        self.numbers, first, self._of = np.unique(ends, return_index=True, return_inverse=True)
-        self._of = self._of.reshape(ends.shape)
+        self.numbers, first, of = np.unique(ends, return_index=True, return_inverse=True)
+        self._of = of.reshape(ends.shape)
         n = len(self.numbers)
+        self._where = pairs.where.ravel()[first]
+        self._owned = np.flatnonzero(self._where >= 0)
+        self._away = np.flatnonzero(self._where < 0)
+        self._here, self._far = self._where[self._owned], -1 - self._where[self._away]
         self._free = pairs.free.reshape(-1, 3)[first]
-        mine = pairs.mine.ravel()[first]
-        self._mine, self.here = np.flatnonzero(mine), pairs.local.ravel()[first][mine]
-        group = np.arange(n)
+        self._members = self._every(contact.members.astype(float)) > 0.0
+        walled = self._members.any(axis=1)
+        self.shared = np.bincount(self._of.ravel(), minlength=n) > 1
+        self.shared_node = self._lowest(self.shared)
+        self.coupled_node = self._lowest(self.shared | walled)
+        self.any = self.coupled_node is not None
+        self.any_walled = self._lowest(walled) is not None
+        self._gather_groups()
+
+    def _lowest(self, which: np.ndarray) -> int | None:
+        lowest = self.pairs.mesh.comm.allreduce(int(self.numbers[which].min(initial=2**62)), op=MPI.MIN)
+        return lowest if lowest < 2**62 else None
+
+    def _gather_groups(self) -> None:
+        """Sort the pairs by the groups that hang together."""
+        group = np.arange(len(self.numbers))
         while True:  # each node takes the lowest label of its pairs, until nothing changes
             lowest = np.minimum(group[self._of[0]], group[self._of[1]])
             before = group.copy()
@@ -49,132 +74,107 @@ class CoupledPairs:
                 np.minimum.at(group, end, lowest)
             if np.array_equal(group, before):
                 break
-        labels = group[self._of[0]]
-        order = np.argsort(labels, kind="stable")
-        self.groups = np.split(order, np.flatnonzero(np.diff(labels[order])) + 1) if len(order) else []
-        walled = np.zeros(n, dtype=np.int64)
-        walled[self._mine] = contact.members[self.here].any(axis=1)
-        self.walled = pairs.sum(walled) > 0
-        self.shared = np.bincount(self._of.ravel(), minlength=n) > 1
-        self.any = bool(self.walled.any() or self.shared.any())
+        labels, self._group = np.unique(group[self._of[0]], return_inverse=True)
+        self._pairs = np.argsort(self._group, kind="stable")
+        self._starts = np.searchsorted(self._group[self._pairs], np.arange(len(labels) + 1))
 
-    def planes(self, x: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray]:
-        """Planes (m, w, 3), (m, w) of the walls at :attr:`here` for positions (m, 3) at a time [s]."""
-        shifts = self.contact.motion.shifts(time)
-        return self.contact.planes(self.contact.concerned(self.here, x, shifts), x, shifts)
+    def _every(self, values: np.ndarray) -> np.ndarray:
+        """Values (n, k) of the nodes of pairs, from those of owned nodes (owned, k). Collective."""
+        partners = self.pairs.partners
+        return self._spread(values[self._here], partners.bring(values[partners.rows]))
 
-    def forces(
-        self,
-        x: np.ndarray,
-        stiffness: np.ndarray,
-        least: np.ndarray,
-        planes: tuple[np.ndarray, np.ndarray],
-        tolerance: float,
+    def _spread(self, here: np.ndarray, far: np.ndarray) -> np.ndarray:
+        """Values (n, k) from those of owned nodes of pairs (m, k) and those that partners sent."""
+        every = np.empty((len(self.numbers), here.shape[1]))
+        every[self._owned] = here
+        every[self._away] = far[self._far]
+        return every
+
+    def part(
+        self, predictor: np.ndarray, u: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float
     ) -> np.ndarray:
-        """Forces (p,) of the pairs [N]. Collective.
+        """Forces of the pairs (p,) [N] in a step: see :meth:`ContactPairs.explicit`. Collective."""
+        contact, partners = self.contact, self.pairs.partners
+        shifts = contact.motion.shifts(time)
+        rows, walls = partners.rows, len(contact.walls)
+        leaving = np.empty((len(rows), 4 + walls))
+        if not partners.alone:
+            leaving[:, :3] = predictor[rows] + u[rows]
+            leaving[:, 3] = stiffness[rows]
+            leaving[:, 4:] = contact.concerned(rows, leaving[:, :3], shifts)
+        far = partners.bring(leaving)
+        here = self._here
+        x = self._spread(predictor[here] + u[here], far[:, :3])
+        hard = self._spread(stiffness[here][:, None], far[:, 3:4])[:, 0]
 
-        Parameters
-        ----------
-        x : (m, 3) free positions of the nodes :attr:`here` [m]
-        stiffness : (m,) force for a displacement of these [N/m]
-        least : (p,) bounds on the distances, -inf for pairs that are no concern [m]
-        planes : of the walls at :attr:`here`, (m, w, 3) and (m, w), -inf where a wall is no concern
-        tolerance : a constraint broken by no more counts as kept [m]
+        def planes(nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            where = self._where[nodes]
+            own = where >= 0
+            concerned = np.empty((len(nodes), walls), dtype=bool)
+            concerned[own] = contact.concerned(where[own], x[nodes[own]], shifts)
+            concerned[~own] = far[-1 - where[~own], 4:] > 0.0
+            return contact.planes(concerned, x[nodes], shifts)
+
+        near = np.zeros(len(x), dtype=bool)
+        if self.any_walled:
+            flat = contact.flat
+            offsets = contact.plane_offsets(time)[flat]
+            members = np.ascontiguousarray(self._members[:, flat])
+            near_planes(x, contact.normals[flat], offsets, np.zeros(len(offsets), bool), members, _ZERO, near)
+        return self._forces(x, hard, self.pairs.gaps, planes, np.flatnonzero(near), tolerance)
+
+    def rest(
+        self, a: np.ndarray, mass: np.ndarray, least: np.ndarray, resting: np.ndarray, tolerance: float
+    ) -> np.ndarray:
+        """Forces of the pairs (p,) [N] that accelerations (owned, 3) need at the start. Collective.
+
+        ``least`` (p,): bounds on n . (a_2 - a_1), -inf for pairs that are no concern; ``resting`` (owned, walls): nodes
+        that walls do not let go.
 
         Raises
         ------
         SimulationFailure
-            On all ranks, where no position keeps all constraints.
+            On ranks that have pairs for which there are none.
         """
-        walls = planes[1].shape[1]
-        data = np.zeros((len(self.numbers), 4 + 4 * walls))
-        data[self._mine, :3] = x
-        data[self._mine, 3] = stiffness
-        data[self._mine, 4 : 4 + 3 * walls] = planes[0].reshape(len(self.here), 3 * walls)
-        # a sum cannot take infinities: no concern is written as a bound that no position breaks
-        data[self._mine, 4 + 3 * walls :] = np.maximum(planes[1], -1e300)
-        self.pairs.sum(data)
-        free_x, k = np.ascontiguousarray(data[:, :3]), data[:, 3]
-        normals = np.ascontiguousarray(data[:, 4 : 4 + 3 * walls]).reshape(len(data), walls, 3)
-        offsets = np.where(data[:, 4 + 3 * walls :] <= -1e300, -np.inf, data[:, 4 + 3 * walls :])
-        force = np.zeros(len(least))
-        if walls:
-            pushed = free_x.copy()
-            project(pushed, self._free == 0.0, normals, offsets, tolerance, np.zeros(offsets.shape))
-            short = self._short(pushed, least) > tolerance
-        else:
-            short = self._short(free_x, least) > tolerance
-        for group in self.groups:
-            if short[group].any():
-                force[group] = self._solve(group, free_x, k, normals, offsets, least, tolerance)
-        return force
+        state, contact = self.contact.state, self.contact
+        data = self._every(np.concatenate([a, mass[:, None], state.position, resting], axis=1))
+        shifts = contact.motion.shifts(state.time)
+        walled = data[:, 7:] > 0.0
+        normals, _ = contact.planes(walled, data[:, 4:7], shifts)
+        offsets = np.where(walled, 0.0, -np.inf)
+        x = np.ascontiguousarray(data[:, :3])
 
-    def _short(self, x: np.ndarray, least: np.ndarray) -> np.ndarray:
-        return least - self.pairs.distances(x[self._of])
+        def planes(nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            return normals[nodes], offsets[nodes]
 
-    def _solve(self, group, x, k, normals, offsets, least, tolerance) -> np.ndarray:
-        """Forces of a group's pairs from the problem with its walls."""
-        ends = self._of[:, group]
-        nodes, at = np.unique(ends, return_inverse=True)
-        at = at.reshape(ends.shape)
-        kept = least[group] > -np.inf
-        rows = np.zeros((len(group), len(nodes), 3))
-        every = np.arange(len(group))
-        rows[every, at[0]] -= self.pairs.normals[group]
-        rows[every, at[1]] += self.pairs.normals[group]
-        values = -self._short(x, least)[group]
-        wall_node, wall = np.nonzero(offsets[nodes] > -np.inf)
-        wall_rows = np.zeros((len(wall), len(nodes), 3))
-        wall_rows[np.arange(len(wall)), wall_node] = normals[nodes[wall_node], wall]
-        wall_values = np.einsum("ri,ri->r", normals[nodes[wall_node], wall], x[nodes[wall_node]])
-        wall_values -= offsets[nodes[wall_node], wall]
-        rows = np.concatenate([rows[kept], wall_rows]) * self._free[nodes]
-        values = np.append(values[kept], wall_values)
-        usable = (rows**2).sum(axis=(1, 2)) > _THIN
-        flat = (rows[usable] / np.sqrt(k[nodes])[:, None]).reshape(int(usable.sum()), -1)
-        multipliers = np.zeros(len(rows))
-        found = complementary(flat @ flat.T, values[usable], tolerance)
-        if found is None:
-            shown = ", ".join(str(number) for number in self.numbers[nodes][:6])
+        near = np.flatnonzero(walled.any(axis=1))
+        return self._forces(x, data[:, 3].copy(), least, planes, near, tolerance)
+
+    def _forces(self, x, stiffness, least, planes, near, tolerance: float) -> np.ndarray:  # noqa: ANN001
+        """Forces of the pairs (p,), of nodes at x (n, 3), of which ``near`` (m,) may be beyond walls.
+
+        ``planes(nodes)`` gives the normals (m, w, 3) and offsets (m, w) of nodes (m,), -inf where a wall is no concern.
+        """
+        pairs, free = self.pairs, self._free
+        force, broken = np.zeros(len(least)), np.empty(len(least), dtype=bool)
+        pushed = x
+        if len(near):
+            pushed = x.copy()
+            moved, (normals, offsets) = x[near], planes(near)
+            project(moved, free[near] == 0.0, normals, offsets, tolerance, np.zeros(offsets.shape))
+            pushed[near] = moved
+        if not broken_pairs(self._of, pushed, least, pairs.normals, tolerance, broken):
+            return force
+        groups = np.unique(self._group[broken])
+        chosen = np.zeros(len(self._starts) - 1, dtype=bool)
+        chosen[groups] = True
+        nodes = np.unique(self._of[:, chosen[self._group]])
+        plane = np.full(len(x), -1)
+        plane[nodes] = np.arange(len(nodes))
+        arguments = self._of, pairs.normals, least, x, stiffness, free, plane, planes(nodes), tolerance, force
+        stuck = solve_groups(groups, self._starts, self._pairs, *arguments)
+        if stuck >= 0:
+            some = np.unique(self._of[:, self._group == stuck])
+            shown = ", ".join(str(number) for number in self.numbers[some[:6]])
             raise SimulationFailure(f"no positions of nodes {shown} satisfy their contact pairs, walls and supports")
-        multipliers[usable] = found
-        force = np.zeros(len(group))
-        force[kept] = multipliers[: int(kept.sum())]
         return force
-
-
-def complementary(matrix: np.ndarray, values: np.ndarray, tolerance: float) -> np.ndarray | None:
-    """0 <= z complementary to (matrix z + values) >= 0 for a symmetric matrix (n, n) without negative eigenvalues.
-
-    By dual active sets, the most broken row first (D. Goldfarb, A. Idnani, Mathematical Programming 27, 1983). Rows
-    broken by no more than the tolerance count as kept; None where there is no solution.
-    """
-    n = len(values)
-    z = np.zeros(n)
-    active: list[int] = []
-    for _ in range(10 * n + 10):
-        left = matrix @ z + values
-        left[active] = 0.0
-        row = int(np.argmin(left)) if n else -1
-        if n == 0 or left[row] >= -tolerance:
-            return z
-        while True:
-            # with the active rows kept, a unit of the new multiplier takes `lost` off theirs, and lifts its row
-            lost = np.linalg.solve(matrix[np.ix_(active, active)], matrix[active, row]) if active else np.zeros(0)
-            gain = matrix[row, row] - matrix[row, active] @ lost
-            full = -left[row] / gain if gain > 1e-10 * matrix[row, row] else np.inf
-            shares = np.array([z[j] / d if d > 0.0 else np.inf for j, d in zip(active, lost, strict=True)])
-            part = float(shares.min(initial=np.inf))
-            if min(full, part) == np.inf:
-                return None
-            step = min(full, part)
-            z[active] -= step * lost
-            z[row] += step
-            if full <= part:
-                active.append(row)
-                break
-            left[row] += step * max(gain, 0.0)
-            z[active.pop(int(np.argmin(shares)))] = 0.0
-            z[active] = np.maximum(z[active], 0.0)
-        z[active] = np.maximum(np.linalg.solve(matrix[np.ix_(active, active)], -values[active]), 0.0)
-    return None

@@ -154,15 +154,13 @@ class Impacts:
     Attributes
     ----------
     met : (m,) owned nodes that have met walls and not left them yet; ``stepper.closed`` (owned, walls) says which
-    closed_pairs : (p,) bool, the same of pairs, on all ranks
     """
 
     def __init__(self, stepper) -> None:
         self.stepper = stepper
         self.model = stepper.model
-        contact, pairs = self.model.contact, self.model.pairs
+        contact = self.model.contact
         self.met = np.flatnonzero(stepper.closed.any(axis=1))
-        self.closed_pairs = np.zeros(0 if pairs is None else len(pairs.force), dtype=bool)
         self.active = self.model.can_touch
         free = contact.motion.free
         self.counted = np.ones(len(contact.names), dtype=bool)
@@ -296,18 +294,26 @@ class Impacts:
         return float((keeps * (sums[:, 0] - given)).sum())
 
     def _of_pairs(self, x, motion, load) -> float:
-        """The same of pairs that meet, whose reduced mass counts. Collective."""
-        pairs = self.model.pairs
+        """The same of pairs that meet, whose reduced mass counts: those whose second nodes are here. Collective."""
+        pairs, mass = self.model.pairs, self.model.inertia.mass
         pressing = pairs.force > 0.0
-        fresh, parted = pressing & ~self.closed_pairs, self.closed_pairs & ~pressing
-        if not fresh.any() and not parted.any():
+        fresh, parted = pressing & ~pairs.closed, pairs.closed & ~pressing
+        pairs.closed = pressing
+        at = np.flatnonzero(fresh | parted)
+
+        def of_nodes(nodes: np.ndarray) -> np.ndarray:
+            free_v, free_a = self._free(nodes, motion, load)
+            return np.column_stack([x[nodes], free_v, free_a, mass[nodes]])
+
+        if len(at) == 0:
             return 0.0
-        free_v, free_a = self._free(np.arange(len(x)), motion, load)
-        ends = pairs.gather(np.concatenate([x, free_v, free_a], axis=1))
-        distance = pairs.distances(ends[:, :, :3]) - pairs.gaps
-        self.closed_pairs = pressing | (parted & (distance <= self.slack))
-        speed, apart = pairs.distances(ends[:, :, 3:6]), pairs.distances(ends[:, :, 6:])
-        square = np.maximum(speed * speed - 2.0 * apart * np.maximum(distance, 0.0), 0.0)
-        closing = fresh & (speed < 0.0)
-        energy = 0.5 * pairs.reduced_mass(self.model.inertia.mass) * square
-        return float(energy[closing].sum()) if self.model.comm.rank == 0 else 0.0
+        ends = pairs.gather_of(at, of_nodes)
+        normals = pairs.normals[at]
+        parts = (ends[1, :, k : k + 3] - ends[0, :, k : k + 3] for k in (0, 3, 6))
+        distance, speed, pull = (np.einsum("pi,pi->p", normals, part) for part in parts)
+        distance -= pairs.gaps[at]
+        pairs.closed[at] |= parted[at] & (distance <= self.slack)
+        square = np.maximum(speed * speed - 2.0 * pull * np.maximum(distance, 0.0), 0.0)
+        closing = fresh[at] & (speed < 0.0) & pairs.mine[1, at]
+        energy = 0.5 * pairs.reduced(ends[:, :, 9], at) * square
+        return float(energy[closing].sum())

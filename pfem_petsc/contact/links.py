@@ -14,6 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 from petsc4py import PETSc
 
+from ..errors import SimulationFailure
 from ..integrators.base import Balance, State
 from .frames import NodalFrames
 
@@ -41,7 +42,7 @@ class Link(Protocol):
         Raises
         ------
         SimulationFailure
-            On all ranks, where no positions keep all rows.
+            Where no positions keep all rows; on this rank at least, after all that is collective.
         """
 
     def coordinates(self) -> LinkCoordinates:
@@ -51,7 +52,7 @@ class Link(Protocol):
         """Owned nodes (k,) on which rows press."""
 
     def totals(self) -> np.ndarray:
-        """Forces (tables, 3) of the rows on their last nodes [N]; the same on all ranks."""
+        """This rank's share of the forces (tables, 3) of the rows on their last nodes [N]."""
 
     def tables(self, owned: int) -> np.ndarray:
         """(owned,) the table whose rows press on an owned node as their last one, -1 for none."""
@@ -84,6 +85,12 @@ class Link(Protocol):
 
     def restore(self, saved: Any) -> None:
         """Take the forces back."""
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """What a checkpoint keeps of it at nodes: name to rows (owned, ...); the same names on all ranks."""
+
+    def put_back(self, name: str, values: np.ndarray) -> None:
+        """Take such an array (owned, ...) back. Collective."""
 
 
 class LinkCoordinates(Protocol):
@@ -175,17 +182,24 @@ class Links:
 
     def explicit(self, balance: Balance, state: State, u, stiffness, none: np.ndarray, tolerance: float) -> np.ndarray:
         """See :meth:`Link.explicit`; the forces (owned, 3) [N], ``none`` where there are no links."""
-        contact = np.zeros_like(u) if self.members else none
+        if not self.members:
+            return none
+        contact, failure = np.zeros(u.shape), None
         for link in self.members:
-            link.explicit(balance, state, u, stiffness, contact, tolerance)
-        return contact
+            try:
+                link.explicit(balance, state, u, stiffness, contact, tolerance)
+            except SimulationFailure as met:  # the next link may be collective
+                failure = failure or met
+        if failure is not None:
+            raise failure
+        return contact if any(len(link.held()) for link in self.members) else none
 
     def held(self, nodes: np.ndarray) -> np.ndarray:
         """Nodes (k,) that walls hold, with those that links hold."""
         return reduce(np.union1d, (link.held() for link in self.members), nodes)
 
     def totals(self) -> np.ndarray:
-        """Forces (tables, 3) of all tables on the last nodes of their rows [N]."""
+        """This rank's share of the forces (tables, 3) of all tables on the last nodes of their rows [N]."""
         return np.concatenate([np.zeros((0, 3)), *(link.totals() for link in self.members)])
 
     def tables(self, owned: int) -> np.ndarray:
@@ -221,6 +235,16 @@ class Links:
     def save(self) -> dict[str, Any]:
         """Forces of all links by key. Collective."""
         return {link.key: link.save() for link in self.members}
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """See :meth:`Link.arrays`; those of all links."""
+        return {name: array for link in self.members for name, array in link.arrays().items()}
+
+    def put_back(self, name: str, values: np.ndarray) -> None:
+        """See :meth:`Link.put_back`."""
+        for link in self.members:
+            if name in link.arrays():
+                link.put_back(name, values)
 
     def restore(self, saved: dict[str, Any]) -> None:
         """Take the forces back from what :meth:`save` gave."""

@@ -1,16 +1,28 @@
 """Nearest neighbours across a direction: how the nodes of a pair table find each other.
 
 Points are sorted into the cells of a square grid in the plane across the direction, about one point a cell, and each
-query looks at rings of cells around its own until no cell left can hold a nearer point.
+query looks at rings of cells around its own until no cell left can hold a nearer point. On several ranks the plane is
+cut into strips with about as many points each, one for each rank. A query goes to the nearest strip first, and then to
+all others that can hold a nearer point than was found there.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from mpi4py import MPI
 
-__all__ = ["nearest_across"]
+from ..mesh.exchange import Router
+
+__all__ = ["across", "nearest_across", "nearest_among_ranks"]
 
 _CHUNK = 1 << 21  # candidates looked at in one go
+_BINS = 1 << 12  # of the histogram by which strips are cut
+
+
+def across(points: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Points (n, 3) without their part along a unit vector; the same to the last bit wherever they are in an array."""
+    along = points[:, 0] * normal[0] + points[:, 1] * normal[1] + points[:, 2] * normal[2]
+    return points - along[:, None] * normal
 
 
 def nearest_across(points: np.ndarray, queries: np.ndarray, normal: np.ndarray) -> np.ndarray:
@@ -18,9 +30,86 @@ def nearest_across(points: np.ndarray, queries: np.ndarray, normal: np.ndarray) 
 
     Of points at the same distance, to the last bit, the first one is taken.
     """
-    points = points - np.outer(points @ normal, normal)
-    queries = queries - np.outer(queries @ normal, normal)
-    return _Grid(points, normal).nearest(queries)
+    return _Grid(across(points, normal), normal).nearest(across(queries, normal))[0]
+
+
+def nearest_among_ranks(
+    comm: MPI.Comm, keys: np.ndarray, points: np.ndarray, queries: np.ndarray, normal: np.ndarray
+) -> np.ndarray:
+    """Keys (m, k) of the points nearest to this rank's queries (m, 3), across a unit vector. Collective.
+
+    Parameters
+    ----------
+    comm : MPI.Comm
+    keys : (n, k) int64
+        What this rank's points are known by. Of points at the same distance, to the last bit, the one with the smallest
+        first key is taken.
+    points : (n, 3)
+        At least one point on all ranks together.
+    queries, normal : (m, 3), (3,)
+    """
+    points, queries = across(points, normal), across(queries, normal)
+    along = _along(comm, points, normal)
+    strips = Router(comm, _strips(comm, points @ along))
+    keys, points = strips.send(keys), strips.send(points)
+    order = np.argsort(keys[:, 0])
+    keys, points = keys[order], points[order]
+    grid = _Grid(points, normal) if len(points) else None
+
+    def answer(ranks: np.ndarray, asking: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        router = Router(comm, ranks)
+        asked = router.send(asking)
+        at, square = grid.nearest(asked) if len(asked) else (np.empty(0, dtype=np.int64), np.empty(0))
+        return router.reply(keys[at]), router.reply(square)
+
+    place = points @ along
+    reach = np.array(comm.allgather((place.min(initial=np.inf), place.max(initial=-np.inf))))
+    held = np.flatnonzero(reach[:, 0] <= reach[:, 1])  # ranks with points, in the order of their strips
+    low, high = reach[held].T
+    at = queries @ along
+    first = np.maximum(np.searchsorted(low, at, side="right") - 1, 0)
+    best, square = answer(held[first], queries)
+    margin = np.sqrt(square) * (1.0 + 1e-12) + 1e-12 * np.abs(reach[held]).max()
+    begin, end = np.searchsorted(high, at - margin), np.searchsorted(low, at + margin, side="right")
+    count = np.maximum(end - begin, 0)
+    query = np.repeat(np.arange(len(queries)), count)
+    strip = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count) + np.repeat(begin, count)
+    again = strip != first[query]
+    query = query[again]
+    found, other = answer(held[strip[again]], queries[query])
+    # of each query's answers the nearest one comes first, then the one with the smallest key
+    query, square = np.append(np.arange(len(queries)), query), np.append(square, other)
+    best = np.concatenate([best, found])
+    order = np.lexsort((best[:, 0], square, query))
+    return best[order[np.append(True, np.diff(query[order]) > 0)[: len(order)]]]
+
+
+def _along(comm: MPI.Comm, points: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """The axis in the plane along which points (n, 3) of all ranks extend the farthest."""
+    axes = _axes(normal)
+    flat = points @ axes
+    ends = np.stack([-flat.min(axis=0, initial=np.inf), flat.max(axis=0, initial=-np.inf)])
+    comm.Allreduce(MPI.IN_PLACE, ends, op=MPI.MAX)
+    return axes[:, int(np.argmax(ends.sum(axis=0)))].copy()
+
+
+def _strips(comm: MPI.Comm, place: np.ndarray) -> np.ndarray:
+    """Ranks (n,) among which points at (n,) are divided, in ascending order and about evenly."""
+    ends = np.array([-place.min(initial=np.inf), place.max(initial=-np.inf)])
+    comm.Allreduce(MPI.IN_PLACE, ends, op=MPI.MAX)
+    width = max(float(ends.sum()) / _BINS, 1e-300)
+    bins = np.clip(((place + ends[0]) / width).astype(np.int64), 0, _BINS - 1)
+    counts = np.bincount(bins, minlength=_BINS)
+    comm.Allreduce(MPI.IN_PLACE, counts)
+    before = np.cumsum(counts) - counts
+    return (before * comm.size // max(int(counts.sum()), 1))[bins]
+
+
+def _axes(normal: np.ndarray) -> np.ndarray:
+    """Two unit vectors across a unit vector, as columns (3, 2)."""
+    first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
+    first /= np.linalg.norm(first)
+    return np.stack([first, np.cross(normal, first)], axis=1)
 
 
 class _Grid:
@@ -28,10 +117,7 @@ class _Grid:
 
     def __init__(self, points: np.ndarray, normal: np.ndarray) -> None:
         self.points = points
-        axis = np.eye(3)[np.argmin(np.abs(normal))]
-        first = np.cross(normal, axis)
-        first /= np.linalg.norm(first)
-        self.axes = np.stack([first, np.cross(normal, first)], axis=1)
+        self.axes = _axes(normal)
         flat = points @ self.axes
         self.low, self.high = flat.min(axis=0), flat.max(axis=0)
         extent, n = self.high - self.low, len(points)
@@ -47,8 +133,8 @@ class _Grid:
     def _cells(self, flat: np.ndarray) -> np.ndarray:
         return np.clip(np.floor((flat - self.low) / self.edge).astype(np.int64), 0, self.shape - 1)
 
-    def nearest(self, queries: np.ndarray) -> np.ndarray:
-        """Indices (m,) of the points nearest to queries (m, 3) in the plane."""
+    def nearest(self, queries: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Indices (m,) of the points nearest to queries (m, 3) in the plane, and the squared distances (m,)."""
         flat = queries @ self.axes
         inside = np.clip(flat, self.low, self.high)
         # the points lie in a box: p is no nearer to a query than sqrt(|q - c|^2 + |c - p|^2), c the box's nearest place
@@ -63,7 +149,7 @@ class _Grid:
             left = left[distance[left] * (1.0 + 1e-12) >= reached]
             if len(left) == 0:
                 break
-        return best
+        return best, distance
 
     def _ranges(self, cells: np.ndarray, ring: int):
         """For each run of cells of the ring around cells (m, 2): the places (m,), (m,) of its points in the order."""

@@ -8,13 +8,15 @@ of a coordinate s of y_c that no wall bounds:
     w_s = (alpha . y_c - beta . y_o)/|alpha_s|,   all others w = y,   and back   y_s = r_c . w_c + r_o . w_o.
 
 The gradient follows, g_c <- g_c - g_s e_s + g_s r_c, g_o <- g_o + g_s r_o, and the pair's force is g_s/|alpha_s| then.
-What supports prescribe is no part of alpha and beta: it moves the bound. The two nodes may be on two ranks. Where
-walls stop no node of a pair the coordinates are the same for all steps.
+What supports prescribe is no part of alpha and beta: it moves the bound. The two nodes may be on two ranks, which both
+have the pair and exchange single numbers of it. Where walls stop no node of a pair the coordinates are the same for all
+steps.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from mpi4py import MPI
 from petsc4py import PETSc
 
 from .frames import NodalFrames
@@ -26,8 +28,39 @@ _THIN = 1e-6  # length of a direction's free part below which supports alone dec
 _LEAST = 0.1  # |alpha_s| at a node with a frame below which the pair must wait
 
 
+class _Ends:
+    """One end of each of some pairs.
+
+    Attributes
+    ----------
+    mine : (k,) bool, which of them this rank owns; ``nodes`` (m,) their owned local indices
+    """
+
+    def __init__(self, pairs: ContactPairs, ends: np.ndarray, at: np.ndarray) -> None:
+        where = pairs.where[ends, at]
+        self.mine = where >= 0
+        self.nodes = where[self.mine]
+        self._far = -1 - where[~self.mine]
+        self._partners = partners = pairs.partners
+        # which of this rank's ends are those that partners want; a node is in one pair
+        order = np.argsort(self.nodes)
+        place = np.minimum(np.searchsorted(self.nodes, partners.rows, sorter=order), max(len(order) - 1, 0))
+        self._leaving = order[place] if len(order) else np.zeros(len(partners.rows), dtype=np.int64)
+        self._wanted = self.nodes[self._leaving] == partners.rows if len(order) else np.zeros(len(place), dtype=bool)
+
+    def known(self, values: np.ndarray) -> np.ndarray:
+        """Numbers (k,) of all ends, from those (m,) that their owners have. Collective."""
+        data = np.empty(len(self.mine))
+        data[self.mine] = values
+        if not self._partners.alone:
+            leaving = np.zeros((len(self._wanted), 1))
+            leaving[self._wanted, 0] = values[self._leaving[self._wanted]]
+            data[~self.mine] = self._partners.bring(leaving)[self._far, 0]
+        return data
+
+
 class PairCoordinates:
-    """The change of coordinates for all pairs of a case.
+    """The change of coordinates for this rank's pairs.
 
     Attributes
     ----------
@@ -45,7 +78,7 @@ class PairCoordinates:
     def place(self, frames: NodalFrames | None) -> None:
         """Take the frames of a solve; None where no wall is near. Collective."""
         pairs = self.pairs
-        if not pairs.coupled.walled.any():
+        if not pairs.coupled.any_walled:
             return
         owned = pairs.mesh.n_owned
         data = np.zeros((owned, 13))
@@ -74,6 +107,7 @@ class PairCoordinates:
         best = np.where(fits, best, 0.0)
         self._at = at = np.flatnonzero(fits.any(axis=0))
         self.waiting = np.setdiff1d(np.flatnonzero(self._usable), at)
+        self._waits = self._anywhere(self.waiting >= 0)
         carrier = np.where(best[1] >= (1.0 - 1e-12) * best[0], 1, 0)[at]
         other, every = 1 - carrier, np.arange(len(at))
         alpha, beta = (
@@ -99,22 +133,16 @@ class PairCoordinates:
         own = -(sign / self._length)[:, None] * alpha
         own[every, slot] = sign
         share = (sign / self._length)[:, None] * beta
-        self._ends = pairs.mine[carrier, at], pairs.mine[other, at]
-        here, there = self._ends
-        self.carriers, self._other = pairs.local[carrier, at][here], pairs.local[other, at][there]
+        self._carrying, self._sharing = _Ends(pairs, carrier, at), _Ends(pairs, other, at)
+        here, there = self._carrying.mine, self._sharing.mine
+        self.carriers, self._other = self._carrying.nodes, self._sharing.nodes
         self._slots, self._turns, self._own = slot[here], turn[here], own[here]
         self._share, self._shared = share[here], share[there]
 
-    def _across(self, here: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Numbers (p,) that the owners of some ends know, on all ranks. Collective."""
-        data = np.zeros(len(self._at))
-        data[here] = values
-        return self.pairs.sum(data)
-
     def _of_others(self, w: np.ndarray) -> np.ndarray:
         """r_o . w_o of the pairs carried here. Collective."""
-        carries, shares = self._ends
-        return self._across(shares, np.einsum("pi,pi->p", self._shared, w[self._other]))[carries]
+        shares = self._sharing.known(np.einsum("pi,pi->p", self._shared, w[self._other]))
+        return shares[self._carrying.mine]
 
     def increment(self, w: np.ndarray) -> None:
         """Turn w (owned, 3) into coordinates of the frames, or u where there are none, in place. Collective."""
@@ -132,26 +160,24 @@ class PairCoordinates:
 
     def gradient(self, g: np.ndarray) -> None:
         """Turn a gradient (owned, 3) by what :meth:`increment` gives into that by w, in place. Collective."""
-        carries, shares = self._ends
         y, every = np.einsum("pij,pj->pi", self._turns, g[self.carriers]), np.arange(len(self.carriers))
         pull = y[every, self._slots].copy()
         y[every, self._slots] = 0.0
         g[self.carriers] = y + pull[:, None] * self._own
-        g[self._other] += self._across(carries, pull)[shares, None] * self._shared
+        g[self._other] += self._carrying.known(pull)[self._sharing.mine, None] * self._shared
 
     def diagonal(self, blocks: np.ndarray, diagonal: np.ndarray) -> None:
         """Put the diagonal (owned, 3) of T^T H T in place of that of H at pairs; bars between the ends are left out.
 
         ``blocks`` (carriers, 3, 3): the diagonal blocks of H there. Collective.
         """
-        carries, shares = self._ends
         every = np.arange(len(self.carriers))
         turned = np.einsum("pji,pjk,pkl->pil", self._turns, blocks, self._turns)
         stiff = turned[every, self._slots, self._slots].copy()
         own = np.tile(np.eye(3), (len(every), 1, 1))
         own[every, self._slots] = self._own
         diagonal[self.carriers] = np.einsum("pji,pjk,pki->pi", own, turned, own)
-        diagonal[self._other] += self._across(carries, stiff)[shares, None] * self._shared**2
+        diagonal[self._other] += self._carrying.known(stiff)[self._sharing.mine, None] * self._shared**2
 
     def matrix(self) -> PETSc.Mat:
         """T of :meth:`increment`, with places for any choice of carriers; the caller destroys it. Collective."""
@@ -206,24 +232,35 @@ class PairCoordinates:
         data = self.pairs.gather(np.concatenate([x + move, move, contact], axis=1))
         reach = 0.5 * np.linalg.norm(data[:, :, 3:6], axis=2).sum(axis=0) + slack
         near = self.pairs.distances(data[:, :, :3]) - self.pairs.gaps < reach
-        return bool((near | data[0, :, 6:].any(axis=1))[self._usable].any())
+        return self._anywhere((near | data[0, :, 6:].any(axis=1))[self._usable])
 
     def broken(self, x: np.ndarray, tolerance: float) -> bool:
         """Whether positions (owned, 3) break a pair by more than a tolerance [m]. Collective."""
         short = self.pairs.gaps - self.pairs.distances(self.pairs.gather(x))
-        return bool((short[self._usable] > tolerance).any())
+        return self._anywhere(short[self._usable] > tolerance)
 
-    def blocked(self, x: np.ndarray, tolerance: float) -> np.ndarray:
-        """Pairs that found no coordinate, and that positions (owned, 3) break by more than a tolerance. Collective."""
-        if len(self.waiting) == 0:
-            return self.waiting
-        short = self.pairs.gaps - self.pairs.distances(self.pairs.gather(x))
-        return self.waiting[short[self.waiting] > tolerance]
+    def _anywhere(self, which: np.ndarray) -> bool:
+        return bool(self.pairs.mesh.comm.allreduce(bool(which.any()), op=MPI.LOR))
+
+    def blocked(self, x: np.ndarray, tolerance: float) -> tuple[int, int, str] | None:
+        """The first pair that found no coordinate, and that positions (owned, 3) break by more than a tolerance. Nodes
+        and table, or None; the same on all ranks. Collective."""
+        if not self._waits:
+            return None
+        pairs = self.pairs
+        short = pairs.gaps - pairs.distances(pairs.gather(x))
+        found = self.waiting[short[self.waiting] > tolerance][:1]
+        mine = [(int(pairs.table[pair]), *pairs.numbers(pair)) for pair in found]
+        every = [pair for some in pairs.mesh.comm.allgather(mine) for pair in some]
+        if not every:
+            return None
+        table, second, first = min(every)
+        return first, second, pairs.names[table]
 
     def bound(self, x: np.ndarray, w: np.ndarray, lower: np.ndarray) -> None:
         """Write the bounds on w into (owned, 3), from positions (owned, 3) and their w. Collective."""
         room = (self.pairs.gaps - self.pairs.distances(self.pairs.gather(x)))[self._at] / self._length
-        lower[self.carriers, self._slots] = w[self.carriers, self._slots] + room[self._ends[0]]
+        lower[self.carriers, self._slots] = w[self.carriers, self._slots] + room[self._carrying.mine]
 
     def press(self, w: np.ndarray, g: np.ndarray, lower: np.ndarray, noise: float) -> None:
         """Set the pairs' forces. Collective.
@@ -239,6 +276,6 @@ class PairCoordinates:
         turned = np.einsum("pij,pj->pi", self._turns, g[at])
         pull = self._own[every, slot] * turned[every, slot]
         pressed = (w[at, slot] <= lower[at, slot]) & (pull > noise)
-        strength = self._across(self._ends[0], np.where(pressed, pull, 0.0)) / self._length
+        strength = self._carrying.known(np.where(pressed, pull, 0.0)) / self._length
         self.pairs.release()
         self.pairs.force[self._at] = strength

@@ -59,11 +59,17 @@ class PairLink:
     def push(self, contact: np.ndarray) -> None:
         self.pairs.push(contact)
 
-    def save(self) -> list[float]:
-        return self.pairs.force.tolist()
+    def save(self) -> None:
+        return None
 
-    def restore(self, saved: list[float]) -> None:
-        self.pairs.force = np.array(saved, dtype=float)
+    def restore(self, saved: None) -> None:
+        """They are in the arrays."""
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        return self.pairs.kept()
+
+    def put_back(self, name: str, values: np.ndarray) -> None:
+        self.pairs.put_back(name, values)
 
 
 class PairLinkCoordinates:
@@ -76,7 +82,7 @@ class PairLinkCoordinates:
     @property
     def varies(self) -> bool:
         """See :class:`~pfem_petsc.contact.links.LinkCoordinates`, here and below."""
-        return bool(self.pairs.coupled.walled.any())
+        return self.pairs.coupled.any_walled
 
     def reached(self, state: State, move: np.ndarray, slack: float) -> bool:
         return self.own.reached(state.position, move, state.contact, slack)
@@ -117,12 +123,11 @@ class PairLinkCoordinates:
     def kept(self, x: np.ndarray, slack: float) -> bool:
         """Pairs that found no coordinate beside the walls at both their nodes must not be broken."""
         blocked = self.own.blocked(x, slack)
-        if len(blocked):
-            pairs = self.pairs
+        if blocked is not None:
+            first, second, name = blocked
             raise NotConverged(
-                f"walls take all directions in which nodes "
-                f"{pairs.first[blocked[0]]} and {pairs.second[blocked[0]]} of contact_pair "
-                f"{pairs.names[pairs.table[blocked[0]]]!r} can separate; use an explicit integrator"
+                f"walls take all directions in which nodes {first} and {second} of contact_pair {name!r} can separate; "
+                "use an explicit integrator"
             )
         return True
 

@@ -6,71 +6,70 @@ whose free positions x break it is a problem of two nodes of stiffness k_1 and k
     lambda = (gap - n . (x_2 - x_1)) / (1/k_1 + 1/k_2),   x_1 -= lambda n / k_1,   x_2 += lambda n / k_2,
 
 where components that supports prescribe do not give way. Where pairs share nodes, or walls stop these as well, see
-:mod:`pfem_petsc.contact.coupled`; else pairs are independent of each other. The ends of a pair may be on two ranks: all
-ranks know all pairs. For implicit steps see :mod:`pfem_petsc.contact.pair_coordinates`.
+:mod:`pfem_petsc.contact.coupled`; else pairs are independent of each other. A rank has the pairs of its own nodes.
+Where another rank owns the other node, both ranks have the pair: they exchange the values of their nodes, and compute
+the same force. For implicit steps see :mod:`pfem_petsc.contact.pair_coordinates`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable
 
 import numpy as np
 from mpi4py import MPI
 
 from ..errors import InputError
+from ..mesh.exchange import swap
+from ..parallel.agreement import agreed
 from .coupled import CoupledPairs
-from .matching import nearest_across
+from .pair_loops import leaving_rows, move_nodes, needed_forces, part_nodes, pressed_nodes, push_nodes, table_forces
+from .pair_search import find_pairs
 
 __all__ = ["ContactPairs"]
 
 
 class ContactPairs:
-    """All pairs of a case. Construction is collective.
+    """The pairs of a case that this rank has: those of its nodes, and those that share nodes with them. Construction is
+    collective.
 
     Attributes
     ----------
     names : of the tables; ``table`` (p,) says to which of them a pair belongs
     first, second : (p,) mesh numbers of the nodes
     normals, gaps : (p, 3), (p,) unit directions, and bounds on n . (x_second - x_first) [m]
-    mine, local : (2, p) which ends this rank owns, and their owned local indices
+    where : (2, p) local index of an end that this rank owns, else -1 less its row among those that others own
+    mine, local : (2, p) which ends this rank owns, and their local indices, else 0
+    partners : GhostExchange that brings values of ends that others own
     coupled : CoupledPairs
     free : (2, p, 3) 1.0 where a component of an end may move, 0.0 where a support prescribes it
-    force : (p,) force of each pair in the last step, positive where it presses [N]; the same on all ranks
+    force : (p,) force of each pair in the last step, positive where it presses [N]; the same on all ranks that have it
+    closed : (p,) bool, pairs that have met and not parted since
     """
 
     def __init__(self, case, nodes: dict[str, np.ndarray], mesh, fixed: np.ndarray, contact) -> None:
         self.source = case.source
         self.mesh = mesh
         self.names = [pair.name for pair in case.contact_pair]
-        self.normals = np.empty((0, 3))
-        self.gaps = np.empty(0)
-        self.table = np.empty(0, dtype=np.int64)
-        self.first = self.second = np.empty(0, dtype=np.int64)
-        for index, pair in enumerate(case.contact_pair):
-            normal = np.array(pair.direction) / np.linalg.norm(pair.direction)
-            first, second = _match(pair, nodes, mesh, normal, f"{case.source}: contact_pair {pair.name!r}")
-            self.first = np.append(self.first, first)
-            self.second = np.append(self.second, second)
-            self.normals = np.vstack([self.normals, np.tile(normal, (len(first), 1))])
-            self.gaps = np.append(self.gaps, np.full(len(first), pair.gap))
-            self.table = np.append(self.table, np.full(len(first), index))
-        ids = mesh.node_ids[: mesh.n_owned]
-        order = np.argsort(ids)
-        ends = np.stack([self.first, self.second])
-        if (self.first == self.second).any():
-            itself = self.first[self.first == self.second][0]
-            raise InputError(f"{case.source}: contact_pair: node {itself} is paired with itself")
-        place = np.searchsorted(ids[order], ends)
-        place = np.minimum(place, max(len(ids) - 1, 0))
-        self.mine = (ids[order][place] == ends) if len(ids) else np.zeros(ends.shape, dtype=bool)
-        self.local = order[place] if len(ids) else np.zeros(ends.shape, dtype=np.int64)
-        self.free = np.zeros((*ends.shape, 3))
-        self.free[self.mine] = np.where(fixed[self.local[self.mine]], 0.0, 1.0)
-        mesh.comm.Allreduce(MPI.IN_PLACE, self.free)
+        found = find_pairs(case, nodes, mesh)
+        self.partners = found.partners
+        self.table, self.where, self._owners = found.table, found.where, found.owners
+        self.first, self.second = found.numbers
+        directions = [np.array(pair.direction) / np.linalg.norm(pair.direction) for pair in case.contact_pair]
+        self.normals = np.array(directions)[self.table]
+        self.gaps = np.array([pair.gap for pair in case.contact_pair], dtype=float)[self.table]
+        self.mine = self.where >= 0
+        self.local = np.maximum(self.where, 0)
+        self.free = self.gather(np.where(fixed, 0.0, 1.0))
         self._along = np.einsum("epi,pi->ep", self.free, self.normals**2)  # how far ends give way to their pairs
-        self._ends = self.local[self.mine]
-        self.coupled = CoupledPairs(self, contact)
+        self._held = (self.free == 0.0).any(axis=2)
+        self._none = np.empty((0, 3))
+        self._nodes = np.empty(int(self.mine.sum()), dtype=np.int64)
+        self._directions = np.empty((len(self._nodes), 3))
+        self.closed = np.zeros(len(self.table), dtype=bool)
         self.release()
+        self._no_totals = np.zeros((len(self.names), 3))
+        table_forces(self.where, self.table, self.force, self.normals, self._no_totals)
+        self.coupled = CoupledPairs(self, contact)
 
     def check_scheme(self, on_its_own: bool, treatment: str) -> None:
         """Refuse what shared nodes and walls at pairs do not go with.
@@ -81,24 +80,22 @@ class ContactPairs:
             On all ranks. ``on_its_own``: each node is solved on its own, by an explicit scheme with lumped mass.
         """
         key, coupled = f"{self.source}: contact_pair", self.coupled
-        if coupled.shared.any() and not on_its_own:
+        if coupled.shared_node is not None and not on_its_own:
             raise InputError(
-                f"{key}: node {coupled.numbers[coupled.shared][0]} is in several pairs, which needs an explicit "
+                f"{key}: node {coupled.shared_node} is in several pairs, which needs an explicit "
                 "integrator with lumped mass"
             )
         if coupled.any and treatment != "scheme":
-            which = coupled.shared | coupled.walled
             raise InputError(
-                f"{key}: node {coupled.numbers[which][0]} is in several pairs, or a wall stops it as well, which needs "
+                f"{key}: node {coupled.coupled_node} is in several pairs, or a wall stops it as well, which needs "
                 'contact.treatment = "scheme"'
             )
         walls = coupled.contact
-        met = np.zeros(len(walls.names), dtype=np.int64)
-        met += walls.members[coupled.here].any(axis=0)
+        met = walls.members[self.local[self.mine]].any(axis=0).astype(np.int64)
+        self.mesh.comm.Allreduce(MPI.IN_PLACE, met)
         special = ~walls.flat | (walls.restitution > 0.0) | (walls.static_friction > 0.0) | walls.ties.tying
         if walls.motion.free is not None:
             special[walls.motion.free.at] = True
-        self.sum(met)
         if (special & (met > 0)).any():
             name = walls.names[int(np.argmax(special & (met > 0)))]
             raise InputError(
@@ -109,13 +106,20 @@ class ContactPairs:
     def check_start(self, x: np.ndarray, length: float, source: str) -> None:
         """Refuse pairs that start beyond each other by more than rounding of the model's size [m]. Collective."""
         distance = self.distances(self.gather(x)) - self.gaps
-        if len(distance) and distance.min() < -1e-12 * length:
-            pair = int(np.argmin(distance))
+        pair = int(np.argmin(distance)) if len(distance) else -1
+        deepest = (np.inf,) if pair < 0 else (float(distance[pair]), int(self.table[pair]), *self.numbers(pair))
+        deepest = min(self.mesh.comm.allgather(deepest))
+        if deepest[0] < -1e-12 * length:
+            distance, table, second, first = deepest
             raise InputError(
-                f"{source}: contact_pair {self.names[self.table[pair]]!r}: nodes {self.first[pair]} and "
-                f"{self.second[pair]} start {-distance[pair]:.6g} m beyond each other; reverse the direction, which "
+                f"{source}: contact_pair {self.names[table]!r}: nodes {first} and "
+                f"{second} start {-distance:.6g} m beyond each other; reverse the direction, which "
                 "points from the first to the second, or move the mesh"
             )
+
+    def numbers(self, pair: int) -> tuple[int, int]:
+        """Mesh numbers of a pair's second and first node."""
+        return int(self.second[pair]), int(self.first[pair])
 
     def explicit(
         self,
@@ -139,32 +143,44 @@ class ContactPairs:
         Raises
         ------
         SimulationFailure
-            On all ranks, where pairs, walls and supports leave nodes no room.
+            On ranks that have such pairs: pairs, walls and supports leave nodes no room.
         """
         if self.coupled.any:
-            here = self.coupled.here
-            x = predictor[here] + u[here]
-            planes = self.coupled.planes(x, time)
-            self.force = self.coupled.forces(x, stiffness[here], self.gaps, planes, tolerance)
-            self._move(u, self.force, stiffness)
+            self.force = self.coupled.part(predictor, u, stiffness, time, tolerance)
+            self._move(u, self.force, stiffness, contact)
         else:
-            self.force = self.part(predictor, u, stiffness)
-        self.push(contact)
+            self.force = self.part(predictor, u, stiffness, contact)
 
     def pressed(self) -> tuple[np.ndarray, np.ndarray]:
         """Owned nodes (k,) that pairs hold, and the directions (k, 3) of their pairs."""
-        pressed = self.mine & (self.force > 0.0)
-        return self.local[pressed], np.broadcast_to(self.normals, (2, *self.normals.shape))[pressed]
+        if not self.force.any():
+            return self._nodes[:0].copy(), self._none
+        count = pressed_nodes(self.where, self.force, self.normals, self._nodes, self._directions)
+        return self._nodes[:count].copy(), self._directions[:count].copy()
+
+    def any_pressed(self) -> bool:
+        """Whether any pair of the model has a force. Collective."""
+        return bool(self.mesh.comm.allreduce(bool(self.force.any()), op=MPI.LOR))
 
     def release(self) -> None:
         """No pair presses."""
         self.force = np.zeros(len(self.table))
 
-    def part(self, predictor: np.ndarray, u: np.ndarray, stiffness: np.ndarray) -> np.ndarray:
-        """Change u (owned, 3) [m] so that predictor + u keeps all pairs; the pairs' forces (p,) [N]. Collective."""
-        x = predictor[self._ends] + u[self._ends]
-        force = np.maximum(self._needed(x, stiffness, self.gaps), 0.0)
-        self._move(u, force, stiffness)
+    def part(
+        self, predictor: np.ndarray, u: np.ndarray, stiffness: np.ndarray, contact: np.ndarray | None = None
+    ) -> np.ndarray:
+        """Change u (owned, 3) [m] so that predictor + u keeps all pairs; the pairs' forces (p,) [N]. Collective.
+
+        ``contact`` (owned, 3): forces on the nodes, to which these are added [N].
+        """
+        force, load = np.empty(len(self.table)), self._none if contact is None else contact
+        far = np.empty((0, 4))
+        if not self.partners.alone:
+            leaving = self.partners.leaving(4)
+            leaving_rows(self.partners.rows, predictor, u, stiffness, leaving)
+            far = self.partners.bring(leaving)
+        arrays = self.where, predictor, u, stiffness, far, self.normals, self._along, self.gaps, self.free, self._held
+        part_nodes(*arrays, force, load)
         return force
 
     def together(
@@ -173,7 +189,8 @@ class ContactPairs:
         """Velocities or accelerations (owned, 3) at which pairs ``which`` (p,) part at ``rates`` (p,); default: those
         that are pressed. Momentum is kept. Collective."""
         same, which = values.copy(), self.force > 0.0 if which is None else which
-        self._move(same, self._needed(values[self._ends], mass, np.where(which, rates, -np.inf)), mass)
+        force = self._needed(values, mass, np.where(which, rates, -np.inf))
+        self._move(same, force, mass)
         return same
 
     def resting(self, x: np.ndarray, v: np.ndarray, slack: float, still: float) -> np.ndarray:
@@ -191,20 +208,22 @@ class ContactPairs:
         """
         least = np.where(closed, 0.0, -np.inf)
         if self.coupled.any:
-            state, here = self.coupled.contact.state, self.coupled.here
-            normals, _ = self.coupled.planes(state.position[here], state.time)
-            planes = normals, np.where(resting[here], 0.0, -np.inf)
             largest = self.mesh.comm.allreduce(float(np.abs(a).max(initial=0.0)), op=MPI.MAX)
-            self.force = self.coupled.forces(a[here], mass[here], least, planes, 1e-13 * largest)
+            with agreed(self.mesh.comm):
+                self.force = self.coupled.rest(a, mass, least, resting, 1e-13 * largest)
         else:
-            self.force = np.maximum(self._needed(a[self._ends], mass, least), 0.0)
+            self.force = np.maximum(self._needed(a, mass, least), 0.0)
         change = np.zeros_like(a)
         self._move(change, self.force, np.ones_like(mass))
         return change
 
     def reduced_mass(self, mass: np.ndarray) -> np.ndarray:
         """1/(1/m_1 + 1/m_2) (p,) [kg] along the directions, from those of owned nodes (owned,). Collective."""
-        gives = (self._along / self.gather(mass)).sum(axis=0)
+        return self.reduced(self.gather(mass), slice(None))
+
+    def reduced(self, mass: np.ndarray, at: np.ndarray | slice) -> np.ndarray:
+        """The same (k,) of pairs ``at``, from the masses of their ends (2, k)."""
+        gives = (self._along[:, at] / mass).sum(axis=0)
         return 1.0 / np.maximum(gives, 1e-300)
 
     def keep(self, values: np.ndarray, of_pairs: np.ndarray) -> None:
@@ -214,68 +233,71 @@ class ContactPairs:
 
     def push(self, contact: np.ndarray, factor: float = 1.0) -> None:
         """Add the pairs' forces, times a factor, to those on the nodes (owned, 3) [N]."""
-        for _, _, at, push in self._pushes(factor * self.force):
-            np.add.at(contact, at, push)
+        push_nodes(self.where, self.force, factor, self.normals, contact)
 
     def _needed(self, x: np.ndarray, stiffness: np.ndarray, least: np.ndarray) -> np.ndarray:
-        """Forces (p,) on the ends here at (k, 3) that make the distances ``least`` (p,), none where that is -inf."""
-        data = np.zeros((*self.mine.shape, 4))
-        data[self.mine, :3] = x
-        data[self.mine, 3] = 1.0 / stiffness[self._ends]
-        self.sum(data)
-        soft = (data[:, :, 3] * self._along).sum(axis=0)
-        usable = (soft > 0.0) & (least > -np.inf)
-        short = np.where(usable, least, 0.0) - self.distances(data[:, :, :3])
-        return np.where(usable, short / np.maximum(soft, 1e-300), 0.0)
+        """Forces (p,) at nodes x (owned, 3) that make the distances ``least`` (p,), none where that is -inf.
+        Collective."""
+        far, force, rows = np.empty((0, 4)), np.empty(len(self.table)), self.partners.rows
+        if not self.partners.alone:
+            far = self.partners.bring(np.column_stack([x[rows], 1.0 / stiffness[rows]]))
+        needed_forces(self.where, x, stiffness, far, self.normals, self._along, least, force)
+        return force
 
-    def _move(self, u: np.ndarray, force: np.ndarray, stiffness: np.ndarray) -> None:
-        for end, here, at, push in self._pushes(force):
-            np.add.at(u, at, push * self.free[end, here] / stiffness[at, None])
-
-    def _pushes(self, force: np.ndarray) -> Iterator[tuple[int, np.ndarray, np.ndarray, np.ndarray]]:
-        """Of both ends: end, (p,) pairs whose force acts on it here, nodes (k,), forces (k, 3) [N]."""
-        if not force.any():
-            return
-        for end, sign in ((0, -1.0), (1, 1.0)):
-            here = self.mine[end] & (force != 0.0)
-            yield end, here, self.local[end, here], sign * force[here, None] * self.normals[here]
+    def _move(self, u: np.ndarray, force: np.ndarray, stiffness: np.ndarray, load: np.ndarray | None = None) -> None:
+        load = self._none if load is None else load
+        move_nodes(self.where, force, self.normals, self.free, self._held, stiffness, u, load)
 
     def totals(self) -> dict[str, np.ndarray]:
-        """Name of each table to its pairs' force on the second nodes (3,) [N], in the last step."""
-        forces = self.force[:, None] * self.normals
-        return {name: forces[self.table == k].sum(axis=0) for k, name in enumerate(self.names)}
+        """Name of each table to its pairs' force on the second nodes of this rank (3,) [N], in the last step."""
+        sums = self._no_totals.copy()
+        if self.force.any():
+            table_forces(self.where, self.table, self.force, self.normals, sums)
+        return dict(zip(self.names, sums, strict=True))
+
+    def kept(self) -> dict[str, np.ndarray]:
+        """What a checkpoint keeps of pairs, at their second nodes: name to (owned, tables)."""
+        at, found = self.mine[1], {}
+        for name, values in (("pairs.force", self.force), ("pairs.closed", self.closed.astype(np.uint8))):
+            found[name] = np.zeros((self.mesh.n_owned, len(self.names)), dtype=values.dtype)
+            found[name][self.local[1, at], self.table[at]] = values[at]
+        return found
+
+    def put_back(self, name: str, values: np.ndarray) -> None:
+        """Take back what :meth:`kept` gave. Collective."""
+        of_pairs = self.gather(values)[1, np.arange(len(self.table)), self.table]
+        if name == "pairs.force":
+            self.force = of_pairs
+        else:
+            self.closed = of_pairs > 0.0
 
     def gather(self, values: np.ndarray) -> np.ndarray:
-        """Values (2, p, ...) of both ends from those of owned nodes (owned, ...), on all ranks. Collective."""
-        data = np.zeros((*self.mine.shape, *values.shape[1:]))
-        data[self.mine] = values[self.local[self.mine]]
-        return self.sum(data)
+        """Values (2, p, ...) of both ends from those of owned nodes (owned, ...). Collective."""
+        values = np.asarray(values, dtype=float)
+        data = values[self.local] if len(values) else np.zeros((*self.local.shape, *values.shape[1:]))
+        if not self.partners.alone:
+            rows = values[self.partners.rows]
+            far = self.partners.bring(rows.reshape(len(rows), int(np.prod(values.shape[1:]))))
+            away = ~self.mine
+            data[away] = far[-1 - self.where[away]].reshape(-1, *values.shape[1:])
+        return data
 
-    def sum(self, data: np.ndarray) -> np.ndarray:
-        """The sum over ranks, in place: what one rank has set, all know. Collective."""
-        if self.mesh.comm.size > 1:
-            self.mesh.comm.Allreduce(MPI.IN_PLACE, data)
+    def gather_of(self, at: np.ndarray, of_nodes: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+        """Values (2, k, n) of both ends of pairs ``at`` (k,), where ``of_nodes`` gives those (m, n) of owned (m,).
+
+        Of a pair that two ranks have, both ask, or neither; only these two meet.
+        """
+        where = self.where[:, at]
+        mine = where >= 0
+        own = of_nodes(where[mine])
+        data = np.empty((*where.shape, own.shape[1]))
+        data[mine] = own
+        cut = np.flatnonzero(mine[0] != mine[1])
+        if len(cut):
+            end = np.where(mine[0, cut], 0, 1)
+            data[1 - end, cut] = swap(self.mesh.comm, self._owners[at[cut]], data[end, cut])
         return data
 
     def distances(self, ends: np.ndarray) -> np.ndarray:
         """n . (x_2 - x_1) (p,) [m] of positions (2, p, 3)."""
         return np.einsum("pi,pi->p", self.normals, ends[1] - ends[0])
-
-
-def _match(pair, nodes, mesh, normal: np.ndarray, key: str) -> tuple[np.ndarray, np.ndarray]:
-    """Mesh numbers of a table's pairs: each second node with the first one nearest to it across the direction."""
-    found = []
-    for name in (pair.first, pair.second):
-        local = nodes[name]
-        parts = mesh.comm.allgather((mesh.node_ids[local], mesh.points[local]))
-        ids = np.concatenate([part[0] for part in parts])
-        order = np.argsort(ids)
-        points = np.concatenate([part[1] for part in parts])[order]
-        found.append((ids[order], points))
-    (first, here), (second, there) = found
-    if len(first) != len(second):
-        raise InputError(f"{key}: first has {len(first)} nodes and second {len(second)}: they cannot be paired")
-    nearest = nearest_across(here, there, normal) if len(first) else np.empty(0, dtype=np.int64)
-    if len(np.unique(nearest)) < len(nearest):
-        raise InputError(f"{key}: two nodes of second are nearest to the same node of first, seen along the direction")
-    return first[nearest], second

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from mpi4py import MPI
 
-__all__ = ["GhostExchange", "Router"]
+__all__ = ["GhostExchange", "Router", "swap"]
 
 # Tags of the ghost messages start here; the number of columns is added, so that exchanges of different width may be
 # under way at the same time.
@@ -95,10 +95,13 @@ class GhostExchange:
         First number owned by each rank, and the end.
     ghosts : (n_ghosts,) int
         Numbers of this rank's ghosts, ascending, so that those of one owner are neighbours.
+    tag : int
+        First of a hundred tags of its messages: exchanges that may be under way at the same time differ in it.
     """
 
-    def __init__(self, comm: MPI.Comm, starts: np.ndarray, ghosts: np.ndarray) -> None:
+    def __init__(self, comm: MPI.Comm, starts: np.ndarray, ghosts: np.ndarray, tag: int = _TAG) -> None:
         self._comm = comm
+        self._tag = tag
         self._n_owned = int(starts[comm.rank + 1] - starts[comm.rank])
         self._n_ghosts = len(ghosts)
         owners = np.searchsorted(starts, ghosts, side="right") - 1
@@ -115,24 +118,60 @@ class GhostExchange:
         """Ranks that send rows to this one or receive rows from it."""
         return len({rank for rank, _, _ in self._leaving} | {rank for rank, _, _ in self._arriving})
 
-    def begin(self, array: np.ndarray) -> None:
-        """Start to bring the owned rows of ``array`` (n_local, k) float64 to their ghosts elsewhere."""
-        if not self._leaving and not self._arriving:
-            return
-        width = array.size // array.shape[0]
-        buffers = self._buffers.get(width)
-        if buffers is None:
-            buffers = self._prepare(array, width)
+    @property
+    def rows(self) -> np.ndarray:
+        """Owned rows that other ranks hold as ghosts, in the order in which they are sent; those of several repeat."""
+        return self._rows
+
+    @property
+    def alone(self) -> bool:
+        """Whether this rank sends nothing and receives nothing."""
+        return not self._leaving and not self._arriving
+
+    def leaving(self, width: int) -> np.ndarray:
+        """Where the values (rows, width) of :attr:`rows` are to be put for :meth:`bring`."""
+        if width not in self._buffers:
+            self._prepare(width)
+        return self._buffers[width].leaving
+
+    def bring(self, leaving: np.ndarray) -> np.ndarray:
+        """Send values (rows, k) float64 of :attr:`rows` where they are ghosts; gives those of the ghosts (ghosts, k).
+
+        What it gives is overwritten by the next call of this width.
+        """
+        if self.alone:
+            return np.empty((0, leaving.shape[1]))
+        buffers = self._begin(leaving.shape[1])
+        if leaving is not buffers.leaving:
+            buffers.leaving[:] = leaving
+        MPI.Prequest.Startall(buffers.requests)
+        MPI.Request.Waitall(buffers.requests)
+        self._busy.discard(leaving.shape[1])
+        return buffers.arriving
+
+    def _begin(self, width: int) -> _Buffers:
         if width in self._busy:
             raise RuntimeError(f"an update of ghosts with {width} columns is already under way: end it first")
         self._busy.add(width)
+        if width not in self._buffers:
+            self._prepare(width)
+        return self._buffers[width]
+
+    def begin(self, array: np.ndarray) -> None:
+        """Start to bring the owned rows of ``array`` (n_local, k) float64 to their ghosts elsewhere."""
+        if self.alone:
+            return
+        width = array.size // array.shape[0]
+        if width not in self._buffers:
+            self._check(array)
+        buffers = self._begin(width)
         # mode="clip": with the default, numpy fills a temporary array first. The rows are known to be in range.
         np.take(array.reshape(-1, width), self._rows, axis=0, out=buffers.leaving, mode="clip")
         MPI.Prequest.Startall(buffers.requests)
 
     def end(self, array: np.ndarray) -> None:
         """Wait for what :meth:`begin` started, and fill the ghost rows of ``array``."""
-        if not self._leaving and not self._arriving:
+        if self.alone:
             return
         width = array.size // array.shape[0]
         buffers = self._buffers[width]
@@ -152,18 +191,38 @@ class GhostExchange:
                 request.Free()
         self._buffers.clear()
 
-    def _prepare(self, array: np.ndarray, width: int) -> _Buffers:
+    def _check(self, array: np.ndarray) -> None:
         if array.dtype != np.float64 or not array.flags.c_contiguous or len(array) != self._n_owned + self._n_ghosts:
             raise ValueError(
                 f"ghosts are updated in C-contiguous float64 arrays of {self._n_owned + self._n_ghosts} rows, "
                 f"not in {array.dtype} {array.shape}"
             )
+
+    def _prepare(self, width: int) -> None:
         leaving = np.empty((len(self._rows), width))
         arriving = np.empty((self._n_ghosts, width))
-        requests = [self._comm.Recv_init(arriving[a:b], rank, _TAG + width) for rank, a, b in self._arriving]
-        requests += [self._comm.Send_init(leaving[a:b], rank, _TAG + width) for rank, a, b in self._leaving]
+        tag = self._tag + width
+        requests = [self._comm.Recv_init(arriving[a:b], rank, tag) for rank, a, b in self._arriving]
+        requests += [self._comm.Send_init(leaving[a:b], rank, tag) for rank, a, b in self._leaving]
         self._buffers[width] = _Buffers(leaving, arriving, requests)
-        return self._buffers[width]
+
+
+def swap(comm: MPI.Comm, ranks: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Rows (n, k) float64 that other ranks have for those sent to them; only the ranks named here meet.
+
+    Row i goes to rank ``ranks[i]``, which sends as many rows to this rank, and in the same order.
+    """
+    order = np.argsort(ranks, kind="stable")
+    there, counts = np.unique(ranks, return_counts=True)
+    leaving, ends = np.ascontiguousarray(rows[order]), np.cumsum(counts)
+    arriving = np.empty_like(leaving)
+    parts = [(int(rank), slice(end - count, end)) for rank, count, end in zip(there, counts, ends, strict=True)]
+    requests = [comm.Irecv(arriving[part], rank, _TAG - 1) for rank, part in parts]
+    requests += [comm.Isend(leaving[part], rank, _TAG - 1) for rank, part in parts]
+    MPI.Request.Waitall(requests)
+    result = np.empty_like(arriving)
+    result[order] = arriving
+    return result
 
 
 def _neighbours(counts: np.ndarray) -> list[tuple[int, int, int]]:

@@ -66,4 +66,4 @@ WALL = Places(
     ]
 )
 
-PAIR = Places([("impulse", 3), ("jump_impulse", 3)])
+PAIR = Places([("force", 3), ("impulse", 3), ("jump_impulse", 3)])

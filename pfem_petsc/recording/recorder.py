@@ -57,7 +57,7 @@ class Recorder:
         self.columns |= {name: shape for name, shape, _ in contact_columns(self.model.contact)}
         self.types |= {name: kind for name, _, kind in contact_columns(self.model.contact) if kind is not float}
         for name in self.model.links.columns:
-            self.columns |= {f"{name}/{what}": (3,) for what in ("force", *PAIR.sizes)}
+            self.columns |= {f"{name}/{what}": (3,) for what in PAIR.sizes}
         self.probe_nodes: dict[str, np.ndarray] = {}
         self._probes: list[tuple[str, np.ndarray, np.ndarray]] = []
         for probe in case.output.probe:
@@ -162,10 +162,8 @@ class Recorder:
         if self._contact.size:
             self._contact.put(sums[walls:links], state.time, vector[begin : begin + self._contact.width])
             begin += self._contact.width
-        width = 3 + PAIR.width
-        columns = vector[begin : begin + width * len(self.model.links.columns)].reshape(-1, width)
-        columns[:, :3] = self.model.links.totals()
-        columns[:, 3:] = sums[links:probes].reshape(-1, PAIR.width)
-        begin += columns.size
+        width = PAIR.width * len(self.model.links.columns)
+        vector[begin : begin + width] = sums[links:probes]
+        begin += width
         vector[begin:] = sums[probes:]
         return vector

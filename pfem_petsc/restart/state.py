@@ -10,12 +10,12 @@ Where what decides is kept: positions, velocities, accelerations, forces and the
 treatment of impact changed are part of it): arrays of the state. Who touches walls, nodes held in the last step, place
 of the kept preconditioner: arrays of the stepper. Level of halving, part and smallest part of the step, counts of the
 kept preconditioner: its numbers. What laws keep, thermal strains, history of the kept preconditioner: arrays of the
-bars. Walls with mass: ``free_walls``, their last increment included. Forces of links: by their keys, as ``pairs``.
-Works and energies: ``ranks``. Energy at the start, the largest energy, iterations since the last row: the recorder's.
-Rows seen, strange ones and energy put in: ``blow_up``. Contact times and impulses: the contact log's. Time step and
-linear solver: the plan in the attributes. Newton's method, Krylov methods, candidates for contact and friction begin
-anew each step. What goes with the clock (meetings, progress, wall time) begins anew with each run, and decides nothing
-of the results.
+bars. Walls with mass: ``free_walls``, their last increment included. Forces of constraints: by their key. Forces of
+pairs, and which of them have met: arrays of their second nodes. Works and energies: ``ranks``. Energy at the start, the
+largest energy, iterations since the last row: the recorder's. Rows seen, strange ones and energy put in: ``blow_up``.
+Contact times and impulses: the contact log's. Time step and linear solver: the plan in the attributes. Newton's method,
+Krylov methods, candidates for contact and friction begin anew each step. What goes with the clock (meetings, progress,
+wall time) begins anew with each run, and decides nothing of the results.
 """
 
 from __future__ import annotations
@@ -99,7 +99,6 @@ class RunState:
             "free_walls": self.model.contact.motion.kept(),
             "contact_times": self.model.contact.log.times(self.comm),
             "row": {name: float(row[name]) for name in ("energy_imbalance", "active_contacts", "step")},
-            "closed_pairs": ledger.impacts.closed_pairs.tolist(),
             "snapshot": snapshot,
             "node_arrays": sorted(set().union(*self.comm.allgather(set(self._node_arrays())))),
             "memories": memories,
@@ -117,6 +116,7 @@ class RunState:
         """Set the stepper to what a checkpoint holds; instead of its ``start``. Collective."""
         stepper, state, owned = self.stepper, self.stepper.state, self.model.mesh.n_owned
         scalars = checkpoint.scalars
+        links = self.model.links.arrays()
         for name in scalars["node_arrays"]:
             values = checkpoint.arrays[name]
             if name.startswith(_MEMORY):
@@ -124,6 +124,8 @@ class RunState:
             elif name.startswith(_KEPT):
                 name = name.removeprefix(_KEPT)
                 setattr(stepper, name, values.astype(getattr(stepper, name).dtype))
+            elif name in links:
+                self.model.links.put_back(name, values)
             elif name in ("x", "f"):
                 getattr(state, name)[:owned] = values
             else:
@@ -152,7 +154,6 @@ class RunState:
         """Set ledger, recorder and watch, made after :meth:`put_back`; gives what is known of the last row."""
         scalars = checkpoint.scalars
         ledger.put_back(self._share(scalars["ranks"])["ledger"])
-        ledger.impacts.closed_pairs[:] = scalars["closed_pairs"]
         recorder.iterations = [int(n) for n in scalars["iterations"]]
         recorder.start_energy = scalars["start_energy"]
         recorder.energy_scale = scalars["energy_scale"]
@@ -175,6 +176,7 @@ class RunState:
                 found[item.name] = value[:owned]
         found |= {_MEMORY + name: array for name, array in state.memory.items()}
         found |= {_KEPT + name: _numbers(getattr(self.stepper, name)) for name in self.stepper.kept_arrays}
+        found |= self.model.links.arrays()
         # a case without walls has no columns for them
         return {name: array for name, array in found.items() if 0 not in array.shape[1:]}
 

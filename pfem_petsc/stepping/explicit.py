@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import numpy as np
 
 from ..errors import SimulationFailure
@@ -38,6 +41,15 @@ class ExplicitStepper(Stepper):
         a[self.model.supports.fixed] = 0.0
         return a
 
+    @contextmanager
+    def _faults(self, balance: Balance) -> Iterator[None]:
+        """Keep the first failure of this rank, until all ranks meet."""
+        try:
+            yield
+        except SimulationFailure as failure:
+            if self.fault is None:
+                self.fault = SimulationFailure(f"{self.when(balance)}: {failure}")
+
     def solve(self, balance: Balance) -> Solution:
         model, state = self.model, self.state
         inertia = model.inertia
@@ -61,19 +73,18 @@ class ExplicitStepper(Stepper):
             positions = supports.positions(balance.time)
             hold(supports.nodes, supports.components, positions, balance.predictor, stiffness, u, load)
         walls, held, tolerance = model.contact.nothing, self._nobody, 1e-13 * model.length
-        try:
+        with self._faults(balance):
             state.contact = model.links.explicit(balance, state, u, stiffness, self.zero, tolerance)
-            if model.contact.any:
+        if model.contact.any:
+            # also where links have failed: walls with mass have all ranks solve for them
+            with self._faults(balance):
                 nodes, force, walls = model.contact.explicit(balance.predictor, u, stiffness, balance.time, tolerance)
                 if len(nodes):
                     if state.contact is self.zero:
                         state.contact = np.zeros_like(u)
                     state.contact[nodes] += force
                 held = nodes
-            held = model.links.held(held)
-        except SimulationFailure as failure:
-            if self.fault is None:
-                self.fault = SimulationFailure(f"{self.when(balance)}: {failure}")
+        held = model.links.held(held)
         if supports.any:
             state.support = np.zeros_like(u)
             react(supports.nodes, supports.components, load, state.contact, stiffness, u, state.support)

@@ -81,7 +81,6 @@ class Impulses:
         rows = self.jumps + self.n_walls + self.n_links
         self.state = State(*(np.zeros((rows, 3)) for _ in range(7)))
         self.force = np.zeros((rows, 3))
-        self._first = model.comm.rank == 0
 
     def start(self, totals: np.ndarray) -> None:
         """Begin, from this rank's sums (3, 3) of support, external and damping force at the start [N]."""
@@ -93,8 +92,7 @@ class Impulses:
         """Put forces into :attr:`force`: totals (3, 3), of walls (walls, 3), of links' tables (tables, 3) [N]."""
         self.force[:WALLS] = totals
         self.force[WALLS : WALLS + self.n_walls] = walls
-        if self._first:  # all ranks know them
-            self.force[WALLS + self.n_walls : self.jumps] = links
+        self.force[WALLS + self.n_walls : self.jumps] = links
         return self.force
 
     def step(self, totals: np.ndarray) -> None:
@@ -149,7 +147,8 @@ class Impulses:
         share[:, WALL["jump_impulse"]] = self.state.v[self.jumps : self.jumps + self.n_walls]
 
     def fill_links(self, share: np.ndarray) -> None:
-        """The same of links, into (tables, width of PAIR)."""
+        """The same of links, into (tables, width of PAIR), and their forces in the last step."""
+        share[:, PAIR["force"]] = self.links.totals()
         share[:, PAIR["impulse"]] = self.state.v[WALLS + self.n_walls : self.jumps]
         share[:, PAIR["jump_impulse"]] = self.state.v[self.jumps + self.n_walls :]
 

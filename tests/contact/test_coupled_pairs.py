@@ -122,11 +122,15 @@ def test_every_step_is_optimal_on_ranks(name, comm, shared_tmp_path):
 
 
 @pytest.mark.parallel
-def test_no_room(comm, shared_tmp_path):
+@pytest.mark.parametrize("heavy", [False, True], ids=["alone", "beside a wall with mass"])
+def test_no_room(heavy, comm, shared_tmp_path):
     """A wall that drives the first body's face into the second one's, which another wall holds."""
     walls = planes([[1.0, 0.0, 0.0]], [0.09], node_set="left") + planes([[-1.0, 0, 0]], [-0.106], node_set="right")
     walls[0]["velocity"] = [1.0, 0.0, 0.0]
+    if heavy:  # for which all ranks solve, while only some find no room
+        walls += planes([[1.0, 0.0, 0.0]], [-1.0], node_set="rear", mass=1.0)
     case = crowded(walls, shared_tmp_path / "m.vtu", velocity=(0.0, 0.0, 0.0), direction=(1.0, 0.0, 0.0))
+    case["node_set"]["rear"] = {"indices": [0]}
     with pytest.raises(SimulationFailure, match=r"step \d+, t = .* s: no positions of nodes \d+.* satisfy") as failure:
         simulation(case, comm, shared_tmp_path).run()
     assert comm.allgather(str(failure.value)) == [str(failure.value)] * comm.size

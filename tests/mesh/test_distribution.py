@@ -4,6 +4,7 @@ from helpers.gathered import slab_from, whole
 
 from pfem_petsc.errors import InputError
 from pfem_petsc.mesh.distribution import distribute
+from pfem_petsc.mesh.exchange import swap
 from pfem_petsc.mesh.generators import lattice, rod
 from pfem_petsc.mesh.ordering import hilbert_keys, sweep_keys
 
@@ -209,3 +210,21 @@ def test_widths_of_one_row_arrays_on_one_rank():
     assert (block.section, block.start, block.counted, block.stop) == (2, 0, 9, 9)
     mesh.update_ghosts(mesh.points)
     assert mesh.n_neighbours == 0
+
+
+def test_values_of_ghosts_can_be_brought_alone(case):
+    _, _, mesh = case
+    exchange = mesh._exchange
+    own = mesh.points[: mesh.n_owned]
+    for _ in range(2):
+        np.testing.assert_array_equal(exchange.bring(own[exchange.rows]), mesh.points[mesh.n_owned :])
+
+
+def test_rows_are_swapped(comm):
+    """Each two ranks send each other as many rows as their numbers say, in an order of their own."""
+    ranks = np.repeat(np.arange(comm.size), comm.rank + np.arange(comm.size) + 1)
+    ranks = np.random.default_rng(comm.rank).permutation(ranks)
+    place = np.array([np.sum(ranks[:k] == rank) for k, rank in enumerate(ranks)])
+    rows = np.column_stack([np.full(len(ranks), comm.rank), ranks, place]).astype(float)
+    expected = np.column_stack([ranks, np.full(len(ranks), comm.rank), place])
+    np.testing.assert_array_equal(swap(comm, ranks, rows), expected)

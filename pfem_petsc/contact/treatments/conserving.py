@@ -46,7 +46,7 @@ class Treatment(Base):
         state, pairs = self.stepper.state, self.stepper.model.pairs
         debt = state.memory.setdefault("contact_debt", np.zeros_like(state.v))
         nodes, v, a = self._off_walls(debt)
-        if pairs is not None and pairs.force.any():
+        if pairs is not None and pairs.any_pressed():
             ends, apart, free = self._apart(debt)
             nodes, v, a = np.append(nodes, ends), np.vstack([v, apart]), np.vstack([a, free])
         if len(nodes):

@@ -13,6 +13,7 @@ with e times the velocity of its approach, and loses (1 - e^2) of that energy: s
 from __future__ import annotations
 
 import numpy as np
+from mpi4py import MPI
 
 from ..restitution import Treatment as Restitution
 
@@ -30,7 +31,7 @@ class Treatment(Restitution):
         super().before()
         state, pairs = self.stepper.state, self.stepper.model.pairs
         self._pressed = None
-        if self._frees and pairs is not None and pairs.force.any():
+        if self._frees and pairs is not None and pairs.any_pressed():
             change = state.memory.get("contact_change", 0.0)
             ends = pairs.gather(np.concatenate([state.contact + change, state.position], axis=1))
             force = 0.5 * pairs.distances(ends[:, :, :3])  # half of what the ends bear against each other
@@ -42,7 +43,7 @@ class Treatment(Restitution):
         state = self.stepper.state
         nodes, v, a = self.on_walls()
         pairs, mass = self.stepper.model.pairs, self.stepper.model.inertia.mass
-        if pairs is not None and pairs.force.any():
+        if pairs is not None and pairs.any_pressed():
             ends, _ = pairs.pressed()
             nodes = np.append(nodes, ends)
             v = np.vstack([v, pairs.together(state.v, mass)[ends]])
@@ -60,7 +61,7 @@ class Treatment(Restitution):
         state, pairs, mass = self.stepper.state, self.stepper.model.pairs, self.stepper.model.inertia.mass
         pressed, force, before = self._pressed
         gone = pressed & ~(pairs.force > 0.0)
-        if not gone.any():
+        if not self.stepper.model.comm.allreduce(bool(gone.any()), op=MPI.LOR):
             return np.empty(0, dtype=np.int64), np.empty((0, 3))
         ends = pairs.gather(np.concatenate([state.position, state.v], axis=1))
         work = 0.5 * force * (pairs.distances(ends[:, :, :3]) - before)

@@ -1,0 +1,129 @@
+"""Which pairs of nodes a rank has: those of its own nodes, and what hangs together with them.
+
+The tables of a case are matched among the ranks (:mod:`~pfem_petsc.contact.matching`), so that the owner of a second
+node learns of its first one. The owner of that is told. Where a node is in several pairs, all ranks that own a node of
+such a group have the whole group.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from mpi4py import MPI
+
+from ..errors import InputError
+from ..mesh.exchange import GhostExchange, Router
+from ..mesh.slab import slab_of
+from .matching import nearest_among_ranks
+
+__all__ = ["PairNodes", "find_pairs"]
+
+_TAG = 7500  # of the messages between partners, apart from those of the mesh's ghosts
+_TABLE, _SECOND, _SECOND_AT, _FIRST, _FIRST_AT = range(5)  # columns of pairs: mesh and PETSc numbers
+
+
+@dataclass(frozen=True)
+class PairNodes:
+    """The pairs of this rank, by table and then by the mesh number of the second node.
+
+    Attributes
+    ----------
+    table : (p,) index of a pair's table
+    numbers : (2, p) mesh numbers of the first and second ends
+    where : (2, p) local index of an end that this rank owns, else -1 less its row among those that others own
+    owners : (p,) rank of the second end where the first one is here, else of the first
+    partners : brings values of ends that others own
+    """
+
+    table: np.ndarray
+    numbers: np.ndarray
+    where: np.ndarray
+    owners: np.ndarray
+    partners: GhostExchange
+
+
+def find_pairs(case, nodes: dict[str, np.ndarray], mesh) -> PairNodes:
+    """Match the tables of a case. Collective.
+
+    Raises
+    ------
+    InputError
+        On all ranks: sets of unequal size, nodes that are paired with themselves, or two with one.
+    """
+    comm = mesh.comm
+    starts = np.concatenate([[0], np.cumsum(comm.allgather(mesh.n_owned))]).astype(np.int64)
+    found = np.concatenate([_match(case, k, nodes, mesh) for k in range(len(case.contact_pair))])
+    _refuse_itself(found, case.source, comm)
+    # of each pair the owner of the first node is told; rows that both have are the same ones
+    owner = np.searchsorted(starts, found[:, _FIRST_AT], side="right") - 1
+    away = owner != comm.rank
+    pairs = _sorted(np.concatenate([found, Router(comm, owner[away]).send(found[away])]))
+    pairs = _with_groups(pairs, starts, comm)
+    first, last = starts[comm.rank], starts[comm.rank + 1]
+    at = pairs[:, [_FIRST_AT, _SECOND_AT]].T
+    mine = (at >= first) & (at < last)
+    ghosts = np.unique(at[~mine])
+    where = np.where(mine, at - first, -1 - np.searchsorted(ghosts, at))
+    numbers = np.ascontiguousarray(pairs[:, [_FIRST, _SECOND]].T)
+    owners = np.searchsorted(starts, at, side="right") - 1
+    partners = GhostExchange(comm, starts, ghosts, _TAG)
+    return PairNodes(pairs[:, _TABLE].copy(), numbers, where, np.where(mine[0], owners[1], owners[0]), partners)
+
+
+def _match(case, index: int, nodes: dict[str, np.ndarray], mesh) -> np.ndarray:
+    """Rows of a table's pairs (m, 5): each second node of this rank with the first one nearest to it."""
+    pair, comm = case.contact_pair[index], mesh.comm
+    key = f"{case.source}: contact_pair {pair.name!r}"
+    normal = np.array(pair.direction) / np.linalg.norm(pair.direction)
+    first, second = nodes[pair.first], nodes[pair.second]
+    counts = np.array([len(first), len(second)])
+    comm.Allreduce(MPI.IN_PLACE, counts)
+    if counts[0] != counts[1]:
+        raise InputError(f"{key}: first has {counts[0]} nodes and second {counts[1]}: they cannot be paired")
+    if counts[0] == 0:
+        return np.empty((0, 5), dtype=np.int64)
+    ends = [np.column_stack([mesh.node_ids[some], mesh.first_node + some.astype(np.int64)]) for some in (first, second)]
+    nearest = nearest_among_ranks(comm, ends[0], mesh.points[first], mesh.points[second], normal)
+    met = np.sort(Router(comm, slab_of(nearest[:, 0], mesh.n_nodes, comm.size)).send(nearest[:, 0]))
+    if comm.allreduce(bool((np.diff(met) == 0).any()), op=MPI.LOR):
+        raise InputError(f"{key}: two nodes of second are nearest to the same node of first, seen along the direction")
+    return np.column_stack([np.full(len(second), index), ends[1], nearest])
+
+
+def _refuse_itself(pairs: np.ndarray, source: str, comm: MPI.Comm) -> None:
+    same = pairs[pairs[:, _FIRST] == pairs[:, _SECOND]]
+    lowest = min(comm.allgather(tuple(same[:, [_TABLE, _FIRST]].min(axis=0).tolist()) if len(same) else (np.inf,)))
+    if len(lowest) > 1:
+        raise InputError(f"{source}: contact_pair: node {lowest[1]} is paired with itself")
+
+
+def _sorted(pairs: np.ndarray) -> np.ndarray:
+    """Each pair once, in their order."""
+    return np.unique(pairs, axis=0)
+
+
+def _with_groups(pairs: np.ndarray, starts: np.ndarray, comm: MPI.Comm) -> np.ndarray:
+    """Add the pairs that share nodes with those of this rank, and so on, until no rank learns of more. Collective."""
+    own = pairs
+    order = [np.argsort(own[:, at], kind="stable") for at in (_FIRST_AT, _SECOND_AT)]
+    first, last = starts[comm.rank], starts[comm.rank + 1]
+    known = np.empty(0, dtype=np.int64)
+    while True:
+        ends = np.unique(pairs[:, [_FIRST_AT, _SECOND_AT]])
+        asked = np.setdiff1d(ends[(ends < first) | (ends >= last)], known)
+        if comm.allreduce(len(asked), op=MPI.MAX) == 0:
+            return pairs
+        known = np.union1d(known, asked)
+        asking = Router(comm, np.searchsorted(starts, asked, side="right") - 1)
+        wanted = asking.send(np.column_stack([asked, np.full(len(asked), comm.rank)]))
+        answers, ranks = [], []
+        for column, rows in zip((_FIRST_AT, _SECOND_AT), order, strict=True):
+            keys = own[rows, column]
+            begin = np.searchsorted(keys, wanted[:, 0])
+            count = np.searchsorted(keys, wanted[:, 0], side="right") - begin
+            place = np.arange(count.sum()) + np.repeat(begin - np.cumsum(count) + count, count)
+            answers.append(own[rows[place]])
+            ranks.append(np.repeat(wanted[:, 1], count))
+        answer = Router(comm, np.concatenate(ranks)).send(np.concatenate(answers))
+        pairs = _sorted(np.concatenate([pairs, answer]))

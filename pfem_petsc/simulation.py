@@ -29,6 +29,7 @@ from .stepping.batch import WORTH, Batches
 from .stepping.model import Model
 from .stepping.prepare import make_plan
 from .stepping.time_stepping import TimeStepping
+from .tolerances import TIME
 
 __all__ = ["Simulation", "Step"]
 
@@ -266,7 +267,7 @@ class Simulation:
         """
         if self.finished and self.comm.rank == 0 and not self.quiet:
             end = self.plan.step * self.plan.steps
-            beyond = f", beyond time.end = {engineering(end, 's')}" if self._reached > end * (1.0 + 1e-9) else ""
+            beyond = f", beyond time.end = {engineering(end, 's')}" if self._reached > end * (1.0 + TIME) else ""
             print(f"{self.folder}: finished already: the results have t = {engineering(self._reached, 's')}{beyond}")
         for _ in self.batches():
             pass

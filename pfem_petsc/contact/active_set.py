@@ -18,6 +18,7 @@ from mpi4py import MPI
 
 from ..errors import NotConverged
 from ..integrators.base import Balance, State
+from ..tolerances import BEYOND, ON_BOUND, PROJECTED
 from .bounds import Bounds
 from .candidates import Candidates, expected_candidates
 from .forces import WallForces
@@ -101,7 +102,7 @@ class ActiveSet:
         kind = NoStepFriction if self.contact.symmetric else StepFriction
         self.friction = kind(model, state, balance)
         self.candidates = expected_candidates(model, state, balance, held, self._shifts)
-        move, slack = (balance.time - state.time) * state.v, 1e-9 * model.length
+        move, slack = (balance.time - state.time) * state.v, BEYOND * model.length
         self._all_links = tuple(links)
         self.links = tuple(link for link in links if link.reached(state, move, slack))
 
@@ -137,7 +138,7 @@ class ActiveSet:
         at = frames.nodes
         x = self.balance.predictor[at] + u[at]
         moved, multipliers = x.copy(), np.zeros(frames.offsets.shape)
-        project(moved, fixed[at], frames.normals, frames.offsets, 1e-13 * self.model.length, multipliers)
+        project(moved, fixed[at], frames.normals, frames.offsets, PROJECTED * self.model.length, multipliers)
         u[at] += moved - x
         tied, _, places = trial.tied
         nodes = at[tied]
@@ -199,7 +200,7 @@ class ActiveSet:
         """
         contact, frames, candidates = self.contact, trial.frames, trial.candidates
         x, at = self.balance.predictor + u, trial.candidates.nodes
-        slack = 1e-12 * self.model.length
+        slack = ON_BOUND * self.model.length
         settled, links, g = self._check_links(trial, bounds, w, x, g, noise, slack)
         normal_forces, pull = np.zeros((len(at), len(contact.walls))), np.where(contact.fixed[at], 0.0, g[at])
         if not contact.any:
@@ -217,7 +218,7 @@ class ActiveSet:
             self._iterations += 1
             if self._iterations >= _ITERATIONS:
                 raise NotConverged(f"{self._when()}: {self._why(left, x)}")
-            rank = 1e-13 * self.model.length
+            rank = PROJECTED * self.model.length
             candidates = candidates.join(contact, self._shifts, joined, broken, x, normal_forces, rank)
             settled = False
         return Outcome(settled, candidates, links, trial, normal_forces, pull)

@@ -13,15 +13,9 @@ import numpy as np
 from mpi4py import MPI
 
 from ..errors import SimulationFailure
+from ..tolerances import BEYOND, FREE_PART
 
-__all__ = ["TOLERANCE", "check_positions"]
-
-TOLERANCE = 1e-9
-"""Depth over the model's size (extent, or distance from the origin where that is more) that counts as being on the
-wall: 4e6 times rounding. Steps keep walls to 1e-12; walls that are almost parallel, walls with mass and nodes tied to
-one wall and carried along another to 1e-9; losses of contact seen are from 1e-4 on."""
-
-_THIN = 1e-12  # squared length of a normal's free part below which supports alone decide
+__all__ = ["check_positions"]
 
 
 def check_positions(stepper) -> None:
@@ -48,7 +42,7 @@ def check_positions(stepper) -> None:
         x, time = balance.predictor + stepper.solution.u, balance.time
     gaps = contact.gaps(x, time)
     gaps[:, [wall.partial for wall in contact.walls]] = np.inf
-    tolerance = TOLERANCE * max(model.length, model.reach)
+    tolerance = BEYOND * max(model.length, model.reach)
     # NaN is no number that a wall could be kept with, but has its own message
     suspects = np.flatnonzero((gaps < -tolerance).any(axis=1))
     if comm.allreduce(len(suspects), op=MPI.MAX) == 0:
@@ -83,4 +77,4 @@ def _prescribed(contact, node: int, wall: int, x: np.ndarray, time: float) -> bo
         return True
     normals, _ = contact.planes(np.ones((1, len(contact.walls)), dtype=bool), x[[node]], contact.motion.shifts(time))
     free = np.where(contact.fixed[node], 0.0, normals[0, wall])
-    return bool(free @ free <= _THIN)
+    return bool(free @ free <= FREE_PART)

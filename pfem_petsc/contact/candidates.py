@@ -8,6 +8,7 @@ import numpy as np
 from mpi4py import MPI
 
 from ..integrators.base import Balance, State
+from ..tolerances import BEYOND
 
 __all__ = ["Candidates", "expected_candidates"]
 
@@ -78,7 +79,7 @@ def expected_candidates(model, state: State, balance: Balance, held: np.ndarray,
     if not contact.any:
         return nobody
     move = (balance.time - state.time) * state.v
-    reach = 0.5 * np.linalg.norm(move, axis=1) + 1e-9 * model.length
+    reach = 0.5 * np.linalg.norm(move, axis=1) + BEYOND * model.length
     near = held | contact.near(state.position + move, shifts, reach) | contact.ties.held
     if model.comm.allreduce(int(near.any()), op=MPI.MAX) == 0:
         return nobody
@@ -91,7 +92,7 @@ def _within_reach(model, state: State, nodes, x, shifts, reach) -> np.ndarray:
     contact = model.contact
     concerned = contact.concerned(nodes, x, shifts)
     within = np.zeros_like(concerned)
-    starts = state.position[nodes], contact.motion.shifts(state.time), 1e-9 * model.length
+    starts = state.position[nodes], contact.motion.shifts(state.time), BEYOND * model.length
     for place, there, distance in ((x, shifts, reach[:, None]), starts):
         normals, offsets = contact.planes(concerned, place, there)
         within |= np.einsum("mwi,mi->mw", normals, place) - offsets < distance

@@ -11,10 +11,9 @@ import math
 import numpy as np
 
 from ..mechanics.compiled import kernel
+from ..tolerances import FREE_PART, SINGULAR_ROW
 
 __all__ = ["complementary", "solve_groups"]
-
-_THIN = 1e-12  # squared length of a constraint's free part below which supports alone decide
 
 
 @kernel
@@ -85,7 +84,7 @@ def _complementary(matrix, values, tolerance, z):
             gain = matrix[row, row]
             for a in range(count):
                 gain -= matrix[row, active[a]] * lost[a]
-            full = -least / gain if gain > 1e-10 * matrix[row, row] else math.inf
+            full = -least / gain if gain > SINGULAR_ROW * matrix[row, row] else math.inf
             part = math.inf
             out = -1
             for a in range(count):
@@ -168,7 +167,7 @@ def solve_groups(
                 soft_second += forth * forth / stiffness[j]
                 distance += pair_normals[p, c] * (x[j, c] - x[i, c])
             soft = soft_first + soft_second
-            settled = square > _THIN and least[p] > -math.inf and soft > 0.0
+            settled = square > FREE_PART and least[p] > -math.inf and soft > 0.0
             strength = 0.0
             if settled and distance - least[p] < -tolerance:
                 strength = -(distance - least[p]) / soft
@@ -186,7 +185,7 @@ def solve_groups(
                         wall_square += part**2
                         along += part * sign * pair_normals[p, c] / stiffness[node_here]
                     broken = gap < -tolerance or gap + along * strength < -tolerance
-                    if wall_square > _THIN and (broken or gap != gap):
+                    if wall_square > FREE_PART and (broken or gap != gap):
                         settled = False
             if settled:
                 force[p] = strength
@@ -209,7 +208,7 @@ def solve_groups(
                 vector[n, 1, c] = pair_normals[p, c] * free[j, c]
                 square += vector[n, 0, c] ** 2 + vector[n, 1, c] ** 2
                 distance += pair_normals[p, c] * (x[j, c] - x[i, c])
-            if square > _THIN:
+            if square > FREE_PART:
                 node[n, 0], node[n, 1] = i, j
                 value[n] = distance - least[p]
                 pair[n] = p
@@ -234,7 +233,7 @@ def solve_groups(
                         vector[n, 1, c] = 0.0
                         square += vector[n, 0, c] ** 2
                         distance += normals[at, k, c] * x[i, c]
-                    if square > _THIN:
+                    if square > FREE_PART:
                         node[n, 0], node[n, 1] = i, -1
                         value[n] = distance - offsets[at, k]
                         pair[n] = -1

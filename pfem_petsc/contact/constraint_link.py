@@ -12,6 +12,7 @@ import numpy as np
 from ..errors import InputError
 from ..integrators.base import Balance, State
 from ..registry import lookup
+from ..tolerances import ON_BOUND
 from .row_coordinates import RowCoordinates
 from .rows import Rows
 
@@ -125,7 +126,7 @@ class ConstraintLink:
             )
         points = rows.gather(model.mesh.points[: model.mesh.n_owned])
         values = rows.values(points)
-        if len(values) and not values.min() >= -1e-12 * model.length:
+        if len(values) and not values.min() >= -ON_BOUND * model.length:
             row = int(np.argmin(values))
             at = ", ".join(str(n) for n in rows.numbers[rows.entry_node[rows.entry_row == row]])
             raise InputError(

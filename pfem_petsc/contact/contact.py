@@ -10,6 +10,7 @@ from mpi4py import MPI
 from ..errors import InputError, SimulationFailure
 from ..parallel.agreement import agreed
 from ..registry import lookup
+from ..tolerances import BEYOND, ON_BOUND
 from .explicit import ExplicitContact
 from .forces import WallForces
 from .frames import MIN_VOLUME, NodalFrames, build_frames
@@ -173,7 +174,7 @@ class Contact:
             if len(gaps):
                 at = int(np.argmin(gaps[:, k]))
                 deepest, node = float(gaps[at, k]), int(self.mesh.node_ids[at])
-                count = int((gaps[:, k] < -1e-12 * length).sum())
+                count = int((gaps[:, k] < -ON_BOUND * length).sum())
             depth, node = min(comm.allgather((deepest, node)))
             count = comm.allreduce(count)
             if count:
@@ -195,7 +196,7 @@ class Contact:
                 if wall.partial:
                     # a node that the wall held may be beyond it by what the scheme makes of the balance
                     held = state.contact[nodes] @ wall.normal > 0.0
-                    slack = np.where(held, 0.1 * wall.half.min(), 1e-9 * self.length)
+                    slack = np.where(held, 0.1 * wall.half.min(), BEYOND * self.length)
                     concerned[:, k] &= wall.stops(before - earlier[k], x - shifts[k], slack)
         return concerned
 
@@ -274,7 +275,7 @@ class Contact:
         normals, offsets = self.planes(concerned, at, self.motion.shifts(time))
         if rank is None:
             rank = np.einsum("iwk,ik->iw", normals, at) - offsets
-        tolerance = 1e-12 * self.length
+        tolerance = ON_BOUND * self.length
         frames = build_frames(candidates, self.fixed[candidates], normals, offsets, rank, tolerance, at, least)
         with agreed(self.mesh.comm):
             if frames.contradiction >= 0:
@@ -301,7 +302,7 @@ class Contact:
             touching = (row >= 0) & (active[every, safe] == -sign)
             # of walls that share a row and are not quite parallel one is nearer
             bound = np.where(sign > 0.0, frames.lower[every, safe], frames.upper[every, safe])
-            touching &= sign * (bound - frames.bounds[:, k]) <= 1e-12 * self.length
+            touching &= sign * (bound - frames.bounds[:, k]) <= ON_BOUND * self.length
             strengths[touching, k] = np.abs(left[every[touching], safe[touching]])
             left[every[touching], safe[touching]] = 0.0  # walls that share a bound: the first takes the force
         return strengths

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..errors import SimulationFailure
+from ..tolerances import FIXED_POINT, PROJECTED, RANK
 from .flat import press_planes
 from .forces import WallForces
 from .friction import add_friction
@@ -82,7 +83,7 @@ class ExplicitContact:
             if self.contact.ties.any:
                 touching = touching & ~self.contact.ties.held[nodes][:, None]
             active = np.where(touching[:, :, None] & ~self.contact.fixed[nodes][:, None, :], normals, 0.0)
-            inverse = np.linalg.pinv(active, rcond=1e-8) if len(nodes) else np.zeros((0, 3, len(self.contact.walls)))
+            inverse = np.linalg.pinv(active, rcond=RANK) if len(nodes) else np.zeros((0, 3, len(self.contact.walls)))
             weight = stiffness[nodes][:, None] * (inverse * inverse).sum(axis=1)  # k (N N^T)^-1 on its diagonal
             slope = np.einsum("mw,mwi,mwj->wij", np.where(touching, weight, 0.0), normals, normals)
             if self.contact.ties.any:
@@ -91,7 +92,7 @@ class ExplicitContact:
                 np.add.at(slope, at, gives[:, :, None] * np.eye(3))
             return walls.force[free.at], slope[free.at]
 
-        free.solve(forces, 1e-15 * self.contact.length)
+        free.solve(forces, FIXED_POINT * self.contact.length)
         if failure is not None:
             raise failure
 
@@ -214,7 +215,7 @@ class ExplicitContact:
         before, fixed = state.position[nodes], self.contact.fixed[nodes]
         normals, offsets = planes
         concerned = offsets > -np.inf
-        tolerance = 1e-13 * self.contact.length
+        tolerance = PROJECTED * self.contact.length
         for _ in range(_CURVED_ROUNDS):
             at, pressing, drag = moved.copy(), strength.copy(), np.zeros(normals.shape)
             unsettled = add_friction(

@@ -16,10 +16,9 @@ import numpy as np
 from mpi4py import MPI
 
 from ..mechanics.compiled import kernel
+from ..tolerances import ON_BOUND
 
 __all__ = ["Impacts", "join_nodes", "plane_gaps", "stop_nodes", "unpressed"]
-
-_SLACK = 1e-12  # of the model's length: farther off, a node has left its wall
 
 
 @kernel
@@ -167,7 +166,7 @@ class Impacts:
         if free is not None:
             self.counted[free.at] = False
         self._free_rates = free.state.v if free is not None else None  # at the start of the step
-        self.slack = _SLACK * self.model.length
+        self.slack = ON_BOUND * self.model.length
         treatment = stepper.treatment
         # nothing is lost where nodes have no mass along the normal, or where a treatment takes the work back
         self.elastic = treatment is not None and treatment.elastic

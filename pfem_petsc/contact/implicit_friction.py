@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..tolerances import ON_BOUND, PROJECTED
 from .friction import add_friction
 from .jamming import jam
 from .projection import project
@@ -158,7 +159,7 @@ class StepFriction:
         fixed, normals, offsets = contact.fixed[nodes], frames.normals[at], frames.offsets[at]
         moved = x - np.where(fixed, 0.0, reaction) / stiffness[:, None]
         pressing, drag = np.zeros(offsets.shape), np.zeros(normals.shape)
-        project(moved, fixed, normals, offsets, 1e-13 * contact.length, pressing)
+        project(moved, fixed, normals, offsets, PROJECTED * contact.length, pressing)
         pressing *= stiffness[:, None]
         for group, static in ((slipping, contact.friction), (~slipping, contact.static_friction)):
             part = np.flatnonzero(group)
@@ -226,7 +227,7 @@ class StepFriction:
         place += (frames.offsets[at, wall] - np.einsum("ki,ki->k", n, place))[:, None] * n
         held = np.einsum("kij,kj->ki", frames.basis[at], place)
         which = ~self.contact.fixed[nodes] & (np.arange(3) != row[:, None])
-        slack = 1e-12 * self.contact.length
+        slack = ON_BOUND * self.contact.length
         fits = (held >= frames.lower[at] - slack) & (held <= frames.upper[at] + slack)
         # another wall pushes it along, or its wall has no row: it cannot stick
         possible = (fits | ~which).all(axis=1) & (row >= 0)

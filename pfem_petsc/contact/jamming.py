@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import numpy as np
 
-__all__ = ["jam"]
+from ..tolerances import FREE_PART
 
-_THIN = 1e-12  # squared length of a normal's free part below which supports alone decide
+__all__ = ["jam"]
 
 
 def jam(contact, node: int, normals: np.ndarray) -> str:
@@ -28,7 +28,7 @@ def jam(contact, node: int, normals: np.ndarray) -> str:
         return ""
     square = (np.where(fixed, 0.0, normals) ** 2).sum(axis=1)
     least = np.sqrt(square / np.maximum(1.0 - square, 1e-300))
-    jams = contact.members[node] & (square > _THIN) & (contact.static_friction >= least)
+    jams = contact.members[node] & (square > FREE_PART) & (contact.static_friction >= least)
     if not jams.any():
         return ""
     wall = int(np.flatnonzero(jams)[0])

@@ -21,6 +21,7 @@ from mpi4py import MPI
 from ..errors import InputError
 from ..mesh.exchange import swap
 from ..parallel.agreement import agreed
+from ..tolerances import ON_BOUND
 from .coupled import CoupledPairs
 from .pair_loops import leaving_rows, move_nodes, needed_forces, part_nodes, pressed_nodes, push_nodes, table_forces
 from .pair_search import find_pairs
@@ -109,7 +110,7 @@ class ContactPairs:
         pair = int(np.argmin(distance)) if len(distance) else -1
         deepest = (np.inf,) if pair < 0 else (float(distance[pair]), int(self.table[pair]), *self.numbers(pair))
         deepest = min(self.mesh.comm.allgather(deepest))
-        if deepest[0] < -1e-12 * length:
+        if deepest[0] < -ON_BOUND * length:
             distance, table, second, first = deepest
             raise InputError(
                 f"{source}: contact_pair {self.names[table]!r}: nodes {first} and "

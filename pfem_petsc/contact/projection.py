@@ -14,10 +14,9 @@ import math
 import numpy as np
 
 from ..mechanics.compiled import kernel
+from ..tolerances import FREE_PART, SINGULAR_ROW
 
 __all__ = ["project"]
-
-_THIN = 1e-12  # squared length of a normal's free part below which supports alone decide
 
 
 @kernel
@@ -29,7 +28,7 @@ def _solve(gram, rhs, n, factor, out):
             for k in range(j):
                 s -= factor[i, k] * factor[j, k]
             if i == j:
-                if s <= 1e-10 * gram[i, i]:
+                if s <= SINGULAR_ROW * gram[i, i]:
                     return False
                 factor[i, i] = math.sqrt(s)
             else:
@@ -152,7 +151,7 @@ def project(x, fixed, normals, offsets, tolerance, multipliers):
                 free[k, c] = 0.0 if fixed[i, c] else normals[i, k, c]
                 length += free[k, c] * free[k, c]
             gap[k] = g
-            usable[k] = length > _THIN and g < math.inf
+            usable[k] = length > FREE_PART and g < math.inf
             if usable[k] and g < 0.0:
                 among[count] = k
                 count += 1

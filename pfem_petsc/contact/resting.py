@@ -16,6 +16,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from ..tolerances import ON_BOUND
 from .forces import WallForces
 from .friction import add_friction
 from .projection import project
@@ -23,7 +24,6 @@ from .projection import project
 __all__ = ["start_at_rest"]
 
 _ROUNDS = 60  # each at least halves the error
-_SLACK = 1e-12  # of lengths and wave speeds: strains that rounding makes
 _FAST = 1e16  # by so much a velocity that decides over the direction of slip is above an acceleration
 
 
@@ -47,13 +47,13 @@ def start_at_rest(model, state, accelerate: Callable[[np.ndarray], np.ndarray], 
     contact, comm, mass = model.contact, model.comm, model.inertia.mass
     x, v = state.position, state.v
     shifts, rates = contact.motion.shifts(state.time), contact.motion.rates(state.time, ahead=True)
-    slack = _SLACK * model.length
+    slack = ON_BOUND * model.length
     nodes = np.flatnonzero(contact.near(x, shifts, np.array([slack])))
     concerned = contact.members[nodes]
     normals, offsets = contact.planes(concerned, x[nodes], shifts)
     gaps = np.einsum("mwi,mi->mw", normals, x[nodes]) - offsets
     away = np.einsum("mwi,mwi->mw", normals, v[nodes][:, None, :] - rates)
-    resting = concerned & (np.abs(gaps) <= slack) & (np.abs(away) <= _SLACK * model.wave_speed)
+    resting = concerned & (np.abs(gaps) <= slack) & (np.abs(away) <= ON_BOUND * model.wave_speed)
     resting[:, [wall.partial for wall in contact.walls]] = False  # beside it, its plane goes on
     resting[:, contact.motion.bodies.at] = False  # these give way
     kept = resting.any(axis=1)
@@ -64,7 +64,7 @@ def start_at_rest(model, state, accelerate: Callable[[np.ndarray], np.ndarray], 
     share = 0.5 if model.inertia.consistent else 1.0
     weight = share * mass[nodes]
     links = model.links
-    closed = links.resting(x, v, slack, _SLACK * model.wave_speed)
+    closed = links.resting(x, v, slack, ON_BOUND * model.wave_speed)
     held = np.zeros(contact.members.shape, dtype=bool)
     held[nodes] = resting
 
@@ -82,7 +82,7 @@ def start_at_rest(model, state, accelerate: Callable[[np.ndarray], np.ndarray], 
         moved = free.copy()
         project(moved, fixed, normals, planes, 0.0, strengths)
         if contact.rough:
-            slack = _SLACK * model.wave_speed
+            slack = ON_BOUND * model.wave_speed
             strengths *= weight[:, None]
             _rub(contact, nodes, v, rates, accelerations, slack, weight, moved, normals, planes, strengths, drag)
             strengths /= weight[:, None]

@@ -18,6 +18,7 @@ from petsc4py import PETSc
 
 from ..errors import NotConverged
 from ..integrators.base import Balance, State
+from ..tolerances import PROJECTED
 from .frames import NodalFrames
 from .links import BlocksOf
 
@@ -125,7 +126,7 @@ class RowCoordinates:
         rows, here = self.rows, self.rows.here
         planes = np.zeros((len(rows.numbers), 0, 3)), np.zeros((len(rows.numbers), 0))
         k = rows.gather(stiffness)
-        tolerance = 1e-13 * self.link.contact.length
+        tolerance = PROJECTED * self.link.contact.length
         force, jacobian = rows.project(rows.gather(predictor + u), k, self._start, planes, tolerance)
         u[here] += (rows.forces(jacobian, force) * rows.free / k[:, None])[rows.mine]
 

@@ -18,12 +18,12 @@ import numpy as np
 from mpi4py import MPI
 
 from ..errors import SimulationFailure
+from ..tolerances import FREE_PART
 from .constraints.base import Constraint
 from .coupled import complementary
 
 __all__ = ["Group", "Rows"]
 
-_THIN = 1e-12  # squared length of a row's free part below which supports alone decide
 _ITERATIONS = 100  # of rows and positions
 
 
@@ -139,7 +139,7 @@ class Rows:
 
     def usable(self, jacobian: np.ndarray) -> np.ndarray:
         """(r,) bool: rows whose nodes supports leave free to keep them."""
-        return self.along(jacobian**2, self.free) > _THIN
+        return self.along(jacobian**2, self.free) > FREE_PART
 
     def solve(
         self,
@@ -177,7 +177,7 @@ class Rows:
             kept = values[group.rows] < np.inf
             rows = np.concatenate([group.dense(jacobian)[kept], walls]) * self.free[group.nodes]
             at = np.append(values[group.rows[kept]], gaps[group.nodes[node], wall])
-            usable = (rows**2).sum(axis=(1, 2)) > _THIN
+            usable = (rows**2).sum(axis=(1, 2)) > FREE_PART
             flat = (rows[usable] / np.sqrt(stiffness[group.nodes])[None, :, None]).reshape(int(usable.sum()), -1)
             found = complementary(flat @ flat.T, at[usable], tolerance)
             if found is None:

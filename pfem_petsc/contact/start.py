@@ -6,6 +6,7 @@ import numpy as np
 
 from ..errors import InputError, SimulationFailure
 from ..parallel.agreement import agreed
+from ..tolerances import BEYOND, PROJECTED
 from .contact import Contact
 
 __all__ = ["adjust_start"]
@@ -35,7 +36,7 @@ def adjust_start(case, nodes: dict[str, np.ndarray], mesh) -> int:
     moved = np.empty(0, dtype=np.int64)
     with agreed(mesh.comm):
         try:
-            moved, *_ = contact.explicit(points, way, np.ones(owned), 0.0, 1e-13 * contact.length)
+            moved, *_ = contact.explicit(points, way, np.ones(owned), 0.0, PROJECTED * contact.length)
         except SimulationFailure as failure:
             raise InputError(f"{case.source}: wall.adjust: {failure}") from failure
     points += way
@@ -43,7 +44,7 @@ def adjust_start(case, nodes: dict[str, np.ndarray], mesh) -> int:
     a, b = mesh.bars.T
     length = np.linalg.norm(mesh.points[b] - mesh.points[a], axis=1)
     with agreed(mesh.comm):
-        if len(length) and length.min() <= 1e-9 * contact.length:
+        if len(length) and length.min() <= BEYOND * contact.length:
             bar = int(np.argmin(length))
             ends = mesh.node_ids[[a[bar], b[bar]]]
             raise InputError(

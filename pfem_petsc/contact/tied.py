@@ -13,13 +13,12 @@ import numpy as np
 
 from ..errors import SimulationFailure
 from ..parallel.agreement import agreed
+from ..tolerances import BEYOND, FREE_PART
 
 __all__ = ["FreshTies", "NoTies", "Ties"]
 
 FreshTies = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Nodes (k,) tied in a step, their walls (k,), and the walls' normals there (k, 3)."""
-
-_SLACK = 1e-9  # of the model's length: how far beyond another wall a tied node may be carried
 
 
 class Ties:
@@ -119,15 +118,15 @@ class Ties:
         concerned[np.arange(len(nodes)), walls] = partly
         normals, offsets = contact.planes(concerned, places, shifts)
         gaps = np.einsum("mwi,mi->mw", normals, places) - offsets
-        gaps[(np.where(contact.fixed[nodes][:, None, :], 0.0, normals) ** 2).sum(axis=2) <= 1e-12] = np.inf
+        gaps[(np.where(contact.fixed[nodes][:, None, :], 0.0, normals) ** 2).sum(axis=2) <= FREE_PART] = np.inf
         node, other = np.unravel_index(np.argmin(gaps), gaps.shape)
-        if gaps[node, other] < -_SLACK * contact.length and other == walls[node]:
+        if gaps[node, other] < -BEYOND * contact.length and other == walls[node]:
             raise SimulationFailure(
                 f"node {contact.mesh.node_ids[nodes[node]]} is tied to wall {contact.names[other]!r} and its supports "
                 f"carry it {-gaps[node, other]:.3g} m beyond the wall; free these components, move the wall with the "
                 "supports, or do not tie the node"
             )
-        if gaps[node, other] < -_SLACK * contact.length:
+        if gaps[node, other] < -BEYOND * contact.length:
             raise SimulationFailure(
                 f"node {contact.mesh.node_ids[nodes[node]]}, tied to wall {contact.names[walls[node]]!r}, is carried "
                 f"{-gaps[node, other]:.3g} m beyond wall {contact.names[other]!r}; keep the walls "

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..tolerances import FREE_PART, ON_BOUND
 from .candidates import Candidates
 from .frames import NodalFrames
 
@@ -35,7 +36,7 @@ def broken_walls(
     place = place[known]
     broken[known] &= (frames.rows[place] < 0) | frames.shared[place]
     broken &= ~contact.ties.held[beyond][:, None]
-    degenerate = (np.where(contact.fixed[beyond][:, None, :], 0.0, normals) ** 2).sum(axis=2) <= 1e-12
+    degenerate = (np.where(contact.fixed[beyond][:, None, :], 0.0, normals) ** 2).sum(axis=2) <= FREE_PART
     broken &= ~degenerate
     met = broken.any(axis=1)
     return beyond[met], broken[met]
@@ -50,7 +51,7 @@ def is_misaligned(frames: NodalFrames, strengths: np.ndarray) -> bool:
         turn = np.abs(
             frames.normals[node, wall] - frames.signs[node, wall] * frames.basis[node, frames.rows[node, wall]]
         )
-        if turn.max() > 1e-12 and not (pressing[node] & own).any():
+        if turn.max() > ON_BOUND and not (pressing[node] & own).any():
             return True
     return False
 
@@ -72,6 +73,6 @@ def is_off_surface(
             place = x[at[pressed]] - shifts[k]
             normals, offsets = contact.walls[k].planes(place)
             gap = np.einsum("ij,ij->i", normals, place) - offsets
-            if np.abs(gap).max() > tolerance or np.abs(normals - frames.normals[pressed, k]).max() > 1e-12:
+            if np.abs(gap).max() > tolerance or np.abs(normals - frames.normals[pressed, k]).max() > ON_BOUND:
                 return True
     return False

@@ -16,6 +16,7 @@ from ..output.integrity import check_seal
 from ..output.units import engineering
 from ..output.verify import examine
 from ..parallel.agreement import on_root
+from ..tolerances import TIME
 from .compare import changed_keys, check_version
 
 __all__ = ["RESULT", "Restart", "find_restart", "finished", "prepare_folder"]
@@ -102,7 +103,7 @@ def _finished(case, path: Path, end: float) -> float | None:
     except InputError:
         # of another case, or not readable: it is moved aside
         return None
-    return max(reached) if reached and min(reached) >= end * (1.0 - 1e-9) else None
+    return max(reached) if reached and min(reached) >= end * (1.0 - TIME) else None
 
 
 def _continues(folder: Path, path: Path) -> bool:

@@ -12,6 +12,7 @@ import numpy as np
 from petsc4py import PETSc
 
 from ..errors import InputError
+from ..tolerances import ROUNDING
 from .lagged import LaggedPreconditioner, Preconditioning
 from .linear import LinearChoice, configure
 from .matrix import HessianMatrix
@@ -26,7 +27,7 @@ _STAGNATION = 100.0  # a residual within this many rounding floors that no longe
 
 def zero_tolerance(length: float) -> float:
     """Distance to a bound [m] that counts as on it, for a model of an extent [m]: rounding of a position."""
-    return 1e-14 * length
+    return ROUNDING * length
 
 
 class Problem(Protocol):

@@ -9,6 +9,7 @@ from ..energies import ENERGIES
 from ..errors import SimulationFailure
 from ..mechanics.bars import StrainEnergy
 from ..output.sums import HEAD, WALL
+from ..tolerances import PROJECTED
 from .march import make_march
 from .march_arrays import BarArrays, Buffers, ImpulseArrays, NodeArrays, ProbeArrays, WallArrays
 from .stepper import Solution
@@ -53,7 +54,7 @@ class Batch:
         room = np.empty(len(inertia.mass), dtype=np.int64)
         work = (room, log.touching, log.present, log.releases)
         impact = (stepper.closed, contact.restitution, ledger.impacts.slack)
-        self._walls = WallArrays(*walls, 1e-13 * model.length, *work, *impact)
+        self._walls = WallArrays(*walls, PROJECTED * model.length, *work, *impact)
         self._probes = ProbeArrays(*recorder.probed())
         self.sums = np.zeros((MOST, recorder.width))
         self._spare = [np.zeros_like(stepper.state.v) for _ in range(4)]

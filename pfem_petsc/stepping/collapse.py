@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..output.units import engineering
+from ..tolerances import TIME
 
 __all__ = ["tell_collapse"]
 
@@ -18,7 +19,7 @@ def tell_collapse(stepper, bar: int) -> str:
     mesh = model.mesh
     a, b = mesh.bars[bar]
     # the step is counted when it is complete, its time is set on arrival
-    step = state.step + (state.time > (state.step + 1e-9) * stepper.h)
+    step = state.step + (state.time > (state.step + TIME) * stepper.h)
     when = f"step {step}, t = {state.time:.6g} s"
     name = f"bar {mesh.bar_ids[bar]} between nodes {mesh.node_ids[a]} and {mesh.node_ids[b]}"
     way = state.x[b] - state.x[a]

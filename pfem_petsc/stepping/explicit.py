@@ -9,6 +9,7 @@ import numpy as np
 
 from ..errors import SimulationFailure
 from ..integrators.base import Balance
+from ..tolerances import PROJECTED
 from .node_loops import explicit_increments, hold, react
 from .stepper import Solution, Stepper
 
@@ -72,7 +73,7 @@ class ExplicitStepper(Stepper):
             load = np.empty(len(supports.nodes))
             positions = supports.positions(balance.time)
             hold(supports.nodes, supports.components, positions, balance.predictor, stiffness, u, load)
-        walls, held, tolerance = model.contact.nothing, self._nobody, 1e-13 * model.length
+        walls, held, tolerance = model.contact.nothing, self._nobody, PROJECTED * model.length
         with self._faults(balance):
             state.contact = model.links.explicit(balance, state, u, stiffness, self.zero, tolerance)
         if model.contact.any:

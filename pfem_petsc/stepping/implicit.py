@@ -20,6 +20,7 @@ from ..solvers.mass import MassSolver
 from ..solvers.matrix import HessianMatrix
 from ..solvers.matrix_free import MatrixFreeHessian
 from ..solvers.newton import NewtonReport, NewtonSolver, zero_tolerance
+from ..tolerances import ON_BOUND
 from .guard import StepGuard
 from .problem import StepProblem
 from .stepper import Solution, Stepper
@@ -194,7 +195,7 @@ class ImplicitStepper(Stepper):
             found.append(self._solve(balance, found[-1].u if found else guess))
             return found[-1].walls.force[bodies.at], None
 
-        bodies.solve(forces, 1e-12 * self.model.length)
+        bodies.solve(forces, ON_BOUND * self.model.length)
         newton, linear = sum(s.newton for s in found), sum(s.linear for s in found)
         return replace(found[-1], newton=newton, linear=linear)
 

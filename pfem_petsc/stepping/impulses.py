@@ -21,6 +21,7 @@ import numpy as np
 from ..integrators.base import State
 from ..mechanics.compiled import kernel
 from ..output.sums import HEAD, PAIR, WALL
+from ..tolerances import RANK
 
 __all__ = ["DAMPING", "EXTERNAL", "SUPPORT", "WALLS", "Impulses", "fill_impulses", "wall_shares"]
 
@@ -54,7 +55,7 @@ def wall_shares(stepper, nodes: np.ndarray, jumps: np.ndarray) -> np.ndarray:
         shifts = contact.motion.shifts(stepper.state.time)
         normals, _ = contact.planes(touching[several], stepper.state.position[at], shifts)
         normals = np.where(touching[several][:, :, None], normals, 0.0)
-        parts = np.einsum("miw,mi->mw", np.linalg.pinv(normals, rcond=1e-8), jumps[several])
+        parts = np.einsum("miw,mi->mw", np.linalg.pinv(normals, rcond=RANK), jumps[several])
         own = parts[:, :, None] * normals
         rest = jumps[several] - own.sum(axis=1)
         count = touching[several].sum(axis=1)[:, None, None]

@@ -6,6 +6,7 @@ import numpy as np
 from mpi4py import MPI
 
 from ..contact.forces import WallForces
+from ..tolerances import ON_BOUND, ROUNDING
 
 __all__ = ["MasslessNodes"]
 
@@ -59,7 +60,7 @@ class MasslessNodes:
             # a bar square to the normal may leave the place open that a force of rounding decides over
             open_way = np.minimum(np.abs(step), np.abs(force) / elastic)
             largest = model.comm.allreduce(float(open_way.max(initial=0.0)), op=MPI.MAX)
-            if largest <= 1e-14 * model.length:
+            if largest <= ROUNDING * model.length:
                 break
         model.mesh.update_ghosts(x)
         if model.temperatures.varying:
@@ -79,7 +80,7 @@ class MasslessNodes:
         moved, contact = self.moved, self.model.contact
         n, nodes = moved.normals, moved.nodes
         strength = -np.einsum("mi,mi->m", load[nodes], n)
-        touching = self.gaps(x, time) <= 1e-12 * self.model.length
+        touching = self.gaps(x, time) <= ON_BOUND * self.model.length
         strength = np.where(touching, np.maximum(strength, 0.0), 0.0) / moved.across
         full = contact.normals[moved.walls]
         force = np.zeros_like(load)

@@ -16,6 +16,7 @@ from ..errors import InputError
 from ..integrators.base import Scheme
 from ..registry import choices, lookup
 from ..solvers.linear import LinearChoice, choose_linear
+from ..tolerances import TIME
 from .contact_check import warn_of_gain
 from .explicit import ExplicitStepper
 from .implicit import ImplicitStepper
@@ -107,13 +108,13 @@ def make_plan(model, recorded: Mapping[str, Any] | None = None) -> Plan:
         step = time.end / steps
     else:
         step = float(time.step)
-        if step > certain * (1.0 + 1e-9):
+        if step > certain * (1.0 + TIME):
             raise InputError(
                 f"{case.source}: time.step = {step:g} s is above the limit of {time.integrator}, which is unstable "
                 f'beyond {critical:.6g} s for this model; reduce it, or use time.step = "auto"'
             )
         steps = _steps_to(time.end, step, case.source)
-        if step > time.end * (1.0 + 1e-9):
+        if step > time.end * (1.0 + TIME):
             model.warnings.append(
                 f"time.step = {step:g} s is longer than time.end = {time.end:g} s: the run makes one step, "
                 f"to t = {step:g} s"

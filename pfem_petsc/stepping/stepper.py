@@ -13,6 +13,7 @@ from ..contact.resting import start_at_rest
 from ..errors import SimulationFailure
 from ..integrators.base import Balance, Scheme, State
 from ..mechanics.bars import StrainEnergy
+from ..tolerances import BEYOND
 from .collapse import tell_collapse
 from .massless import MasslessNodes
 from .prescribed import PrescribedMotion
@@ -118,7 +119,7 @@ class Stepper(ABC):
         if supports.any:
             state.position[supports.at] = supports.positions(0.0)
             state.v[supports.at] = supports.rates(0.0, 0.0)[0]
-        if self.massless is not None and self.massless.settle(state.x, 0.0, 0.0) > 1e-9 * model.length:
+        if self.massless is not None and self.massless.settle(state.x, 0.0, 0.0) > BEYOND * model.length:
             self.fault = SimulationFailure(
                 "step 0, t = 0 s: contact nodes without mass found no equilibrium; take another contact.treatment"
             )

@@ -5,8 +5,9 @@ import re
 import pytest
 
 from pfem_petsc import Case, Simulation
-from pfem_petsc.contact.alarm import TOLERANCE, check_positions
+from pfem_petsc.contact.alarm import check_positions
 from pfem_petsc.errors import SimulationFailure
+from pfem_petsc.tolerances import BEYOND
 
 
 def run(comm, folder, *keys):
@@ -25,7 +26,7 @@ def test_a_node_beyond_a_wall_is_an_error(scheme, comm, shared_tmp_path):
     tip = simulation.model.nodes["tip"]
     where = stepper.state.position if stepper.scheme.solves_end else stepper.balance.predictor
     solved = where if stepper.scheme.solves_end else where + stepper.solution.u
-    where[tip, 0] += 1.05 - solved[tip, 0] + 0.5 * TOLERANCE
+    where[tip, 0] += 1.05 - solved[tip, 0] + 0.5 * BEYOND
     check_positions(stepper)
     where[tip, 0] += 2e-3
     with pytest.raises(SimulationFailure) as failure:

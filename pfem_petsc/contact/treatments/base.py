@@ -11,10 +11,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ...integrators.base import Scheme
+from ...tolerances import FREE_PART, RANK
 
 __all__ = ["Jump", "Treatment"]
-
-_THIN = 1e-12  # squared length of a normal's free part below which supports alone decide
 
 
 @dataclass
@@ -94,8 +93,8 @@ class Treatment(ABC):
         normals = np.where(touching[:, :, None], normals, 0.0)
         # the normals' pseudo-inverse serves any number of walls at a node, parallel ones too
         free = np.where(stepper.model.supports.fixed[nodes][:, None, :], 0.0, normals)
-        free[(free * free).sum(axis=2) <= _THIN] = 0.0
-        inverse = np.linalg.pinv(free, rcond=1e-8) if len(nodes) else np.zeros((0, 3, normals.shape[1]))
+        free[(free * free).sum(axis=2) <= FREE_PART] = 0.0
+        inverse = np.linalg.pinv(free, rcond=RANK) if len(nodes) else np.zeros((0, 3, normals.shape[1]))
         rates = contact.motion.rates(stepper.state.time)
         away = np.einsum("mwi,wi->mw", normals, rates) + self.leaving(nodes, touching, normals, rates)
         speeds = np.einsum("miw,mw->mi", inverse, away)

@@ -17,12 +17,11 @@ import numpy as np
 from ...errors import InputError
 from ...integrators.base import Scheme
 from ...parallel.agreement import agreed
+from ...tolerances import FREE_PART
 from .base import Jump
 from .base import Treatment as Base
 
 __all__ = ["Redistribution", "Treatment", "redistribute"]
-
-_THIN = 1e-12  # squared length of a normal's free part below which supports alone decide
 
 
 class Redistribution:
@@ -133,7 +132,7 @@ def _movable(contact) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     # the whole normal as it is: its last digits decide nothing, but results stay what they were
     free = np.where(contact.fixed[nodes].any(axis=1)[:, None], free, normals)
     across = np.sqrt((free * free).sum(axis=1))
-    can = across**2 > _THIN
+    can = across**2 > FREE_PART
     return nodes[can], walls[can], free[can] / across[can, None], across[can]
 
 

@@ -28,7 +28,7 @@ from pfem_petsc.errors import InputError, SimulationFailure
 from pfem_petsc.registry import lookup
 from pfem_petsc.stepping.contact_check import BOUND, contact_gain, overshoots
 from pfem_petsc.stepping.model import Model
-from pfem_petsc.stepping.prepare import CONSERVING, make_plan, make_stepper
+from pfem_petsc.stepping.prepare import make_plan, make_stepper
 
 DOCS = Path(__file__).parent.parent / "docs"
 START, END = "<!-- table: scripts/impact_phases.py -->\n", "<!-- end of phases -->"
@@ -203,10 +203,10 @@ def judged(
     module = lookup("pfem_petsc.integrators", integrator, "")
     known = module.Parameters(**parameters)
     scheme = module.Scheme(known)
-    if treatment == "conserving" and integrator not in CONSERVING:
-        return None
-    if treatment == "mass_redistribution" and scheme.explicit and not scheme.leads:
-        return None
+    if treatment != "scheme":
+        refuses = lookup("pfem_petsc.contact.treatments", treatment, "").Treatment.refuses
+        if refuses(scheme) is not None:
+            return None
     asked = Asked(treatment, mass == "consistent", step, restitution)
     found = scan_impacts(scheme, asked)
     warned = contact_gain(integrator, known.model_dump_json(), asked) > BOUND or overshoots(integrator, step)

@@ -59,6 +59,10 @@ class ConstraintLink:
         self.rows = Rows(sources, mesh, fixed)
         self.release()
 
+    @property
+    def numbers(self) -> np.ndarray:
+        return self.rows.numbers
+
     def release(self) -> None:
         """No row presses."""
         self.force = np.zeros(len(self.rows.source))
@@ -113,9 +117,9 @@ class ConstraintLink:
         key, rows, walls = f"{self.source}: constraint", self.rows, self.contact
         if model.case.contact.treatment != "scheme":
             raise InputError(f'{key}: constraints need contact.treatment = "scheme"')
-        pairs = set() if model.pairs is None else {*model.pairs.first.tolist(), *model.pairs.second.tolist()}
-        both = pairs.intersection(rows.numbers.tolist())
-        if model.mesh.comm.allreduce(len(both)):
+        others = [link.numbers for link in model.links if link is not self]
+        both = sum(np.isin(rows.numbers, numbers).sum() for numbers in others)
+        if model.mesh.comm.allreduce(int(both)):
             raise InputError(f"{key}: a node is in a contact_pair as well as in a constraint; use one of them")
         met = rows.mesh.comm.allreduce(walls.members[rows.here].sum(axis=0)) > 0
         special = walls.special & met

@@ -28,10 +28,12 @@ class Link(Protocol):
     ----------
     key : under which checkpoints hold its forces
     columns : of its tables in the history, like ``pair/NAME``
+    numbers : mesh numbers of the nodes of its rows, at least of those whose nodes this rank owns
     """
 
     key: str
     columns: list[str]
+    numbers: np.ndarray
 
     def explicit(self, balance: Balance, state: State, u, stiffness, contact, tolerance: float) -> None:
         """Correct the increments ``u`` (owned, 3) of a step in which each node is solved on its own. Collective.

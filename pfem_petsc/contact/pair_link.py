@@ -26,6 +26,11 @@ class PairLink:
         self.pairs = pairs
         self.columns = [f"pair/{name}" for name in pairs.names]
 
+    @property
+    def numbers(self) -> np.ndarray:
+        """See :class:`~pfem_petsc.contact.links.Link`."""
+        return np.append(self.pairs.first, self.pairs.second)
+
     def explicit(self, balance: Balance, state: State, u, stiffness, contact, tolerance: float) -> None:
         """See :class:`~pfem_petsc.contact.links.Link`, here and below."""
         self.pairs.explicit(balance.predictor, u, stiffness, contact, balance.time, tolerance)

@@ -109,8 +109,7 @@ class Ties:
         partly = contact.fixed[nodes].any(axis=1)
         if len(contact.walls) == 1 and not partly.any():
             return
-        if contact.motion.free is not None:
-            partly &= ~np.isin(walls, contact.motion.free.at)  # whose place may be a trial
+        partly &= ~np.isin(walls, contact.motion.bodies.at)  # whose place may be a trial
         if len(nodes) == 0:
             return
         shifts = contact.motion.shifts(time)

@@ -5,11 +5,8 @@ from __future__ import annotations
 import numpy as np
 from mpi4py import MPI
 
-from ..contact.constraint_link import ConstraintLink
 from ..contact.contact import Contact
-from ..contact.links import Link, Links
-from ..contact.pair_link import PairLink
-from ..contact.pairs import ContactPairs
+from ..contact.sources import make_links
 from ..contact.start import adjust_start
 from ..errors import InputError
 from ..mechanics.bars import Bars, section_of_bars
@@ -73,14 +70,7 @@ class Model:
             self.supports = Supports(case, self.nodes, mesh)
             self.temperatures = Temperatures(case, mesh, self.bars)
         self.contact = Contact(case, self.nodes, mesh, self.supports.fixed)
-        self.pairs = None
-        if case.contact_pair:
-            self.pairs = ContactPairs(case, self.nodes, mesh, self.supports.fixed, self.contact)
-
-        links: list[Link] = [] if self.pairs is None else [PairLink(self.pairs)]
-        if case.constraint:
-            links.append(ConstraintLink(case, self.nodes, mesh, self.supports.fixed, self.contact))
-        self.links = Links(links)
+        self.links, self.pairs = make_links(case, self.nodes, mesh, self.supports.fixed, self.contact)
         self.can_touch = self.contact.any or bool(self.links)
 
         points = mesh.points[: mesh.n_owned]

@@ -1,0 +1,40 @@
+"""The links of a case: what its tables name that couples nodes to nodes. The one place that knows which there are."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .constraint_link import ConstraintLink
+from .links import Link, Links
+from .pair_link import PairLink
+from .pairs import ContactPairs
+
+__all__ = ["make_links"]
+
+
+def make_links(
+    case, nodes: dict[str, np.ndarray], mesh, fixed: np.ndarray, contact
+) -> tuple[Links, ContactPairs | None]:
+    """All links in the order in which a step takes them, and the contact pairs among them. Collective.
+
+    Parameters
+    ----------
+    case : Case
+    nodes : owned local indices of each node set
+    mesh : Mesh
+    fixed : (owned, 3) bool, prescribed components
+    contact : Contact
+
+    Raises
+    ------
+    InputError
+        On all ranks: nodes that cannot be paired, or a constraint that refuses its keys.
+    """
+    links: list[Link] = []
+    pairs = None
+    if case.contact_pair:
+        pairs = ContactPairs(case, nodes, mesh, fixed, contact)
+        links.append(PairLink(pairs))
+    if case.constraint:
+        links.append(ConstraintLink(case, nodes, mesh, fixed, contact))
+    return Links(links), pairs

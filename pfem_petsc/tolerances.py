@@ -34,8 +34,8 @@ ON_BOUND = 1e-12
 ten times what a projection leaves"""
 BEYOND = 1e-9
 """of L: how far a node may be beyond a wall before it is a failure, 4e6 roundings, and how much farther than a step
-takes it a node looks for walls. Steps keep walls to 1e-12; walls that are almost parallel, walls with mass and nodes tied to
-one wall and carried along another to 1e-9; losses of contact that were seen are from 1e-4 on"""
+takes it a node looks for walls. Steps keep walls to 1e-12; walls that are almost parallel, walls with mass and nodes
+tied to one wall and carried along another to 1e-9; losses of contact that were seen are from 1e-4 on"""
 
 FREE_PART = 1e-12
 """squared length of the part of a unit direction that supports leave free: below it, supports alone decide there. The

@@ -11,7 +11,7 @@ import pytest
 PACKAGE = Path(__file__).resolve().parent.parent / "pfem_petsc"
 
 FLOORS = (
-    ("energies", "errors", "fields", "signals"),
+    ("energies", "errors", "fields", "signals", "tolerances"),
     ("registry",),
     ("parallel",),
     ("case", "cases"),

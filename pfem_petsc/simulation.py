@@ -15,7 +15,7 @@ from .errors import EarlyStop, InputError, PfemError
 from .output.lock import FolderLock
 from .output.units import engineering
 from .parallel.agreement import on_root
-from .parallel.petsc_log import lay_over, staged
+from .parallel.petsc_log import instrument, staged
 from .preflight.forecast import forecast
 from .preflight.inspection import inspect, warnings_before
 from .preflight.summary import summarise
@@ -25,7 +25,7 @@ from .run.compilation import ReportedCompilation
 from .run.outputs import Outputs
 from .run.stop import StopRequest
 from .run.synchroniser import Synchroniser
-from .stepping.batch import WORTH, Batches
+from .stepping.fused_steps import WORTH, Batches
 from .stepping.model import Model
 from .stepping.prepare import make_plan
 from .stepping.time_stepping import TimeStepping
@@ -197,7 +197,7 @@ class Simulation:
             on_root(self.comm, self._lock.take)
             self._stop.watch()
             self.outputs.open(self.restart, self.notes)
-            lay_over(self)
+            instrument(self)
             self.outputs.record_start()
         except PfemError:
             self._finish("failed")
@@ -211,16 +211,16 @@ class Simulation:
         with self._compilation:
             yield from self._steps()
 
-    def batches(self, worth: int = WORTH) -> Iterator[Step]:
+    def batches(self, min_steps: int = WORTH) -> Iterator[Step]:
         """Run as iteration does, but give only some of the steps: those between may be made by one compiled call.
 
-        ``worth``: steps of a run for which that call is compiled, which takes some seconds when it is first met.
+        ``min_steps``: steps of a run for which that call is compiled, which takes some seconds when it is first met.
         """
         self._usable()
         if self.finished:
             return
         with self._compilation:
-            yield from self._steps(Batches(worth))
+            yield from self._steps(Batches(min_steps))
 
     def _steps(self, batches: Batches | None = None) -> Iterator[Step]:
         if self._started and not self.outputs.is_open and self.state.step < self.plan.steps:

@@ -60,14 +60,14 @@ def advance(scheme: Scheme, state: State, h: float, held: bool) -> None:
 
     The balance is solved as the program does: M a + (1 - w) f(x0) + w f(x) = 0, or x = 0.
     """
-    if scheme.leads:
+    if scheme.solves_next_position:
         scheme.advance(state, h)
     balance = scheme.balance(state, h)
     known = 0.0 if balance.a_hat is None else float(balance.a_hat[0, 0])
     predictor, x0 = float(balance.predictor[0, 0]), float(state.x[0, 0])
     if held:
         u = -predictor
-    elif balance.from_start:  # the discrete gradient of a quadratic energy: the force at the middle
+    elif balance.discrete_gradient:  # the discrete gradient of a quadratic energy: the force at the middle
         u = -(known + 0.5 * (x0 + predictor)) / (balance.alpha + 0.5)
     else:
         weight = balance.weight
@@ -158,7 +158,7 @@ def held_table() -> str:
         state = State(zero.copy(), one.copy(), zero.copy(), zero, zero, zero, zero)
         state.memory = {name: one.copy() for name in names}
         shown = []
-        if scheme.leads:  # the position has come from the velocity before: at the wall by then
+        if scheme.solves_next_position:  # the position has come from the velocity before: at the wall by then
             state.x = -one
         for _ in range(6):
             advance(scheme, state, h, held=True)

@@ -84,7 +84,7 @@ def time_job(
         ready = perf_counter()
         times, cpu, newton, linear = [], 0.0, 0, 0
         count = None
-        running = simulation.batches(worth=1)  # as a long run
+        running = simulation.batches(min_steps=1)  # as a long run
         next(running)
         first = perf_counter() - ready
         last = next(running).step  # loads what makes several steps at once

@@ -98,10 +98,10 @@ class ActiveSet:
         self.state = state
         self.balance = balance
         self._iterations = self._link_iterations = 0
-        self._shifts = self.contact.motion.shifts(balance.time)
+        self._displacements = self.contact.motion.displacements(balance.time)
         kind = NoStepFriction if self.contact.symmetric else StepFriction
         self.friction = kind(model, state, balance)
-        self.candidates = expected_candidates(model, state, balance, held, self._shifts)
+        self.candidates = expected_candidates(model, state, balance, held, self._displacements)
         move, slack = (balance.time - state.time) * state.v, BEYOND * model.length
         self._all_links = tuple(links)
         self.links = tuple(link for link in links if link.reached(state, move, slack))
@@ -208,18 +208,18 @@ class ActiveSet:
         if candidates.anywhere:
             turned = np.einsum("nji,nj->ni", frames.inverse, g[at])
             normal_forces = contact.strengths(frames, turned, bounds.active(at, w, turned, noise))
-        joined, broken = broken_walls(contact, self._shifts, candidates, frames, x, slack)
+        joined, broken = broken_walls(contact, self._displacements, candidates, frames, x, slack)
         if candidates.anywhere:
             normal_forces = self.friction.check(frames, x[at], pull, normal_forces, noise, tolerance)
         left = np.union1d(joined, self.friction.unsettled)
         unsettled = is_misaligned(frames, normal_forces)
-        unsettled = unsettled or is_off_surface(contact, self._shifts, frames, normal_forces, x, slack)
+        unsettled = unsettled or is_off_surface(contact, self._displacements, frames, normal_forces, x, slack)
         if self.model.comm.allreduce(int(unsettled or len(left) > 0), op=MPI.MAX):
             self._iterations += 1
             if self._iterations >= _ITERATIONS:
                 raise NotConverged(f"{self._when()}: {self._why(left, x)}")
             rank = PROJECTED * self.model.length
-            candidates = candidates.join(contact, self._shifts, joined, broken, x, normal_forces, rank)
+            candidates = candidates.join(contact, self._displacements, joined, broken, x, normal_forces, rank)
             settled = False
         return Outcome(settled, candidates, links, trial, normal_forces, pull)
 
@@ -228,7 +228,7 @@ class ActiveSet:
 
     def _why(self, left: np.ndarray, x: np.ndarray) -> str:
         """Why solves of nodes (k,) at (owned, 3) do not converge, and what to do. Collective."""
-        comm, jams = self.model.comm, self.friction.jams(left, x, self._shifts)
+        comm, jams = self.model.comm, self.friction.jams(left, x, self._displacements)
         jams = [text for part in comm.allgather(jams[:1]) for text in part]
         if jams:
             return jams[0]

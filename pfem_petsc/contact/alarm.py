@@ -75,6 +75,8 @@ def _prescribed(contact, node: int, wall: int, x: np.ndarray, time: float) -> bo
     """Whether supports prescribe an owned node of those at (owned, 3) along a wall's normal, or in part a tied node."""
     if contact.ties.any and contact.ties.held[node] and contact.fixed[node].any():
         return True
-    normals, _ = contact.planes(np.ones((1, len(contact.walls)), dtype=bool), x[[node]], contact.motion.shifts(time))
+    normals, _ = contact.planes(
+        np.ones((1, len(contact.walls)), dtype=bool), x[[node]], contact.motion.displacements(time)
+    )
     free = np.where(contact.fixed[node], 0.0, normals[0, wall])
     return bool(free @ free <= FREE_PART)

@@ -32,7 +32,7 @@ class Candidates:
     def join(
         self,
         contact,
-        shifts: np.ndarray,
+        displacements: np.ndarray,
         joined: np.ndarray,
         broken: np.ndarray,
         x: np.ndarray,
@@ -44,7 +44,7 @@ class Candidates:
         Parameters
         ----------
         contact : Contact
-        shifts : (walls, 3) of walls [m]
+        displacements : (walls, 3) of walls [m]
         joined, broken : (k,) nodes beyond walls, and which walls these are (k, walls)
         x : (owned, 3) positions [m]
         strengths : (m, walls) normal forces on the present candidates [N]
@@ -55,12 +55,12 @@ class Candidates:
         applicable[np.searchsorted(nodes, joined)] = broken
         place = np.searchsorted(nodes, self.nodes)
         applicable[place] |= self.applicable
-        normals, offsets = contact.planes(applicable, x[nodes], shifts)
+        normals, offsets = contact.planes(applicable, x[nodes], displacements)
         priority = np.einsum("iwk,ik->iw", normals, x[nodes]) - offsets
-        pressing = strengths > 0.0
+        normal_forces = strengths > 0.0
         largest = max(float(strengths.max(initial=0.0)), 1e-300)
         held = priority[place]
-        held[pressing] = -largest_rank * (1.0 + strengths[pressing] / largest)
+        held[normal_forces] = -largest_rank * (1.0 + strengths[normal_forces] / largest)
         priority[place] = held
         return Candidates(nodes, applicable, priority)
 
@@ -69,10 +69,12 @@ class Candidates:
         return replace(self, applicable=self.applicable & ~held[self.nodes][:, None])
 
 
-def expected_candidates(model, state: State, balance: Balance, held: np.ndarray, shifts: np.ndarray) -> Candidates:
+def expected_candidates(
+    model, state: State, balance: Balance, held: np.ndarray, displacements: np.ndarray
+) -> Candidates:
     """Owned nodes that may touch a wall in a step, ``held`` (owned,) by walls before among them. Collective.
 
-    ``shifts`` (walls, 3) : of the walls where the balance holds [m]
+    ``displacements`` (walls, 3) : of the walls where the balance holds [m]
     """
     contact, walls = model.contact, len(model.contact.walls)
     nobody = Candidates(np.empty(0, dtype=np.int64), np.zeros((0, walls), dtype=bool), anywhere=False)
@@ -80,20 +82,22 @@ def expected_candidates(model, state: State, balance: Balance, held: np.ndarray,
         return nobody
     move = (balance.time - state.time) * state.v
     reach = 0.5 * np.linalg.norm(move, axis=1) + BEYOND * model.length
-    near = held | contact.near(state.position + move, shifts, reach) | contact.ties.held
+    near = held | contact.near(state.position + move, displacements, reach) | contact.ties.held
     if model.comm.allreduce(int(near.any()), op=MPI.MAX) == 0:
         return nobody
     nodes = np.flatnonzero(near)
-    return Candidates(nodes, _within_reach(model, state, nodes, (state.position + move)[nodes], shifts, reach[nodes]))
+    return Candidates(
+        nodes, _within_reach(model, state, nodes, (state.position + move)[nodes], displacements, reach[nodes])
+    )
 
 
-def _within_reach(model, state: State, nodes, x, shifts, reach) -> np.ndarray:
+def _within_reach(model, state: State, nodes, x, displacements, reach) -> np.ndarray:
     """(m, walls) bool: walls that nodes (m,) on their way to (m, 3) come within reach (m,) [m] of, or are at."""
     contact = model.contact
-    concerned = contact.concerned(nodes, x, shifts)
-    within = np.zeros_like(concerned)
-    starts = state.position[nodes], contact.motion.shifts(state.time), BEYOND * model.length
-    for place, there, distance in ((x, shifts, reach[:, None]), starts):
-        normals, offsets = contact.planes(concerned, place, there)
+    applicable = contact.applicable(nodes, x, displacements)
+    within = np.zeros_like(applicable)
+    starts = state.position[nodes], contact.motion.displacements(state.time), BEYOND * model.length
+    for place, there, distance in ((x, displacements, reach[:, None]), starts):
+        normals, offsets = contact.planes(applicable, place, there)
         within |= np.einsum("mwi,mi->mw", normals, place) - offsets < distance
-    return within & concerned
+    return within & applicable

@@ -82,8 +82,8 @@ class ConstraintLink:
         """Planes (n, w, 3), (n, w) of walls at all nodes, from positions (m, 3) of those here. Collective."""
         contact, here = self.contact, self.rows.here
         walls = len(contact.walls)
-        shifts = contact.motion.shifts(time)
-        normals, offsets = contact.planes(contact.concerned(here, x, shifts), x, shifts)
+        displacements = contact.motion.displacements(time)
+        normals, offsets = contact.planes(contact.applicable(here, x, displacements), x, displacements)
         # a sum over ranks cannot take infinities
         data = np.zeros((len(contact.members), 4 * walls))
         data[here] = np.hstack([normals.reshape(len(here), 3 * walls), np.maximum(offsets, -1e300)])
@@ -168,7 +168,7 @@ class ConstraintLink:
     def arrays(self) -> dict[str, np.ndarray]:
         return {}
 
-    def put_back(self, name: str, values: np.ndarray) -> None:
+    def load_state(self, name: str, values: np.ndarray) -> None:
         """There are no arrays."""
 
     def restore(self, saved: dict[str, list]) -> None:

@@ -34,7 +34,7 @@ class Contact:
     moving : (walls,) bool
     normals : (walls, 3) of flat walls, zero for the others
     log : ContactLog
-    restitution, friction, static_friction : (walls,); rough : whether any wall has friction
+    restitution, friction, static_friction : (walls,); has_friction : whether any wall has friction
     ties : Ties
     plain : whether walls are flat and do nothing but stop nodes
     rebounds : whether restitution is a bound on the next position, as for schemes that solve for it in advance
@@ -54,7 +54,7 @@ class Contact:
         ]
         self.motion = WallMotion(walls)
         self.moving = self.motion.moving
-        self.everyone = np.array([wall.node_set is None for wall in walls], dtype=bool)
+        self.all_nodes = np.array([wall.node_set is None for wall in walls], dtype=bool)
         self.members = np.ones((mesh.n_owned, len(walls)), dtype=bool)
         for k, wall in enumerate(walls):
             if wall.node_set is not None:
@@ -66,7 +66,7 @@ class Contact:
         self.static_friction = np.array(static, dtype=np.float64)
         self.restitution = np.array([wall.restitution for wall in walls], dtype=np.float64)
         self.rebounds = False
-        self.rough = bool(self.static_friction.any())
+        self.has_friction = bool(self.static_friction.any())
         self.ties = Ties(self, walls) if any(wall.tied for wall in walls) else NoTies(self, walls)
         self.flat = np.array([wall.flat for wall in self.walls], dtype=bool)
         self.partial = any(wall.partial for wall in self.walls)
@@ -91,7 +91,7 @@ class Contact:
     @property
     def symmetric(self) -> bool:
         """Whether the Hessian of a step with these walls is symmetric: friction makes it unsymmetric."""
-        return not self.rough
+        return not self.has_friction
 
     @cached_property
     def nothing(self) -> WallForces:
@@ -111,7 +111,7 @@ class Contact:
 
     def positions(self, time: float) -> np.ndarray:
         """Where the walls' centres are (walls, 3) [m]."""
-        return np.array([wall.centre for wall in self.walls]).reshape(-1, 3) + self.motion.shifts(time)
+        return np.array([wall.centre for wall in self.walls]).reshape(-1, 3) + self.motion.displacements(time)
 
     def gaps(self, x: np.ndarray, time: float, nodes: np.ndarray | None = None) -> np.ndarray:
         """Distances (m, walls) [m] of owned nodes at (m, 3) from the walls, infinite where a wall is no concern.
@@ -119,18 +119,18 @@ class Contact:
         ``nodes`` (m,) says which they are; default: all of them.
         """
         members = self.members if nodes is None else self.members[nodes]
-        shifts = self.motion.shifts(time)
+        displacements = self.motion.displacements(time)
         gaps = np.full((len(x), len(self.walls)), np.inf)
         for k in range(len(self.walls)):
-            gaps[:, k] = self.gap(k, x, shifts)
-            if not self.everyone[k]:
+            gaps[:, k] = self.gap(k, x, displacements)
+            if not self.all_nodes[k]:
                 gaps[~members[:, k], k] = np.inf
         return gaps
 
-    def gap(self, k: int, x: np.ndarray, shifts: np.ndarray) -> np.ndarray:
+    def gap(self, k: int, x: np.ndarray, displacements: np.ndarray) -> np.ndarray:
         """Distances (m,) [m] of positions (m, 3) from wall k."""
-        normals, offsets = self.walls[k].planes(x - shifts[k])
-        return np.einsum("ij,ij->i", normals, x - shifts[k]) - offsets
+        normals, offsets = self.walls[k].planes(x - displacements[k])
+        return np.einsum("ij,ij->i", normals, x - displacements[k]) - offsets
 
     @property
     def steady(self) -> bool:
@@ -141,18 +141,18 @@ class Contact:
         """Offsets (w,) [m] of the planes n . x = d of flat walls at a time [s]."""
         if not self.moving.any():
             return self._offsets
-        return self._offsets + np.einsum("ij,ij->i", self.normals, self.motion.shifts(time))
+        return self._offsets + np.einsum("ij,ij->i", self.normals, self.motion.displacements(time))
 
-    def near(self, x: np.ndarray, shifts: np.ndarray, reach: np.ndarray = _ZERO) -> np.ndarray:
+    def near(self, x: np.ndarray, displacements: np.ndarray, reach: np.ndarray = _ZERO) -> np.ndarray:
         """(owned,) bool: nodes at positions (owned, 3) within reach of a wall; (owned,) or (1,) [m], 0: beyond it."""
         near = np.zeros(len(x), dtype=bool)
         if self.flat.any():
             at = self.flat
-            offsets = self._offsets[at] + np.einsum("ij,ij->i", self.normals[at], shifts[at])
+            offsets = self._offsets[at] + np.einsum("ij,ij->i", self.normals[at], displacements[at])
             members = self.members if self.flat.all() else np.ascontiguousarray(self.members[:, at])
-            near_planes(x, self.normals[at], offsets, self.everyone[at], members, reach, near)
+            near_planes(x, self.normals[at], offsets, self.all_nodes[at], members, reach, near)
         for k in np.flatnonzero(~self.flat):
-            near |= (self.gap(k, x, shifts) < reach) & self.members[:, k]
+            near |= (self.gap(k, x, displacements) < reach) & self.members[:, k]
         return near
 
     def check_start(self, x: np.ndarray, length: float) -> None:
@@ -185,29 +185,29 @@ class Contact:
                     "'adjust = true' move the nodes"
                 )
 
-    def concerned(self, nodes: np.ndarray, x: np.ndarray, shifts: np.ndarray) -> np.ndarray:
+    def applicable(self, nodes: np.ndarray, x: np.ndarray, displacements: np.ndarray) -> np.ndarray:
         """(m, walls) bool: walls that can stop nodes on their way to positions (m, 3)."""
-        concerned = self.members[nodes]
+        applicable = self.members[nodes]
         if self.partial and self.state is not None:
             state = self.state
             before = state.position[nodes]
-            earlier = self.motion.shifts(state.time)
+            earlier = self.motion.displacements(state.time)
             for k, wall in enumerate(self.walls):
                 if wall.partial:
                     # a node that the wall held may be beyond it by what the scheme makes of the balance
                     held = state.contact[nodes] @ wall.normal > 0.0
                     slack = np.where(held, 0.1 * wall.half.min(), BEYOND * self.length)
-                    concerned[:, k] &= wall.stops(before - earlier[k], x - shifts[k], slack)
-        return concerned
+                    applicable[:, k] &= wall.stops(before - earlier[k], x - displacements[k], slack)
+        return applicable
 
-    def planes(self, concerned: np.ndarray, x: np.ndarray, shifts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def planes(self, applicable: np.ndarray, x: np.ndarray, displacements: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Planes (m, w, 3), (m, w) at positions (m, 3); offset -inf where a wall is no concern."""
         normals = np.empty((len(x), len(self.walls), 3))
         offsets = np.empty((len(x), len(self.walls)))
         for k, wall in enumerate(self.walls):
-            normals[:, k], offsets[:, k] = wall.planes(x - shifts[k])
-            offsets[:, k] += normals[:, k] @ shifts[k]
-        offsets[~concerned] = -np.inf
+            normals[:, k], offsets[:, k] = wall.planes(x - displacements[k])
+            offsets[:, k] += normals[:, k] @ displacements[k]
+        offsets[~applicable] = -np.inf
         return normals, offsets
 
     def explicit(
@@ -247,7 +247,7 @@ class Contact:
         """See :meth:`~pfem_petsc.contact.tied.Ties.calm`; velocities (owned, 3), and what :meth:`record` gave."""
         self.ties.calm(*fresh, v, self.motion.rates(time), h)
 
-    def no_room(self, node: int, offsets: np.ndarray) -> str:
+    def infeasible_message(self, node: int, offsets: np.ndarray) -> str:
         """What to tell about a node (owned index) whose planes contradict each other."""
         touched = [name for name, offset in zip(self.names, offsets, strict=True) if offset > -np.inf]
         return (
@@ -261,18 +261,18 @@ class Contact:
         candidates: np.ndarray,
         x: np.ndarray,
         time: float,
-        concerned: np.ndarray,
+        applicable: np.ndarray,
         rank: np.ndarray | None = None,
         least: float = MIN_VOLUME,
     ) -> NodalFrames:
         """Coordinates and bounds of candidate nodes from their planes at positions (owned, 3). Collective.
 
-        ``concerned`` (m, walls) says which walls can stop a candidate; ``rank`` (m, walls) in which order they are
+        ``applicable`` (m, walls) says which walls can stop a candidate; ``rank`` (m, walls) in which order they are
         taken where there are more than three; default: nearest first; ``least`` is for
         :func:`~pfem_petsc.contact.frames.build_frames`.
         """
         at = x[candidates]
-        normals, offsets = self.planes(concerned, at, self.motion.shifts(time))
+        normals, offsets = self.planes(applicable, at, self.motion.displacements(time))
         if rank is None:
             rank = np.einsum("iwk,ik->iw", normals, at) - offsets
         tolerance = ON_BOUND * self.length
@@ -280,7 +280,7 @@ class Contact:
         with agreed(self.mesh.comm):
             if frames.contradiction >= 0:
                 node = frames.contradiction
-                raise SimulationFailure(self.no_room(candidates[node], offsets[node]))
+                raise SimulationFailure(self.infeasible_message(candidates[node], offsets[node]))
         return frames
 
     def strengths(self, frames: NodalFrames, residual: np.ndarray, active: np.ndarray) -> np.ndarray:

@@ -95,13 +95,13 @@ class CoupledPairs:
     ) -> np.ndarray:
         """Forces of the pairs (p,) [N] in a step: see :meth:`ContactPairs.explicit`. Collective."""
         contact, partners = self.contact, self.pairs.partners
-        shifts = contact.motion.shifts(time)
+        displacements = contact.motion.displacements(time)
         rows, walls = partners.rows, len(contact.walls)
         leaving = np.empty((len(rows), 4 + walls))
         if not partners.alone:
             leaving[:, :3] = predictor[rows] + u[rows]
             leaving[:, 3] = stiffness[rows]
-            leaving[:, 4:] = contact.concerned(rows, leaving[:, :3], shifts)
+            leaving[:, 4:] = contact.applicable(rows, leaving[:, :3], displacements)
         far = partners.bring(leaving)
         here = self._here
         x = self._spread(predictor[here] + u[here], far[:, :3])
@@ -110,10 +110,10 @@ class CoupledPairs:
         def planes(nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             where = self._where[nodes]
             own = where >= 0
-            concerned = np.empty((len(nodes), walls), dtype=bool)
-            concerned[own] = contact.concerned(where[own], x[nodes[own]], shifts)
-            concerned[~own] = far[-1 - where[~own], 4:] > 0.0
-            return contact.planes(concerned, x[nodes], shifts)
+            applicable = np.empty((len(nodes), walls), dtype=bool)
+            applicable[own] = contact.applicable(where[own], x[nodes[own]], displacements)
+            applicable[~own] = far[-1 - where[~own], 4:] > 0.0
+            return contact.planes(applicable, x[nodes], displacements)
 
         near = np.zeros(len(x), dtype=bool)
         if self.any_walled:
@@ -138,9 +138,9 @@ class CoupledPairs:
         """
         state, contact = self.contact.state, self.contact
         data = self._every(np.concatenate([a, mass[:, None], state.position, resting], axis=1))
-        shifts = contact.motion.shifts(state.time)
+        displacements = contact.motion.displacements(state.time)
         walled = data[:, 7:] > 0.0
-        normals, _ = contact.planes(walled, data[:, 4:7], shifts)
+        normals, _ = contact.planes(walled, data[:, 4:7], displacements)
         offsets = np.where(walled, 0.0, -np.inf)
         x = np.ascontiguousarray(data[:, :3])
 
@@ -172,9 +172,9 @@ class CoupledPairs:
         plane = np.full(len(x), -1)
         plane[nodes] = np.arange(len(nodes))
         arguments = self._of, pairs.normals, least, x, stiffness, free, plane, planes(nodes), tolerance, force
-        stuck = solve_groups(groups, self._starts, self._pairs, *arguments)
-        if stuck >= 0:
-            some = np.unique(self._of[:, self._group == stuck])
+        infeasible = solve_groups(groups, self._starts, self._pairs, *arguments)
+        if infeasible >= 0:
+            some = np.unique(self._of[:, self._group == infeasible])
             shown = ", ".join(str(number) for number in self.numbers[some[:6]])
             raise SimulationFailure(f"no positions of nodes {shown} satisfy their contact pairs, walls and supports")
         return force

@@ -28,7 +28,7 @@ class ExplicitContact:
 
     def __init__(self, contact) -> None:
         self.contact = contact
-        plain = contact.flat.all() and not (contact.rough or contact.partial or contact.ties.any)
+        plain = contact.flat.all() and not (contact.has_friction or contact.partial or contact.ties.any)
         self.plain = bool(plain and not contact.restitution.any())
         self._room = np.empty(len(contact.members) if plain else 0, dtype=np.int64)
 
@@ -48,20 +48,20 @@ class ExplicitContact:
     def _press_planes(self, predictor, u, stiffness, time: float, tolerance: float) -> tuple:
         contact = self.contact
         offsets = contact.plane_offsets(time)
-        nodes, stuck, offsets, force, touching, places, *sums = press_planes(
+        nodes, infeasible, offsets, force, touching, places, *sums = press_planes(
             predictor,
             u,
             contact.fixed,
             contact.normals,
             offsets,
-            contact.everyone,
+            contact.all_nodes,
             contact.members,
             tolerance,
             stiffness,
             self._room,
         )
-        if stuck >= 0:
-            raise SimulationFailure(contact.no_room(nodes[stuck], offsets[stuck]))
+        if infeasible >= 0:
+            raise SimulationFailure(contact.infeasible_message(nodes[infeasible], offsets[infeasible]))
         if len(nodes) == 0:
             return nodes, force, contact.nothing
         return nodes, force, WallForces(*sums, nodes, touching, places)
@@ -78,7 +78,7 @@ class ExplicitContact:
             except SimulationFailure as met:  # told once all ranks have left the iteration
                 failure = failure or met
                 return np.zeros((len(free.at), 3)), np.zeros((len(free.at), 3, 3))
-            normals, _ = self.contact.planes(walls.touching, walls.places, self.contact.motion.shifts(time))
+            normals, _ = self.contact.planes(walls.touching, walls.places, self.contact.motion.displacements(time))
             touching = walls.touching
             if self.contact.ties.any:
                 touching = touching & ~self.contact.ties.held[nodes][:, None]
@@ -122,8 +122,8 @@ class ExplicitContact:
     def _press(self, x: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float, booked: bool) -> tuple:
         """Nodes (m,) near walls that do not hold them for good, places (m, 3), forces (m, w, 3), touching (m, w), and
         the energy that friction takes [J]."""
-        shifts = self.contact.motion.shifts(time)
-        near = self.contact.near(x, shifts)
+        displacements = self.contact.motion.displacements(time)
+        near = self.contact.near(x, displacements)
         if self.contact.rebounds:
             near |= self._returning()
         if self.contact.ties.any:
@@ -133,18 +133,18 @@ class ExplicitContact:
             walls = len(self.contact.walls)
             return nodes, np.empty((0, 3)), np.empty((0, walls, 3)), np.empty((0, walls), dtype=bool), 0.0
         free = x[nodes]
-        concerned = self.contact.concerned(nodes, free, shifts)
+        applicable = self.contact.applicable(nodes, free, displacements)
         at = free
         rebounds = self._returning()[nodes] if self.contact.rebounds else np.zeros(len(nodes), dtype=bool)
         pull = self._pull(nodes, free, time) if self.contact.rebounds else free
         for _ in range(_CURVED_ROUNDS):
-            normals, offsets = self.contact.planes(concerned, at, shifts)
+            normals, offsets = self.contact.planes(applicable, at, displacements)
             if rebounds.any():
                 offsets[rebounds] += self._rebound(nodes[rebounds], normals[rebounds], pull[rebounds])
             moved, multipliers = free.copy(), np.zeros(offsets.shape)
-            stuck = project(moved, self.contact.fixed[nodes], normals, offsets, tolerance, multipliers)
-            if stuck >= 0:
-                raise SimulationFailure(self.contact.no_room(nodes[stuck], offsets[stuck]))
+            infeasible = project(moved, self.contact.fixed[nodes], normals, offsets, tolerance, multipliers)
+            if infeasible >= 0:
+                raise SimulationFailure(self.contact.infeasible_message(nodes[infeasible], offsets[infeasible]))
             if self.contact.flat.all() or np.abs(moved - at).max() <= tolerance:
                 break
             at = moved
@@ -157,12 +157,12 @@ class ExplicitContact:
         strength = multipliers * stiffness[nodes][:, None]
         force = strength[:, :, None] * normals
         friction = 0.0
-        if self.contact.rough:
-            moved, force, friction = self._rub(
-                nodes, free, shifts, (normals, offsets), stiffness[nodes], moved, strength, time
+        if self.contact.has_friction:
+            moved, force, friction = self._apply_friction(
+                nodes, free, displacements, (normals, offsets), stiffness[nodes], moved, strength, time
             )
         if booked and self.contact.rebounds:
-            self._remember_impacts(nodes, free, moved, pull, shifts, normals, strength)
+            self._remember_impacts(nodes, free, moved, pull, displacements, normals, strength)
         return nodes, moved, force, np.einsum("mwi,mwi->mw", force, normals) > 0.0, friction
 
     def _returning(self) -> np.ndarray:
@@ -184,12 +184,12 @@ class ExplicitContact:
         way = rebound_way(self.contact.restitution, squares, arrivals, towards) - 0.5 * towards
         return np.where(squares > 0.0, np.maximum(way, 0.0), 0.0)
 
-    def _remember_impacts(self, nodes, free, moved, pull, shifts, normals, strength) -> None:
+    def _remember_impacts(self, nodes, free, moved, pull, displacements, normals, strength) -> None:
         """Who hits a wall with restitution in this step, and how: see :mod:`~pfem_petsc.contact.rebound`."""
         state = self.contact.state
         shape = len(self.contact.members), len(self.contact.walls)
         squares, arrivals = (state.memory.setdefault(name, np.zeros(shape)) for name in ("rebound", "arrival"))
-        way = shifts - self.contact.motion.shifts(state.time)
+        way = displacements - self.contact.motion.displacements(state.time)
         unpushed = way.copy()
         if self.contact.motion.free is not None:  # how they would meet, not how the wall gives way
             at = self.contact.motion.free.at
@@ -203,21 +203,21 @@ class ExplicitContact:
         squares[nodes] = np.where(fresh, impact_square(approach, arrival, towards), 0.0)
         arrivals[nodes] = np.where(fresh, arrival, 0.0)
 
-    def _rub(
-        self, nodes, free, shifts, planes, stiffness, moved, strength, time
+    def _apply_friction(
+        self, nodes, free, displacements, planes, stiffness, moved, strength, time
     ) -> tuple[np.ndarray, np.ndarray, float]:
         """Positions and forces (m, w, 3) with friction, from those without, and the energy that it takes [J].
 
         Curved walls are taken by their planes at the result.
         """
         contact, state = self.contact, self.contact.state
-        way = shifts - self.contact.motion.shifts(state.time)
+        way = displacements - self.contact.motion.displacements(state.time)
         before, fixed = state.position[nodes], self.contact.fixed[nodes]
         normals, offsets = planes
-        concerned = offsets > -np.inf
+        applicable = offsets > -np.inf
         tolerance = PROJECTED * self.contact.length
         for _ in range(_CURVED_ROUNDS):
-            at, pressing, drag = moved.copy(), strength.copy(), np.zeros(normals.shape)
+            at, normal_forces, drag = moved.copy(), strength.copy(), np.zeros(normals.shape)
             unsettled = add_friction(
                 at,
                 before,
@@ -228,7 +228,7 @@ class ExplicitContact:
                 self.contact.friction,
                 self.contact.static_friction,
                 stiffness,
-                pressing,
+                normal_forces,
                 drag,
             )
             if unsettled >= 0:
@@ -239,7 +239,7 @@ class ExplicitContact:
                 )
             if self.contact.flat.all():
                 break
-            normals_there, offsets = self.contact.planes(concerned, at, shifts)
+            normals_there, offsets = self.contact.planes(applicable, at, displacements)
             if np.abs(normals_there - normals).max() <= 1e-14:
                 break
             normals = normals_there
@@ -247,4 +247,4 @@ class ExplicitContact:
             project(moved, fixed, normals, offsets, tolerance, multipliers)
             strength = multipliers * stiffness[:, None]
         friction = -float((drag * (at[:, None, :] - before[:, None, :] - way)).sum())
-        return at, pressing[:, :, None] * normals + drag, friction
+        return at, normal_forces[:, :, None] * normals + drag, friction

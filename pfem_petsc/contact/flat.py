@@ -13,7 +13,7 @@ __all__ = ["press_planes"]
 
 
 @kernel
-def press_planes(predictor, u, fixed, normals, offsets, everyone, members, tolerance, stiffness, room):
+def press_planes(predictor, u, fixed, normals, offsets, all_nodes, members, tolerance, stiffness, room):
     """Stop the nodes that are beyond planes, and sum up what the planes do.
 
     Parameters
@@ -40,7 +40,7 @@ def press_planes(predictor, u, fixed, normals, offsets, everyone, members, toler
             gap = -offsets[k]
             for c in range(3):
                 gap += normals[k, c] * (predictor[i, c] + u[i, c])
-            if gap < 0.0 and (everyone[k] or members[i, k]):
+            if gap < 0.0 and (all_nodes[k] or members[i, k]):
                 room[m] = i
                 m += 1
                 break
@@ -57,10 +57,10 @@ def press_planes(predictor, u, fixed, normals, offsets, everyone, members, toler
         for k in range(w):
             for c in range(3):
                 all_normals[j, k, c] = normals[k, c]
-            all_offsets[j, k] = offsets[k] if everyone[k] or members[i, k] else -math.inf
+            all_offsets[j, k] = offsets[k] if all_nodes[k] or members[i, k] else -math.inf
     free = places.copy()
     multipliers = np.zeros((m, w))
-    stuck = project(places, held, all_normals, all_offsets, tolerance, multipliers)
+    infeasible = project(places, held, all_normals, all_offsets, tolerance, multipliers)
     total = np.zeros((m, 3))
     touching = np.zeros((m, w), dtype=np.bool_)
     force = np.zeros((w, 3))
@@ -87,4 +87,4 @@ def press_planes(predictor, u, fixed, normals, offsets, everyone, members, toler
             moment[k, 2] += x * fy - y * fx
             touching[j, k] = True
             contacts[k] += 1
-    return nodes, stuck, all_offsets, total, touching, places, force, contacts, moment
+    return nodes, infeasible, all_offsets, total, touching, places, force, contacts, moment

@@ -53,7 +53,7 @@ class FreeWalls:
 
     def begin(self, time: float, h: float) -> None:
         """The balance of a step from ``time``; for schemes that lead, the walls move first."""
-        if self.scheme.leads and time > self.state.time:
+        if self.scheme.solves_next_position and time > self.state.time:
             self.scheme.advance(self.state, h)
         self.state.time = time
         self._balance = self.scheme.balance(self.state, h)
@@ -61,7 +61,7 @@ class FreeWalls:
     def finish(self, h: float) -> None:
         """Complete the walls' state with the solution."""
         self.scheme.finish(self.state, self._balance, self._u, h)
-        if not self.scheme.leads:
+        if not self.scheme.solves_next_position:
             self.state.time = self._balance.time if self.scheme.solves_end else self.state.time + h
 
     @property
@@ -145,7 +145,7 @@ class FreeWalls:
             "increment": self._u.tolist(),
         }
 
-    def put_back(self, kept: dict[str, Any]) -> None:
+    def load_state(self, kept: dict[str, Any]) -> None:
         """Take the state from a checkpoint."""
         shape = self.state.x.shape
         for name in ("x", "v", "a"):
@@ -189,5 +189,5 @@ class NoFreeWalls:
     def kept(self) -> None:
         """Nothing."""
 
-    def put_back(self, kept: None) -> None:
+    def load_state(self, kept: None) -> None:
         """Nothing."""

@@ -21,7 +21,7 @@ _OVERSHOOT = 0.9  # of the drag over the normal force, from which on sweeps go a
 
 
 @kernel
-def add_friction(x, before, way, fixed, normals, offsets, dynamic, static, stiffness, pressing, drag):
+def add_friction(x, before, way, fixed, normals, offsets, dynamic, static, stiffness, normal_forces, drag):
     """Drag the nodes that walls with friction press.
 
     Parameters
@@ -33,7 +33,7 @@ def add_friction(x, before, way, fixed, normals, offsets, dynamic, static, stiff
     normals, offsets : (m, w, 3), (m, w) planes n . x >= d; -inf where a wall is no concern
     dynamic, static : (w,) coefficients of friction
     stiffness : (m,) force for a displacement of the node [N/m]
-    pressing : (m, w) normal forces [N], changed in place
+    normal_forces : (m, w) normal forces [N], changed in place
     drag : (m, w, 3) tangential forces, out [N]
 
     Returns
@@ -49,7 +49,7 @@ def add_friction(x, before, way, fixed, normals, offsets, dynamic, static, stiff
         for k in range(w):
             for c in range(3):
                 drag[i, k, c] = 0.0
-            if pressing[i, k] > 0.0:
+            if normal_forces[i, k] > 0.0:
                 rubbing = rubbing or static[k] > 0.0
         if not rubbing:
             continue
@@ -88,7 +88,7 @@ def add_friction(x, before, way, fixed, normals, offsets, dynamic, static, stiff
                     continue
                 least = min(least, length)
                 # normal
-                old = pressing[i, k]
+                old = normal_forces[i, k]
                 new = max(0.0, old - gap * stiffness[i] / length)
                 if new == 0.0 and old == 0.0:
                     continue
@@ -98,7 +98,7 @@ def add_friction(x, before, way, fixed, normals, offsets, dynamic, static, stiff
                 for c in range(3):
                     if not fixed[i, c]:
                         x[i, c] += (new - old) * normals[i, k, c] * soft
-                pressing[i, k] = new
+                normal_forces[i, k] = new
                 largest = max(largest, new)
                 # tangential: the force that would end the slip, and what the wall can give of it
                 if static[k] == 0.0:

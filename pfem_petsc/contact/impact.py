@@ -177,7 +177,7 @@ class Impacts:
         motion: tuple[np.ndarray, np.ndarray],
         load: np.ndarray | None,
         time: float,
-        shifts: np.ndarray,
+        displacements: np.ndarray,
     ) -> float:
         """Energy [J] of this rank's closing contacts in the step just solved. Collective with pairs or free walls.
 
@@ -186,11 +186,11 @@ class Impacts:
         x, motion : (owned, 3) at the start of the step of closure, velocity and acceleration there; for schemes that
             solve in advance, those of the balance
         load : (owned, 3) all forces there but those of contact and damping [N]; None where the scheme solves in advance
-        time, shifts : of the walls there
+        time, displacements : of the walls there
         """
         if not self.active:
             return 0.0
-        loss = self._on_walls(x, motion, load, time, shifts) if self.model.contact.any else 0.0
+        loss = self._on_walls(x, motion, load, time, displacements) if self.model.contact.any else 0.0
         if self.model.pairs is not None:
             loss += self._of_pairs(x, motion, load)
         return 0.0 if self.elastic else loss
@@ -221,7 +221,7 @@ class Impacts:
             return v, a
         return np.where(fixed, motion[0][nodes], v), np.where(fixed, motion[1][nodes], a)
 
-    def _on_walls(self, x, motion, load, time: float, shifts: np.ndarray) -> float:
+    def _on_walls(self, x, motion, load, time: float, displacements: np.ndarray) -> float:
         contact, log = self.model.contact, self.model.contact.log
         free = contact.motion.free
         if len(self.met) == 0 and len(log.last) == 0 and free is None:
@@ -230,7 +230,9 @@ class Impacts:
         if contact.plain and free is None:
             normals, gaps = plane_gaps(nodes, x, contact.normals, contact.plane_offsets(time))
         else:
-            normals, offsets = contact.planes(np.ones((len(nodes), len(contact.names)), dtype=bool), x[nodes], shifts)
+            normals, offsets = contact.planes(
+                np.ones((len(nodes), len(contact.names)), dtype=bool), x[nodes], displacements
+            )
             gaps = np.einsum("mwi,mi->mw", normals, x[nodes]) - offsets
         free_v, free_a = self._free(nodes, motion, load)
         rates, speeds = contact.motion.rates(time, ahead=True), np.empty(gaps.shape)
@@ -295,9 +297,9 @@ class Impacts:
     def _of_pairs(self, x, motion, load) -> float:
         """The same of pairs that meet, whose reduced mass counts: those whose second nodes are here. Collective."""
         pairs, mass = self.model.pairs, self.model.inertia.mass
-        pressing = pairs.force > 0.0
-        fresh, parted = pressing & ~pairs.closed, pairs.closed & ~pressing
-        pairs.closed = pressing
+        normal_forces = pairs.force > 0.0
+        fresh, parted = normal_forces & ~pairs.closed, pairs.closed & ~normal_forces
+        pairs.closed = normal_forces
         at = np.flatnonzero(fresh | parted)
 
         def of_nodes(nodes: np.ndarray) -> np.ndarray:

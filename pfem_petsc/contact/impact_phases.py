@@ -117,7 +117,7 @@ class _Rods:
         self.square, self.arrival = np.zeros(phases), np.zeros(phases)
         self._inverse: tuple[float, np.ndarray] | None = None
         scheme.start(self.state, step)
-        if scheme.leads:
+        if scheme.solves_next_position:
             self._solve()
 
     def rods(self, values: np.ndarray) -> np.ndarray:
@@ -139,7 +139,7 @@ class _Rods:
         before, touched = self.strength + self.change, self.touching
         free = self._free()
         speed, approach = state.v[self.tips, 0].copy(), self._approach(start, free)
-        if self.scheme.leads:
+        if self.scheme.solves_next_position:
             self.scheme.advance(state, self.h)
             state.time += self.h
             self._solve()
@@ -150,7 +150,7 @@ class _Rods:
         if self.massless:
             if not self.scheme.explicit:
                 self._set(np.ones_like(self.touching), (state.x[self.tips, 0] - start) / self.h, 0.0)
-        elif self.treatment == "stick" or (self.restitution and not self.scheme.leads):
+        elif self.treatment == "stick" or (self.restitution and not self.scheme.solves_next_position):
             self._set(self.touching, 0.0, 0.0)
             if self.restitution:
                 way, after = np.maximum(state.x[self.tips, 0] - start, 0.0), self._free()
@@ -161,14 +161,14 @@ class _Rods:
                     square = impact_square(approach, way, self.h * self.h * free)
                     away = rebound_way(self.restitution, square, way, self.h * self.h * after) / self.h
                 self._set(self.touching & ~touched, -away, after)
-            if self.scheme.at_ends and not self.scheme.leads:
+            if self.scheme.balance_at_endpoints and not self.scheme.solves_next_position:
                 self._let_go(touched & ~self.touching, start, before)
         elif self.treatment == "conserving":
             self._take_back(start, before)
 
     def _approach(self, start: np.ndarray, free: np.ndarray) -> np.ndarray | None:
         """(phases,) way of the last nodes in the next step without a wall, by an explicit scheme that does not lead."""
-        if not self.restitution or not self.scheme.explicit or self.scheme.leads:
+        if not self.restitution or not self.scheme.explicit or self.scheme.solves_next_position:
             return None
         balance = self.scheme.balance(self.state, self.h)
         known = 0.0 if balance.a_hat is None else balance.a_hat[self.tips, 0]
@@ -180,7 +180,7 @@ class _Rods:
         load = np.zeros(self.shape)
         if balance.a_hat is not None:
             load -= self.rods(balance.a_hat) @ self.m
-        weight = 0.5 * balance.weight if balance.from_start else balance.weight
+        weight = 0.5 * balance.weight if balance.discrete_gradient else balance.weight
         load -= (weight * predictor + (1.0 - weight) * x) @ self.k
         if self.massless and self.scheme.explicit:
             u, self.strength = self._in_equilibrium(balance, load, predictor, x)
@@ -196,13 +196,13 @@ class _Rods:
             self._inverse = hessian[0, 0], np.linalg.inv(hessian)
         inverse = self._inverse[1]
         u = load @ inverse
-        if self.restitution and self.scheme.leads:
+        if self.restitution and self.scheme.solves_next_position:
             way = rebound_way(self.restitution, self.square, self.arrival, u[:, -1]) - 0.5 * u[:, -1]
             wall = wall - np.where(self.square > 0.0, np.maximum(way, 0.0), 0.0)
         strength = (predictor[:, -1] + u[:, -1] - wall) / inverse[-1, -1]
         if not self.held:
             strength = np.maximum(strength, 0.0)
-        if self.restitution and self.scheme.leads:
+        if self.restitution and self.scheme.solves_next_position:
             approach = predictor[:, -1] + u[:, -1] - self.state.x[self.tips, 0]
             fresh = (strength > _CONTACT / self.h) & ~self.touching
             way = self.wall - self.state.x[self.tips, 0]
@@ -246,7 +246,7 @@ class _Rods:
     def _take_back(self, start: np.ndarray, before: np.ndarray) -> None:
         """The velocity of Laursen and Love: it takes the work of contact back."""
         state = self.state
-        force = 0.5 * (self.strength + before) if self.scheme.at_ends else self.strength
+        force = 0.5 * (self.strength + before) if self.scheme.balance_at_endpoints else self.strength
         work = self.debt - force * (state.x[self.tips, 0] - start)
         square = state.v[self.tips, 0] ** 2 - 2.0 * work / self.tip
         self.debt = np.where(self.touching, np.maximum(-0.5 * self.tip * square, 0.0), self.debt)

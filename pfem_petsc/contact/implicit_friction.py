@@ -46,8 +46,8 @@ class StepFriction:
         self.model = model
         self.contact = model.contact
         self.state = state
-        shifts = self.contact.motion.shifts
-        self._way = shifts(balance.time) - shifts(state.time)
+        displacements = self.contact.motion.displacements
+        self._way = displacements(balance.time) - displacements(state.time)
         inertia = model.inertia
         self._inertial = balance.alpha * inertia.mass + balance.eta * inertia.damping
         self._stiffness = self._inertial + balance.weight * model.nodal_stiffness
@@ -76,8 +76,8 @@ class StepFriction:
     def apply(self, frames, x: np.ndarray) -> None:
         """Hold the sticking nodes of the frames and drag the slipping ones, for a guess of positions (owned, 3)."""
         nodes = frames.nodes
-        rough = self._rough(frames)
-        fresh = rough & ~self._guessed[nodes]
+        has_friction = self._has_friction(frames)
+        fresh = has_friction & ~self._guessed[nodes]
         if fresh.any():
             at = np.flatnonzero(fresh)
             reaction = self.state.contact[nodes[at]]
@@ -86,8 +86,8 @@ class StepFriction:
             self._forces[nodes[at]] = own[2].sum(axis=1)
             self._decide(frames, at, x[nodes[at]], none, *own)
             self._guessed[nodes[at]] = True
-        self._hold(frames, np.flatnonzero(rough & (self._sticks[nodes] >= 0)))
-        moving = rough & (self._sticks[nodes] < 0) & (self._directions[nodes] != 0.0).any(axis=(1, 2))
+        self._hold(frames, np.flatnonzero(has_friction & (self._sticks[nodes] >= 0)))
+        moving = has_friction & (self._sticks[nodes] < 0) & (self._directions[nodes] != 0.0).any(axis=(1, 2))
         frames.sliding = self._slide(frames, np.flatnonzero(moving))
 
     def check(
@@ -105,9 +105,9 @@ class StepFriction:
         nodes, contact = frames.nodes, self.contact
         strengths = strengths.copy()
         self.drag = np.zeros((*strengths.shape, 3))
-        at = np.flatnonzero(self._rough(frames))
+        at = np.flatnonzero(self._has_friction(frames))
         slipping = self._sticks[nodes[at]] < 0
-        moved, pressing, drag, stiffness = self._local(frames, at, x[at], reaction[at], slipping)
+        moved, normal_forces, drag, stiffness = self._local(frames, at, x[at], reaction[at], slipping)
         self._forces[nodes[at]] = drag.sum(axis=1)
         apart = stiffness * np.linalg.norm(moved - x[at], axis=1)
         # rounding of positions, and of the frames' coordinates on the way to them
@@ -115,15 +115,15 @@ class StepFriction:
         kept = apart <= np.maximum(max(tolerance, 2.0 * noise), floor)
         wrong = np.flatnonzero(~kept)
         if len(wrong):
-            parts = (moved[wrong], pressing[wrong], drag[wrong], stiffness[wrong])
+            parts = (moved[wrong], normal_forces[wrong], drag[wrong], stiffness[wrong])
             self._decide(frames, at[wrong], x[at[wrong]], slipping[wrong], *parts)
-        may = self._may_stick(nodes[at], slipping & kept, x[at], pressing, frames.normals[at])
+        may = self._may_stick(nodes[at], slipping & kept, x[at], normal_forces, frames.normals[at])
         trying = may.any(axis=1)
         self._sticks[nodes[at[trying]]] = may[trying].argmax(axis=1)
         self.unsettled = nodes[np.union1d(at[wrong], at[trying])]
-        none = pressing <= noise
-        pressing[none], drag[none] = 0.0, 0.0
-        strengths[at], self.drag[at] = pressing, drag
+        none = normal_forces <= noise
+        normal_forces[none], drag[none] = 0.0, 0.0
+        strengths[at], self.drag[at] = normal_forces, drag
         return strengths
 
     def relax(self) -> bool:
@@ -140,17 +140,17 @@ class StepFriction:
         lagged, self._lagged = self._lagged, True
         return moving and not lagged
 
-    def jams(self, nodes: np.ndarray, x: np.ndarray, shifts: np.ndarray) -> list[str]:
+    def jams(self, nodes: np.ndarray, x: np.ndarray, displacements: np.ndarray) -> list[str]:
         """What to tell of nodes (k,) at (owned, 3) that walls and their friction hold in a wedge that locks itself."""
-        normals, _ = self.contact.planes(self.contact.members[nodes], x[nodes], shifts)
+        normals, _ = self.contact.planes(self.contact.members[nodes], x[nodes], displacements)
         return [text for node, n in zip(nodes, normals, strict=True) if (text := jam(self.contact, node, n))]
 
-    def _rough(self, frames) -> np.ndarray:
+    def _has_friction(self, frames) -> np.ndarray:
         """(m,) bool: frames with a wall that has friction."""
         return ((frames.rows >= 0) & (self.contact.static_friction > 0.0)).any(axis=1)
 
     def _local(self, frames, at, x, reaction, slipping) -> tuple[np.ndarray, ...]:
-        """The nodes' own problems: places (k, 3), pressing (k, w) and drag (k, w, 3) forces, and stiffness (k,).
+        """The nodes' own problems: places (k, 3), normal (k, w) and friction (k, w, 3) forces, and stiffness (k,).
 
         Slipping nodes are asked with the dynamic coefficient alone: whether they stick is seen when it is tried.
         """
@@ -158,12 +158,12 @@ class StepFriction:
         stiffness = self._stiffness[nodes]
         fixed, normals, offsets = contact.fixed[nodes], frames.normals[at], frames.offsets[at]
         moved = x - np.where(fixed, 0.0, reaction) / stiffness[:, None]
-        pressing, drag = np.zeros(offsets.shape), np.zeros(normals.shape)
-        project(moved, fixed, normals, offsets, PROJECTED * contact.length, pressing)
-        pressing *= stiffness[:, None]
+        normal_forces, drag = np.zeros(offsets.shape), np.zeros(normals.shape)
+        project(moved, fixed, normals, offsets, PROJECTED * contact.length, normal_forces)
+        normal_forces *= stiffness[:, None]
         for group, static in ((slipping, contact.friction), (~slipping, contact.static_friction)):
             part = np.flatnonzero(group)
-            place, press, pull = moved[part], pressing[part], drag[part]
+            place, press, pull = moved[part], normal_forces[part], drag[part]
             add_friction(
                 place,
                 self.state.position[nodes[part]],
@@ -177,45 +177,45 @@ class StepFriction:
                 press,
                 pull,
             )
-            moved[part], pressing[part], drag[part] = place, press, pull
-        return moved, pressing, drag, stiffness
+            moved[part], normal_forces[part], drag[part] = place, press, pull
+        return moved, normal_forces, drag, stiffness
 
-    def _may_stick(self, nodes, slipping, x, pressing, normals) -> np.ndarray:
+    def _may_stick(self, nodes, slipping, x, normal_forces, normals) -> np.ndarray:
         """(k, w) bool: walls that might hold slipping nodes by their static coefficient, which is to be tried once."""
         contact = self.contact
         slip = self._slip(nodes, x, normals)
         # with the rest of the truss going along, inertia alone resists
-        needed = contact.friction * pressing + self._inertial[nodes, None] * np.linalg.norm(slip, axis=2)
-        may = (contact.static_friction > contact.friction) & (needed <= contact.static_friction * pressing)
-        return may & (pressing > 0.0) & (slipping & ~self._failed[nodes])[:, None]
+        needed = contact.friction * normal_forces + self._inertial[nodes, None] * np.linalg.norm(slip, axis=2)
+        may = (contact.static_friction > contact.friction) & (needed <= contact.static_friction * normal_forces)
+        return may & (normal_forces > 0.0) & (slipping & ~self._failed[nodes])[:, None]
 
     def _slip(self, nodes, x, normals) -> np.ndarray:
         """How nodes at (k, 3) have slipped on their walls (k, w, 3) [m]."""
         slip = x[:, None, :] - self.state.position[nodes][:, None, :] - self._way
         return slip - np.einsum("kwi,kwi->kw", slip, normals)[:, :, None] * normals
 
-    def _decide(self, frames, at, x, slipping, moved, pressing, drag, stiffness) -> None:
+    def _decide(self, frames, at, x, slipping, moved, normal_forces, drag, stiffness) -> None:
         """What nodes do next, from where they are, x, and from their own problems' solutions."""
         nodes, contact = frames.nodes[at], self.contact
         slip = self._slip(nodes, moved, frames.normals[at])
         size = np.linalg.norm(drag, axis=2)
         # a wall that presses with rounding alone neither holds nor drags
-        least = 1e-9 * pressing.max(axis=1, initial=0.0)
-        rubbing = (pressing > least[:, None]) & (contact.static_friction > 0.0)
+        least = 1e-9 * normal_forces.max(axis=1, initial=0.0)
+        rubbing = (normal_forces > least[:, None]) & (contact.static_friction > 0.0)
         needed = np.linalg.norm(drag - stiffness[:, None, None] * slip, axis=2)
-        limit = np.where(slipping[:, None], contact.friction, contact.static_friction) * pressing
+        limit = np.where(slipping[:, None], contact.friction, contact.static_friction) * normal_forces
         slips = rubbing & (needed > (1.0 + 1e-13) * limit)
         was = self._sticks[nodes] >= 0
         forwards = np.einsum("kwi,kwi->kw", self._slip(nodes, x, frames.normals[at]), self._directions[nodes])
         # the drag has turned the slip round: it is enough to end it
         slips &= (forwards >= 0.0) | was[:, None]
         holds = rubbing & ~slips
-        stuck = holds.any(axis=1)
+        infeasible = holds.any(axis=1)
         unit = np.where(slips[:, :, None], -drag / np.maximum(size, 1e-300)[:, :, None], 0.0)
-        self._slips[nodes] = ~stuck & ~was & (forwards > 0.0).any(axis=1)
-        self._failed[nodes] |= was & ~stuck
-        self._sticks[nodes] = np.where(stuck, holds.argmax(axis=1), -1)
-        self._directions[nodes] = unit * np.maximum(contact.friction * pressing, 1e-300)[:, :, None]
+        self._slips[nodes] = ~infeasible & ~was & (forwards > 0.0).any(axis=1)
+        self._failed[nodes] |= was & ~infeasible
+        self._sticks[nodes] = np.where(infeasible, holds.argmax(axis=1), -1)
+        self._directions[nodes] = unit * np.maximum(contact.friction * normal_forces, 1e-300)[:, :, None]
 
     def _hold(self, frames, at: np.ndarray) -> None:
         """Hold sticking nodes where they do not slip."""
@@ -277,7 +277,7 @@ class NoStepFriction:
         """Normal forces as they are."""
         return strengths
 
-    def jams(self, nodes: np.ndarray, x: np.ndarray, shifts: np.ndarray) -> list[str]:
+    def jams(self, nodes: np.ndarray, x: np.ndarray, displacements: np.ndarray) -> list[str]:
         """Nothing jams."""
         return []
 

@@ -91,7 +91,7 @@ class Link(Protocol):
     def arrays(self) -> dict[str, np.ndarray]:
         """What a checkpoint keeps of it at nodes: name to rows (owned, ...); the same names on all ranks."""
 
-    def put_back(self, name: str, values: np.ndarray) -> None:
+    def load_state(self, name: str, values: np.ndarray) -> None:
         """Take such an array (owned, ...) back. Collective."""
 
 
@@ -242,11 +242,11 @@ class Links:
         """See :meth:`Link.arrays`; those of all links."""
         return {name: array for link in self.members for name, array in link.arrays().items()}
 
-    def put_back(self, name: str, values: np.ndarray) -> None:
+    def load_state(self, name: str, values: np.ndarray) -> None:
         """See :meth:`Link.put_back`."""
         for link in self.members:
             if name in link.arrays():
-                link.put_back(name, values)
+                link.load_state(name, values)
 
     def restore(self, saved: dict[str, Any]) -> None:
         """Take the forces back from what :meth:`save` gave."""

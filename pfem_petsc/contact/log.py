@@ -123,7 +123,7 @@ class ContactLog:
         comm.Allreduce(MPI.IN_PLACE, flags, op=MPI.MAX)
         return {"sum": self.time.tolist(), "steps": self._steps[: self._pending].tolist(), "flags": flags.tolist()}
 
-    def put_back(self, share: dict[str, Any], times: dict[str, Any], touching: np.ndarray) -> None:
+    def load_state(self, share: dict[str, Any], times: dict[str, Any], touching: np.ndarray) -> None:
         """Take this rank's sums, the contact times and who touches what from a checkpoint."""
         self.releases[:] = np.array(share["wall_releases"], dtype=np.int64)
         self.changes = int(share["contact_changes"])

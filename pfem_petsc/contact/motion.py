@@ -63,18 +63,18 @@ class WallMotion:
         """What a checkpoint must hold, None where no wall has mass."""
         return self.bodies.kept()
 
-    def put_back(self, kept: dict[str, Any] | None) -> None:
+    def load_state(self, kept: dict[str, Any] | None) -> None:
         """Restore walls with mass from a checkpoint."""
-        self.bodies.put_back(kept)
+        self.bodies.load_state(kept)
 
-    def shifts(self, time: float) -> np.ndarray:
+    def displacements(self, time: float) -> np.ndarray:
         """Displacements (w, 3) [m] at a time [s]."""
-        shifts = np.zeros((len(self._motions), 3))
+        displacements = np.zeros((len(self._motions), 3))
         for k, motion in enumerate(self._motions):
             if motion is not None:
-                shifts[k] = motion.at(time)[0]
-        shifts[self.bodies.at] = self.bodies.displacements(time)
-        return shifts
+                displacements[k] = motion.at(time)[0]
+        displacements[self.bodies.at] = self.bodies.displacements(time)
+        return displacements
 
     def rates(self, time: float, ahead: bool = False) -> np.ndarray:
         """Velocities (w, 3) [m/s] at a time [s]; in the kinks of a linear table that before, or that ahead."""

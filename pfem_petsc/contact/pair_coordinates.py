@@ -106,8 +106,8 @@ class PairCoordinates:
         fits = best > np.where(framed, _LEAST, _THIN)
         best = np.where(fits, best, 0.0)
         self._at = at = np.flatnonzero(fits.any(axis=0))
-        self.waiting = np.setdiff1d(np.flatnonzero(self._usable), at)
-        self._waits = self._anywhere(self.waiting >= 0)
+        self.deferred = np.setdiff1d(np.flatnonzero(self._usable), at)
+        self._waits = self._anywhere(self.deferred >= 0)
         carrier = np.where(best[1] >= (1.0 - 1e-12) * best[0], 1, 0)[at]
         other, every = 1 - carrier, np.arange(len(at))
         alpha, beta = (
@@ -135,7 +135,7 @@ class PairCoordinates:
         share = (sign / self._length)[:, None] * beta
         self._carrying, self._sharing = _Ends(pairs, carrier, at), _Ends(pairs, other, at)
         here, there = self._carrying.mine, self._sharing.mine
-        self.carriers, self._other = self._carrying.nodes, self._sharing.nodes
+        self.slave_nodes, self._other = self._carrying.nodes, self._sharing.nodes
         self._slots, self._turns, self._own = slot[here], turn[here], own[here]
         self._share, self._shared = share[here], share[there]
 
@@ -146,24 +146,24 @@ class PairCoordinates:
 
     def increment(self, w: np.ndarray) -> None:
         """Turn w (owned, 3) into coordinates of the frames, or u where there are none, in place. Collective."""
-        y = w[self.carriers]
+        y = w[self.slave_nodes]
         y[np.arange(len(y)), self._slots] = np.einsum("pi,pi->p", self._own, y) + self._of_others(w)
-        w[self.carriers] = np.einsum("pij,pj->pi", self._turns, y)
+        w[self.slave_nodes] = np.einsum("pij,pj->pi", self._turns, y)
 
     def coordinates(self, y: np.ndarray) -> None:
         """Turn what :meth:`increment` gives (owned, 3) into w, in place. Collective."""
-        w, every = np.einsum("pij,pj->pi", self._turns, y[self.carriers]), np.arange(len(self.carriers))
+        w, every = np.einsum("pij,pj->pi", self._turns, y[self.slave_nodes]), np.arange(len(self.slave_nodes))
         sign = self._own[every, self._slots]
         rest = np.einsum("pi,pi->p", self._own, w) - sign * w[every, self._slots] + self._of_others(y)
         w[every, self._slots] = sign * (w[every, self._slots] - rest)
-        y[self.carriers] = w
+        y[self.slave_nodes] = w
 
     def gradient(self, g: np.ndarray) -> None:
         """Turn a gradient (owned, 3) by what :meth:`increment` gives into that by w, in place. Collective."""
-        y, every = np.einsum("pij,pj->pi", self._turns, g[self.carriers]), np.arange(len(self.carriers))
+        y, every = np.einsum("pij,pj->pi", self._turns, g[self.slave_nodes]), np.arange(len(self.slave_nodes))
         pull = y[every, self._slots].copy()
         y[every, self._slots] = 0.0
-        g[self.carriers] = y + pull[:, None] * self._own
+        g[self.slave_nodes] = y + pull[:, None] * self._own
         g[self._other] += self._carrying.known(pull)[self._sharing.mine, None] * self._shared
 
     def diagonal(self, blocks: np.ndarray, diagonal: np.ndarray) -> None:
@@ -171,12 +171,12 @@ class PairCoordinates:
 
         ``blocks`` (carriers, 3, 3): the diagonal blocks of H there. Collective.
         """
-        every = np.arange(len(self.carriers))
+        every = np.arange(len(self.slave_nodes))
         turned = np.einsum("pji,pjk,pkl->pil", self._turns, blocks, self._turns)
         stiff = turned[every, self._slots, self._slots].copy()
         own = np.tile(np.eye(3), (len(every), 1, 1))
         own[every, self._slots] = self._own
-        diagonal[self.carriers] = np.einsum("pji,pjk,pki->pi", own, turned, own)
+        diagonal[self.slave_nodes] = np.einsum("pji,pjk,pki->pi", own, turned, own)
         diagonal[self._other] += self._carrying.known(stiff)[self._sharing.mine, None] * self._shared**2
 
     def matrix(self) -> PETSc.Mat:
@@ -214,15 +214,15 @@ class PairCoordinates:
         values = np.zeros(len(columns))
         # rows of nodes that carry nothing are those of the unit matrix
         values[local == np.repeat(np.arange(3 * mesh.n_owned), np.diff(pointers))] = 1.0
-        place = pointers[3 * self.carriers[:, None] + np.arange(3)][:, :, None] + np.arange(6)
-        every = np.arange(len(self.carriers))
+        place = pointers[3 * self.slave_nodes[:, None] + np.arange(3)][:, :, None] + np.arange(6)
+        every = np.arange(len(self.slave_nodes))
         own = np.tile(np.eye(3), (len(every), 1, 1))
         own[every, self._slots] = self._own
         own = self._turns @ own
         share = self._turns[every, :, self._slots][:, :, None] * self._share[:, None, :]
         partner = np.zeros(mesh.n_owned, dtype=np.int64)
         partner[pairs.local[pairs.mine]] = self._numbers[::-1][pairs.mine]
-        low = (mesh.first_node + self.carriers < partner[self.carriers])[:, None, None]
+        low = (mesh.first_node + self.slave_nodes < partner[self.slave_nodes])[:, None, None]
         values[place] = np.where(low, np.concatenate([own, share], axis=2), np.concatenate([share, own], axis=2))
         matrix.setValuesCSR(pointers, columns, values)
         matrix.assemble()
@@ -249,7 +249,7 @@ class PairCoordinates:
             return None
         pairs = self.pairs
         short = pairs.gaps - pairs.distances(pairs.gather(x))
-        found = self.waiting[short[self.waiting] > tolerance][:1]
+        found = self.deferred[short[self.deferred] > tolerance][:1]
         mine = [(int(pairs.table[pair]), *pairs.numbers(pair)) for pair in found]
         every = [pair for some in pairs.mesh.comm.allgather(mine) for pair in some]
         if not every:
@@ -260,7 +260,7 @@ class PairCoordinates:
     def bound(self, x: np.ndarray, w: np.ndarray, lower: np.ndarray) -> None:
         """Write the bounds on w into (owned, 3), from positions (owned, 3) and their w. Collective."""
         room = (self.pairs.gaps - self.pairs.distances(self.pairs.gather(x)))[self._at] / self._length
-        lower[self.carriers, self._slots] = w[self.carriers, self._slots] + room[self._carrying.mine]
+        lower[self.slave_nodes, self._slots] = w[self.slave_nodes, self._slots] + room[self._carrying.mine]
 
     def press(self, w: np.ndarray, g: np.ndarray, lower: np.ndarray, noise: float) -> None:
         """Set the pairs' forces. Collective.
@@ -271,7 +271,7 @@ class PairCoordinates:
         lower : (owned, 3) bounds on w [m]
         noise : of the residual [N]
         """
-        at, slot = self.carriers, self._slots
+        at, slot = self.slave_nodes, self._slots
         every = np.arange(len(at))
         turned = np.einsum("pij,pj->pi", self._turns, g[at])
         pull = self._own[every, slot] * turned[every, slot]

@@ -73,8 +73,8 @@ class PairLink:
     def arrays(self) -> dict[str, np.ndarray]:
         return self.pairs.kept()
 
-    def put_back(self, name: str, values: np.ndarray) -> None:
-        self.pairs.put_back(name, values)
+    def load_state(self, name: str, values: np.ndarray) -> None:
+        self.pairs.load_state(name, values)
 
 
 class PairLinkCoordinates:
@@ -108,7 +108,7 @@ class PairLinkCoordinates:
         self.own.gradient(g)
 
     def diagonal(self, blocks: BlocksOf, diagonal: np.ndarray) -> None:
-        self.own.diagonal(blocks(self.own.carriers), diagonal)
+        self.own.diagonal(blocks(self.own.slave_nodes), diagonal)
 
     def matrix(self) -> PETSc.Mat:
         return self.own.matrix()

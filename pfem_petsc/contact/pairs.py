@@ -264,7 +264,7 @@ class ContactPairs:
             found[name][self.local[1, at], self.table[at]] = values[at]
         return found
 
-    def put_back(self, name: str, values: np.ndarray) -> None:
+    def load_state(self, name: str, values: np.ndarray) -> None:
         """Take back what :meth:`kept` gave. Collective."""
         of_pairs = self.gather(values)[1, np.arange(len(self.table)), self.table]
         if name == "pairs.force":

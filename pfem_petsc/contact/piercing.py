@@ -65,15 +65,15 @@ class Piercing:
         members[: mesh.n_owned] = model.contact.members[:, self.walls]
         mesh.update_ghosts(members)
         self._bars = mesh.bars[mesh.counted]
-        self._concerned = (members[self._bars[:, 0]] > 0.0) & (members[self._bars[:, 1]] > 0.0)
+        self._applicable = (members[self._bars[:, 0]] > 0.0) & (members[self._bars[:, 1]] > 0.0)
 
     def look(self, x: np.ndarray, time: float) -> list[str]:
         """What to tell of bars at positions (local, 3), ghosts included, that is new. Collective."""
         if not self.walls:
             return []
         self.looks += 1
-        shifts = self._model.contact.motion.shifts(time)
-        found = np.array([self._across(i, k, x, shifts[k]) for i, k in enumerate(self.walls)])
+        displacements = self._model.contact.motion.displacements(time)
+        found = np.array([self._across(i, k, x, displacements[k]) for i, k in enumerate(self.walls)])
         counts, lowest = found[:, 0].copy(), found[:, 1].copy()
         comm = self._model.comm
         comm.Allreduce(MPI.IN_PLACE, counts, op=MPI.SUM)
@@ -93,7 +93,7 @@ class Piercing:
     def _across(self, i: int, k: int, x: np.ndarray, shift: np.ndarray) -> tuple[int, int]:
         """Number of this rank's bars across wall ``k``, and the lowest of their numbers in the mesh."""
         mesh, wall = self._model.mesh, self._model.contact.walls[k]
-        rows = np.flatnonzero(self._concerned[:, i])
+        rows = np.flatnonzero(self._applicable[:, i])
         starts, ends = x[self._bars[rows, 0]] - shift, x[self._bars[rows, 1]] - shift
         if wall.partial:
             across = _crossing(wall, starts, ends, 1e-6 * self._model.length)

@@ -139,7 +139,7 @@ def project(x, fixed, normals, offsets, tolerance, multipliers):
     chosen = np.zeros(3, dtype=np.int64)
     strengths = np.zeros(3)
     move = np.zeros(3)
-    stuck = -1
+    infeasible = -1
     for i in range(m):
         count = 0
         for k in range(w):
@@ -173,8 +173,8 @@ def project(x, fixed, normals, offsets, tolerance, multipliers):
         while count > 0:
             found = _best_set(free, gap, among, count, tolerance, gram, rhs, factor, solution, chosen, strengths, move)
             if found == 0:
-                if stuck < 0:
-                    stuck = i
+                if infeasible < 0:
+                    infeasible = i
                 break
             before = count
             for k in range(w):
@@ -197,4 +197,4 @@ def project(x, fixed, normals, offsets, tolerance, multipliers):
         if found > 0:
             for c in range(3):
                 x[i, c] += move[c]
-    return stuck
+    return infeasible

@@ -38,8 +38,9 @@ class Treatment(Base):
         self._touched = self.stepper.touching.copy()
         contact, state = self.stepper.model.contact, self.stepper.state
         scheme = self.stepper.scheme
-        self._frees = scheme.at_ends and not scheme.leads  # nodes whose first free step the wall's old force works on
-        if self._frees or contact.rough or contact.restitution.any():
+        # nodes whose first free step the wall's old force works on
+        self._frees = scheme.balance_at_endpoints and not scheme.solves_next_position
+        if self._frees or contact.has_friction or contact.restitution.any():
             self._time, self._place = state.time, state.position.copy()
         if self._frees:
             mine = self._touched if self.everywhere else self._touched & (contact.restitution > 0.0)
@@ -92,7 +93,7 @@ class Treatment(Base):
         gone, force = self._held[left], self._force[left]
         walls = self._touched[gone].argmax(axis=1)
         motion = stepper.model.contact.motion
-        way = (motion.shifts(state.time) - motion.shifts(self._time))[walls]
+        way = (motion.displacements(state.time) - motion.displacements(self._time))[walls]
         rate = motion.rates(state.time)[walls]
         work = 0.5 * np.einsum("mi,mi->m", force, state.position[gone] - self._place[gone] - way)
         away = force / np.maximum(np.linalg.norm(force, axis=1), 1e-300)[:, None]
@@ -124,7 +125,7 @@ class Treatment(Base):
         stepper, state, h = self.stepper, self.stepper.state, self.stepper.part
         contact, balance, mass = stepper.model.contact, stepper.balance, stepper.model.inertia.mass[nodes, None]
         push = np.where(stepper.model.supports.fixed[nodes], 0.0, state.contact[nodes]) / mass
-        way = contact.motion.shifts(state.time) - contact.motion.shifts(self._time)
+        way = contact.motion.displacements(state.time) - contact.motion.displacements(self._time)
         moved = (state.position[nodes] - self._place[nodes] - push / balance.alpha)[:, None, :] - way
         known = 0.0 if balance.a_hat is None else balance.a_hat[nodes]
         free = balance.alpha * stepper.solution.u[nodes] + known - push
@@ -137,7 +138,7 @@ class Treatment(Base):
     def sticking(self, nodes: np.ndarray, touching: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """See :class:`~pfem_petsc.contact.treatments.base.Treatment`."""
         model = self.stepper.model
-        if not model.contact.rough:
+        if not model.contact.has_friction:
             return np.zeros(touching.shape, dtype=bool)
         slip = self._moved(nodes)
         slip -= np.einsum("mwi,mwi->mw", slip, normals)[:, :, None] * normals
@@ -147,13 +148,13 @@ class Treatment(Base):
     def _moved(self, nodes: np.ndarray) -> np.ndarray:
         """How nodes (m,) moved in this step relative to the walls (m, w, 3) [m]."""
         contact, state = self.stepper.model.contact, self.stepper.state
-        way = contact.motion.shifts(state.time) - contact.motion.shifts(self._time)
+        way = contact.motion.displacements(state.time) - contact.motion.displacements(self._time)
         return (state.position[nodes] - self._place[nodes])[:, None, :] - way
 
-    def on_walls(self, concerned: np.ndarray | bool = True) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def on_walls(self, applicable: np.ndarray | bool = True) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Nodes that walls hold (m,), and velocities and accelerations (m, 3) that they get [m/s], [m/s2]."""
         state, model = self.stepper.state, self.stepper.model
-        nodes, normal, speed = self.held(concerned)
+        nodes, normal, speed = self.held(applicable)
         v, a = state.v[nodes], state.a[nodes]
         v = v - np.einsum("mij,mj->mi", normal, v) + speed
         a = a - np.einsum("mij,mj->mi", normal, a)

@@ -98,7 +98,7 @@ class RowCoordinates:
         self._solved = inverses
         self._turned = turned
         self._placed = np.flatnonzero(self._pivot >= 0)
-        self._waiting = np.flatnonzero((self._pivot < 0) & rows.usable(jacobian))
+        self._deferred = np.flatnonzero((self._pivot < 0) & rows.usable(jacobian))
         # T on the pivots' rows, as entries
         parts = []
         for unknowns, transform in self._blocks:
@@ -218,7 +218,7 @@ class RowCoordinates:
     def kept(self, x: np.ndarray, slack: float) -> bool:
         rows, every = self.rows, self.rows.gather(x)
         values, pressed = rows.values(every), self.link.force > 0.0
-        blocked = self._waiting[values[self._waiting] < -slack]
+        blocked = self._deferred[values[self._deferred] < -slack]
         if len(blocked):
             nodes = rows.numbers[rows.entry_node[rows.entry_row == blocked[0]]]
             raise NotConverged(

@@ -8,7 +8,7 @@ __all__ = ["near_planes"]
 
 
 @kernel
-def near_planes(x, normals, offsets, everyone, members, reach, near):
+def near_planes(x, normals, offsets, all_nodes, members, reach, near):
     """Mark nodes within reach of a plane.
 
     Parameters
@@ -31,7 +31,7 @@ def near_planes(x, normals, offsets, everyone, members, reach, near):
         limit = reach[i] if per_node else reach[0]
         for k in range(len(offsets)):
             gap = normals[k, 0] * x[i, 0] + normals[k, 1] * x[i, 1] + normals[k, 2] * x[i, 2] - offsets[k]
-            if gap < limit and (everyone[k] or members[i, k]):
+            if gap < limit and (all_nodes[k] or members[i, k]):
                 near[i] = True
                 count += 1
                 break

@@ -88,8 +88,8 @@ class Sliding:
         # what a turn of the slip makes of the drag
         self.stiffness[:] = 0.0
         for k in range(self.rows.shape[1]):
-            pressing = np.maximum(self.signs[:, k] * g[every, np.maximum(self.rows[:, k], 0)], 0.0)
-            factor = self.friction[:, k] * pressing * self.weight / size[:, k]
+            normal_forces = np.maximum(self.signs[:, k] * g[every, np.maximum(self.rows[:, k], 0)], 0.0)
+            factor = self.friction[:, k] * normal_forces * self.weight / size[:, k]
             n, d = self.normals[:, k], directions[:, k]
             across = np.eye(3) - n[:, :, None] * n[:, None, :] - d[:, :, None] * d[:, None, :]
             self.stiffness += factor[:, None, None] * across

@@ -56,7 +56,7 @@ class Ties:
     def targets(self, time: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Tied nodes (m,), their walls (m,), and where these hold them at a time [s] (m, 3) [m]."""
         nodes, walls = self.nodes()
-        return nodes, walls, self._memory()[1][nodes] + self.contact.motion.shifts(time)[walls]
+        return nodes, walls, self._memory()[1][nodes] + self.contact.motion.displacements(time)[walls]
 
     def hold(self, x: np.ndarray, stiffness: np.ndarray, time: float) -> tuple[np.ndarray, ...]:
         """Tied nodes (m,) of an explicit step, with their walls (m,), places and forces (m, 3) [m], [N].
@@ -112,10 +112,10 @@ class Ties:
         partly &= ~np.isin(walls, contact.motion.bodies.at)  # whose place may be a trial
         if len(nodes) == 0:
             return
-        shifts = contact.motion.shifts(time)
-        concerned = contact.concerned(nodes, places, shifts)
-        concerned[np.arange(len(nodes)), walls] = partly
-        normals, offsets = contact.planes(concerned, places, shifts)
+        displacements = contact.motion.displacements(time)
+        applicable = contact.applicable(nodes, places, displacements)
+        applicable[np.arange(len(nodes)), walls] = partly
+        normals, offsets = contact.planes(applicable, places, displacements)
         gaps = np.einsum("mwi,mi->mw", normals, places) - offsets
         gaps[(np.where(contact.fixed[nodes][:, None, :], 0.0, normals) ** 2).sum(axis=2) <= FREE_PART] = np.inf
         node, other = np.unravel_index(np.argmin(gaps), gaps.shape)
@@ -142,7 +142,7 @@ class Ties:
         met = fresh.any(axis=1)
         walls = fresh[met].argmax(axis=1)
         tied_to[nodes[met]] = walls + 1
-        own = places[met] - self.contact.motion.shifts(time)[walls]
+        own = places[met] - self.contact.motion.displacements(time)[walls]
         tied_at[nodes[met]] = own
         normals = np.zeros((len(walls), 3))
         for k in np.unique(walls):

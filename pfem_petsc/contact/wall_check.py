@@ -12,21 +12,21 @@ __all__ = ["broken_walls", "is_misaligned", "is_off_surface"]
 
 
 def broken_walls(
-    contact, shifts: np.ndarray, candidates: Candidates, frames: NodalFrames, x: np.ndarray, tolerance: float
+    contact, displacements: np.ndarray, candidates: Candidates, frames: NodalFrames, x: np.ndarray, tolerance: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Nodes (k,) beyond walls that no bound on them stands for, and which walls these are (k, walls).
 
     Parameters
     ----------
     contact : Contact
-    shifts : (walls, 3) of walls [m]
+    displacements : (walls, 3) of walls [m]
     candidates, frames : of the solve
     x : (owned, 3) solution [m]
     tolerance : depth that counts as none [m]
     """
-    beyond = np.flatnonzero(contact.near(x, shifts, np.array([-tolerance])))
-    concerned = contact.concerned(beyond, x[beyond], shifts)
-    normals, offsets = contact.planes(concerned, x[beyond], shifts)
+    beyond = np.flatnonzero(contact.near(x, displacements, np.array([-tolerance])))
+    applicable = contact.applicable(beyond, x[beyond], displacements)
+    normals, offsets = contact.planes(applicable, x[beyond], displacements)
     gaps = np.einsum("iwk,ik->iw", normals, x[beyond]) - offsets
     broken = gaps < -tolerance
     place = np.searchsorted(candidates.nodes, beyond)
@@ -44,20 +44,20 @@ def broken_walls(
 
 def is_misaligned(frames: NodalFrames, strengths: np.ndarray) -> bool:
     """Whether a wall presses on the row of an almost parallel one that does not: the force is off its normal."""
-    pressing = strengths > 0.0
-    astray = pressing & frames.shared
+    normal_forces = strengths > 0.0
+    astray = normal_forces & frames.shared
     for node, wall in np.argwhere(astray):
         own = (frames.rows[node] == frames.rows[node, wall]) & ~frames.shared[node]
         turn = np.abs(
             frames.normals[node, wall] - frames.signs[node, wall] * frames.basis[node, frames.rows[node, wall]]
         )
-        if turn.max() > ON_BOUND and not (pressing[node] & own).any():
+        if turn.max() > ON_BOUND and not (normal_forces[node] & own).any():
             return True
     return False
 
 
 def is_off_surface(
-    contact, shifts: np.ndarray, frames: NodalFrames, strengths: np.ndarray, x: np.ndarray, tolerance: float
+    contact, displacements: np.ndarray, frames: NodalFrames, strengths: np.ndarray, x: np.ndarray, tolerance: float
 ) -> bool:
     """Whether a node pressed on a curved wall is off its surface, or was held by the plane of another point.
 
@@ -67,10 +67,10 @@ def is_off_surface(
     for k in np.flatnonzero(~contact.flat):
         pressed = strengths[:, k] > 0.0
         passed = ~pressed & (frames.rows[:, k] >= 0)
-        if passed.any() and (contact.gap(k, x[at[passed]], shifts) < -tolerance).any():
+        if passed.any() and (contact.gap(k, x[at[passed]], displacements) < -tolerance).any():
             return True
         if pressed.any():
-            place = x[at[pressed]] - shifts[k]
+            place = x[at[pressed]] - displacements[k]
             normals, offsets = contact.walls[k].planes(place)
             gap = np.einsum("ij,ij->i", normals, place) - offsets
             if np.abs(gap).max() > tolerance or np.abs(normals - frames.normals[pressed, k]).max() > ON_BOUND:

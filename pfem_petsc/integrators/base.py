@@ -77,7 +77,7 @@ class Balance:
     time: float
     loads: tuple[tuple[float, float], ...]
     weight: float
-    from_start: bool = False
+    discrete_gradient: bool = False
 
 
 class NoParameters(StrictModel):
@@ -94,10 +94,10 @@ class Scheme(ABC):
     at_ends : the balance holds at the ends of steps, so that works follow the trapezoidal rule; else the forces of the
         balance work over the whole step
     solves_end : the position solved for is x_{n+1}
-    discrete_gradient : the internal force of its balances is that of the step (``Balance.from_start``)
+    discrete_gradient : the internal force of its balances is that of the step (``Balance.discrete_gradient``)
     force_acts_once : the contact force of a step acts in that step alone once its acceleration is taken away
     loops : ``inlined`` functions that move nodes and finish a step, for the loop over many steps
-        (``stepping/march.py``); None: steps are made one by one
+        (``stepping/fused_loop.py``); None: steps are made one by one
     symmetric : whether the Hessian is
     remembers : names of what it keeps of nodes in the state's memory, linear in motions
     dissipates : whether the scheme takes energy from high frequencies
@@ -107,8 +107,8 @@ class Scheme(ABC):
     """
 
     explicit = False
-    leads = False
-    at_ends = True
+    solves_next_position = False
+    balance_at_endpoints = True
     solves_end = True
     discrete_gradient = False
     force_acts_once = False

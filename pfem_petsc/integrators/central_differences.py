@@ -43,7 +43,7 @@ drift, kick = kernel(move), kernel(finish)
 class Scheme(ExplicitScheme):
     """Central differences (explicit)."""
 
-    leads = True
+    solves_next_position = True
     loops = (move, finish)
     remembers = ("half_velocity",)
     dissipates = False

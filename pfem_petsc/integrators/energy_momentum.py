@@ -21,7 +21,7 @@ Parameters = NoParameters
 class Scheme(Base):
     """Energy-momentum conserving scheme (implicit)."""
 
-    at_ends = False
+    balance_at_endpoints = False
     force_acts_once = True
     discrete_gradient = True
     symmetric = False
@@ -38,7 +38,7 @@ class Scheme(Base):
             time=state.time + h,
             loads=((1.0, state.time + 0.5 * h),),
             weight=1.0,
-            from_start=self.discrete_gradient,
+            discrete_gradient=self.discrete_gradient,
         )
 
     def finish(self, state: State, balance: Balance, u: np.ndarray, h: float) -> None:

@@ -30,7 +30,7 @@ class Parameters(StrictModel):
 class Scheme(Base):
     """Generalised-alpha (implicit, Chung and Hulbert)."""
 
-    at_ends = False
+    balance_at_endpoints = False
 
     def __init__(self, parameters: StrictModel) -> None:
         super().__init__(parameters)

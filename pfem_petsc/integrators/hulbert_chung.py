@@ -46,7 +46,7 @@ def _complete(square, old, new, predictor, u, v, a, x, v1, a1):
 class Scheme(ExplicitScheme):
     """Explicit generalised-alpha (Hulbert and Chung)."""
 
-    at_ends = False
+    balance_at_endpoints = False
 
     def __init__(self, parameters: StrictModel) -> None:
         super().__init__(parameters)

@@ -36,7 +36,7 @@ class Parameters(StrictModel):
 class Scheme(Base):
     """Wilson's theta method (implicit)."""
 
-    at_ends = False
+    balance_at_endpoints = False
     solves_end = False
 
     def limit(self, damping_ratio: float = 0.0) -> float:

@@ -98,14 +98,14 @@ def make_conserving_kernels(law: Law, measure: Callable) -> SimpleNamespace:
     @kernel
     def forces(x0, cold, x, bars, rest, heat, p, area, step, history, start, stop, f):
         """Add the step's internal forces to ``f``."""
-        warm = heat.shape[1] > 0
+        has_thermal = heat.shape[1] > 0
         for k in range(start, stop):
             a = bars[k, 0]
             b = bars[k, 1]
-            shift0 = cold[0, k] if warm else 0.0
-            shift = heat[0, k] if warm else 0.0
-            warmth0 = cold[1, k] if warm else 0.0
-            warmth = heat[1, k] if warm else 0.0
+            shift0 = cold[0, k] if has_thermal else 0.0
+            shift = heat[0, k] if has_thermal else 0.0
+            warmth0 = cold[1, k] if has_thermal else 0.0
+            warmth = heat[1, k] if has_thermal else 0.0
             q = take(history, k - start, like)
             kept = history[last + 1, k - start] if by_rate else 0.0
             ox = x0[b, 0] - x0[a, 0]
@@ -128,14 +128,14 @@ def make_conserving_kernels(law: Law, measure: Callable) -> SimpleNamespace:
         x0, cold, x, bars, rest, heat, p, area, step, history, start, stop, inertia, weight, ptr, slots, values
     ):
         """Add ``weight`` df/dx1 = c/2 I + dc/dl1 d n1^T (not symmetric) and the consistent inertia."""
-        warm = heat.shape[1] > 0
+        has_thermal = heat.shape[1] > 0
         for k in range(start, stop):
             a = bars[k, 0]
             b = bars[k, 1]
-            shift0 = cold[0, k] if warm else 0.0
-            shift = heat[0, k] if warm else 0.0
-            warmth0 = cold[1, k] if warm else 0.0
-            warmth = heat[1, k] if warm else 0.0
+            shift0 = cold[0, k] if has_thermal else 0.0
+            shift = heat[0, k] if has_thermal else 0.0
+            warmth0 = cold[1, k] if has_thermal else 0.0
+            warmth = heat[1, k] if has_thermal else 0.0
             q = take(history, k - start, like)
             kept = history[last + 1, k - start] if by_rate else 0.0
             ox = x0[b, 0] - x0[a, 0]

@@ -62,7 +62,7 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
         """
         failed = -1
         shortened = False
-        warm = heat.shape[1] > 0
+        has_thermal = heat.shape[1] > 0
         origin = starts[0]
         # end differences, force over length, energies, new history
         work = np.zeros((4 + n_energies + n_rows, CHUNK))
@@ -89,7 +89,7 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
                     work[2, i] = dz
                     work[3, i] = dx * dx + dy * dy + dz * dz
             rests = rest[first:stop]
-            shifts = heat[0][first:stop]
+            displacements = heat[0][first:stop]
             warmths = heat[1][first:stop]
             begin = first - origin  # column of the history
             short = 0
@@ -100,8 +100,8 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
                 short += 0 if stretch >= SHORTENED_STRETCH else 1  # NaN counts
                 strain, slope, _ = measure(stretch)
                 warmth = 0.0
-                if warm:
-                    strain -= shifts[i]
+                if has_thermal:
+                    strain -= displacements[i]
                     warmth = warmths[i]
                 q = take(history, begin + i, like)
                 rate = 0.0
@@ -178,12 +178,12 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
         ``slots`` (b, 4): index among all blocks of (a, a), (a, b), (b, b), (b, a), -1 where the row is not owned;
         ``ptr`` (owned + 1,) first block of a row; ``values``: the matrix in scalar compressed rows.
         """
-        warm = heat.shape[1] > 0
+        has_thermal = heat.shape[1] > 0
         for k in range(start, stop):
             a = bars[k, 0]
             b = bars[k, 1]
-            shift = heat[0, k] if warm else 0.0
-            warmth = heat[1, k] if warm else 0.0
+            shift = heat[0, k] if has_thermal else 0.0
+            warmth = heat[1, k] if has_thermal else 0.0
             nx = x[b, 0] - x[a, 0]
             ny = x[b, 1] - x[a, 1]
             nz = x[b, 2] - x[a, 2]
@@ -222,12 +222,12 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
     @kernel
     def product(x, bars, rest, heat, p, area, step, history, start, stop, u, out):
         """Add K_t u to ``out``; both (local nodes, 3), ``u`` with ghosts."""
-        warm = heat.shape[1] > 0
+        has_thermal = heat.shape[1] > 0
         for k in range(start, stop):
             a = bars[k, 0]
             b = bars[k, 1]
-            shift = heat[0, k] if warm else 0.0
-            warmth = heat[1, k] if warm else 0.0
+            shift = heat[0, k] if has_thermal else 0.0
+            warmth = heat[1, k] if has_thermal else 0.0
             nx = x[b, 0] - x[a, 0]
             ny = x[b, 1] - x[a, 1]
             nz = x[b, 2] - x[a, 2]
@@ -254,12 +254,12 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
     @kernel
     def linearise(x, bars, rest, heat, p, area, step, history, start, stop, weight, stored):
         """What a product with ``weight`` K_t needs of each bar: n, dN/dl - N/l and N/l, to ``stored`` (b, 5)."""
-        warm = heat.shape[1] > 0
+        has_thermal = heat.shape[1] > 0
         for k in range(start, stop):
             a = bars[k, 0]
             b = bars[k, 1]
-            shift = heat[0, k] if warm else 0.0
-            warmth = heat[1, k] if warm else 0.0
+            shift = heat[0, k] if has_thermal else 0.0
+            warmth = heat[1, k] if has_thermal else 0.0
             dx = x[b, 0] - x[a, 0]
             dy = x[b, 1] - x[a, 1]
             dz = x[b, 2] - x[a, 2]
@@ -275,7 +275,7 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
     @kernel
     def fields(x, bars, rest, heat, p, area, step, history, start, stop, strain_out, stress_out, force_out):
         """Total strain, stress [Pa] and axial force [N] of each bar at the end of the last step."""
-        warm = heat.shape[1] > 0
+        has_thermal = heat.shape[1] > 0
         for k in range(start, stop):
             a = bars[k, 0]
             b = bars[k, 1]
@@ -283,8 +283,8 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
             dy = x[b, 1] - x[a, 1]
             dz = x[b, 2] - x[a, 2]
             strain, slope, _ = measure(math.sqrt(dx * dx + dy * dy + dz * dz) / rest[k])
-            shift = heat[0, k] if warm else 0.0
-            warmth = heat[1, k] if warm else 0.0
+            shift = heat[0, k] if has_thermal else 0.0
+            warmth = heat[1, k] if has_thermal else 0.0
             q = take(history, k - start, like)
             if by_rate:
                 stress = history[last + 1, k - start]

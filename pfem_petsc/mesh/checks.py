@@ -66,8 +66,8 @@ def _check_points(slab: MeshSlab, comm: MPI.Comm) -> None:
 def _check_ends(slab: MeshSlab, comm: MPI.Comm) -> None:
     bad = np.flatnonzero(((slab.bars < 0) | (slab.bars >= slab.n_nodes)).any(axis=1))
     lines = [_bar(slab, i) for i in bad[:_SHOWN]]
-    way_out = f"nodes are numbered from 0 to {slab.n_nodes - 1}"
-    _refuse(slab, comm, lines, len(bad), "bars have an end that does not exist", way_out)
+    remedy = f"nodes are numbered from 0 to {slab.n_nodes - 1}"
+    _refuse(slab, comm, lines, len(bad), "bars have an end that does not exist", remedy)
     bad = np.flatnonzero(slab.bars[:, 0] == slab.bars[:, 1])
     lines = [_bar(slab, i) for i in bad[:_SHOWN]]
     _refuse(slab, comm, lines, len(bad), "bars start and end at the same node", "remove them")
@@ -78,10 +78,10 @@ def _check_bare_nodes(slab: MeshSlab, comm: MPI.Comm, used: np.ndarray) -> None:
     bare[used] = False
     bad = np.flatnonzero(bare)
     lines = [f"node {slab.first_node + i}" for i in bad[:_SHOWN]]
-    way_out = "remove them: a node without bars has neither mass nor stiffness"
+    remedy = "remove them: a node without bars has neither mass nor stiffness"
     if slab.source.endswith(".msh"):
-        way_out += " (Gmsh saves the nodes of physical groups alone where there are any: put only the bars in them)"
-    _refuse(slab, comm, lines, len(bad), "nodes belong to no bar", way_out)
+        remedy += " (Gmsh saves the nodes of physical groups alone where there are any: put only the bars in them)"
+    _refuse(slab, comm, lines, len(bad), "nodes belong to no bar", remedy)
 
 
 def _check_lengths(slab: MeshSlab, comm: MPI.Comm, points: np.ndarray, ends: np.ndarray) -> list[str]:
@@ -91,8 +91,8 @@ def _check_lengths(slab: MeshSlab, comm: MPI.Comm, points: np.ndarray, ends: np.
         length = np.sqrt(np.einsum("ij,ij->i", length, length))
     bad = np.flatnonzero(~((length > 0.0) & (length < np.inf)))
     lines = [f"{_bar(slab, i)}, length {length[i]:g}" for i in bad[:_SHOWN]]
-    way_out = "merge the nodes at its ends, or correct their positions"
-    _refuse(slab, comm, lines, len(bad), "bars have no length that can be computed with", way_out)
+    remedy = "merge the nodes at its ends, or correct their positions"
+    _refuse(slab, comm, lines, len(bad), "bars have no length that can be computed with", remedy)
     mean = comm.allreduce(float(length.sum())) / slab.n_bars
     short = np.flatnonzero(length < SHORT * mean)
     lines = [f"{_bar(slab, i)}, length {length[i]:g} m" for i in short[:_SHOWN]]
@@ -133,8 +133,8 @@ def _sentence(comm: MPI.Comm, lines: list[str], count: int, what: str) -> str:
     return f"{total} {what}: {', '.join(found[:_SHOWN])}{more}"
 
 
-def _refuse(slab: MeshSlab, comm: MPI.Comm, lines: list[str], count: int, what: str, way_out: str) -> None:
+def _refuse(slab: MeshSlab, comm: MPI.Comm, lines: list[str], count: int, what: str, remedy: str) -> None:
     """Raise the same InputError on all ranks when any found something. Collective."""
     text = _sentence(comm, lines, count, what)
     if text:
-        raise InputError(f"{slab.source}: {text}; {way_out}")
+        raise InputError(f"{slab.source}: {text}; {remedy}")

@@ -33,7 +33,7 @@ from .hdf5 import (
     write_rows,
     writing,
 )
-from .integrity import check_seal, checksum, seal, seal_size, way_out
+from .integrity import check_seal, checksum, remedy, seal, seal_size
 
 __all__ = [
     "Checkpoint",
@@ -187,7 +187,7 @@ class OpenCheckpoint:
         with _sound(self.path), h5py.File(self._raw, "r") as file:
             state = file["state"][()]
             if zlib.crc32(state) != file["state"].attrs["checksum"]:
-                raise InputError(f"{self.path}: damaged: its state does not match the checksum; {way_out(self.path)}")
+                raise InputError(f"{self.path}: damaged: its state does not match the checksum; {remedy(self.path)}")
         state = json.loads(state)
         return state["scalars"], state["attributes"]
 
@@ -225,7 +225,7 @@ class OpenCheckpoint:
                 expected[name] = int(dataset.attrs["checksum"])
         for name, slab in slabs.items():
             if checksum(self.comm, slab, orders[name].first) != expected[name]:
-                raise InputError(f"{path}: damaged: the values of {name} do not match their checksum; {way_out(path)}")
+                raise InputError(f"{path}: damaged: the values of {name} do not match their checksum; {remedy(path)}")
         arrays = {name: orders[name].from_slab(slab) for name, slab in slabs.items()}
         return Checkpoint(path, arrays, self.scalars, self.attributes)
 
@@ -284,7 +284,7 @@ def _open(path: Path) -> BinaryIO:
                 break
             time.sleep(0.02)
         except OSError as error:
-            raise InputError(f"{path}: cannot be read: {error.strerror}; {way_out(path)}") from error
+            raise InputError(f"{path}: cannot be read: {error.strerror}; {remedy(path)}") from error
     raise InputError(f"{path}: there is no such checkpoint; name an existing one, or start without --restart")
 
 
@@ -293,7 +293,7 @@ def _sound(path: Path) -> Iterator[None]:
     try:
         yield
     except HDF5_ERRORS as error:
-        raise InputError(f"{path}: not a checkpoint, or damaged: {first_line(error)}; {way_out(path)}") from error
+        raise InputError(f"{path}: not a checkpoint, or damaged: {first_line(error)}; {remedy(path)}") from error
 
 
 def _plain(value: Any) -> Any:

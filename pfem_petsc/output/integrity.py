@@ -19,7 +19,7 @@ from mpi4py import MPI
 
 from ..errors import InputError
 
-__all__ = ["check_seal", "checksum", "seal", "seal_size", "way_out", "word_sum"]
+__all__ = ["check_seal", "checksum", "remedy", "seal", "seal_size", "word_sum"]
 
 FORMAT, VERSION = "pfem_petsc checkpoint", 1
 LARGEST_SEAL = 1 << 20
@@ -100,7 +100,7 @@ def check_seal(path: Path, raw: BinaryIO | None = None) -> str:
                 return _checked(path, raw)
         return _checked(path, raw)
     except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}; {way_out(path)}") from error
+        raise InputError(f"{path}: cannot be read: {error.strerror}; {remedy(path)}") from error
 
 
 def _checked(path: Path, raw: BinaryIO) -> str:
@@ -109,11 +109,11 @@ def _checked(path: Path, raw: BinaryIO) -> str:
     first = head[0].decode(errors="replace")
     name, _, version = first.rpartition(" ")
     if name != FORMAT:
-        raise InputError(f"{path}: not a checkpoint of pfem_petsc, or damaged at its beginning; {way_out(path)}")
+        raise InputError(f"{path}: not a checkpoint of pfem_petsc, or damaged at its beginning; {remedy(path)}")
     if version != str(VERSION):
         raise InputError(
             f"{path}: has version {version} of the checkpoint format, this program reads {VERSION}: restart with "
-            f"the version of pfem_petsc that wrote it, or {way_out(path)}"
+            f"the version of pfem_petsc that wrote it, or {remedy(path)}"
         )
     digest = None
     try:
@@ -121,16 +121,16 @@ def _checked(path: Path, raw: BinaryIO) -> str:
         size, digest = int(content["size"]), content.pop("digest")
         actual = os.fstat(raw.fileno()).st_size
         if actual != size:
-            raise InputError(f"{path}: damaged: has {actual} bytes of {size}; {way_out(path)}")
+            raise InputError(f"{path}: damaged: has {actual} bytes of {size}; {remedy(path)}")
         sound = _digest(raw, content) == digest
     except (ValueError, KeyError, TypeError, IndexError, OverflowError, AttributeError):
         sound = False
     if not sound:
-        raise InputError(f"{path}: damaged: what describes its content does not match the digest; {way_out(path)}")
+        raise InputError(f"{path}: damaged: what describes its content does not match the digest; {remedy(path)}")
     return str(digest)
 
 
-def way_out(path: Path) -> str:
+def remedy(path: Path) -> str:
     """What to do without this checkpoint."""
     previous = path.with_name(f"{path.stem}-previous{path.suffix}")
     if previous.is_file():

@@ -10,7 +10,7 @@ import functools
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-__all__ = ["EVENTS", "STAGES", "lay_over", "staged"]
+__all__ = ["EVENTS", "STAGES", "instrument", "staged"]
 
 SET_UP, STEPS = "pfem set-up", "pfem steps"
 
@@ -53,7 +53,7 @@ def staged(method: Method) -> Method:
     return in_stage  # type: ignore[return-value]
 
 
-def lay_over(simulation: Any) -> None:
+def instrument(simulation: Any) -> None:
     """Lay the stage of the steps and all events over a simulation that is set up, if PETSc logs."""
     from petsc4py import PETSc
 

@@ -184,14 +184,16 @@ class _Film:
 
     def _moved(self, walls: Sequence[Any]) -> dict[int, list[Surface]]:
         """Frame to the surfaces of the walls where they are then; a wall at rest has the same one in all."""
-        shifts = dict(zip(self.frames, wall_shifts(self.result, self.result.times[list(self.frames)]), strict=True))
+        displacements = dict(
+            zip(self.frames, wall_shifts(self.result, self.result.times[list(self.frames)]), strict=True)
+        )
         still = {surface.name: surface for surface in wall_surfaces(walls, self.bounds, self.note)}
         surfaces: dict[int, list[Surface]] = {frame: [] for frame in self.frames}
         for k, wall in enumerate(walls):
             if wall.name not in still:
                 continue
             for frame in self.frames:
-                surface, shift = still[wall.name], shifts[frame][k]
+                surface, shift = still[wall.name], displacements[frame][k]
                 if shift.any():
                     point = tuple((np.asarray(wall.point) + shift).tolist())
                     (surface,) = wall_surfaces([wall.model_copy(update={"point": point})], self.bounds)

@@ -84,11 +84,11 @@ def wall_shifts(result: Any, times: Sequence[float]) -> np.ndarray:
     """
     walls = list(result.case.wall)
     motion = WallMotion(walls)
-    shifts = np.array([motion.shifts(time) for time in times]).reshape(len(times), len(walls), 3)
+    displacements = np.array([motion.displacements(time) for time in times]).reshape(len(times), len(walls), 3)
     for k, wall in enumerate(walls):
         if wall.mass is not None:
             when = np.asarray(result.history["time"], dtype=float)
             places = np.asarray(result.history[f"wall/{wall.name}/position"], dtype=float)
             for axis in range(3):
-                shifts[:, k, axis] = np.interp(times, when, places[:, axis] - places[0, axis])
-    return shifts
+                displacements[:, k, axis] = np.interp(times, when, places[:, axis] - places[0, axis])
+    return displacements

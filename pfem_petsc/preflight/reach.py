@@ -62,4 +62,4 @@ def _way(keys, motion, k: int, times: np.ndarray) -> np.ndarray:
     """Displacements (times, 3) [m] of a wall as given; with its first velocity, where it has mass."""
     if keys.mass is not None:
         return np.outer(times, keys.velocity if keys.velocity is not None else (0.0, 0.0, 0.0))
-    return np.array([motion.shifts(time)[k] for time in times])
+    return np.array([motion.displacements(time)[k] for time in times])

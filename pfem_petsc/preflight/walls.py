@@ -24,7 +24,7 @@ def wall_gaps(model) -> tuple[dict[str, str], list[str]]:
     now, then = contact.gaps(points, 0.0), contact.gaps(points + ahead * v, ahead)
     bodies = contact.motion.bodies  # not under way yet: the nodes' way as these walls see it
     for k, speed in zip(bodies.at, bodies.state.v, strict=True):
-        seen = contact.gap(k, points + ahead * (v - speed), contact.motion.shifts(0.0))
+        seen = contact.gap(k, points + ahead * (v - speed), contact.motion.displacements(0.0))
         then[:, k] = np.where(contact.members[:, k], seen, np.inf)
     with np.errstate(invalid="ignore"):
         rate = (then - now) / ahead

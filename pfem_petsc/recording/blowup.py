@@ -29,7 +29,7 @@ class BlowUp:
         """What a checkpoint must hold: rows so far, how many of the last were strange, and the most put in [J]."""
         return {"rows": self._rows, "strange": self._strange, "most": self._most}
 
-    def put_back(self, kept: dict[str, Any]) -> None:
+    def load_state(self, kept: dict[str, Any]) -> None:
         """Go on as the run that is continued would have."""
         self._rows, self._strange, self._most = int(kept["rows"]), int(kept["strange"]), float(kept["most"])
 

@@ -63,11 +63,11 @@ class Recorder:
         for probe in case.output.probe:
             local = self.model.nodes[probe.node_set]
             ids = mesh.node_ids[local]
-            everyone = np.sort(np.concatenate(comm.allgather(ids)))
-            self.probe_nodes[probe.name] = everyone
-            self._probes.append((probe.name, local, np.searchsorted(everyone, ids)))
+            all_nodes = np.sort(np.concatenate(comm.allgather(ids)))
+            self.probe_nodes[probe.name] = all_nodes
+            self._probes.append((probe.name, local, np.searchsorted(all_nodes, ids)))
             for quantity in _PROBED:
-                self.columns[f"probe/{probe.name}/{quantity}"] = (len(everyone), 3)
+                self.columns[f"probe/{probe.name}/{quantity}"] = (len(all_nodes), 3)
         self.layout = RowLayout(self.columns, self.types)
         self._contact = ContactColumns(self.model.contact)
         probed = sum(12 * len(nodes) for nodes in self.probe_nodes.values())

@@ -77,7 +77,7 @@ class Checkpoints:
         check_mesh_is_the_same(restart.path, self._mark, restart.attributes, self.case.source)
         checkpoint = restart.file.read(self.state.orders(restart.scalars))
         restart.file.close()
-        self.state.put_back(checkpoint)
+        self.state.load_state(checkpoint)
         if restart.continues:
             self.last_step = restart.step
         return checkpoint

@@ -112,7 +112,7 @@ class RunState:
         bars = NaturalOrder(self.comm, slab, self.model.mesh.n_bars)
         return dict.fromkeys(scalars["node_arrays"], self.node_order) | dict.fromkeys(scalars["bar_arrays"], bars)
 
-    def put_back(self, checkpoint: Checkpoint) -> None:
+    def load_state(self, checkpoint: Checkpoint) -> None:
         """Set the stepper to what a checkpoint holds; instead of its ``start``. Collective."""
         stepper, state, owned = self.stepper, self.stepper.state, self.model.mesh.n_owned
         scalars = checkpoint.scalars
@@ -125,7 +125,7 @@ class RunState:
                 name = name.removeprefix(_KEPT)
                 setattr(stepper, name, values.astype(getattr(stepper, name).dtype))
             elif name in links:
-                self.model.links.put_back(name, values)
+                self.model.links.load_state(name, values)
             elif name in ("x", "f"):
                 getattr(state, name)[:owned] = values
             else:
@@ -146,18 +146,18 @@ class RunState:
         sums = {n: np.array(mine["walls"][n], dtype=a.dtype).reshape(a.shape) for n, a in like.items()}
         stepper.solution.walls = dataclasses.replace(walls, **sums)
         stepper.solution.contacts = int(mine["contacts"])
-        self.model.contact.motion.put_back(scalars["free_walls"])
+        self.model.contact.motion.load_state(scalars["free_walls"])
         self.model.links.restore(scalars)
-        self.model.contact.log.put_back(mine["contact_log"], scalars["contact_times"], stepper.touching)
+        self.model.contact.log.load_state(mine["contact_log"], scalars["contact_times"], stepper.touching)
 
     def put_back_sums(self, checkpoint: Checkpoint, ledger, recorder, blow_up) -> dict[str, Any]:
         """Set ledger, recorder and watch, made after :meth:`put_back`; gives what is known of the last row."""
         scalars = checkpoint.scalars
-        ledger.put_back(self._share(scalars["ranks"])["ledger"])
+        ledger.load_state(self._share(scalars["ranks"])["ledger"])
         recorder.iterations = [int(n) for n in scalars["iterations"]]
         recorder.start_energy = scalars["start_energy"]
         recorder.energy_scale = scalars["energy_scale"]
-        blow_up.put_back(scalars["blow_up"])
+        blow_up.load_state(scalars["blow_up"])
         return dict(scalars["row"])
 
     def _share(self, ranks: list[dict[str, Any]]) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from ..recording.report import ProgressReport
 from ..recording.snapshots import Snapshots
 from ..restart.checkpoints import Checkpoints
 from ..restart.folder import Restart, prepare_folder
-from ..stepping.batch import Batches
+from ..stepping.fused_steps import Batches
 from ..stepping.time_stepping import TimeStepping
 from .compilation import ReportedCompilation
 from .opening import open_progress, open_result_file

@@ -98,7 +98,7 @@ class LaggedPreconditioner:
         balance = problem.balance
         wanted = [balance.alpha, balance.eta, balance.weight]
         due = beyond > _SET_UP.get(self.kind, 0)
-        own = not problem.transform.identity or balance.from_start
+        own = not problem.transform.identity or balance.discrete_gradient
         usable = self.outlasts and not own
         self._kept = kept
         if problem is not self._problem:

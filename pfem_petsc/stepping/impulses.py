@@ -52,8 +52,8 @@ def wall_shares(stepper, nodes: np.ndarray, jumps: np.ndarray) -> np.ndarray:
     several = np.flatnonzero(touching.sum(axis=1) > 1)
     if len(several):
         at = nodes[several]
-        shifts = contact.motion.shifts(stepper.state.time)
-        normals, _ = contact.planes(touching[several], stepper.state.position[at], shifts)
+        displacements = contact.motion.displacements(stepper.state.time)
+        normals, _ = contact.planes(touching[several], stepper.state.position[at], displacements)
         normals = np.where(touching[several][:, :, None], normals, 0.0)
         parts = np.einsum("miw,mi->mw", np.linalg.pinv(normals, rcond=RANK), jumps[several])
         own = parts[:, :, None] * normals
@@ -160,7 +160,7 @@ class Impulses:
             f"memory.{name}": array.tolist() for name, array in state.memory.items()
         }
 
-    def put_back(self, kept: dict[str, Any]) -> None:
+    def load_state(self, kept: dict[str, Any]) -> None:
         """Take the share from a checkpoint."""
         shape = self.state.v.shape
         self.state.memory = {}

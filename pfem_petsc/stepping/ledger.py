@@ -1,8 +1,8 @@
 """The energy ledger: every term by its own formula, so that their balance is a check and not a definition.
 
-For a scheme whose balance holds at the ends of steps (``at_ends``), works follow the trapezoidal rule: with
-dx = x1 - x0, external work = (e0 + e1) dx/2, contact work (r0 + r1) dx/2, damping dissipation (C v0 + C v1) dx/2, and
-the numerical dissipation is what inertia and internal force work beyond the change of their energies:
+For a scheme whose balance holds at the ends of steps (``balance_at_endpoints``), works follow the trapezoidal rule:
+with dx = x1 - x0, external work = (e0 + e1) dx/2, contact work (r0 + r1) dx/2, damping dissipation (C v0 + C v1) dx/2,
+and the numerical dissipation is what inertia and internal force work beyond the change of their energies:
 (M a0 + M a1) dx/2 - dT + (f0 + f1) dx/2 - dU - dD + dH, with the work dH of changing temperatures. For the others the
 forces of the one balance work over the whole step, and damping takes C dx . dx/h.
 The sum of all changes is then the work of the residual, zero up to the solver's tolerance.
@@ -68,7 +68,7 @@ class Ledger:
         self._pending = [0.0, 0.0]  # what impact and friction take in the step that a scheme has solved in advance
         if stepper.totals_at_start is not None:
             self.impulses.start(stepper.totals_at_start)
-            if stepper.scheme.leads:
+            if stepper.scheme.solves_next_position:
                 self.impulses.step(stepper.totals_solved)
                 self.impulses.state.v[:] = 0.0  # as the velocities of nodes, which have not jumped yet
                 self._pending = [self._impact(self._before, started=True), stepper.solution.walls.friction]
@@ -85,7 +85,7 @@ class Ledger:
         jump = stepper.treatment.jump if stepper.treatment is not None else None
         if jump is not None and not self.model.inertia.products:  # where nodes lack mass, none of it jumps
             after, jumped = self._before_jump(after)
-        first, second = (before, after) if stepper.scheme.at_ends else 2 * (balanced(stepper, before),)
+        first, second = (before, after) if stepper.scheme.balance_at_endpoints else 2 * (balanced(stepper, before),)
         self._book(present, first, second, stepper.before[:owned])
         self.impulses.step(self._totals[3:])
         if jump is not None:
@@ -96,7 +96,7 @@ class Ledger:
         stored = present.kinetic - jumped - before.kinetic + present.energy.total - before.energy.total
         heating = self._heating.work()
         work, given, weight, lost = self._work_of_walls(before)
-        damping = self._damped() if self.model.inertia.damped and not stepper.scheme.at_ends else None
+        damping = self._damped() if self.model.inertia.damped and not stepper.scheme.balance_at_endpoints else None
         if damping is not None:
             of, by = WORKS.index("inertial"), WORKS.index("damping")
             self._works[of] = self._works[of] + self._works[by] - damping
@@ -118,7 +118,7 @@ class Ledger:
         """What impact and friction take in the step just made [J]."""
         stepper = self.stepper
         impact, friction = self._impact(before), stepper.solution.walls.friction
-        if not stepper.scheme.leads:
+        if not stepper.scheme.solves_next_position:
             if not stepper.scheme.solves_end:  # the slip of friction is that to the place solved for
                 friction *= stepper.part / (stepper.balance.time - (stepper.state.time - stepper.part))
             return impact, friction
@@ -128,14 +128,14 @@ class Ledger:
     def _impact(self, before: Moment, started: bool = False) -> float:
         """What closing contacts take [J], those of the next step where the scheme has solved it in advance."""
         stepper, state = self.stepper, self.stepper.state
-        if stepper.scheme.leads and not started:
-            shifts = self.model.contact.motion.shifts(state.time)
+        if stepper.scheme.solves_next_position and not started:
+            displacements = self.model.contact.motion.displacements(state.time)
             free = self._before_contact(before) if self.impacts.active else (state.v, state.a)
-            return self.impacts.step(state.position, free, None, state.time, shifts)
+            return self.impacts.step(state.position, free, None, state.time, displacements)
         load = before.external - before.internal if self.impacts.active else None
         x, time = (state.x, state.time) if started else (stepper.before, state.time - stepper.part)
         motion = (before.velocity, before.acceleration)
-        return self.impacts.step(x[: len(state.v)], motion, load, time, self._shifts)
+        return self.impacts.step(x[: len(state.v)], motion, load, time, self._displacements)
 
     def _before_contact(self, before: Moment) -> tuple[np.ndarray, np.ndarray]:
         """Velocity and acceleration (owned, 3) of a balance solved in advance, less what a treatment made of them;
@@ -155,7 +155,7 @@ class Ledger:
     def _walls_before(self) -> None:
         """Keep what the next step must know of walls that move."""
         contact = self.model.contact
-        self._shifts = contact.motion.shifts(self.stepper.state.time)
+        self._displacements = contact.motion.displacements(self.stepper.state.time)
         if not contact.moving.any():
             return
         self._push = self.stepper.solution.walls.force.copy()
@@ -173,13 +173,13 @@ class Ledger:
         stepper, contact = self.stepper, self.model.contact
         if not contact.moving.any():
             return 0.0, 0.0, 0.0, 0.0
-        shifts, push, ends = self._shifts, self._push, stepper.scheme.at_ends
+        displacements, push, ends = self._displacements, self._push, stepper.scheme.balance_at_endpoints
         force = stepper.solution.walls.force
         rule = 0.5 * (push + force) if ends else force
         bodies = contact.motion.bodies
         accelerated, kinetic = self._bodies_a, self._bodies_kinetic
         self._walls_before()
-        way = self._shifts - shifts
+        way = self._displacements - displacements
         works = (rule * way).sum(axis=1)
         jump = stepper.treatment.jump if stepper.treatment is not None else None
         if jump is not None and not self.model.inertia.products:
@@ -249,14 +249,14 @@ class Ledger:
         """This rank's share, for a checkpoint: numbers that may be summed over ranks."""
         return {"sums": self.sums.tolist(), "pending": list(self._pending), "impulses": self.impulses.kept()}
 
-    def put_back(self, kept: dict[str, Any]) -> None:
+    def load_state(self, kept: dict[str, Any]) -> None:
         """Take the share from a checkpoint; the present state is that of it already."""
         present = self.sums[_TOTALS].copy()
         self.sums[:] = kept["sums"]
         self.sums[_TOTALS] = present
         self.sums[_AT["kinetic_energy"]] = self._before.kinetic
         self._pending = [float(value) for value in kept["pending"]]
-        self.impulses.put_back(kept["impulses"])
+        self.impulses.load_state(kept["impulses"])
         if self.model.contact.moving.any():
             self._walls_before()
 

@@ -20,7 +20,7 @@ from ..tolerances import TIME
 from .contact_check import warn_of_gain
 from .explicit import ExplicitStepper
 from .implicit import ImplicitStepper
-from .redistributed import RedistributedStepper
+from .massless_contact import RedistributedStepper
 from .stability import Frequency, highest_frequency
 from .stepper import Stepper
 
@@ -255,7 +255,7 @@ def _check_serves(treatment: type[Treatment] | None, what: str, key: str) -> Non
 def _check_restitution(model, plan: Plan, treatment: type[Treatment] | None, k: int, key: str) -> None:
     if model.inertia.consistent:
         raise InputError(f'{key}: restitution needs time.mass = "lumped": one node\'s velocity jumps')
-    if plan.scheme.leads:
+    if plan.scheme.solves_next_position:
         model.contact.rebounds = True
         if treatment is not None:
             raise InputError(f'{key}: with {model.case.time.integrator} restitution needs contact.treatment = "scheme"')

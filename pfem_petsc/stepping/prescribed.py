@@ -68,7 +68,7 @@ class PrescribedMotion:
         supports, state = self.supports, self.stepper.state
         state.v[supports.at], state.a[supports.at] = supports.rates(time, self.stepper.part)
         self.stepper.scheme.restart(state, supports.at, self.stepper.part)
-        if self.stepper.scheme.leads:
+        if self.stepper.scheme.solves_next_position:
             way = supports.positions(self.stepper.balance.time) - state.position[supports.at]
             state.memory["half_velocity"][supports.at] = way / self.stepper.part
         ruled, given = self._ruled, {"v": state.v, "a": state.a, **state.memory}

@@ -77,7 +77,7 @@ class StepProblem:
         g += self.known
         if balance.weight:
             self.place(u)
-            if balance.from_start:
+            if balance.discrete_gradient:
                 self.model.bars.step_forces(self.state.x, self.x, self.f)
             else:
                 self.model.bars.forces(self.x, self.f, commit=False)
@@ -109,7 +109,7 @@ class StepProblem:
         coefficients = inertia.coefficients(balance.alpha, balance.eta)
         if balance.weight or inertia.consistent:
             bars, arguments = self.model.bars, (balance.weight, coefficients, matrix.pattern, values)
-            if balance.from_start:
+            if balance.discrete_gradient:
                 bars.step_tangents(self.state.x, self.x, *arguments)
             elif stored is not None:
                 bars.tangents(self.x, 0.0, *arguments[1:])

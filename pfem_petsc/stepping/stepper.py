@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..contact.forces import WallForces
-from ..contact.resting import start_at_rest
+from ..contact.initial_equilibrium import start_at_rest
 from ..errors import SimulationFailure
 from ..integrators.base import Balance, Scheme, State
 from ..mechanics.bars import StrainEnergy
@@ -65,7 +65,7 @@ class Stepper(ABC):
     velocity_solved : (owned, 3) of that balance, in which its damping force acts [m/s]
     walls_at_start, links_at_start : (walls, 3), (tables of links, 3) forces at the start [N]
     renews_forces : each evaluation of the state fills another array ``state.f``, so that the last one is kept
-    steady : the loop over many steps (``stepping/march.py``) makes the same steps, where all else allows it
+    steady : the loop over many steps (``stepping/fused_loop.py``) makes the same steps, where all else allows it
     kept_numbers, kept_arrays, kept_bars : names of attributes that, with the state, determine what comes: numbers,
         arrays with a row for each owned node, and for each local bar
     """
@@ -148,7 +148,7 @@ class Stepper(ABC):
         self.scheme.start(state, self.h)
         motion = model.contact.motion
         motion.start(self.h)
-        if self.scheme.leads:
+        if self.scheme.solves_next_position:
             v, speeds = state.v, motion.speeds
             self._solve_and_finish()
             self.totals_solved = self._totals()
@@ -164,7 +164,7 @@ class Stepper(ABC):
         at another time: nodes that nothing holds have the one of the forces at the end of the step.
         """
         state, model, scheme = self.state, self.model, self.scheme
-        if scheme.at_ends or state.step == 0:
+        if scheme.balance_at_endpoints or state.step == 0:
             return state.a
         load = -state.f[: len(state.a)]
         if model.external.active:
@@ -193,7 +193,7 @@ class Stepper(ABC):
             self.model.bars.heat_at_start[:] = self.model.bars.heat
         if self.treatment is not None:
             self.treatment.before()
-        if self.scheme.leads:
+        if self.scheme.solves_next_position:
             self.before[:] = self.state.x
             self.scheme.advance(self.state, self.part)
             self.prescribed.place(end)
@@ -226,10 +226,10 @@ class Stepper(ABC):
         self.model.bars.step = self.balance.time - state.time
         self.solution = self.solve(self.balance)
         fresh = self.model.contact.record(self.solution.walls, self.balance.time, self.part)
-        if not self.scheme.leads:
+        if not self.scheme.solves_next_position:
             self.before[:] = state.x
         self.scheme.finish(state, self.balance, self.solution.u, self.part)
-        if self.scheme.leads and self.prescribed.moving:
+        if self.scheme.solves_next_position and self.prescribed.moving:
             self.prescribed.take_rates(state.time)
         self.model.contact.motion.finish(self.part)
         if self.scheme.turns_held and self.treatment is None:
@@ -261,7 +261,7 @@ class Stepper(ABC):
     def when(self, balance: Balance) -> str:
         """The step that a balance is for, and the time that it holds at, for messages."""
         step = self.state.step + 1
-        if self.scheme.leads and self.state.time > 0.0:
+        if self.scheme.solves_next_position and self.state.time > 0.0:
             step += 1  # the position solved for is that of the step after
         return f"step {step}, t = {balance.time:.6g} s"
 

@@ -14,7 +14,7 @@ import numpy as np
 
 
 @numba.njit(fastmath=True, error_model="numpy")
-def march(steps, x, v, f, bars, rest, mass, plastic, back, contact, h, area, young, hardening, yield_stress):  # noqa: ANN201 - Numba infers
+def fused_loop(steps, x, v, f, bars, rest, mass, plastic, back, contact, h, area, young, hardening, yield_stress):  # noqa: ANN201 - Numba infers
     """Advance by leapfrog; ``plastic`` strain (b,), or (0,) for elastic bars."""
     yields = len(plastic) > 0
     for _ in range(steps):
@@ -69,7 +69,7 @@ def main() -> None:
     constants = (m.EXPLICIT_STEP, m.AREA, m.YOUNG_MODULUS, hardening, m.YIELD_STRESS)
 
     def run(count: int) -> None:
-        march(count, x, v, f, bars, rest, mass, plastic, foot, contact, *constants)
+        fused_loop(count, x, v, f, bars, rest, mass, plastic, foot, contact, *constants)
 
     run(1)  # compiled
     wall, cpu = time.perf_counter(), time.process_time()

@@ -50,7 +50,7 @@ def run(cells: int, mode: str, steps: int, operator: str, folder: str) -> tuple[
     """Run as from the command line; seconds a step after the first, and iterations of the linear solver."""
     case = Case.from_dict(table(cells, mode, steps, operator), source="peers", folder=Path(folder))
     simulation = Simulation(case, output=folder, quiet=True)
-    running = simulation.batches(worth=1)  # as a long run
+    running = simulation.batches(min_steps=1)  # as a long run
     linear = next(running).linear
     newton = 0
     wall, cpu = time.perf_counter(), time.process_time()

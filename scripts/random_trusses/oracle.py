@@ -89,9 +89,9 @@ def _walls(result: Loaded, case: Case, history: dict[str, np.ndarray]) -> Faults
 
 def _members(case: Case, name: str | None, result: Loaded) -> np.ndarray:
     """Mesh numbers of the nodes that a wall stops; groups are read from the mesh."""
-    everyone = np.arange(result.positions.shape[1])
+    all_nodes = np.arange(result.positions.shape[1])
     if name is None or case.node_set[name].all:
-        return everyone
+        return all_nodes
     table, points = case.node_set[name], result.positions[0]
     if table.indices is not None:
         return np.array(table.indices)

@@ -163,11 +163,11 @@ def _law(chance: random.Random, wall: dict[str, Any], treatment: str, time: dict
         wall["friction"] = 10 ** chance.uniform(-1.3, 0.3)
         if chance.random() < 0.4:
             wall["static_friction"] = wall["friction"] * chance.uniform(1.0, 1.6)
-    leads = time["integrator"] == "central_differences"
-    fits = "mass" not in time and (treatment == "scheme" or treatment == "stick" and not leads)
-    if kind == "restitution" and (odd or fits and (leads or "mass" not in wall)):
+    solves_next_position = time["integrator"] == "central_differences"
+    fits = "mass" not in time and (treatment == "scheme" or treatment == "stick" and not solves_next_position)
+    if kind == "restitution" and (odd or fits and (solves_next_position or "mass" not in wall)):
         wall["restitution"] = chance.choice((0.3, 0.7, 1.0, chance.random()))
-        if leads and chance.random() < 0.2:
+        if solves_next_position and chance.random() < 0.2:
             wall["friction"] = 0.3
     if kind == "tied" and (odd or treatment in ("scheme", "stick")):
         wall["tied"] = True

@@ -75,10 +75,10 @@ def parts_from(found: dict, latency: float | None, bandwidth: float | None) -> P
     overhead = next(r["best"] for r in found["overhead"] if r["job"] == "tiny")
     messages = found["messages"] or {"latency": 1e-6, "bandwidth": 1e10, "reduction": 0.0}
     # on several ranks a tiny step has an exchange and a sum in it, which are counted apart
-    waiting = messages["reduction"] + messages["latency"] * run["neighbours"] if found["ranks"] > 1 else 0.0
-    overhead = max(overhead - waiting, 0.5 * overhead)
+    deferred = messages["reduction"] + messages["latency"] * run["neighbours"] if found["ranks"] > 1 else 0.0
+    overhead = max(overhead - deferred, 0.5 * overhead)
     return Parts(
-        bar=max(run["best"] - overhead - waiting, 0.0) * found["ranks"] / run["evaluated"],
+        bar=max(run["best"] - overhead - deferred, 0.0) * found["ranks"] / run["evaluated"],
         overhead=overhead,
         latency=latency if latency is not None else messages["latency"],
         bandwidth=bandwidth if bandwidth is not None else messages["bandwidth"],

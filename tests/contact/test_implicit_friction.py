@@ -180,10 +180,10 @@ def test_law_of_coulomb(name, integrator, parameters, comm, shared_tmp_path):
     """Every force of every step: within the cone, and on it against the slip where there is any."""
     wall = WALLS[name][0]
     run = simulation(tumbling(WALLS[name], integrator, parameters), comm, shared_tmp_path)
-    solve, stuck, slipping = run.stepper.solve, 0, 0
+    solve, infeasible, slipping = run.stepper.solve, 0, 0
 
     def observed(balance):
-        nonlocal stuck, slipping
+        nonlocal infeasible, slipping
         state = run.state
         before, start = state.position.copy(), state.time
         solution = solve(balance)
@@ -208,13 +208,13 @@ def test_law_of_coulomb(name, integrator, parameters, comm, shared_tmp_path):
         assert (np.linalg.norm(drag, axis=1)[~slips] <= holds * strength[~slips] + 1e-9 * largest).all()
         expected = -wall["friction"] * strength[slips, None] * slip[slips] / size[slips, None]
         assert np.abs(drag[slips] - expected).max(initial=0.0) <= 1e-6 * largest
-        stuck, slipping = stuck + int((~slips).sum()), slipping + int(slips.sum())
+        infeasible, slipping = infeasible + int((~slips).sum()), slipping + int(slips.sum())
         return solution
 
     run.stepper.solve = observed
     rows = [step.row for step in run]
-    stuck, slipping = comm.allreduce(stuck), comm.allreduce(slipping)
-    assert stuck >= 3 and slipping >= 10
+    infeasible, slipping = comm.allreduce(infeasible), comm.allreduce(slipping)
+    assert infeasible >= 3 and slipping >= 10
     most = max(row["kinetic_energy"] for row in rows)
     assert max(abs(row["energy_imbalance"]) for row in rows) < 1e-9 * most
 

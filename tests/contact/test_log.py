@@ -50,7 +50,7 @@ def test_pending_steps_come_back_from_a_checkpoint(comm, monkeypatch):
     booked(whole, comm, 167).meet(comm)
     booked(stopped, comm, 99)
     share, times = stopped.share(), stopped.times(comm)
-    again.put_back(share, times, np.zeros((7, 2), bool))
+    again.load_state(share, times, np.zeros((7, 2), bool))
     assert len(times["steps"]) == 19
     booked(again, comm, 167, start=99).meet(comm)
     assert again.time.tobytes() == whole.time.tobytes()
@@ -60,6 +60,6 @@ def test_no_walls(comm):
     log = ContactLog(3, 0)
     for _ in range(10):
         log.book(walls([]), 1.0, MPI.COMM_SELF)
-    log.put_back(log.share(), log.times(comm), np.zeros((3, 0), bool))
+    log.load_state(log.share(), log.times(comm), np.zeros((3, 0), bool))
     log.meet(comm)
     assert len(log.time) == 0

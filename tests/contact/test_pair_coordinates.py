@@ -109,8 +109,8 @@ def framed(model, pairs):
     """Frames of nodes near walls that stop them, low ones with the first, high ones with both."""
     x = model.mesh.points[: model.mesh.n_owned]
     nodes = np.flatnonzero((x[:, 2] < 0.02) | (x[:, 2] > 0.08))
-    concerned = np.stack([np.ones(len(nodes), dtype=bool), x[nodes, 2] > 0.05], axis=1)
-    frames = model.contact.frames(nodes, x, 0.0, concerned)
+    applicable = np.stack([np.ones(len(nodes), dtype=bool), x[nodes, 2] > 0.05], axis=1)
+    frames = model.contact.frames(nodes, x, 0.0, applicable)
     pairs.place(frames)
     return frames
 
@@ -125,7 +125,7 @@ def test_matrix_gradient_and_inverse_beside_walls(walled, comm):
     np.testing.assert_allclose(whole(pairs.increment, walled, comm), matrix, atol=1e-14)
     np.testing.assert_allclose(whole(pairs.gradient, walled, comm), matrix.T, atol=1e-14)
     np.testing.assert_allclose(whole(pairs.coordinates, walled, comm), np.linalg.inv(matrix), atol=1e-12)
-    assert len(pairs.waiting) == 0
+    assert len(pairs.deferred) == 0
 
 
 def test_both_operators_are_the_congruent_matrix_beside_walls(walled, comm):

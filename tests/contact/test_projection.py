@@ -42,8 +42,8 @@ def test_equals_search_over_all_sets(walls):
         x[fixed] = inside[fixed]
         expected = search(x, fixed, normals, offsets)
         moved, multipliers = x[None].copy(), np.zeros((1, walls))
-        stuck = project(moved, fixed[None], normals[None].copy(), offsets[None].copy(), 1e-13, multipliers)
-        assert stuck == -1 and expected is not None
+        infeasible = project(moved, fixed[None], normals[None].copy(), offsets[None].copy(), 1e-13, multipliers)
+        assert infeasible == -1 and expected is not None
         np.testing.assert_allclose(moved[0] - x, expected[1], atol=1e-12)
         assert (multipliers >= 0.0).all()
         np.testing.assert_allclose(multipliers[0] @ np.where(fixed, 0.0, normals), moved[0] - x, atol=1e-12)

@@ -72,7 +72,7 @@ def test_tip_keeps_its_place(integrator, comm, shared_tmp_path):
             nodes, _, places = run.model.contact.ties.targets(run.state.time)
             if len(nodes) == 0:
                 continue
-            away = run.state.position[nodes] - run.model.contact.motion.shifts(run.state.time)[0]
+            away = run.state.position[nodes] - run.model.contact.motion.displacements(run.state.time)[0]
             if place is None and run.state.time > 0.3:
                 place = away
             if place is not None:
@@ -254,9 +254,9 @@ def test_restart_is_bitwise(integrator, comm, shared_tmp_path):
 @pytest.mark.parametrize("integrator", ["central_differences", "newmark"])
 def test_any_number_of_ranks(integrator, comm, shared_tmp_path):
     case = Case.from_dict(drop(integrator), name="it")
-    everyone = Simulation(case, comm, output=shared_tmp_path / "all", quiet=True)
-    last = [step.row for step in everyone][-1]
-    x = everyone.gather(everyone.state.position)
+    all_nodes = Simulation(case, comm, output=shared_tmp_path / "all", quiet=True)
+    last = [step.row for step in all_nodes][-1]
+    x = all_nodes.gather(all_nodes.state.position)
     if comm.rank == 0:
         alone = Simulation(case, MPI.COMM_SELF, output=shared_tmp_path / "one", quiet=True)
         row = [step.row for step in alone][-1]

@@ -146,9 +146,9 @@ def test_stress_shows_in_colour(tmp_path):
 def test_point_field_and_component(tmp_path):
     files = draw(tmp_path, field="velocity", component="x", frames=[3, 9])
     there, back = (drawing(file) for file in files)
-    warm = [int(((p[..., 0] - p[..., 2]) > 70).sum()) for p in (there, back)]
+    has_thermal = [int(((p[..., 0] - p[..., 2]) > 70).sum()) for p in (there, back)]
     cold = [int(((p[..., 2] - p[..., 0]) > 70).sum()) for p in (there, back)]
-    assert warm[0] > 10 * max(1, cold[0]) and cold[1] > 10 * max(1, warm[1])
+    assert has_thermal[0] > 10 * max(1, cold[0]) and cold[1] > 10 * max(1, has_thermal[1])
 
 
 @pytest.mark.parametrize("structure", [rod, lattice])

@@ -74,22 +74,22 @@ class Treatment(ABC):
     def after(self) -> None:
         """Called after each part of a step, before it is booked: changes v, a and memory of the state."""
 
-    def held(self, concerned: np.ndarray | bool = True) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def held(self, applicable: np.ndarray | bool = True) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Nodes that walls hold (m,), projections (m, 3, 3) on their normals, velocities (m, 3) to have there [m/s].
 
         These are the walls' own, and :meth:`leaving` away from them. Of nodes that walls hold for good or by friction
-        the projection is on all directions. ``concerned`` (walls,) bool: of which walls; default: all.
+        the projection is on all directions. ``applicable`` (walls,) bool: of which walls; default: all.
 
         Components that supports prescribe are not changed: projections P are along the others, P v = F^+ N v with the
         normals N and their free parts F, so that v - P v has no part along the normals.
         """
         stepper = self.stepper
         contact, walls = stepper.model.contact, stepper.solution.walls
-        touching = walls.touching & concerned
+        touching = walls.touching & applicable
         touched = touching.any(axis=1)
         nodes, touching = walls.nodes[touched], touching[touched]
-        shifts = contact.motion.shifts(stepper.state.time)
-        normals, _ = contact.planes(touching, stepper.state.position[nodes], shifts)
+        displacements = contact.motion.displacements(stepper.state.time)
+        normals, _ = contact.planes(touching, stepper.state.position[nodes], displacements)
         normals = np.where(touching[:, :, None], normals, 0.0)
         # the normals' pseudo-inverse serves any number of walls at a node, parallel ones too
         free = np.where(stepper.model.supports.fixed[nodes][:, None, :], 0.0, normals)
@@ -103,11 +103,11 @@ class Treatment(ABC):
             tied = contact.ties.held[nodes]
             normal[tied] = np.eye(3)
             speeds[tied] = rates[contact.ties.walls(nodes[tied])]
-        stuck = self.sticking(nodes, touching, normals)
-        holds = stuck.any(axis=1)
+        infeasible = self.sticking(nodes, touching, normals)
+        holds = infeasible.any(axis=1)
         if holds.any():  # there may be no walls at all, but pairs
             normal[holds] = np.eye(3)
-            speeds[holds] = rates[stuck[holds].argmax(axis=1)]
+            speeds[holds] = rates[infeasible[holds].argmax(axis=1)]
         return nodes, normal, speeds
 
     def leaving(self, nodes: np.ndarray, touching: np.ndarray, normals: np.ndarray, rates: np.ndarray) -> np.ndarray:

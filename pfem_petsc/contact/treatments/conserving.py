@@ -56,7 +56,7 @@ class Treatment(Base):
         """Work (m,) [J] of contact on nodes (m,) in this part of the step."""
         state = self.stepper.state
         force = state.contact[nodes]
-        if self.stepper.scheme.at_ends:
+        if self.stepper.scheme.balance_at_endpoints:
             force = 0.5 * (force + self._force[nodes])
         return np.einsum("mi,mi->m", force, state.position[nodes] - self._start[nodes])
 

@@ -76,7 +76,7 @@ def redistribute(model) -> Redistribution:
     source = model.case.source
     key = f'{source}: contact.treatment = "mass_redistribution"'
     for k, wall in enumerate(contact.walls):
-        if not wall.flat or wall.partial or contact.everyone[k]:
+        if not wall.flat or wall.partial or contact.all_nodes[k]:
             raise InputError(
                 f"{key}: wall {contact.names[k]!r} must be a plane, not curved nor a rectangle, and name a node_set: "
                 "its nodes lose mass; take another contact.treatment"
@@ -144,7 +144,7 @@ class Treatment(Base):
     @classmethod
     def refuses(cls, scheme: Scheme) -> str | None:
         """See :class:`~pfem_petsc.contact.treatments.base.Treatment`."""
-        if scheme.explicit and not scheme.leads:
+        if scheme.explicit and not scheme.solves_next_position:
             return "of the explicit schemes only central_differences can have nodes without mass"
         return None
 

@@ -22,7 +22,7 @@ from .impulses import WALLS, fill_impulses
 from .node_loops import WORKS, book_nodes, explicit_increments, hold, react
 from .sum_loops import add_totals, add_works, fill_bars, fill_probes, fill_walls
 
-__all__ = ["make_march"]
+__all__ = ["make_fused_loop"]
 
 
 _HEAD, _KINETIC = HEAD.width, HEAD.first("kinetic_energy")  # constants of the machine code
@@ -30,7 +30,7 @@ _CONTACTS, _ALARM = HEAD.first("active_contacts"), HEAD.first("alarm")
 
 
 @cache
-def make_march(forces: Callable, drift: Callable, kick: Callable) -> Callable:
+def make_fused_loop(forces: Callable, drift: Callable, kick: Callable) -> Callable:
     """The loop over steps for the bars' loop ``forces`` of a law and strain measure, and the loops of a scheme.
 
     Its arguments: most steps; step [s]; positions, those of the step before, velocities at half steps (n, 3); arrays of
@@ -45,7 +45,7 @@ def make_march(forces: Callable, drift: Callable, kick: Callable) -> Callable:
     """
 
     @kernel
-    def march(
+    def fused_loop(
         count,
         h,
         x,
@@ -88,7 +88,7 @@ def make_march(forces: Callable, drift: Callable, kick: Callable) -> Callable:
         pressed, pressed_before = touched, touched  # nodes with entries in the two arrays of wall forces
         failed = -1
         turned = -1
-        stuck = -1
+        infeasible = -1
         done = 0
         for step in range(count):
             flat_before[:] = flat_x
@@ -131,13 +131,13 @@ def make_march(forces: Callable, drift: Callable, kick: Callable) -> Callable:
             for i in pressed:
                 contact[i] = 0.0
             if n_walls > 0:
-                near, stuck, stuck_offsets, total, touching, places, force, contacts, moment = press_planes(
+                near, infeasible, stuck_offsets, total, touching, places, force, contacts, moment = press_planes(
                     predictor,
                     u,
                     walls.fixed,
                     walls.normals,
                     walls.offsets,
-                    walls.everyone,
+                    walls.all_nodes,
                     walls.members,
                     walls.tolerance,
                     stiffness,
@@ -240,14 +240,14 @@ def make_march(forces: Callable, drift: Callable, kick: Callable) -> Callable:
             reaction = support if supported else nothing
             fill_probes(row, at, probes.nodes, probes.starts, x, v, a, contact, reaction)
             done += 1
-            if failed >= 0 or turned >= 0 or stuck >= 0 or not np.isfinite(kinetic + held1):
+            if failed >= 0 or turned >= 0 or infeasible >= 0 or not np.isfinite(kinetic + held1):
                 break
         after = (f, f1, a, a1, v, v1, support, support1, contact, contact1)
         return (
             done,
             failed,
             turned,
-            stuck,
+            infeasible,
             stuck_offsets,
             after,
             kinetic,
@@ -257,4 +257,4 @@ def make_march(forces: Callable, drift: Callable, kick: Callable) -> Callable:
             met,
         )
 
-    return march
+    return fused_loop

@@ -39,7 +39,7 @@ class WallArrays(NamedTuple):
     fixed: np.ndarray
     normals: np.ndarray
     offsets: np.ndarray
-    everyone: np.ndarray
+    all_nodes: np.ndarray
     members: np.ndarray
     tolerance: float
     room: np.ndarray

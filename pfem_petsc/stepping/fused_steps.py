@@ -10,8 +10,8 @@ from ..errors import SimulationFailure
 from ..mechanics.bars import StrainEnergy
 from ..output.sums import HEAD, WALL
 from ..tolerances import PROJECTED
-from .march import make_march
-from .march_arrays import BarArrays, Buffers, ImpulseArrays, NodeArrays, ProbeArrays, WallArrays
+from .fused_arrays import BarArrays, Buffers, ImpulseArrays, NodeArrays, ProbeArrays, WallArrays
+from .fused_loop import make_fused_loop
 from .stepper import Solution
 
 __all__ = ["MOST", "WORTH", "Batch", "Batches"]
@@ -39,7 +39,7 @@ class Batch:
         model = stepper.model
         self.model = model
         block = model.bars.blocks[0]
-        self._march = make_march(block.kernels.sweep_forces, *stepper.scheme.loops)
+        self._fused_loop = make_fused_loop(block.kernels.sweep_forces, *stepper.scheme.loops)
         bars = model.bars
         law = (bars.far, bars.rest, bars.heat, block.parameters, block.area, block.history)
         self._bars = BarArrays(bars.ends, tuple(block.sweep), *law)
@@ -50,7 +50,7 @@ class Batch:
         held = supports.positions(0.0)
         self._nodes = NodeArrays(inertia.mass, damping, external, supports.nodes, supports.components, held)
         log = contact.log
-        walls = (contact.fixed, contact.normals, contact.plane_offsets(0.0), contact.everyone, contact.members)
+        walls = (contact.fixed, contact.normals, contact.plane_offsets(0.0), contact.all_nodes, contact.members)
         room = np.empty(len(inertia.mass), dtype=np.int64)
         work = (room, log.touching, log.present, log.releases)
         impact = (stepper.closed, contact.restitution, ledger.impacts.slack)
@@ -98,7 +98,7 @@ class Batch:
         pushed = ledger.impulses.state
         impulses = ImpulseArrays(pushed.memory["half_velocity"], pushed.a, pushed.v)
         ledger.take_pending()
-        done, failed, turned, stuck, offsets, after, kinetic, u, touched, log.last, met = self._march(
+        done, failed, turned, infeasible, offsets, after, kinetic, u, touched, log.last, met = self._fused_loop(
             count,
             stepper.h,
             state.x,
@@ -130,8 +130,8 @@ class Batch:
         stepper.balance = scheme.balance(state, stepper.h)
         if failed >= 0 or turned >= 0:
             stepper.fault = SimulationFailure(stepper.collapse(max(failed, turned)))
-        elif stuck >= 0:
-            text = self.model.contact.no_room(touched[3][stuck], offsets[stuck])
+        elif infeasible >= 0:
+            text = self.model.contact.infeasible_message(touched[3][infeasible], offsets[infeasible])
             stepper.fault = SimulationFailure(f"{stepper.when(stepper.balance)}: {text}")
         state.step += 1
         ledger.impacts.met = met
@@ -149,8 +149,8 @@ class Batches:
     worth : fewest steps of a run for which the loop over steps is compiled
     """
 
-    def __init__(self, worth: int = WORTH) -> None:
-        self._worth = worth
+    def __init__(self, min_steps: int = WORTH) -> None:
+        self._min_steps = min_steps
         self._batch: Batch | None = None
         self._refused = False
 
@@ -173,7 +173,7 @@ class Batches:
         begin = state.step
         count = min(left, end - begin, MOST + 1) - 1
         # the first step is damped by velocities that are not those of the state, where walls stop nodes at once
-        if self._refused or count < _FEWEST or end < self._worth or begin == 0:
+        if self._refused or count < _FEWEST or end < self._min_steps or begin == 0:
             return True
         if self._batch is None:
             self._refused = not Batch.serves(stepper)

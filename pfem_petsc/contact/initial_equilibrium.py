@@ -46,14 +46,14 @@ def start_at_rest(model, state, accelerate: Callable[[np.ndarray], np.ndarray], 
     """
     contact, comm, mass = model.contact, model.comm, model.inertia.mass
     x, v = state.position, state.v
-    shifts, rates = contact.motion.shifts(state.time), contact.motion.rates(state.time, ahead=True)
+    displacements, rates = contact.motion.displacements(state.time), contact.motion.rates(state.time, ahead=True)
     slack = ON_BOUND * model.length
-    nodes = np.flatnonzero(contact.near(x, shifts, np.array([slack])))
-    concerned = contact.members[nodes]
-    normals, offsets = contact.planes(concerned, x[nodes], shifts)
+    nodes = np.flatnonzero(contact.near(x, displacements, np.array([slack])))
+    applicable = contact.members[nodes]
+    normals, offsets = contact.planes(applicable, x[nodes], displacements)
     gaps = np.einsum("mwi,mi->mw", normals, x[nodes]) - offsets
     away = np.einsum("mwi,mwi->mw", normals, v[nodes][:, None, :] - rates)
-    resting = concerned & (np.abs(gaps) <= slack) & (np.abs(away) <= ON_BOUND * model.wave_speed)
+    resting = applicable & (np.abs(gaps) <= slack) & (np.abs(away) <= ON_BOUND * model.wave_speed)
     resting[:, [wall.partial for wall in contact.walls]] = False  # beside it, its plane goes on
     resting[:, contact.motion.bodies.at] = False  # these give way
     kept = resting.any(axis=1)
@@ -81,10 +81,12 @@ def start_at_rest(model, state, accelerate: Callable[[np.ndarray], np.ndarray], 
         free = apart[nodes] + between[nodes] / weight[:, None]
         moved = free.copy()
         project(moved, fixed, normals, planes, 0.0, strengths)
-        if contact.rough:
+        if contact.has_friction:
             slack = ON_BOUND * model.wave_speed
             strengths *= weight[:, None]
-            _rub(contact, nodes, v, rates, accelerations, slack, weight, moved, normals, planes, strengths, drag)
+            _apply_friction(
+                contact, nodes, v, rates, accelerations, slack, weight, moved, normals, planes, strengths, drag
+            )
             strengths /= weight[:, None]
         before, hold = hold, weight[:, None] * (moved - free)
         sizes = [np.abs(part).max(initial=0.0) for part in (hold - before, between - earlier, hold, between)]
@@ -104,19 +106,21 @@ def start_at_rest(model, state, accelerate: Callable[[np.ndarray], np.ndarray], 
     return contact.sums(nodes, force, x[nodes], strengths > 0.0)
 
 
-def _rub(contact, nodes, v, rates, accelerations, slack, weight, a, normals, planes, pressing, drag) -> None:
-    """Friction at the start: accelerations (m, 3), pressing (m, w) and drag (m, w, 3) forces, in place.
+def _apply_friction(
+    contact, nodes, v, rates, accelerations, slack, weight, a, normals, planes, normal_forces, drag
+) -> None:
+    """Friction at the start: accelerations (m, 3), normal (m, w) and friction (m, w, 3) forces, in place.
 
     Nodes that slide have a slip in which their velocity outweighs any acceleration; that of the others is their
     acceleration, relative to that of the wall.
     """
     away = v[nodes][:, None, :] - rates
     away -= np.einsum("mwi,mwi->mw", away, normals)[:, :, None] * normals
-    slides = ((np.linalg.norm(away, axis=2) > slack) & (pressing > 0.0)).any(axis=1)
-    largest = max(float(np.abs(a).max(initial=0.0)), float((pressing / weight[:, None]).max(initial=0.0)))
+    slides = ((np.linalg.norm(away, axis=2) > slack) & (normal_forces > 0.0)).any(axis=1)
+    largest = max(float(np.abs(a).max(initial=0.0)), float((normal_forces / weight[:, None]).max(initial=0.0)))
     for group in (slides, ~slides):
         part = np.flatnonzero(group)
-        moved, press, pull = a[part], pressing[part], drag[part]
+        moved, press, pull = a[part], normal_forces[part], drag[part]
         fast = np.linalg.norm(v[nodes[part]], axis=1).max(initial=0.0) + np.abs(rates).max(initial=0.0)
         factor = _FAST * largest / fast if group is slides and fast > 0.0 else 0.0
         add_friction(
@@ -132,4 +136,4 @@ def _rub(contact, nodes, v, rates, accelerations, slack, weight, a, normals, pla
             press,
             pull,
         )
-        a[part], pressing[part], drag[part] = moved, press, pull
+        a[part], normal_forces[part], drag[part] = moved, press, pull

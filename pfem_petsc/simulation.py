@@ -11,16 +11,18 @@ import numpy as np
 from mpi4py import MPI
 
 from .analysis import Step
+from .case.schema import Case
+from .contact.start import check_start
 from .errors import EarlyStop, InputError, PfemError
+from .integrators.base import State
 from .output.lock import FolderLock
-from .output.units import engineering
 from .parallel.agreement import on_root
 from .parallel.petsc_log import instrument, staged
 from .preflight.forecast import forecast
 from .preflight.inspection import inspect, warnings_before
 from .preflight.summary import summarise
 from .recording.recorder import Recorder
-from .restart.folder import Restart, find_restart, finished
+from .restart.folder import Restart, find_restart, finished, finished_message
 from .run.compilation import ReportedCompilation
 from .run.outputs import Outputs
 from .run.stop import StopRequest
@@ -29,7 +31,6 @@ from .stepping.fused_steps import WORTH, Batches
 from .stepping.model import Model
 from .stepping.prepare import make_plan
 from .stepping.time_stepping import TimeStepping
-from .tolerances import TIME
 
 __all__ = ["Simulation", "Step"]
 
@@ -66,7 +67,7 @@ class Simulation:
     @staged
     def __init__(
         self,
-        case,
+        case: Case,
         comm: MPI.Comm | None = None,
         output: Path | str | None = None,
         restart: bool | Path | None = None,
@@ -101,7 +102,7 @@ class Simulation:
         self._reached: float | None = None
         if self.restart is not None and self.restart.continues or self.notes:
             self._reached = finished(case, self.comm, self.folder, self.plan.step * self.plan.steps)
-        self.model.contact.check_start(self.model.mesh.points[: self.model.mesh.n_owned], self.model.length)
+        check_start(self.model.contact, self.model.mesh.points[: self.model.mesh.n_owned], self.model.length)
         self.analysis = TimeStepping(self.model, self.plan)
         self.mesh, self.stepper = self.model.mesh, self.analysis.stepper
         self._started = False
@@ -147,7 +148,7 @@ class Simulation:
         return self._reached is not None
 
     @property
-    def state(self):  # noqa: ANN201
+    def state(self) -> State:
         """The state of this rank's nodes: :class:`~pfem_petsc.integrators.base.State`."""
         return self.analysis.state
 
@@ -266,9 +267,7 @@ class Simulation:
             On all ranks; what was recorded before is in the result file.
         """
         if self.finished and self.comm.rank == 0 and not self.quiet:
-            end = self.plan.step * self.plan.steps
-            beyond = f", beyond time.end = {engineering(end, 's')}" if self._reached > end * (1.0 + TIME) else ""
-            print(f"{self.folder}: finished already: the results have t = {engineering(self._reached, 's')}{beyond}")
+            print(finished_message(self.folder, self._reached, self.plan.step * self.plan.steps))
         for _ in self.batches():
             pass
         return 0

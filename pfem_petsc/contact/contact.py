@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 from mpi4py import MPI
 
-from ..errors import InputError, SimulationFailure
+from ..errors import SimulationFailure
 from ..parallel.agreement import agreed
 from ..registry import lookup
 from ..tolerances import BEYOND, ON_BOUND
@@ -154,36 +154,6 @@ class Contact:
         for k in np.flatnonzero(~self.flat):
             near |= (self.gap(k, x, displacements) < reach) & self.members[:, k]
         return near
-
-    def check_start(self, x: np.ndarray, length: float) -> None:
-        """Refuse nodes that start beyond a wall by more than rounding of the model's size ``length`` [m]. Collective.
-
-        Raises
-        ------
-        InputError
-            On all ranks; names the wall, the deepest node and its depth.
-        """
-        if not self.any:
-            return
-        comm = self.mesh.comm
-        gaps = self.gaps(x, 0.0)
-        for k, wall in enumerate(self.walls):
-            if wall.partial:  # nothing starts beyond a wall that nodes can pass by
-                continue
-            deepest, node, count = 0.0, -1, 0
-            if len(gaps):
-                at = int(np.argmin(gaps[:, k]))
-                deepest, node = float(gaps[at, k]), int(self.mesh.node_ids[at])
-                count = int((gaps[:, k] < -ON_BOUND * length).sum())
-            depth, node = min(comm.allgather((deepest, node)))
-            count = comm.allreduce(count)
-            if count:
-                raise InputError(
-                    f"{self.source}: wall {self.names[k]!r}: node {node} starts {-depth:.6g} "
-                    f"m beyond the wall ({count} node{'s' if count > 1 else ''} in all); move the wall or the mesh, "
-                    "turn the normal to the allowed side, name the nodes that it applies to with 'node_set', or let "
-                    "'adjust = true' move the nodes"
-                )
 
     def applicable(self, nodes: np.ndarray, x: np.ndarray, displacements: np.ndarray) -> np.ndarray:
         """(m, walls) bool: walls that can stop nodes on their way to positions (m, 3)."""

@@ -11,6 +11,7 @@ from ..errors import NotConverged
 from ..integrators.base import Balance, State
 from .frames import NodalFrames
 from .links import BlocksOf
+from .pair_checks import check_scheme, check_start
 from .pair_coordinates import PairCoordinates
 from .pairs import ContactPairs
 
@@ -52,8 +53,8 @@ class PairLink:
 
     def check(self, model, on_its_own: bool) -> None:
         treatment = model.case.contact.treatment
-        self.pairs.check_scheme(on_its_own, treatment)
-        self.pairs.check_start(model.mesh.points[: model.mesh.n_owned], model.length, model.case.source)
+        check_scheme(self.pairs, on_its_own, treatment)
+        check_start(self.pairs, model.mesh.points[: model.mesh.n_owned], model.length, model.case.source)
 
     def resting(self, x: np.ndarray, v: np.ndarray, slack: float, still: float) -> np.ndarray:
         return self.pairs.resting(x, v, slack, still)

@@ -18,10 +18,8 @@ from collections.abc import Callable
 import numpy as np
 from mpi4py import MPI
 
-from ..errors import InputError
 from ..mesh.exchange import swap
 from ..parallel.agreement import agreed
-from ..tolerances import ON_BOUND
 from .coupled import CoupledPairs
 from .pair_loops import leaving_rows, move_nodes, needed_forces, part_nodes, pressed_nodes, push_nodes, table_forces
 from .pair_search import find_pairs
@@ -71,52 +69,6 @@ class ContactPairs:
         self._no_totals = np.zeros((len(self.names), 3))
         table_forces(self.where, self.table, self.force, self.normals, self._no_totals)
         self.coupled = CoupledPairs(self, contact)
-
-    def check_scheme(self, on_its_own: bool, treatment: str) -> None:
-        """Refuse what shared nodes and walls at pairs do not go with.
-
-        Raises
-        ------
-        InputError
-            On all ranks. ``on_its_own``: each node is solved on its own, by an explicit scheme with lumped mass.
-        """
-        key, coupled = f"{self.source}: contact_pair", self.coupled
-        if coupled.shared_node is not None and not on_its_own:
-            raise InputError(
-                f"{key}: node {coupled.shared_node} is in several pairs, which needs an explicit "
-                "integrator with lumped mass"
-            )
-        if coupled.any and treatment != "scheme":
-            raise InputError(
-                f"{key}: node {coupled.coupled_node} is in several pairs, or a wall stops it as well, which needs "
-                'contact.treatment = "scheme"'
-            )
-        walls = coupled.contact
-        met = walls.members[self.local[self.mine]].any(axis=0).astype(np.int64)
-        self.mesh.comm.Allreduce(MPI.IN_PLACE, met)
-        special = ~walls.flat | (walls.restitution > 0.0) | (walls.static_friction > 0.0) | walls.ties.tying
-        if walls.motion.free is not None:
-            special[walls.motion.free.at] = True
-        if (special & (met > 0)).any():
-            name = walls.names[int(np.argmax(special & (met > 0)))]
-            raise InputError(
-                f"{key}: wall {name!r} stops nodes of pairs: such a wall must be flat, without mass, friction and "
-                "restitution, and not tied; or give it a node_set without them"
-            )
-
-    def check_start(self, x: np.ndarray, length: float, source: str) -> None:
-        """Refuse pairs that start beyond each other by more than rounding of the model's size [m]. Collective."""
-        distance = self.distances(self.gather(x)) - self.gaps
-        pair = int(np.argmin(distance)) if len(distance) else -1
-        deepest = (np.inf,) if pair < 0 else (float(distance[pair]), int(self.table[pair]), *self.numbers(pair))
-        deepest = min(self.mesh.comm.allgather(deepest))
-        if deepest[0] < -ON_BOUND * length:
-            distance, table, second, first = deepest
-            raise InputError(
-                f"{source}: contact_pair {self.names[table]!r}: nodes {first} and "
-                f"{second} start {-distance:.6g} m beyond each other; reverse the direction, which "
-                "points from the first to the second, or move the mesh"
-            )
 
     def numbers(self, pair: int) -> tuple[int, int]:
         """Mesh numbers of a pair's second and first node."""

@@ -1,4 +1,4 @@
-"""Nodes that start beyond walls with ``adjust = true`` are moved onto them before anything is built on their places."""
+"""Nodes that start beyond walls: ``adjust = true`` moves them before the model is built; others are refused."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import numpy as np
 
 from ..errors import InputError, SimulationFailure
 from ..parallel.agreement import agreed
-from ..tolerances import BEYOND, PROJECTED
+from ..tolerances import BEYOND, ON_BOUND, PROJECTED
 from .contact import Contact
 
-__all__ = ["adjust_start"]
+__all__ = ["adjust_start", "check_start"]
 
 
 def adjust_start(case, nodes: dict[str, np.ndarray], mesh) -> int:
@@ -52,3 +52,34 @@ def adjust_start(case, nodes: dict[str, np.ndarray], mesh) -> int:
                 "length left once its nodes are on the wall; move the wall or the mesh"
             )
     return mesh.comm.allreduce(len(moved))
+
+
+def check_start(contact: Contact, x: np.ndarray, length: float) -> None:
+    """Refuse nodes that start beyond a wall by more than rounding of the model's size ``length`` [m]. Collective.
+
+    Raises
+    ------
+    InputError
+        On all ranks; names the wall, the deepest node and its depth.
+    """
+    if not contact.any:
+        return
+    comm = contact.mesh.comm
+    gaps = contact.gaps(x, 0.0)
+    for k, wall in enumerate(contact.walls):
+        if wall.partial:  # nothing starts beyond a wall that nodes can pass by
+            continue
+        deepest, node, count = 0.0, -1, 0
+        if len(gaps):
+            at = int(np.argmin(gaps[:, k]))
+            deepest, node = float(gaps[at, k]), int(contact.mesh.node_ids[at])
+            count = int((gaps[:, k] < -ON_BOUND * length).sum())
+        depth, node = min(comm.allgather((deepest, node)))
+        count = comm.allreduce(count)
+        if count:
+            raise InputError(
+                f"{contact.source}: wall {contact.names[k]!r}: node {node} starts {-depth:.6g} "
+                f"m beyond the wall ({count} node{'s' if count > 1 else ''} in all); move the wall or the mesh, "
+                "turn the normal to the allowed side, name the nodes that it applies to with 'node_set', or let "
+                "'adjust = true' move the nodes"
+            )

@@ -1,10 +1,8 @@
-"""Checkpoints: the state of a run in the mesh's own numbering, read back bit for bit on any number of ranks."""
+"""Checkpoints are read back bit for bit on any number of ranks; :mod:`.checkpoint_writer` writes them."""
 
 from __future__ import annotations
 
-import errno
 import json
-import os
 import time
 import zlib
 from collections.abc import Iterator, Mapping
@@ -17,32 +15,13 @@ import h5py
 import numpy as np
 from mpi4py import MPI
 
-from ..errors import InputError, SimulationFailure
+from ..errors import InputError
 from ..parallel.agreement import agreed, on_root
 from ..parallel.natural import NaturalOrder
-from .hdf5 import (
-    HDF5_ERRORS,
-    create_new,
-    first_line,
-    fsync_all,
-    open_shared,
-    release,
-    require_parallel_hdf5,
-    require_room,
-    set_text,
-    write_rows,
-    writing,
-)
-from .integrity import check_seal, checksum, remedy, seal, seal_size
+from .hdf5 import HDF5_ERRORS, first_line
+from .integrity import check_seal, checksum, remedy
 
-__all__ = [
-    "Checkpoint",
-    "OpenCheckpoint",
-    "newest_checkpoint",
-    "read_checkpoint",
-    "read_checkpoint_header",
-    "write_checkpoint",
-]
+__all__ = ["Checkpoint", "OpenCheckpoint", "newest_checkpoint", "read_checkpoint", "read_checkpoint_header"]
 
 NAME, PREVIOUS = "checkpoint.h5", "checkpoint-previous.h5"
 
@@ -66,72 +45,6 @@ class Checkpoint:
     arrays: dict[str, np.ndarray]
     scalars: dict[str, Any]
     attributes: dict[str, Any]
-
-
-def write_checkpoint(
-    path: Path | str,
-    comm: MPI.Comm,
-    arrays: Mapping[str, tuple[NaturalOrder, np.ndarray]],
-    scalars: Mapping[str, Any],
-    attributes: Mapping[str, Any],
-) -> None:
-    """Write a checkpoint so that at any moment there is a complete one.
-
-    It is written under a temporary name, brought onto the disk, and renamed; the one before stays as
-    ``checkpoint-previous.h5``. Collective.
-
-    Parameters
-    ----------
-    path : Path or str
-        The file, commonly ``checkpoint.h5``, in a folder that exists.
-    comm : MPI.Comm
-    arrays : mapping of name to (order, owned rows (n_owned, ...))
-        Numbers of 1, 2, 4 or 8 bytes.
-    scalars, attributes : mappings
-        What JSON can hold; the attributes describe the run (case, versions), the scalars are its state.
-
-    Raises
-    ------
-    SimulationFailure
-        On all ranks: disk full, folder gone. The checkpoints before stay.
-    """
-    require_parallel_hdf5(comm)
-    path = Path(path)
-    # by name: what contact remembers may have come in another order on another rank
-    slabs = {name: arrays[name][0].to_slab(np.asarray(arrays[name][1])) for name in sorted(arrays)}
-    shapes = {name: ((arrays[name][0].n_global, *slab.shape[1:]), slab.dtype) for name, slab in slabs.items()}
-    n_bytes = sum(dtype.itemsize * int(np.prod(shape, dtype=np.int64)) for shape, dtype in shapes.values())
-    require_room(comm, path, n_bytes, target=path.parent)
-    checks = {name: checksum(comm, slab, arrays[name][0].first) for name, slab in slabs.items()}
-    state = json.dumps({"scalars": dict(scalars), "attributes": dict(attributes)}, default=_plain)
-    try:
-        temporary = create_new(path, comm, _create, shapes, checks, state, userblock_size=seal_size(len(shapes)))
-    except InputError as error:
-        raise SimulationFailure(f"{path}: no checkpoint could be written: {error}") from error
-
-    with writing(comm, temporary):
-        file = open_shared(temporary, comm)
-    try:
-        for name, slab in slabs.items():
-            with writing(comm, temporary):
-                write_rows(file["arrays"][name], arrays[name][0].first, slab, collective=comm.size > 1)
-        with writing(comm, temporary):
-            file.flush()
-    except SimulationFailure:
-        release(file, comm)
-        if comm.rank == 0:
-            temporary.unlink(missing_ok=True)
-        raise
-    with writing(comm, temporary):
-        file.close()
-    with writing(comm, temporary):
-        if comm.rank == 0:
-            seal(temporary)
-    with writing(comm, temporary):
-        fsync_all(temporary)
-    with writing(comm, path):
-        if comm.rank == 0:
-            _put_in_place(temporary, path)
 
 
 class OpenCheckpoint:
@@ -254,26 +167,6 @@ def newest_checkpoint(folder: Path | str) -> Path | None:
     return None
 
 
-def _create(file: h5py.File, shapes: Mapping, checks: Mapping[str, int], state: str) -> None:
-    set_text(file, "state", state)
-    file["state"].attrs["checksum"] = zlib.crc32(state.encode())
-    group = file.create_group("arrays")
-    for name, (shape, dtype) in shapes.items():
-        group.create_dataset(name, shape=shape, dtype=dtype).attrs["checksum"] = np.uint64(checks[name])
-
-
-def _put_in_place(temporary: Path, path: Path) -> None:
-    if path.exists():
-        os.replace(path, path.with_name(f"{path.stem}-previous{path.suffix}"))
-    os.replace(temporary, path)
-    # Some network file systems cannot sync folders; they do not delay their entries either.
-    try:
-        fsync_all(path.parent)
-    except OSError as error:
-        if error.errno not in (errno.EINVAL, errno.ENOTSUP):
-            raise
-
-
 def _open(path: Path) -> BinaryIO:
     for _ in range(_ATTEMPTS):
         try:
@@ -294,11 +187,3 @@ def _sound(path: Path) -> Iterator[None]:
         yield
     except HDF5_ERRORS as error:
         raise InputError(f"{path}: not a checkpoint, or damaged: {first_line(error)}; {remedy(path)}") from error
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    if isinstance(value, np.generic):
-        return value.item()
-    raise TypeError(f"a checkpoint cannot hold {type(value).__name__} {value!r}")

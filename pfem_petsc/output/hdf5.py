@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -25,12 +24,10 @@ __all__ = [
     "create_new",
     "dataset_names",
     "first_line",
-    "fsync_all",
     "grow",
     "open_shared",
     "release",
     "require_parallel_hdf5",
-    "require_room",
     "set_text",
     "set_unit",
     "write_rows",
@@ -262,46 +259,6 @@ def release(file: h5py.File, comm: MPI.Comm) -> None:
         os.dup2(nowhere, file.id.get_vfd_handle())
         os.close(nowhere)
         file.close()
-
-
-def require_room(comm: MPI.Comm, path: Path, n_bytes: int, target: Path | None = None) -> None:
-    """Stop before a write that would not fit, while the file is whole: a disk that runs full inside HDF5 may damage it.
-
-    Collective; the numbers of rank 0 count.
-
-    Raises
-    ------
-    SimulationFailure
-        On all ranks, when the file (or folder ``target``) is gone or fewer than ``n_bytes`` + 1 MiB are free.
-    """
-
-    def look() -> None:
-        try:
-            (target or path).stat()
-            free = shutil.disk_usage(path.parent).free
-        except OSError as error:
-            raise SimulationFailure(
-                f"{path}: gone or unreachable during the run ({os.strerror(error.errno)}); "
-                "do not move or remove the output folder of a run that is going on"
-            ) from error
-        needed = n_bytes + (1 << 20)
-        if free < needed:
-            raise SimulationFailure(
-                f"{path}: disk full: {free / 1e6:.1f} MB are free, and the next write may take {needed / 1e6:.1f} MB. "
-                "What was written before is complete; make room and continue with --restart, or write less "
-                "(fields_every, fields, precision in [output])"
-            )
-
-    on_root(comm, look)
-
-
-def fsync_all(path: Path) -> None:
-    """Bring a file, or the entries of a folder, onto the disk."""
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
 
 
 def first_line(error: BaseException) -> str:

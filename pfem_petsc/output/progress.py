@@ -11,6 +11,7 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Self, TextIO
 
 from ..parallel.agreement import agreed
+from .bar import ProgressBar, is_terminal
 from .log import LogFile
 from .units import duration, engineering
 
@@ -22,14 +23,6 @@ __all__ = ["Progress"]
 FIRST_LINE = 2.0  # seconds until the first line, and between the first ones
 LAST_LINE = 10.0  # seconds between lines, at most
 BAR_REFRESH = 0.1  # seconds between two drawings of the bar
-
-# Open MPI gives rank 0 a pseudo-terminal, so that isatty() alone would draw a bar into mpirun's line-wise forwarding.
-_LAUNCHERS = ("OMPI_COMM_WORLD_SIZE", "PMI_RANK", "PMIX_RANK", "SLURM_PROCID")
-
-
-def _is_terminal(stream: TextIO) -> bool:
-    launched = any(name in os.environ for name in _LAUNCHERS)
-    return stream.isatty() and not launched and os.environ.get("TERM", "dumb") != "dumb"
 
 
 def _speed(rate: float) -> str:
@@ -75,7 +68,8 @@ class Progress:
         self._root = comm.rank == 0
         self._title, self._n_steps, self._end_time = title, n_steps, end_time
         self._stream = None if quiet else (stream or sys.stdout)
-        self._bar = self._bar_task = self._log = None
+        self._bar: ProgressBar | None = None
+        self._log: LogFile | None = None
         self._clock = clock
         with agreed(comm):
             if self._root and log_path is not None:
@@ -90,8 +84,8 @@ class Progress:
         self._next_line = self._due = self._begin + FIRST_LINE
         self._closed = False
         self._compiling = 0.0
-        if self._root and self._stream is not None and _is_terminal(self._stream):
-            self._start_bar()
+        if self._root and self._stream is not None and is_terminal(self._stream):
+            self._bar = ProgressBar(title, self._stream)
             self._due = self._begin + BAR_REFRESH
 
     def __enter__(self) -> Self:
@@ -158,7 +152,7 @@ class Progress:
         self._log_line(text, "WARNING")
         with contextlib.suppress(OSError):  # it is in the log
             if self._bar is not None:
-                self._bar.console.print(f"warning: {text}", style="yellow", markup=False, highlight=False)
+                self._bar.print(f"warning: {text}", style="yellow")
             else:
                 print(f"warning: {text}", file=sys.stderr, flush=True)
 
@@ -248,33 +242,13 @@ class Progress:
         parts += [_speed(self._rate[0])] if self._rate is not None else []
         return "  ".join([*parts, f"ETA {duration(remaining)}"])
 
-    def _start_bar(self) -> None:
-        # only a terminal pays for loading rich
-        from rich.console import Console
-        from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-        from rich.progress import Progress as Bar
-
-        columns = (
-            BarColumn(bar_width=20),
-            TaskProgressColumn(),
-            TextColumn("{task.fields[state]}", markup=False),
-            TimeElapsedColumn(),
-            TextColumn("ETA"),
-            TimeRemainingColumn(),
-        )
-        # no refresh thread: it would take time from the solver whenever it liked
-        self._bar = Bar(*columns, console=Console(file=self._stream), auto_refresh=False)
-        self._bar_task = self._bar.add_task(self._title, total=1.0, state="")
-        self._bar.start()
-
     def _draw_bar(self) -> None:
         step, time, _, contacts, _ = self._last
         total = f"/{self._n_steps}" if self._n_steps is not None else ""
         # must fit into 80 columns; the lines of the log have the rest
         state = f"{step}{total}  t = {engineering(time, 's')}" + (f"  contacts {contacts:,}" if contacts else "")
         try:
-            self._bar.update(self._bar_task, completed=self._done(), state=state)
-            self._bar.refresh()
+            self._bar.draw(self._done(), state)
         except OSError:
             self._let_go_of_stdout()
 
@@ -285,7 +259,7 @@ class Progress:
             return
         try:
             if self._bar is not None:
-                self._bar.console.print(text, markup=False, highlight=False)
+                self._bar.print(text)
             else:
                 print(text, file=self._stream, flush=True)
         except OSError:

@@ -14,7 +14,8 @@ import numpy as np
 
 from ..errors import InputError
 from .digests import CHECKS
-from .hdf5 import create_checked, dataset_names, fsync_all, grow, write_rows
+from .disk import fsync_all
+from .hdf5 import create_checked, dataset_names, grow, write_rows
 from .history import check_columns
 from .layout import (
     PER_STEP,

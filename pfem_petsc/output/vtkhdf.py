@@ -14,30 +14,29 @@ from mpi4py import MPI
 
 from ..errors import PfemError, SimulationFailure
 from ..parallel.agreement import on_root
-from .digests import CHECKS, mark_digest, mesh_digest, snapshot_digests
+from .connectivity import write_connectivity
+from .digests import snapshot_digests
+from .disk import require_room
 from .hdf5 import (
     create_new,
     grow,
     open_shared,
     release,
     require_parallel_hdf5,
-    require_room,
     write_rows,
     writing,
 )
 from .history import HistoryWriter
-from .integrity import word_sum
-from .layout import PER_STEP, create_field, create_result, create_snapshot_checks, field_datasets
+from .layout import create_field, create_result, field_datasets
 from .provenance import describe_run
 from .repair import reopen
+from .snapshot_index import SnapshotIndex
 
 if TYPE_CHECKING:
     from ..mesh.distribution import DistributedMesh
     from ..parallel.natural import NaturalOrder
 
 __all__ = ["ResultWriter"]
-
-_PIECE = 2**20  # bars whose connectivity is written at once on one rank
 
 
 class ResultWriter:
@@ -125,19 +124,15 @@ class ResultWriter:
             )
         with writing(comm, self.path):
             self._file = open_shared(self._unpublished or self.path, comm)
-        vtk, steps = self._file["VTKHDF"], self._file["VTKHDF/Steps"]
-        self._per_step = {name: steps[name] for name in PER_STEP}
-        self._times = steps["Values"]
-        self._marks = {name: self._file["snapshots"][name] for name in ("step", "time")}
-        self._n_steps = h5py.h5a.open(steps.id, b"NSteps")
-        self.n_snapshots = int(steps.attrs["NSteps"])
+        vtk = self._file["VTKHDF"]
+        self.n_snapshots = int(vtk["Steps"].attrs["NSteps"])
         # Points and fields; made with the first snapshot, which knows the shapes.
         self._data = field_datasets(vtk) if self.n_snapshots else {}
-        self._digests = self._file[CHECKS]["snapshots"] if self.n_snapshots else None
+        self._index = SnapshotIndex(self._file, comm, self.path, mesh)
         self._history = HistoryWriter(self._file, comm, self.path, columns)
         if append_after_step is None:
             with self._whole_or_failed():
-                self._write_connectivity(mesh)
+                write_connectivity(self._file, comm, self.path, mesh)
 
     def write_snapshot(
         self,
@@ -190,19 +185,12 @@ class ResultWriter:
                 with writing(self.comm, self.path):
                     first = n * order.n_global + order.first
                     write_rows(self._data[name], first, slab, collective=self.comm.size > 1)
-            self._append_marks(n, step, time, digests)
+            self._index.append(n, step, time, digests)
             self._history.write()
             with writing(self.comm, self.path):
                 file.flush()
             self._history.commit()
-            with writing(self.comm, self.path):
-                self._n_steps.write(np.array(n + 1, dtype=np.int64))
-                file.flush()
-            with writing(self.comm, self.path):
-                grow(self._times, n + 1)
-                if self.comm.rank == 0:
-                    write_rows(self._times, n, np.array([time], dtype=np.float64))
-                file.flush()
+            self._index.publish(n, time)
             self._publish()
         self.n_snapshots = n + 1
 
@@ -300,31 +288,6 @@ class ResultWriter:
         n_rows = self.n_bars if name.startswith("CellData") else self.n_nodes
         return n_rows * self._row_type(name, slab).itemsize * int(np.prod(slab.shape[1:], dtype=np.int64))
 
-    def _write_connectivity(self, mesh: DistributedMesh) -> None:
-        vtk, first, count = self._file["VTKHDF"], self.bar_order.first, self.bar_order.count
-        together = self.comm.size > 1
-        # one rank holds all bars: pieces keep the working arrays small
-        piece = count if together else min(count, _PIECE)
-        total = 0
-        for start in range(0, max(count, 1), max(piece, 1)):
-            stop = min(start + piece, count)
-            if together:
-                ends = self.bar_order.to_slab(mesh.node_ids[mesh.bars[self.counted]].astype(np.int64).reshape(-1, 2))
-            else:
-                ends = mesh.node_ids[mesh.bars[self.bar_order.owned_rows(start, stop)]].astype(np.int64)
-            total += word_sum(ends.ravel(), 2 * (first + start))
-            with writing(self.comm, self.path):
-                write_rows(vtk["Connectivity"], 2 * (first + start), ends.ravel(), collective=together)
-            # one offset more than bars: the last rank's
-            end = first + stop + (stop == count and self.comm.rank == self.comm.size - 1)
-            with writing(self.comm, self.path):
-                write_rows(vtk["Offsets"], first + start, 2 * np.arange(first + start, end), collective=together)
-        digest = mesh_digest(self.comm, total & (2**64 - 1))
-        with writing(self.comm, self.path):
-            if self.comm.rank == 0:
-                write_rows(self._file[CHECKS]["mesh"], 0, digest)
-            self._file.flush()
-
     def _create_fields(self, slabs: Mapping[str, np.ndarray]) -> None:
         vtk = self._file["VTKHDF"]
         with writing(self.comm, self.path):
@@ -333,19 +296,4 @@ class ResultWriter:
                     kind, _, field = name.partition("/")
                     create_field(vtk, kind, field, slab.shape[1:], self._row_type(name, slab))
             self._data = field_datasets(vtk)
-            self._digests = create_snapshot_checks(self._file)
-
-    def _append_marks(self, n: int, step: int, time: float, digests: np.ndarray) -> None:
-        """The rows of snapshot n in everything that has one row a snapshot, but for its time in VTKHDF."""
-        with writing(self.comm, self.path):
-            for dataset in (*self._per_step.values(), *self._marks.values(), self._digests):
-                grow(dataset, n + 1)
-        rows = {"PointOffsets": n * self.n_nodes, "CellDataRows": n * self.n_bars, "NumberOfParts": 1}
-        with writing(self.comm, self.path):
-            if self.comm.rank == 0:
-                for name, dataset in self._per_step.items():
-                    write_rows(dataset, n, np.full((1, *dataset.shape[1:]), rows.get(name, 0)))
-                write_rows(self._marks["step"], n, np.array([step]))
-                write_rows(self._marks["time"], n, np.array([time]))
-                mark = np.array([mark_digest(n, step, time)], dtype=np.uint64)
-                write_rows(self._digests, n, np.concatenate([mark, digests])[None])
+            self._index.create_checks()

@@ -6,7 +6,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from ..output.checkpoint import NAME, write_checkpoint
+from ..output.checkpoint import NAME
+from ..output.checkpoint_writer import write_checkpoint
 from .compare import check_mesh_is_the_same, mesh_mark
 from .folder import Restart
 from .state import STATE_VERSION, RunState

@@ -19,7 +19,7 @@ from ..parallel.agreement import on_root
 from ..tolerances import TIME
 from .compare import changed_keys, check_version
 
-__all__ = ["RESULT", "Restart", "find_restart", "finished", "prepare_folder"]
+__all__ = ["RESULT", "Restart", "find_restart", "finished", "finished_message", "prepare_folder"]
 
 RESULT = "result.vtkhdf"
 ASIDE = "checkpoint-later.h5"
@@ -104,6 +104,12 @@ def _finished(case, path: Path, end: float) -> float | None:
         # of another case, or not readable: it is moved aside
         return None
     return max(reached) if reached and min(reached) >= end * (1.0 - TIME) else None
+
+
+def finished_message(folder: Path, reached: float, end: float) -> str:
+    """The message about a run whose results have ``reached`` its end [s]."""
+    beyond = f", beyond time.end = {engineering(end, 's')}" if reached > end * (1.0 + TIME) else ""
+    return f"{folder}: finished already: the results have t = {engineering(reached, 's')}{beyond}"
 
 
 def _continues(folder: Path, path: Path) -> bool:

@@ -13,7 +13,7 @@ from functools import cache
 import numpy as np
 
 from ..contact.flat import press_planes
-from ..contact.impact import join_nodes, plane_gaps, stop_nodes, unpressed
+from ..contact.impact_loops import join_nodes, plane_gaps, stop_nodes, unpressed
 from ..contact.log import compare_contacts
 from ..mechanics.bars import first_inverted
 from ..mechanics.compiled import kernel

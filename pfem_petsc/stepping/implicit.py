@@ -19,8 +19,9 @@ from ..solvers.linear import LinearChoice, unsymmetric
 from ..solvers.mass import MassSolver
 from ..solvers.matrix import HessianMatrix
 from ..solvers.matrix_free import MatrixFreeHessian
-from ..solvers.newton import NewtonReport, NewtonSolver, zero_tolerance
+from ..solvers.newton import NewtonSolver, zero_tolerance
 from ..tolerances import ON_BOUND
+from .convergence import failure_message, residual_tolerance
 from .guard import StepGuard
 from .problem import StepProblem
 from .stepper import Solution, Stepper
@@ -31,7 +32,6 @@ atexit.register(gc.collect)
 
 __all__ = ["ImplicitStepper"]
 
-_MASS_RTOL = 1e-3  # of solver.rtol, for systems of the mass matrix alone
 _HALVINGS = 10  # most halvings of a step: to 1/1024
 _WAY_OUT = "Reduce time.step; if such jumps are intended, set solver.guard = false"
 
@@ -203,7 +203,7 @@ class ImplicitStepper(Stepper):
         model, state = self.model, self.state
         if model.temperatures.varying:
             model.temperatures.apply(balance.time)
-        tolerance = self._tolerance(balance)
+        tolerance = residual_tolerance(model, state, balance, self.part)
         active_set = ActiveSet(model, self.state, balance, self.held, self.links)
         candidates, links = active_set.candidates, active_set.links
         newton = linear = 0
@@ -227,7 +227,8 @@ class ImplicitStepper(Stepper):
             if relaxed:
                 continue
             if not report.converged:
-                raise NotConverged(self._failure(problem, w, bounds.arrays, report, tolerance))
+                text = failure_message(problem, w, bounds.arrays, report, tolerance)
+                raise NotConverged(f"{self.when(balance)}: {text}")
             bounds.project(w, 2.0 * zero_tolerance(model.length))
             u = problem.increment(w).copy()
             g = np.empty_like(u)
@@ -256,22 +257,6 @@ class ImplicitStepper(Stepper):
         u -= shift
         g -= problem.nodal[:, None] * shift
 
-    def _tolerance(self, balance: Balance) -> float:
-        """Of the residual's 2-norm [N]: relative to the forces at work (momentum per step, loads, internal forces)."""
-        model, state, solver = self.model, self.state, self.model.case.solver
-        owned = model.mesh.n_owned
-        sums = np.array(
-            [
-                ((model.inertia.mass[:, None] * state.v) ** 2).sum() / self.part**2,
-                (state.external**2).sum(),
-                (state.f[:owned] ** 2).sum(),
-            ]
-        )
-        model.comm.Allreduce(MPI.IN_PLACE, sums)
-        # an explicit scheme's balance is a well-conditioned linear system: what is left of it would be an impulse
-        rtol = solver.rtol if balance.weight else _MASS_RTOL * solver.rtol
-        return max(rtol * float(np.sqrt(sums.max())), solver.atol or 0.0)
-
     def _guess(self, balance: Balance) -> np.ndarray:
         """The acceleration goes on as it was; prescribed components where they will be."""
         guess = self.state.a / balance.alpha
@@ -280,27 +265,6 @@ class ImplicitStepper(Stepper):
             at = (supports.nodes, supports.components)
             guess[at] = supports.positions(balance.time) - balance.predictor[at]
         return guess
-
-    def _failure(
-        self, problem: StepProblem, w: np.ndarray, bounds: tuple | None, report: NewtonReport, tolerance: float
-    ) -> str:
-        """What to tell about a step that did not converge: worst node and residual, reasons, ways out. Collective."""
-        model = self.model
-        g = np.empty_like(w)
-        problem.residual(w, g)
-        if bounds is not None:  # what walls bear is no error
-            g[((w <= bounds[0]) & (g > 0.0)) | ((w >= bounds[1]) & (g < 0.0))] = 0.0
-        size = np.linalg.norm(np.nan_to_num(g, nan=np.inf), axis=1)
-        worst = (0.0, -1)
-        if len(size):
-            at = int(np.argmax(size))
-            worst = (float(size[at]), int(model.mesh.node_ids[at]))
-        residual, node = max(model.comm.allgather(worst))
-        return (
-            f"{self.when(problem.balance)}: no convergence after {report.newton} "
-            f"Newton iterations: {report.why}; residual {report.norm:.3g} N, required {tolerance:.3g} N; worst at "
-            f'node {node} ({residual:.3g} N). Reduce time.step, or set solver.linear = "mumps"'
-        )
 
 
 def _free_left_over(comm: MPI.Comm) -> None:

@@ -29,6 +29,7 @@ from pfem_petsc.registry import lookup
 from pfem_petsc.stepping.contact_check import BOUND, contact_gain, overshoots
 from pfem_petsc.stepping.model import Model
 from pfem_petsc.stepping.prepare import make_plan, make_stepper
+from pfem_petsc.stepping.stepper import Stepper
 
 DOCS = Path(__file__).parent.parent / "docs"
 START, END = "<!-- table: scripts/impact_phases.py -->\n", "<!-- end of phases -->"
@@ -126,7 +127,7 @@ def impacts(
     return _run(model, stepper, int(np.ceil(2.5 / h)) + 8)
 
 
-def _run(model, stepper, steps: int) -> Impacts:
+def _run(model: Model, stepper: Stepper, steps: int) -> Impacts:
     ids = model.mesh.node_ids[: model.mesh.n_owned]
     rod, order = ids // (ELEMENTS + 1), np.argsort(ids)
     tips = order.reshape(PHASES, -1)[:, -1]

@@ -28,6 +28,7 @@ from collections import Counter, defaultdict
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import TextIO
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
@@ -244,7 +245,7 @@ def _number(word: str) -> bool:
     return any(letter.isdigit() for letter in word)
 
 
-def _pump(stream, lines: queue.Queue[str | None]) -> None:
+def _pump(stream: TextIO, lines: queue.Queue[str | None]) -> None:
     for text in stream:
         lines.put(text)
     lines.put(None)

@@ -13,11 +13,15 @@ import argparse
 import os
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from scaling_study.model import parts_from, plot_model, step_time, table
 from scaling_study.plots import plot_study
 from scaling_study.points import Point, points_of, read_point, run_point
 from scaling_study.tables import markdown, rows_of, write_csv
+
+if TYPE_CHECKING:
+    import numpy as np
 
 ROOT = Path(__file__).resolve().parent.parent
 MODEL_SIZES = [1e6, 1e7, 1e8, 1e9, 1e10]
@@ -102,7 +106,7 @@ def _model(points: list[Point], folder: Path, arguments: argparse.Namespace) -> 
     plot_model(parts, MODEL_SIZES, folder / "model.png")
 
 
-def _array(ranks: int):  # noqa: ANN202 - NumPy is imported by the model alone
+def _array(ranks: int) -> np.ndarray:  # NumPy is imported by the model alone
     import numpy as np
 
     return np.array([ranks])

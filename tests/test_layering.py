@@ -1,4 +1,7 @@
-"""Imports never climb: a folder of the package imports only from floors below its own, within functions as well."""
+"""Imports never climb: a folder of the package imports only from floors below its own, within functions as well.
+
+What only a checker of types reads (``if TYPE_CHECKING:``) may name a type of a higher floor.
+"""
 
 from __future__ import annotations
 
@@ -39,11 +42,21 @@ other."""
 FLOOR = {name: number for number, names in enumerate(FLOORS) for name in names}
 
 
+def is_for_types(node: ast.AST) -> bool:
+    """Whether a statement is ``if TYPE_CHECKING:``."""
+    return isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"
+
+
 def imports(path: Path, package: Path) -> Iterator[tuple[int, str]]:
     """Line, and folder or module of the package, of each import of its parts in a file."""
     # the package that relative imports of the file start from, below the root of all
     here = path.relative_to(package).parts[:-1]
-    for node in ast.walk(ast.parse(path.read_text(), str(path))):
+    tree = ast.parse(path.read_text(), str(path))
+    guarded = (part for node in ast.walk(tree) if is_for_types(node) for part in node.body)
+    types = {id(inner) for part in guarded for inner in ast.walk(part)}
+    for node in ast.walk(tree):
+        if id(node) in types:
+            continue
         found: list[tuple[str, ...]] = []
         if isinstance(node, ast.Import):
             names = (alias.name.split(".") for alias in node.names)
@@ -107,3 +120,14 @@ def test_a_climbing_import_is_found_with_its_line(tmp_path, text):
     (found,) = climbing(package)
     assert f"contact/one.py:{line}: contact" in found
     assert "stepping" in found or "__init__" in found
+
+
+def test_types_may_be_of_a_higher_floor(tmp_path):
+    package = tmp_path / "pfem_petsc"
+    for folder in ("contact", "stepping"):
+        (package / folder).mkdir(parents=True)
+    guarded = "if TYPE_CHECKING:\n    from ..stepping.stepper import Stepper\n"
+    (package / "contact" / "one.py").write_text(guarded)
+    assert climbing(package) == []
+    (package / "contact" / "one.py").write_text(f"{guarded}else:\n    from ..stepping.stepper import Stepper\n")
+    assert len(climbing(package)) == 1

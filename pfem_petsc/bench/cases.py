@@ -5,7 +5,10 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from ..case.schema import Case
 
 __all__ = ["KINDS", "PITCH", "WAVE_SPEED", "Job", "bars_of", "cells_for", "make_case"]
 
@@ -68,7 +71,7 @@ def cells_for(kind: str, bars: int) -> int:
     return n if bars - bars_of(kind, n) <= bars_of(kind, n + 1) - bars else n + 1
 
 
-def make_case(job: Job, kind: str, cells: int, steps: int, **time: Any):  # noqa: ANN201 - the type would import the schema
+def make_case(job: Job, kind: str, cells: int, steps: int, **time: Any) -> Case:
     """The case of a job on a lattice: ``steps`` steps, history but no fields.
 
     ``time`` holds further keys of ``[time]``.

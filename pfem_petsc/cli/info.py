@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from ..energies import LOST, STORED, SUPPLIED
@@ -10,6 +11,8 @@ from ..errors import printable
 from .parser import PROGRAM, add_result, surviving
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from ..output.result import Result
 
 RANKS = "one"
@@ -66,7 +69,7 @@ def describe(result: Result) -> list[str]:
     return lines
 
 
-def _energies(history, names: list[str]) -> list[str]:  # noqa: ANN001 - any mapping of names to (rows,) arrays
+def _energies(history: Mapping[str, np.ndarray], names: list[str]) -> list[str]:
     """Energies [J] at start and end, and what their balance leaves over, also of the largest that any had meanwhile."""
     from ..output.units import engineering
 

@@ -15,6 +15,8 @@ from .petsc_options import start_petsc
 if TYPE_CHECKING:
     from mpi4py import MPI
 
+    from ..case.schema import Case
+
 RANKS = "all"
 
 EXAMPLE = f"""\
@@ -71,7 +73,7 @@ def run(arguments: argparse.Namespace, comm: MPI.Comm) -> int:
         raise
 
 
-def load_case(arguments: argparse.Namespace, comm: MPI.Comm):  # noqa: ANN201 - the type would import the schema
+def load_case(arguments: argparse.Namespace, comm: MPI.Comm) -> Case:
     """The case of the command line, read by rank 0; PETSc is started with its options. Collective.
 
     A restart goes on with the values that the run it continues was given by ``--set``, and those given now over them.
@@ -82,7 +84,7 @@ def load_case(arguments: argparse.Namespace, comm: MPI.Comm):  # noqa: ANN201 - 
     return on_root(comm, _load, arguments)
 
 
-def _load(arguments: argparse.Namespace):  # noqa: ANN202
+def _load(arguments: argparse.Namespace) -> Case:
     from ..case.builtin import built_in_path
     from ..case.schema import Case
 
@@ -97,7 +99,7 @@ def _load(arguments: argparse.Namespace):  # noqa: ANN202
     return Case.load(arguments.case, overrides)
 
 
-def _command(arguments: argparse.Namespace, case, ranks: int) -> str:  # noqa: ANN001
+def _command(arguments: argparse.Namespace, case: Case, ranks: int) -> str:
     """The command line that continues this run, to be pasted into a shell."""
     launcher = []
     if ranks > 1:

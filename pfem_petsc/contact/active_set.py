@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
@@ -23,11 +24,16 @@ from .bounds import Bounds
 from .candidates import Candidates, expected_candidates
 from .forces import WallForces
 from .frames import MIN_VOLUME, NodalFrames
-from .implicit_friction import NoStepFriction, StepFriction
+from .implicit_friction import StepFriction
 from .links import LinkCoordinates
+from .no_friction import NoStepFriction
 from .projection import project
 from .transform import Transform
 from .wall_check import broken_walls, is_misaligned, is_off_surface
+
+if TYPE_CHECKING:
+    from ..stepping.model import Model
+    from ..stepping.problem import StepProblem
 
 __all__ = ["ActiveSet", "Outcome", "Trial"]
 
@@ -91,7 +97,7 @@ class ActiveSet:
     """
 
     def __init__(
-        self, model, state: State, balance: Balance, held: np.ndarray, links: Sequence[LinkCoordinates] = ()
+        self, model: Model, state: State, balance: Balance, held: np.ndarray, links: Sequence[LinkCoordinates] = ()
     ) -> None:
         self.contact = model.contact
         self.model = model
@@ -145,7 +151,7 @@ class ActiveSet:
         u[nodes] = np.where(fixed[nodes], u[nodes], places - self.balance.predictor[nodes])
         return u
 
-    def approach(self, trial: Trial, problem, u: np.ndarray) -> np.ndarray:
+    def approach(self, trial: Trial, problem: StepProblem, u: np.ndarray) -> np.ndarray:
         """A guess (owned, 3) with a better active set, by projected steepest descent. Collective.
 
         In oblique coordinates Newton's active sets can cycle; projections onto the true planes cannot.

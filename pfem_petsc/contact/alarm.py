@@ -9,16 +9,22 @@ they take it beyond, both cannot be meant, and that is told as well.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from mpi4py import MPI
 
 from ..errors import SimulationFailure
 from ..tolerances import BEYOND, FREE_PART
 
+if TYPE_CHECKING:
+    from ..stepping.stepper import Stepper
+    from .contact import Contact
+
 __all__ = ["check_positions"]
 
 
-def check_positions(stepper) -> None:
+def check_positions(stepper: Stepper) -> None:
     """Refuse a state with a node beyond a wall. One pass over the nodes and one reduction. Collective.
 
     Parameters
@@ -71,7 +77,7 @@ def check_positions(stepper) -> None:
     )
 
 
-def _prescribed(contact, node: int, wall: int, x: np.ndarray, time: float) -> bool:
+def _prescribed(contact: Contact, node: int, wall: int, x: np.ndarray, time: float) -> bool:
     """Whether supports prescribe an owned node of those at (owned, 3) along a wall's normal, or in part a tied node."""
     if contact.ties.any and contact.ties.held[node] and contact.fixed[node].any():
         return True

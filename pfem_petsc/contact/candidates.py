@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
 
 from ..integrators.base import Balance, State
 from ..tolerances import BEYOND
+
+if TYPE_CHECKING:
+    from ..stepping.model import Model
+    from .contact import Contact
 
 __all__ = ["Candidates", "expected_candidates"]
 
@@ -31,7 +36,7 @@ class Candidates:
 
     def join(
         self,
-        contact,
+        contact: Contact,
         displacements: np.ndarray,
         joined: np.ndarray,
         broken: np.ndarray,
@@ -70,7 +75,7 @@ class Candidates:
 
 
 def expected_candidates(
-    model, state: State, balance: Balance, held: np.ndarray, displacements: np.ndarray
+    model: Model, state: State, balance: Balance, held: np.ndarray, displacements: np.ndarray
 ) -> Candidates:
     """Owned nodes that may touch a wall in a step, ``held`` (owned,) by walls before among them. Collective.
 
@@ -91,7 +96,9 @@ def expected_candidates(
     )
 
 
-def _within_reach(model, state: State, nodes, x, displacements, reach) -> np.ndarray:
+def _within_reach(
+    model: Model, state: State, nodes: np.ndarray, x: np.ndarray, displacements: np.ndarray, reach: np.ndarray
+) -> np.ndarray:
     """(m, walls) bool: walls that nodes (m,) on their way to (m, 3) come within reach (m,) [m] of, or are at."""
     contact = model.contact
     applicable = contact.applicable(nodes, x, displacements)

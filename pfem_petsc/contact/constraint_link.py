@@ -5,7 +5,7 @@ All ranks know all rows and solve the same small problems; each applies what con
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,6 +15,12 @@ from ..registry import lookup
 from ..tolerances import ON_BOUND
 from .row_coordinates import RowCoordinates
 from .rows import Rows
+
+if TYPE_CHECKING:
+    from ..case.schema import Case
+    from ..mesh.distribution import DistributedMesh
+    from ..stepping.model import Model
+    from .contact import Contact
 
 __all__ = ["ConstraintLink"]
 
@@ -32,7 +38,9 @@ class ConstraintLink:
 
     key = "constraints"
 
-    def __init__(self, case, nodes: dict[str, np.ndarray], mesh, fixed: np.ndarray, contact) -> None:
+    def __init__(
+        self, case: Case, nodes: dict[str, np.ndarray], mesh: DistributedMesh, fixed: np.ndarray, contact: Contact
+    ) -> None:
         self.source, self.contact = case.source, contact
         self.names = [parameters.name for parameters in case.constraint]
         self.columns = [f"constraint/{name}" for name in self.names]
@@ -68,7 +76,15 @@ class ConstraintLink:
         self.force = np.zeros(len(self.rows.source))
         self.jacobian = np.zeros((len(self.rows.entry_row), 3))
 
-    def explicit(self, balance: Balance, state: State, u, stiffness, contact, tolerance: float) -> None:
+    def explicit(
+        self,
+        balance: Balance,
+        state: State,
+        u: np.ndarray,
+        stiffness: np.ndarray,
+        contact: np.ndarray,
+        tolerance: float,
+    ) -> None:
         rows, here = self.rows, self.rows.here
         x = balance.predictor + u
         start = rows.gather(state.position) if acts_at_start(balance, state) else None
@@ -113,7 +129,7 @@ class ConstraintLink:
         tables[rows.here] = of_nodes[rows.mine]
         return tables
 
-    def check(self, model, on_its_own: bool) -> None:
+    def check(self, model: Model, on_its_own: bool) -> None:
         key, rows, walls = f"{self.source}: constraint", self.rows, self.contact
         if model.case.contact.treatment != "scheme":
             raise InputError(f'{key}: constraints need contact.treatment = "scheme"')

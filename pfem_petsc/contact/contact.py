@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
@@ -18,6 +20,11 @@ from .log import ContactLog
 from .motion import WallMotion
 from .search import near_planes
 from .tied import FreshTies, NoTies, Ties
+
+if TYPE_CHECKING:
+    from ..case.schema import Case
+    from ..mesh.distribution import DistributedMesh
+    from .walls.base import WallKeys
 
 __all__ = ["Contact"]
 
@@ -41,7 +48,14 @@ class Contact:
     state : of the nodes, for walls that must know where nodes come from; set by the stepper
     """
 
-    def __init__(self, case, nodes: dict[str, np.ndarray], mesh, fixed: np.ndarray, parameters=None) -> None:
+    def __init__(
+        self,
+        case: Case,
+        nodes: dict[str, np.ndarray],
+        mesh: DistributedMesh,
+        fixed: np.ndarray,
+        parameters: Sequence[WallKeys] | None = None,
+    ) -> None:
         walls = list(case.wall) if parameters is None else parameters
         self.source = case.source
         self.mesh = mesh

@@ -13,6 +13,9 @@ projection onto walls, which follows, finds the walls' own.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
 import numpy as np
 from mpi4py import MPI
 
@@ -21,6 +24,10 @@ from .complementarity import complementary, solve_groups
 from .pair_loops import broken_pairs
 from .projection import project
 from .search import near_planes
+
+if TYPE_CHECKING:
+    from .contact import Contact
+    from .pairs import ContactPairs
 
 __all__ = ["CoupledPairs", "complementary"]
 
@@ -39,7 +46,7 @@ class CoupledPairs:
     shared : (n,) bool, which are in several pairs
     """
 
-    def __init__(self, pairs, contact) -> None:  # noqa: ANN001
+    def __init__(self, pairs: ContactPairs, contact: Contact) -> None:
         self.pairs = pairs
         self.contact = contact
         ends = np.stack([pairs.first, pairs.second])
@@ -150,7 +157,15 @@ class CoupledPairs:
         near = np.flatnonzero(walled.any(axis=1))
         return self._forces(x, data[:, 3].copy(), least, planes, near, tolerance)
 
-    def _forces(self, x, stiffness, least, planes, near, tolerance: float) -> np.ndarray:  # noqa: ANN001
+    def _forces(
+        self,
+        x: np.ndarray,
+        stiffness: np.ndarray,
+        least: np.ndarray,
+        planes: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
+        near: np.ndarray,
+        tolerance: float,
+    ) -> np.ndarray:
         """Forces of the pairs (p,), of nodes at x (n, 3), of which ``near`` (m,) may be beyond walls.
 
         ``planes(nodes)`` gives the normals (m, w, 3) and offsets (m, w) of nodes (m,), -inf where a wall is no concern.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from ..errors import SimulationFailure
@@ -12,6 +14,9 @@ from .friction import add_friction
 from .jamming import jam
 from .projection import project
 from .rebound import impact_square, rebound_way
+
+if TYPE_CHECKING:
+    from .contact import Contact
 
 __all__ = ["ExplicitContact"]
 
@@ -26,7 +31,7 @@ class ExplicitContact:
     plain : flat walls without friction, restitution, ends or ties: one compiled pass does all
     """
 
-    def __init__(self, contact) -> None:
+    def __init__(self, contact: Contact) -> None:
         self.contact = contact
         plain = contact.flat.all() and not (contact.has_friction or contact.partial or contact.ties.any)
         self.plain = bool(plain and not contact.restitution.any())
@@ -45,7 +50,9 @@ class ExplicitContact:
         u[nodes] += correction
         return nodes, force, walls
 
-    def _press_planes(self, predictor, u, stiffness, time: float, tolerance: float) -> tuple:
+    def _press_planes(
+        self, predictor: np.ndarray, u: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float
+    ) -> tuple:
         contact = self.contact
         offsets = contact.plane_offsets(time)
         nodes, infeasible, offsets, force, touching, places, *sums = press_planes(
@@ -184,7 +191,16 @@ class ExplicitContact:
         way = rebound_way(self.contact.restitution, squares, arrivals, towards) - 0.5 * towards
         return np.where(squares > 0.0, np.maximum(way, 0.0), 0.0)
 
-    def _remember_impacts(self, nodes, free, moved, pull, displacements, normals, strength) -> None:
+    def _remember_impacts(
+        self,
+        nodes: np.ndarray,
+        free: np.ndarray,
+        moved: np.ndarray,
+        pull: np.ndarray,
+        displacements: np.ndarray,
+        normals: np.ndarray,
+        strength: np.ndarray,
+    ) -> None:
         """Who hits a wall with restitution in this step, and how: see :mod:`~pfem_petsc.contact.rebound`."""
         state = self.contact.state
         shape = len(self.contact.members), len(self.contact.walls)
@@ -204,7 +220,15 @@ class ExplicitContact:
         arrivals[nodes] = np.where(fresh, arrival, 0.0)
 
     def _apply_friction(
-        self, nodes, free, displacements, planes, stiffness, moved, strength, time
+        self,
+        nodes: np.ndarray,
+        free: np.ndarray,
+        displacements: np.ndarray,
+        planes: tuple[np.ndarray, np.ndarray],
+        stiffness: np.ndarray,
+        moved: np.ndarray,
+        strength: np.ndarray,
+        time: float,
     ) -> tuple[np.ndarray, np.ndarray, float]:
         """Positions and forces (m, w, 3) with friction, from those without, and the energy that it takes [J].
 

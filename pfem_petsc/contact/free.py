@@ -9,13 +9,16 @@ not turn.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
 
 from ..integrators.base import Balance, Scheme, State
+
+if TYPE_CHECKING:
+    from .walls.base import WallKeys
 
 __all__ = ["FreeWalls", "NoFreeWalls"]
 
@@ -34,7 +37,9 @@ class FreeWalls:
     weight : (f, 3) of those on which gravity acts [N]
     """
 
-    def __init__(self, walls, scheme: Scheme, comm: MPI.Comm, gravity: tuple[float, float, float]) -> None:
+    def __init__(
+        self, walls: Sequence[WallKeys], scheme: Scheme, comm: MPI.Comm, gravity: tuple[float, float, float]
+    ) -> None:
         self.at = np.array([k for k, wall in enumerate(walls) if wall.mass is not None], dtype=np.int64)
         self.mass = np.array([walls[k].mass for k in self.at])
         self.scheme, self.comm = scheme, comm

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from ..output.sums import WALL
 from .contact import Contact
 from .forces import WallForces
+
+if TYPE_CHECKING:
+    from ..stepping.impulses import Impulses
 
 __all__ = ["ContactColumns", "contact_columns"]
 
@@ -44,7 +49,7 @@ class ContactColumns:
         self._moving = np.flatnonzero(contact.moving)
         self._motion_at = starts[self._moving, None] + np.arange(WALL.width, WALL.width + 6)
 
-    def fill(self, sums: np.ndarray, walls: WallForces, impulses) -> None:  # noqa: ANN001
+    def fill(self, sums: np.ndarray, walls: WallForces, impulses: Impulses) -> None:
         """Put this rank's share into ``sums`` (size,)."""
         log = self.contact.log
         sums[0] = log.changes

@@ -12,11 +12,16 @@ A node that a scheme lets go of for a moment, and that has not left its wall, is
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from mpi4py import MPI
 
 from ..tolerances import ON_BOUND
 from .impact_loops import join_nodes, plane_gaps, stop_nodes, unpressed
+
+if TYPE_CHECKING:
+    from ..stepping.stepper import Stepper
 
 __all__ = ["Impacts"]
 
@@ -29,7 +34,7 @@ class Impacts:
     met : (m,) owned nodes that have met walls and not left them yet; ``stepper.closed`` (owned, walls) says which
     """
 
-    def __init__(self, stepper) -> None:
+    def __init__(self, stepper: Stepper) -> None:
         self.stepper = stepper
         self.model = stepper.model
         contact = self.model.contact
@@ -95,7 +100,14 @@ class Impacts:
             return v, a
         return np.where(fixed, motion[0][nodes], v), np.where(fixed, motion[1][nodes], a)
 
-    def _on_walls(self, x, motion, load, time: float, displacements: np.ndarray) -> float:
+    def _on_walls(
+        self,
+        x: np.ndarray,
+        motion: tuple[np.ndarray, np.ndarray],
+        load: np.ndarray | None,
+        time: float,
+        displacements: np.ndarray,
+    ) -> float:
         contact, log = self.model.contact, self.model.contact.log
         free = contact.motion.free
         if len(self.met) == 0 and len(log.last) == 0 and free is None:
@@ -141,7 +153,9 @@ class Impacts:
             loss += self._on_free_walls(nodes, normals, speeds)
         return loss
 
-    def _tied(self, nodes, normals, speeds, v, rates) -> float:
+    def _tied(
+        self, nodes: np.ndarray, normals: np.ndarray, speeds: np.ndarray, v: np.ndarray, rates: np.ndarray
+    ) -> float:
         """What walls that hold nodes for good take of their motion along them."""
         contact = self.model.contact
         across = v[:, None, :] - rates
@@ -151,7 +165,7 @@ class Impacts:
         energy = 0.5 * self.model.inertia.mass[nodes, None] * (across * across).sum(axis=2)
         return float(energy[caught].sum())
 
-    def _on_free_walls(self, nodes, normals, speeds) -> float:
+    def _on_free_walls(self, nodes: np.ndarray, normals: np.ndarray, speeds: np.ndarray) -> float:
         """Nodes that close on a wall of mass M together: sum m s^2/2 - (sum m s n)^2/(2 (M + sum m)). Collective."""
         contact, free = self.model.contact, self.model.contact.motion.free
         mass = self.model.inertia.mass[nodes, None]
@@ -168,7 +182,7 @@ class Impacts:
         given = 0.5 * (sums[:, 2:] ** 2).sum(axis=1) / (free.mass + sums[:, 1])
         return float((keeps * (sums[:, 0] - given)).sum())
 
-    def _of_pairs(self, x, motion, load) -> float:
+    def _of_pairs(self, x: np.ndarray, motion: tuple[np.ndarray, np.ndarray], load: np.ndarray | None) -> float:
         """The same of pairs that meet, whose reduced mass counts: those whose second nodes are here. Collective."""
         pairs, mass = self.model.pairs, self.model.inertia.mass
         normal_forces = pairs.force > 0.0

@@ -12,6 +12,8 @@ wrong way round, the node sticks. Once it is known to slip, its direction is sol
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from ..tolerances import ON_BOUND, PROJECTED
@@ -20,7 +22,12 @@ from .jamming import jam
 from .projection import project
 from .sliding import Sliding
 
-__all__ = ["NoStepFriction", "StepFriction"]
+if TYPE_CHECKING:
+    from ..integrators.base import Balance, State
+    from ..stepping.model import Model
+    from .frames import NodalFrames
+
+__all__ = ["StepFriction"]
 
 # Weight of the known direction in one that is solved for, ten times as much each time that this fails: 0.01 saves a
 # fifth of the solves at first, but fails where nodes slip by micrometres.
@@ -42,7 +49,7 @@ class StepFriction:
     unsettled : owned nodes whose solution did not keep the law in :meth:`check`
     """
 
-    def __init__(self, model, state, balance) -> None:
+    def __init__(self, model: Model, state: State, balance: Balance) -> None:
         self.model = model
         self.contact = model.contact
         self.state = state
@@ -73,7 +80,7 @@ class StepFriction:
         force += self.drag
         return self.dissipated(nodes, x)
 
-    def apply(self, frames, x: np.ndarray) -> None:
+    def apply(self, frames: NodalFrames, x: np.ndarray) -> None:
         """Hold the sticking nodes of the frames and drag the slipping ones, for a guess of positions (owned, 3)."""
         nodes = frames.nodes
         has_friction = self._has_friction(frames)
@@ -91,7 +98,13 @@ class StepFriction:
         frames.sliding = self._slide(frames, np.flatnonzero(moving))
 
     def check(
-        self, frames, x: np.ndarray, reaction: np.ndarray, strengths: np.ndarray, noise: float, tolerance: float
+        self,
+        frames: NodalFrames,
+        x: np.ndarray,
+        reaction: np.ndarray,
+        strengths: np.ndarray,
+        noise: float,
+        tolerance: float,
     ) -> np.ndarray:
         """Find the nodes whose solution does not keep the law; normal forces (m, walls) of all nodes of the frames [N].
 
@@ -145,11 +158,13 @@ class StepFriction:
         normals, _ = self.contact.planes(self.contact.members[nodes], x[nodes], displacements)
         return [text for node, n in zip(nodes, normals, strict=True) if (text := jam(self.contact, node, n))]
 
-    def _has_friction(self, frames) -> np.ndarray:
+    def _has_friction(self, frames: NodalFrames) -> np.ndarray:
         """(m,) bool: frames with a wall that has friction."""
         return ((frames.rows >= 0) & (self.contact.static_friction > 0.0)).any(axis=1)
 
-    def _local(self, frames, at, x, reaction, slipping) -> tuple[np.ndarray, ...]:
+    def _local(
+        self, frames: NodalFrames, at: np.ndarray, x: np.ndarray, reaction: np.ndarray, slipping: np.ndarray
+    ) -> tuple[np.ndarray, ...]:
         """The nodes' own problems: places (k, 3), normal (k, w) and friction (k, w, 3) forces, and stiffness (k,).
 
         Slipping nodes are asked with the dynamic coefficient alone: whether they stick is seen when it is tried.
@@ -180,7 +195,9 @@ class StepFriction:
             moved[part], normal_forces[part], drag[part] = place, press, pull
         return moved, normal_forces, drag, stiffness
 
-    def _may_stick(self, nodes, slipping, x, normal_forces, normals) -> np.ndarray:
+    def _may_stick(
+        self, nodes: np.ndarray, slipping: np.ndarray, x: np.ndarray, normal_forces: np.ndarray, normals: np.ndarray
+    ) -> np.ndarray:
         """(k, w) bool: walls that might hold slipping nodes by their static coefficient, which is to be tried once."""
         contact = self.contact
         slip = self._slip(nodes, x, normals)
@@ -189,12 +206,22 @@ class StepFriction:
         may = (contact.static_friction > contact.friction) & (needed <= contact.static_friction * normal_forces)
         return may & (normal_forces > 0.0) & (slipping & ~self._failed[nodes])[:, None]
 
-    def _slip(self, nodes, x, normals) -> np.ndarray:
+    def _slip(self, nodes: np.ndarray, x: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """How nodes at (k, 3) have slipped on their walls (k, w, 3) [m]."""
         slip = x[:, None, :] - self.state.position[nodes][:, None, :] - self._way
         return slip - np.einsum("kwi,kwi->kw", slip, normals)[:, :, None] * normals
 
-    def _decide(self, frames, at, x, slipping, moved, normal_forces, drag, stiffness) -> None:
+    def _decide(
+        self,
+        frames: NodalFrames,
+        at: np.ndarray,
+        x: np.ndarray,
+        slipping: np.ndarray,
+        moved: np.ndarray,
+        normal_forces: np.ndarray,
+        drag: np.ndarray,
+        stiffness: np.ndarray,
+    ) -> None:
         """What nodes do next, from where they are, x, and from their own problems' solutions."""
         nodes, contact = frames.nodes[at], self.contact
         slip = self._slip(nodes, moved, frames.normals[at])
@@ -217,7 +244,7 @@ class StepFriction:
         self._sticks[nodes] = np.where(infeasible, holds.argmax(axis=1), -1)
         self._directions[nodes] = unit * np.maximum(contact.friction * normal_forces, 1e-300)[:, :, None]
 
-    def _hold(self, frames, at: np.ndarray) -> None:
+    def _hold(self, frames: NodalFrames, at: np.ndarray) -> None:
         """Hold sticking nodes where they do not slip."""
         nodes = frames.nodes[at]
         wall = self._sticks[nodes]
@@ -234,7 +261,7 @@ class StepFriction:
         self._sticks[nodes[~possible]] = -1
         frames.pin(at[possible], held[possible], which[possible])
 
-    def _slide(self, frames, at: np.ndarray) -> Sliding:
+    def _slide(self, frames: NodalFrames, at: np.ndarray) -> Sliding:
         nodes = frames.nodes[at]
         friction = np.where((self._directions[nodes] != 0.0).any(axis=2), self.contact.friction, 0.0)
         friction = np.where(frames.rows[at] >= 0, friction, 0.0)
@@ -260,31 +287,3 @@ class StepFriction:
             start,
             np.where(slips, self._stiffness[nodes], 0.0),
         )
-
-
-class NoStepFriction:
-    """Stands for :class:`StepFriction` where no wall has friction; see there."""
-
-    def __init__(self, model, state, balance) -> None:
-        self.unsettled = np.empty(0, dtype=np.int64)
-
-    def apply(self, frames, x: np.ndarray) -> None:
-        """Nothing sticks or slips."""
-
-    def check(
-        self, frames, x: np.ndarray, reaction: np.ndarray, strengths: np.ndarray, noise: float, tolerance: float
-    ) -> np.ndarray:
-        """Normal forces as they are."""
-        return strengths
-
-    def jams(self, nodes: np.ndarray, x: np.ndarray, displacements: np.ndarray) -> list[str]:
-        """Nothing jams."""
-        return []
-
-    def relax(self) -> bool:
-        """There is nothing to ask less of."""
-        return False
-
-    def add(self, force: np.ndarray, nodes: np.ndarray, x: np.ndarray) -> float:
-        """No energy."""
-        return 0.0

@@ -13,6 +13,7 @@ with a jolt of h g, which dies out slowly with some schemes.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,13 +22,20 @@ from .forces import WallForces
 from .friction import add_friction
 from .projection import project
 
+if TYPE_CHECKING:
+    from ..integrators.base import State
+    from ..stepping.model import Model
+    from .contact import Contact
+
 __all__ = ["start_at_rest"]
 
 _ROUNDS = 60  # each at least halves the error
 _FAST = 1e16  # by so much a velocity that decides over the direction of slip is above an acceleration
 
 
-def start_at_rest(model, state, accelerate: Callable[[np.ndarray], np.ndarray], load: np.ndarray) -> WallForces | None:
+def start_at_rest(
+    model: Model, state: State, accelerate: Callable[[np.ndarray], np.ndarray], load: np.ndarray
+) -> WallForces | None:
     """Put the acceleration and the contact forces of resting nodes into the state; the forces per wall. Collective.
 
     The forces are found by projections with the lumped mass: at once where the mass is lumped. A consistent mass is
@@ -107,7 +115,18 @@ def start_at_rest(model, state, accelerate: Callable[[np.ndarray], np.ndarray], 
 
 
 def _apply_friction(
-    contact, nodes, v, rates, accelerations, slack, weight, a, normals, planes, normal_forces, drag
+    contact: Contact,
+    nodes: np.ndarray,
+    v: np.ndarray,
+    rates: np.ndarray,
+    accelerations: np.ndarray,
+    slack: float,
+    weight: np.ndarray,
+    a: np.ndarray,
+    normals: np.ndarray,
+    planes: np.ndarray,
+    normal_forces: np.ndarray,
+    drag: np.ndarray,
 ) -> None:
     """Friction at the start: accelerations (m, 3), normal (m, w) and friction (m, w, 3) forces, in place.
 

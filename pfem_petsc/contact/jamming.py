@@ -8,14 +8,19 @@ it presses: a wedge that locks itself.
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from ..tolerances import FREE_PART
 
+if TYPE_CHECKING:
+    from .contact import Contact
+
 __all__ = ["jam"]
 
 
-def jam(contact, node: int, normals: np.ndarray) -> str:
+def jam(contact: Contact, node: int, normals: np.ndarray) -> str:
     """Why the friction of an owned node cannot be found, and the way out; empty where nothing jams it.
 
     Parameters

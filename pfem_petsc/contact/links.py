@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from functools import reduce
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from petsc4py import PETSc
@@ -17,6 +17,9 @@ from petsc4py import PETSc
 from ..errors import SimulationFailure
 from ..integrators.base import Balance, State
 from .frames import NodalFrames
+
+if TYPE_CHECKING:
+    from ..stepping.model import Model
 
 __all__ = ["Link", "LinkCoordinates", "Links"]
 
@@ -35,7 +38,15 @@ class Link(Protocol):
     columns: list[str]
     numbers: np.ndarray
 
-    def explicit(self, balance: Balance, state: State, u, stiffness, contact, tolerance: float) -> None:
+    def explicit(
+        self,
+        balance: Balance,
+        state: State,
+        u: np.ndarray,
+        stiffness: np.ndarray,
+        contact: np.ndarray,
+        tolerance: float,
+    ) -> None:
         """Correct the increments ``u`` (owned, 3) of a step in which each node is solved on its own. Collective.
 
         ``stiffness`` (owned,) is the force for a displacement of a node [N/m], ``contact`` (owned, 3) takes the forces
@@ -59,7 +70,7 @@ class Link(Protocol):
     def tables(self, owned: int) -> np.ndarray:
         """(owned,) the table whose rows press on an owned node as their last one, -1 for none."""
 
-    def check(self, model, on_its_own: bool) -> None:
+    def check(self, model: Model, on_its_own: bool) -> None:
         """Refuse what it does not go with, and nodes that start beyond it. Collective.
 
         ``on_its_own``: each node is solved on its own, by an explicit scheme with lumped mass.
@@ -182,7 +193,9 @@ class Links:
     def __iter__(self) -> Iterator[Link]:
         return iter(self.members)
 
-    def explicit(self, balance: Balance, state: State, u, stiffness, none: np.ndarray, tolerance: float) -> np.ndarray:
+    def explicit(
+        self, balance: Balance, state: State, u: np.ndarray, stiffness: np.ndarray, none: np.ndarray, tolerance: float
+    ) -> np.ndarray:
         """See :meth:`Link.explicit`; the forces (owned, 3) [N], ``none`` where there are no links."""
         if not self.members:
             return none
@@ -213,7 +226,7 @@ class Links:
             first += len(link.columns)
         return tables
 
-    def check(self, model, on_its_own: bool) -> None:
+    def check(self, model: Model, on_its_own: bool) -> None:
         """See :meth:`Link.check`."""
         for link in self.members:
             link.check(model, on_its_own)

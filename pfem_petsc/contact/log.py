@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
 
 from ..mechanics.compiled import kernel
+
+if TYPE_CHECKING:
+    from .forces import WallForces
 
 __all__ = ["ContactLog", "compare_contacts"]
 
@@ -75,7 +78,7 @@ class ContactLog:
         self._steps = np.empty(_PENDING)
         self._flags = np.empty((_PENDING, n_walls), dtype=np.uint8)
 
-    def book(self, walls, step: float, comm: MPI.Comm) -> None:
+    def book(self, walls: WallForces, step: float, comm: MPI.Comm) -> None:
         """Book the forces of a step of so many seconds. Collective where many have come together."""
         self.note(walls.contacts > 0, step, comm)
         if len(walls.nodes) == 0 and len(self.last) == 0:

@@ -8,6 +8,8 @@ all others that can hold a nearer point than was found there.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from mpi4py import MPI
 
@@ -151,7 +153,7 @@ class _Grid:
                 break
         return best, distance
 
-    def _ranges(self, cells: np.ndarray, ring: int):
+    def _ranges(self, cells: np.ndarray, ring: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
         """For each run of cells of the ring around cells (m, 2): the places (m,), (m,) of its points in the order."""
         for row in range(-ring, ring + 1):
             runs = [(-ring, ring)] if abs(row) == ring else [(-ring, -ring), (ring, ring)]
@@ -164,7 +166,15 @@ class _Grid:
                 end = np.searchsorted(self.keys, key + np.minimum(high, self.shape[1] - 1), side="right")
                 yield begin, np.where(there, end, begin)
 
-    def _look(self, queries, left, begin, end, best, distance) -> None:
+    def _look(
+        self,
+        queries: np.ndarray,
+        left: np.ndarray,
+        begin: np.ndarray,
+        end: np.ndarray,
+        best: np.ndarray,
+        distance: np.ndarray,
+    ) -> None:
         """Compare queries ``left`` with their points at begin..end of the order; best and distance are brought up."""
         counts = end - begin
         met = np.flatnonzero(counts)

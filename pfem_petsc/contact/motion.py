@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..mechanics.motion import motion_of
 from .free import FreeWalls, NoFreeWalls
+
+if TYPE_CHECKING:
+    from ..integrators.base import Scheme
+    from .walls.base import WallKeys
 
 __all__ = ["WallMotion"]
 
@@ -21,7 +26,7 @@ class WallMotion:
     bodies : FreeWalls, the walls with mass; NoFreeWalls where there are none
     """
 
-    def __init__(self, walls) -> None:
+    def __init__(self, walls: Sequence[WallKeys]) -> None:
         self._motions = [motion_of(wall) for wall in walls]
         self.bodies: FreeWalls | NoFreeWalls = NoFreeWalls()
         self.moving = np.array(
@@ -55,7 +60,7 @@ class WallMotion:
         """Complete the state of walls with mass after a step of ``h`` [s]."""
         self.bodies.finish(h)
 
-    def step_changed(self, scheme) -> None:
+    def step_changed(self, scheme: Scheme) -> None:
         """Tell the scheme to forget of walls with mass what holds for steps of another size."""
         self.bodies.step_changed(scheme)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from petsc4py import PETSc
@@ -14,6 +14,9 @@ from .links import BlocksOf
 from .pair_checks import check_scheme, check_start
 from .pair_coordinates import PairCoordinates
 from .pairs import ContactPairs
+
+if TYPE_CHECKING:
+    from ..stepping.model import Model
 
 __all__ = ["PairLink", "PairLinkCoordinates"]
 
@@ -32,7 +35,15 @@ class PairLink:
         """See :class:`~pfem_petsc.contact.links.Link`."""
         return np.append(self.pairs.first, self.pairs.second)
 
-    def explicit(self, balance: Balance, state: State, u, stiffness, contact, tolerance: float) -> None:
+    def explicit(
+        self,
+        balance: Balance,
+        state: State,
+        u: np.ndarray,
+        stiffness: np.ndarray,
+        contact: np.ndarray,
+        tolerance: float,
+    ) -> None:
         """See :class:`~pfem_petsc.contact.links.Link`, here and below."""
         self.pairs.explicit(balance.predictor, u, stiffness, contact, balance.time, tolerance)
 
@@ -51,7 +62,7 @@ class PairLink:
         tables[pairs.local[1, second]] = pairs.table[second]
         return tables
 
-    def check(self, model, on_its_own: bool) -> None:
+    def check(self, model: Model, on_its_own: bool) -> None:
         treatment = model.case.contact.treatment
         check_scheme(self.pairs, on_its_own, treatment)
         check_start(self.pairs, model.mesh.points[: model.mesh.n_owned], model.length, model.case.source)

@@ -8,6 +8,7 @@ such a group have the whole group.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
@@ -16,6 +17,10 @@ from ..errors import InputError
 from ..mesh.exchange import GhostExchange, Router
 from ..mesh.slab import slab_of
 from .matching import nearest_among_ranks
+
+if TYPE_CHECKING:
+    from ..case.schema import Case
+    from ..mesh.distribution import DistributedMesh
 
 __all__ = ["PairNodes", "find_pairs"]
 
@@ -43,7 +48,7 @@ class PairNodes:
     partners: GhostExchange
 
 
-def find_pairs(case, nodes: dict[str, np.ndarray], mesh) -> PairNodes:
+def find_pairs(case: Case, nodes: dict[str, np.ndarray], mesh: DistributedMesh) -> PairNodes:
     """Match the tables of a case. Collective.
 
     Raises
@@ -71,7 +76,7 @@ def find_pairs(case, nodes: dict[str, np.ndarray], mesh) -> PairNodes:
     return PairNodes(pairs[:, _TABLE].copy(), numbers, where, np.where(mine[0], owners[1], owners[0]), partners)
 
 
-def _match(case, index: int, nodes: dict[str, np.ndarray], mesh) -> np.ndarray:
+def _match(case: Case, index: int, nodes: dict[str, np.ndarray], mesh: DistributedMesh) -> np.ndarray:
     """Rows of a table's pairs (m, 5): each second node of this rank with the first one nearest to it."""
     pair, comm = case.contact_pair[index], mesh.comm
     key = f"{case.source}: contact_pair {pair.name!r}"

@@ -14,6 +14,7 @@ the same force. For implicit steps see :mod:`pfem_petsc.contact.pair_coordinates
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
@@ -23,6 +24,11 @@ from ..parallel.agreement import agreed
 from .coupled import CoupledPairs
 from .pair_loops import leaving_rows, move_nodes, needed_forces, part_nodes, pressed_nodes, push_nodes, table_forces
 from .pair_search import find_pairs
+
+if TYPE_CHECKING:
+    from ..case.schema import Case
+    from ..mesh.distribution import DistributedMesh
+    from .contact import Contact
 
 __all__ = ["ContactPairs"]
 
@@ -45,7 +51,9 @@ class ContactPairs:
     closed : (p,) bool, pairs that have met and not parted since
     """
 
-    def __init__(self, case, nodes: dict[str, np.ndarray], mesh, fixed: np.ndarray, contact) -> None:
+    def __init__(
+        self, case: Case, nodes: dict[str, np.ndarray], mesh: DistributedMesh, fixed: np.ndarray, contact: Contact
+    ) -> None:
         self.source = case.source
         self.mesh = mesh
         self.names = [pair.name for pair in case.contact_pair]

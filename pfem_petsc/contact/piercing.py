@@ -7,8 +7,15 @@ gets deeper than a quarter of the radius. A rectangle is crossed by a bar whose 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
 import numpy as np
 from mpi4py import MPI
+
+if TYPE_CHECKING:
+    from ..stepping.model import Model
+    from .walls.base import BaseWall
 
 __all__ = ["DEEP", "Piercing", "distances", "small_walls"]
 
@@ -16,7 +23,7 @@ DEEP = 0.25
 """Part of the radius from which on a bar inside a curved wall counts as piercing it."""
 
 
-def small_walls(walls) -> list[int]:
+def small_walls(walls: Sequence[BaseWall]) -> list[int]:
     """Indices of the walls that a bar can pierce while its nodes keep them."""
     return [k for k, wall in enumerate(walls) if wall.partial or getattr(wall, "sign", -1.0) > 0.0]
 
@@ -31,7 +38,7 @@ def distances(starts: np.ndarray, ends: np.ndarray, point: np.ndarray, axis: np.
     return np.linalg.norm(first + np.clip(part, 0.0, 1.0)[:, None] * way, axis=1)
 
 
-def _crossing(wall, starts: np.ndarray, ends: np.ndarray, slack: float) -> np.ndarray:
+def _crossing(wall: BaseWall, starts: np.ndarray, ends: np.ndarray, slack: float) -> np.ndarray:
     """(m,) bool: segments that cross a rectangle, relative to where it is at rest."""
     first, second = starts @ wall.normal - wall.offset, ends @ wall.normal - wall.offset
     across = np.minimum(first, second) < -slack
@@ -52,7 +59,7 @@ class Piercing:
     looks : snapshots looked at
     """
 
-    def __init__(self, model) -> None:
+    def __init__(self, model: Model) -> None:
         self._model = model
         self.walls = small_walls(model.contact.walls)
         self.first: dict[int, float] = {}

@@ -13,6 +13,8 @@ taken again at the solution, until it keeps them and their gradients are those o
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from petsc4py import PETSc
 
@@ -21,6 +23,9 @@ from ..integrators.base import Balance, State
 from ..tolerances import PROJECTED
 from .frames import NodalFrames
 from .links import BlocksOf
+
+if TYPE_CHECKING:
+    from .constraint_link import ConstraintLink
 
 __all__ = ["RowCoordinates"]
 
@@ -38,7 +43,7 @@ class RowCoordinates:
 
     varies = True
 
-    def __init__(self, link) -> None:
+    def __init__(self, link: ConstraintLink) -> None:
         self.link, self.rows = link, link.rows
         n = len(self.rows.numbers)
         self._start: np.ndarray | None = None

@@ -13,6 +13,7 @@ walls that stop the same nodes are rows of it.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
@@ -21,6 +22,9 @@ from ..errors import SimulationFailure
 from ..tolerances import FREE_PART
 from .constraints.base import Constraint
 from .coupled import complementary
+
+if TYPE_CHECKING:
+    from ..mesh.distribution import DistributedMesh
 
 __all__ = ["Group", "Rows"]
 
@@ -61,7 +65,7 @@ class Rows:
     groups : rows that share nodes
     """
 
-    def __init__(self, sources: Sequence[Constraint], mesh, fixed: np.ndarray) -> None:
+    def __init__(self, sources: Sequence[Constraint], mesh: DistributedMesh, fixed: np.ndarray) -> None:
         self.sources, self.mesh = list(sources), mesh
         counts = [len(source.nodes) for source in self.sources]
         self.source = np.repeat(np.arange(len(counts)), counts)

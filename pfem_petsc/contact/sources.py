@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from .constraint_link import ConstraintLink
@@ -9,11 +11,16 @@ from .links import Link, Links
 from .pair_link import PairLink
 from .pairs import ContactPairs
 
+if TYPE_CHECKING:
+    from ..case.schema import Case
+    from ..mesh.distribution import DistributedMesh
+    from .contact import Contact
+
 __all__ = ["make_links"]
 
 
 def make_links(
-    case, nodes: dict[str, np.ndarray], mesh, fixed: np.ndarray, contact
+    case: Case, nodes: dict[str, np.ndarray], mesh: DistributedMesh, fixed: np.ndarray, contact: Contact
 ) -> tuple[Links, ContactPairs | None]:
     """All links in the order in which a step takes them, and the contact pairs among them. Collective.
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from ..errors import InputError, SimulationFailure
@@ -9,10 +11,14 @@ from ..parallel.agreement import agreed
 from ..tolerances import BEYOND, ON_BOUND, PROJECTED
 from .contact import Contact
 
+if TYPE_CHECKING:
+    from ..case.schema import Case
+    from ..mesh.distribution import DistributedMesh
+
 __all__ = ["adjust_start", "check_start"]
 
 
-def adjust_start(case, nodes: dict[str, np.ndarray], mesh) -> int:
+def adjust_start(case: Case, nodes: dict[str, np.ndarray], mesh: DistributedMesh) -> int:
     """Move nodes of the mesh onto the walls that ask for it; the bars are unstressed there. Collective.
 
     Returns

@@ -9,11 +9,19 @@ place relative to the wall [m].
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from ..errors import SimulationFailure
 from ..parallel.agreement import agreed
 from ..tolerances import BEYOND, FREE_PART
+
+if TYPE_CHECKING:
+    from .contact import Contact
+    from .frames import NodalFrames
+    from .walls.base import WallKeys
 
 __all__ = ["FreshTies", "NoTies", "Ties"]
 
@@ -33,7 +41,7 @@ class Ties:
 
     nobody: FreshTies = (np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty((0, 3)))
 
-    def __init__(self, contact, walls) -> None:
+    def __init__(self, contact: Contact, walls: Sequence[WallKeys]) -> None:
         self.contact = contact
         self.tying = np.array([wall.tied for wall in walls], dtype=bool)
         self.any = bool(self.tying.any())
@@ -76,7 +84,7 @@ class Ties:
         self.check(nodes, walls, places, time)
         return nodes, walls, places, stiffness[nodes, None] * (places - x[nodes])
 
-    def pin(self, frames, x: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def pin(self, frames: NodalFrames, x: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Hold the tied nodes of an implicit step, of which there are frames. Collective.
 
         ``x`` (owned, 3) has the prescribed components at ``time`` [m].
@@ -182,7 +190,7 @@ class Ties:
 class NoTies(Ties):
     """Stands for :class:`Ties` where no wall ties: keeps nothing in the state."""
 
-    def __init__(self, contact, walls) -> None:
+    def __init__(self, contact: Contact, walls: Sequence[WallKeys]) -> None:
         super().__init__(contact, walls)
         self._nowhere = np.zeros(contact.mesh.n_owned, dtype=bool)
         self._nowhere.flags.writeable = False
@@ -192,7 +200,7 @@ class NoTies(Ties):
         """See :class:`Ties`."""
         return self._nowhere
 
-    def pin(self, frames, x: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def pin(self, frames: NodalFrames, x: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """See :class:`Ties`; not collective."""
         return self.nobody
 

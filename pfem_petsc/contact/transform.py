@@ -9,6 +9,7 @@ the identity.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,6 +17,10 @@ from ..mechanics.compiled import kernel
 from .frames import NodalFrames
 from .links import BlocksOf, LinkCoordinates
 from .sliding import Sliding
+
+if TYPE_CHECKING:
+    from ..solvers.matrix import HessianMatrix
+    from ..stepping.model import Model
 
 __all__ = ["Transform"]
 
@@ -67,7 +72,7 @@ class Transform:
     bounded : whether the solve has bounds
     """
 
-    def __init__(self, model, frames: NodalFrames | None = None, links: Sequence[LinkCoordinates] = ()) -> None:
+    def __init__(self, model: Model, frames: NodalFrames | None = None, links: Sequence[LinkCoordinates] = ()) -> None:
         self.mesh = model.mesh
         self.links = tuple(links)
         walls = model.contact.members.shape[1]
@@ -147,7 +152,7 @@ class Transform:
         blocks[at] = inverse.transpose(0, 2, 1) @ blocks[at] @ inverse
         return blocks
 
-    def turn(self, matrix, values: np.ndarray) -> None:
+    def turn(self, matrix: HessianMatrix, values: np.ndarray) -> None:
         """Turn the values of an assembled Hessian into frames; links have no coordinates there. Collective."""
         if not self._oblique:
             return

@@ -2,17 +2,27 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from ..tolerances import FREE_PART, ON_BOUND
 from .candidates import Candidates
 from .frames import NodalFrames
 
+if TYPE_CHECKING:
+    from .contact import Contact
+
 __all__ = ["broken_walls", "is_misaligned", "is_off_surface"]
 
 
 def broken_walls(
-    contact, displacements: np.ndarray, candidates: Candidates, frames: NodalFrames, x: np.ndarray, tolerance: float
+    contact: Contact,
+    displacements: np.ndarray,
+    candidates: Candidates,
+    frames: NodalFrames,
+    x: np.ndarray,
+    tolerance: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Nodes (k,) beyond walls that no bound on them stands for, and which walls these are (k, walls).
 
@@ -57,7 +67,12 @@ def is_misaligned(frames: NodalFrames, strengths: np.ndarray) -> bool:
 
 
 def is_off_surface(
-    contact, displacements: np.ndarray, frames: NodalFrames, strengths: np.ndarray, x: np.ndarray, tolerance: float
+    contact: Contact,
+    displacements: np.ndarray,
+    frames: NodalFrames,
+    strengths: np.ndarray,
+    x: np.ndarray,
+    tolerance: float,
 ) -> bool:
     """Whether a node pressed on a curved wall is off its surface, or was held by the plane of another point.
 

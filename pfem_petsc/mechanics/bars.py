@@ -5,20 +5,23 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from types import SimpleNamespace
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from ..case.materials import internal_variables, law_of
 from ..energies import BAR_ENERGIES
-from ..errors import InputError
-from ..registry import nearest
 from .compiled import kernel
 from .conserving import make_conserving_kernels
 from .kernels import make_kernels
 from .materials.base import Law
 from .strain import MEASURES
 from .sweep import Sweep, make_sweep
+
+if TYPE_CHECKING:
+    from ..case.schema import Case
+    from ..mesh.distribution import DistributedMesh
+    from ..solvers.matrix import BlockPattern
 
 __all__ = ["BarBlock", "Bars", "StrainEnergy", "first_inverted"]
 
@@ -115,7 +118,7 @@ class Bars:
     blocks : bars by section
     """
 
-    def __init__(self, mesh, case) -> None:
+    def __init__(self, mesh: DistributedMesh, case: Case) -> None:
         self.mesh = mesh
         self.ends = mesh.bars
         self.rest = np.empty(len(mesh.bars))
@@ -182,7 +185,9 @@ class Bars:
         """
         return first_inverted(x, before, self.ends, self.rest)
 
-    def tangents(self, x: np.ndarray, weight: float, inertia: list[float], pattern, values: np.ndarray) -> None:
+    def tangents(
+        self, x: np.ndarray, weight: float, inertia: list[float], pattern: BlockPattern, values: np.ndarray
+    ) -> None:
         """Add ``weight`` K_t(x) and the consistent inertia (a coefficient per block) to a matrix's values."""
         for block, m in zip(self.blocks, inertia, strict=True):
             block.kernels.tangents(
@@ -201,7 +206,15 @@ class Bars:
             arguments = self._arguments(x, block)
             block.conserving.forces(x0, self.heat_at_start, *arguments, block.start, block.stop, f)
 
-    def step_tangents(self, x0, x, weight: float, inertia: list[float], pattern, values: np.ndarray) -> None:
+    def step_tangents(
+        self,
+        x0: np.ndarray,
+        x: np.ndarray,
+        weight: float,
+        inertia: list[float],
+        pattern: BlockPattern,
+        values: np.ndarray,
+    ) -> None:
         """As :meth:`tangents`, for :meth:`step_forces`."""
         for block, m in zip(self.blocks, inertia, strict=True):
             arguments = (x0, self.heat_at_start, *self._arguments(x, block), block.start, block.stop)
@@ -246,41 +259,3 @@ class Bars:
         for block in self.blocks:
             for name, _, values in block.variables():
                 values[:] = history[block.start : block.stop, self.kept_names.index(name)]
-
-
-def section_of_bars(case, slab) -> np.ndarray:
-    """Section index (m,) int32 of each bar of a slab: the section that names its group, else the default one.
-
-    Raises
-    ------
-    InputError
-        Where a section names a group that the mesh lacks, or a bar has two sections or none.
-    """
-    chosen = np.full(len(slab.bars), -1, dtype=np.int32)
-    for index, (name, section) in enumerate(case.section.items()):
-        if section.bars is None:
-            continue
-        if section.bars not in slab.bar_groups:
-            hint = nearest(section.bars, sorted(slab.bar_groups)) if slab.bar_groups else "; the mesh has no bar groups"
-            raise InputError(
-                f"{case.source}: section.{name}.bars = {section.bars!r}: no such bar group in {slab.source}{hint}"
-            )
-        members = slab.bar_groups[section.bars] - slab.first_bar
-        taken = members[chosen[members] >= 0]
-        if len(taken):
-            other = list(case.section)[chosen[taken[0]]]
-            raise InputError(
-                f"{case.source}: section.{name}.bars: bar {taken[0] + slab.first_bar} already belongs to section "
-                f"{other!r}; give each bar one section"
-            )
-        chosen[members] = index
-    default = [i for i, section in enumerate(case.section.values()) if section.bars is None]
-    if default:
-        chosen[chosen < 0] = default[0]
-    bare = np.flatnonzero(chosen < 0)
-    if len(bare):
-        raise InputError(
-            f"{case.source}: section: bar {bare[0] + slab.first_bar} of {slab.source} (and {len(bare) - 1} more here) "
-            "has no section; add a section without 'bars' as the default"
-        )
-    return chosen

@@ -2,7 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
 import numpy as np
+
+if TYPE_CHECKING:
+    from ..case.schema import Case
+    from .mass import Inertia
 
 __all__ = ["ExternalForce", "Table"]
 
@@ -10,7 +17,7 @@ __all__ = ["ExternalForce", "Table"]
 class Table:
     """Piecewise linear in time, constant before the first and after the last entry."""
 
-    def __init__(self, rows) -> None:
+    def __init__(self, rows: Sequence[Sequence[float]]) -> None:
         rows = np.asarray(rows, dtype=np.float64)
         self.times = np.ascontiguousarray(rows[:, 0])
         self.values = np.ascontiguousarray(rows[:, 1:])
@@ -29,7 +36,7 @@ class ExternalForce:
     steady : whether the forces are constant
     """
 
-    def __init__(self, case, nodes: dict[str, np.ndarray], inertia) -> None:
+    def __init__(self, case: Case, nodes: dict[str, np.ndarray], inertia: Inertia) -> None:
         self.loads = [
             (nodes[load.node_set], np.array(load.force), Table(load.table) if load.table else None)
             for load in case.load

@@ -6,9 +6,16 @@ rho A l0 / 2. Damping is c_m per reference volume, distributed the same way.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from .compiled import kernel
+
+if TYPE_CHECKING:
+    from ..mesh.distribution import DistributedMesh
+    from .bars import BarBlock, Bars
 
 __all__ = ["Inertia", "consistent_product"]
 
@@ -43,7 +50,7 @@ class Inertia:
     damped : whether any bar of the whole model has damping
     """
 
-    def __init__(self, mesh, bars, consistent: bool) -> None:
+    def __init__(self, mesh: DistributedMesh, bars: Bars, consistent: bool) -> None:
         self.mesh = mesh
         self.bars = bars
         self.consistent = consistent
@@ -77,7 +84,9 @@ class Inertia:
             return out
         return self._times(v, out, self.damping, lambda block: block.damping)
 
-    def _times(self, u, out, lumped, density):
+    def _times(
+        self, u: np.ndarray, out: np.ndarray, lumped: np.ndarray, density: Callable[[BarBlock], float]
+    ) -> np.ndarray:
         if not self.consistent:
             np.multiply(lumped[:, None], u, out=out)
             if self.redistribution is not None and lumped is self.mass:

@@ -14,7 +14,13 @@ Accelerations are linear between their rows and zero outside, and are integrated
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
+
+if TYPE_CHECKING:
+    from ..case.tables import Support
+    from ..contact.walls.base import WallKeys
 
 __all__ = ["Motion", "motion_of"]
 
@@ -63,7 +69,7 @@ class Motion:
         return moved
 
 
-def motion_of(entry) -> Motion | None:
+def motion_of(entry: Support | WallKeys) -> Motion | None:
     """The motion that a support or a wall of a case is given; None for none.
 
     Parameters

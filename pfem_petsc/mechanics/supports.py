@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from ..errors import InputError
 from .motion import Motion, motion_of
+
+if TYPE_CHECKING:
+    from ..case.schema import Case
+    from ..mesh.distribution import DistributedMesh
 
 __all__ = ["Supports"]
 
@@ -21,7 +27,7 @@ class Supports:
     nodes, components : (k,) indices of the prescribed components, in order of the nodes
     """
 
-    def __init__(self, case, nodes: dict[str, np.ndarray], mesh) -> None:
+    def __init__(self, case: Case, nodes: dict[str, np.ndarray], mesh: DistributedMesh) -> None:
         self.fixed = np.zeros((mesh.n_owned, 3), dtype=bool)
         motions: list[tuple[np.ndarray, list[int], Motion]] = []
         for index, support in enumerate(case.support):

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from ..errors import InputError
 from ..registry import nearest
 from .loads import Table
+
+if TYPE_CHECKING:
+    from ..case.schema import Case
+    from ..mesh.distribution import DistributedMesh
+    from .bars import Bars
 
 __all__ = ["Temperatures"]
 
@@ -21,7 +28,7 @@ class Temperatures:
     varying : whether any of them changes over time
     """
 
-    def __init__(self, case, mesh, bars) -> None:
+    def __init__(self, case: Case, mesh: DistributedMesh, bars: Bars) -> None:
         self.any = bool(case.temperature)
         self.varying = any(entry.table is not None for entry in case.temperature)
         self._bars = bars

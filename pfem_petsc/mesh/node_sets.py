@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from ..errors import InputError
 from ..registry import nearest
 
+if TYPE_CHECKING:
+    from ..case.schema import Case
+    from ..case.tables import NodeSet
+    from .distribution import DistributedMesh
+
 __all__ = ["resolve_node_sets"]
 
 
-def resolve_node_sets(case, mesh) -> dict[str, np.ndarray]:
+def resolve_node_sets(case: Case, mesh: DistributedMesh) -> dict[str, np.ndarray]:
     """Owned local indices (int64, ascending) of each node set. Collective.
 
     Raises
@@ -28,7 +35,7 @@ def resolve_node_sets(case, mesh) -> dict[str, np.ndarray]:
     return sets
 
 
-def _members(where: str, node_set, mesh) -> np.ndarray:
+def _members(where: str, node_set: NodeSet, mesh: DistributedMesh) -> np.ndarray:
     points = mesh.points[: mesh.n_owned]
     ids = mesh.node_ids[: mesh.n_owned]
     if node_set.nearest is not None:

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .camera import Camera
 from .chart import literal
 from .fields import ColourScale
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from matplotlib.patches import FancyArrowPatch
 
 __all__ = ["Page"]
 
@@ -118,7 +123,7 @@ class Page:
         """Font size in points (at 100 dots an inch) for pixels of a page of 1280 by 720."""
         return max(6.0, 0.72 * pixels * self._unit)
 
-    def _colour_bar(self, figure, field: str, scale: ColourScale) -> None:
+    def _colour_bar(self, figure: Figure, field: str, scale: ColourScale) -> None:
         from matplotlib.ticker import MaxNLocator
 
         width, height = self.size
@@ -153,7 +158,7 @@ class Page:
             linespacing=1.25,
         )
 
-    def _length_scale(self, figure, metres_a_pixel: float, left: int) -> None:
+    def _length_scale(self, figure: Figure, metres_a_pixel: float, left: int) -> None:
         from matplotlib.lines import Line2D
 
         from ..output.units import prefix_for
@@ -181,7 +186,7 @@ class Page:
             fontsize=self._points(16),
         )
 
-    def _axes(self, figure, camera: Camera) -> None:
+    def _axes(self, figure: Figure, camera: Camera) -> None:
         """Axes of space as seen by the camera, below the colour bar."""
         width, height = self.size
         size = 34 * self._unit
@@ -205,7 +210,7 @@ class Page:
             )
 
 
-def _arrow(figure, start: np.ndarray, end: np.ndarray, head: float, line: float):
+def _arrow(figure: Figure, start: np.ndarray, end: np.ndarray, head: float, line: float) -> FancyArrowPatch:
     from matplotlib.patches import FancyArrowPatch
 
     return FancyArrowPatch(

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from .rigidity import model_directions
+
+if TYPE_CHECKING:
+    from ..stepping.model import Model
 
 __all__ = ["chain_nodes", "chain_warning"]
 
 _STRAIGHT = 1e-4  # angle between two bars that count as collinear [rad]
 
 
-def chain_nodes(model) -> tuple[int, int]:
+def chain_nodes(model: Model) -> tuple[int, int]:
     """How many nodes no support holds and only two collinear bars meet at; and the first of them. Collective.
 
     A straight rod has such nodes and is meant: of a truss on one line there are none.

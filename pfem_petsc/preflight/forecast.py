@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Collection, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
 
 from ..output.units import duration, engineering
 from ..solvers.linear import DIRECT
+
+if TYPE_CHECKING:
+    from ..case.schema import Case
+    from ..mesh.distribution import DistributedMesh
+    from ..recording.fields import Fields
+    from ..stepping.model import Model
+    from ..stepping.prepare import Plan
 
 __all__ = ["checkpoint_bytes", "forecast", "memory_of_machine", "memory_warning", "result_bytes"]
 
@@ -25,7 +34,14 @@ _SECONDS_PER_ITERATION = 4e-8
 _SECONDS_PER_STEP = 2.5e-4
 
 
-def forecast(case, model, plan, fields, columns, types) -> dict[str, str]:
+def forecast(
+    case: Case,
+    model: Model,
+    plan: Plan,
+    fields: Fields,
+    columns: Mapping[str, tuple[int, ...]],
+    types: Mapping[str, Any],
+) -> dict[str, str]:
     """Label and text: memory, time, disk. Collective."""
     size = result_bytes(case, model.mesh, plan.steps, fields.points, fields.cells, columns, types)
     held = model.comm.allreduce(_needed(model, plan))
@@ -39,7 +55,15 @@ def forecast(case, model, plan, fields, columns, types) -> dict[str, str]:
     return entries
 
 
-def result_bytes(case, mesh, steps: int, point_fields, cell_fields, columns, types) -> float:
+def result_bytes(
+    case: Case,
+    mesh: DistributedMesh,
+    steps: int,
+    point_fields: Collection[str],
+    cell_fields: Collection[str],
+    columns: Mapping[str, tuple[int, ...]],
+    types: Mapping[str, Any],
+) -> float:
     """Size of the result file [B]: snapshots and rows that the case asks for, and the structure around them."""
     output = case.output
     item = 4 if output.precision == "float32" else 8
@@ -52,12 +76,12 @@ def result_bytes(case, mesh, steps: int, point_fields, cell_fields, columns, typ
     return 1e5 + 33.0 * mesh.n_bars + snapshots * (a_snapshot + 80.0) + chunks * a_row
 
 
-def checkpoint_bytes(model) -> float:
+def checkpoint_bytes(model: Model) -> float:
     """Size of a checkpoint [B]."""
     return 1e4 + model.mesh.n_nodes * 24.0 * 8 + 8.0 * len(model.bars.kept_names) * model.mesh.n_bars
 
 
-def memory_warning(case, model, plan) -> list[str]:
+def memory_warning(case: Case, model: Model, plan: Plan) -> list[str]:
     """A text where the ranks of some machine will need more memory than it has. Collective."""
     comm = model.comm
     machine = comm.Split_type(MPI.COMM_TYPE_SHARED)
@@ -90,7 +114,7 @@ def memory_of_machine() -> float:
     return min(found)
 
 
-def _needed(model, plan) -> float:
+def _needed(model: Model, plan: Plan) -> float:
     """Of this rank, at most [B]."""
     bars = len(model.mesh.bars)
     kind = "" if plan.linear is None else plan.linear.preconditioner
@@ -102,7 +126,7 @@ def _needed(model, plan) -> float:
     return _EMPTY + each * bars
 
 
-def _seconds(model, plan) -> float:
+def _seconds(model: Model, plan: Plan) -> float:
     """Of all steps, by the slowest rank; an order of magnitude for implicit schemes, whose iterations are not known."""
     bars = max(model.comm.allgather(len(model.mesh.bars)))
     if plan.linear is None:

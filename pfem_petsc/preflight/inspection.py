@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from .chains import chain_nodes, chain_warning
 from .forecast import memory_warning
 from .motions import jumping_motions
@@ -12,10 +14,16 @@ from .rigidity import global_rigidity, model_directions, unbraced_nodes
 from .sanity import odd_numbers
 from .walls import wall_gaps
 
+if TYPE_CHECKING:
+    from ..case.schema import Case
+    from ..mesh.distribution import DistributedMesh
+    from ..stepping.model import Model
+    from ..stepping.prepare import Plan
+
 __all__ = ["inspect", "warnings_before"]
 
 
-def warnings_before(case, model, plan) -> list[str]:
+def warnings_before(case: Case, model: Model, plan: Plan) -> list[str]:
     """What looks wrong and is cheap to find: for every start. Collective."""
     texts = odd_numbers(case, model) + memory_warning(case, model, plan) + wall_gaps(model)[1]
     texts += jumping_motions(case, plan) + bars_larger_than_walls(case, model)
@@ -45,7 +53,7 @@ def warnings_before(case, model, plan) -> list[str]:
     return texts
 
 
-def inspect(case, model) -> tuple[dict[str, str], list[str]]:
+def inspect(case: Case, model: Model) -> tuple[dict[str, str], list[str]]:
     """Label and text of what ``check`` tells besides, and what looks wrong. Collective."""
     entries, warnings = {}, []
     count, _, _ = count_parts(model.mesh)
@@ -65,7 +73,7 @@ def inspect(case, model) -> tuple[dict[str, str], list[str]]:
     return entries, warnings
 
 
-def _nodes_on_bars(mesh, entries: dict[str, str]) -> list[str]:
+def _nodes_on_bars(mesh: DistributedMesh, entries: dict[str, str]) -> list[str]:
     found = nodes_on_bars(mesh)
     if found is None:
         entries["nodes on bars"] = "not looked for: too many nodes, or bars of too different lengths"

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ..case.schema import Case
+    from ..stepping.prepare import Plan
+
 __all__ = ["jumping_motions"]
 
 
-def jumping_motions(case, plan) -> list[str]:
+def jumping_motions(case: Case, plan: Plan) -> list[str]:
     """Warn of linear interpolation with a scheme that keeps the vibrations that its jumps of velocity cause."""
     if plan.scheme.dissipates:
         return []

@@ -6,12 +6,15 @@ stiffer and heavier there than meant. Bars that cross at an angle, like bracings
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from mpi4py import MPI
 
 from ..mechanics.compiled import kernel
+
+if TYPE_CHECKING:
+    from ..mesh.distribution import DistributedMesh
 
 __all__ = ["LARGEST", "NodesOnBars", "nodes_on_bars", "overlapping_bars"]
 
@@ -41,7 +44,7 @@ class NodesOnBars(NamedTuple):
     shown_coinciding: list[str]
 
 
-def overlapping_bars(mesh) -> tuple[int, list[str]]:
+def overlapping_bars(mesh: DistributedMesh) -> tuple[int, list[str]]:
     """How many pairs of bars leave a common node in the same direction; the first few as texts. Collective.
 
     The bars of a node are compared in the order of their directions along a generic line: O(n log n) for n bars.
@@ -77,7 +80,7 @@ def overlapping_bars(mesh) -> tuple[int, list[str]]:
     return mesh.comm.allreduce(len(pairs)), [text for _, text in every[:_SHOWN]]
 
 
-def nodes_on_bars(mesh) -> NodesOnBars | None:
+def nodes_on_bars(mesh: DistributedMesh) -> NodesOnBars | None:
     """Nodes that lie on bars which do not end there. Collective.
 
     Every rank looks along its bars through a grid that holds all nodes: time and memory go with their number, where
@@ -198,7 +201,7 @@ def _look(points, bars, length, low, cell, across, keys, order, found, twins):
     return between, taken
 
 
-def _directions(mesh, bars: np.ndarray) -> np.ndarray:
+def _directions(mesh: DistributedMesh, bars: np.ndarray) -> np.ndarray:
     """Unit vectors (n, 3) of bars from their first ends on."""
     direction = mesh.points[mesh.bars[bars, 1]]
     direction -= mesh.points[mesh.bars[bars, 0]]
@@ -206,6 +209,6 @@ def _directions(mesh, bars: np.ndarray) -> np.ndarray:
     return direction
 
 
-def _name(mesh, k: int) -> str:
+def _name(mesh: DistributedMesh, k: int) -> str:
     a, b = mesh.node_ids[mesh.bars[k]].tolist()
     return f"bar {mesh.bar_ids[k]} (nodes {a} and {b})"

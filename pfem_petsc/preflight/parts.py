@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from mpi4py import MPI
 
 from ..mechanics.compiled import kernel
+
+if TYPE_CHECKING:
+    from ..mesh.distribution import DistributedMesh
 
 __all__ = ["count_parts"]
 
@@ -29,7 +34,7 @@ def _spread(bars, label):
                     changed = True
 
 
-def count_parts(mesh) -> tuple[int, int, int]:
+def count_parts(mesh: DistributedMesh) -> tuple[int, int, int]:
     """Number of connected parts, nodes of the smallest, and its lowest mesh number of a node. Collective.
 
     Every node takes the lowest mesh number that it is connected to: within a rank in compiled sweeps, between ranks by

@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from ..contact.piercing import distances, small_walls
 from ..output.units import engineering
+
+if TYPE_CHECKING:
+    from ..case.schema import Case
+    from ..contact.motion import WallMotion
+    from ..contact.walls.base import WallKeys
+    from ..stepping.model import Model
 
 __all__ = ["bars_larger_than_walls"]
 
@@ -13,7 +21,7 @@ _SAMPLES = 64  # places of a wall on its way that are looked at
 _LARGEST = 5_000_000  # bars of a rank beyond which only their lengths are looked at
 
 
-def bars_larger_than_walls(case, model) -> list[str]:
+def bars_larger_than_walls(case: Case, model: Model) -> list[str]:
     """Warn of small walls with longer bars near the way that they seem to take. Collective.
 
     The way is straight: that of the wall as given, relative to the mean velocity of the truss at the start, and under
@@ -58,7 +66,7 @@ def bars_larger_than_walls(case, model) -> list[str]:
     return told
 
 
-def _way(keys, motion, k: int, times: np.ndarray) -> np.ndarray:
+def _way(keys: WallKeys, motion: WallMotion, k: int, times: np.ndarray) -> np.ndarray:
     """Displacements (times, 3) [m] of a wall as given; with its first velocity, where it has mass."""
     if keys.mass is not None:
         return np.outer(times, keys.velocity if keys.velocity is not None else (0.0, 0.0, 0.0))

@@ -6,11 +6,14 @@ the commonest mistake in a truss.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from ..mechanics.compiled import kernel
+
+if TYPE_CHECKING:
+    from ..stepping.model import Model
 
 __all__ = ["LARGEST", "Rigidity", "global_rigidity", "model_directions", "unbraced_nodes"]
 
@@ -45,7 +48,7 @@ def _directions(points, bars, owned, total):
                         total[end, i, j] += d[i] * d[j]
 
 
-def model_directions(model) -> np.ndarray:
+def model_directions(model: Model) -> np.ndarray:
     """Orthonormal directions (r, 3) that the bars span: 1 for a straight rod, 2 for a plane truss. Collective."""
     tensors = np.zeros((model.mesh.n_owned, 3, 3))
     _directions(model.mesh.points, model.mesh.bars, model.mesh.n_owned, tensors)
@@ -53,7 +56,7 @@ def model_directions(model) -> np.ndarray:
     return vectors[:, values > 1e-12 * values[-1]].T
 
 
-def unbraced_nodes(model) -> tuple[int, int]:
+def unbraced_nodes(model: Model) -> tuple[int, int]:
     """How many nodes can move freely, to first order, because too few directions hold them; and the first. Collective.
 
     Directions count within the line or plane that the whole truss lies in: a plane truss is not braced out of it.
@@ -74,7 +77,7 @@ def unbraced_nodes(model) -> tuple[int, int]:
     return model.comm.allreduce(len(bad)), min(model.comm.allgather(first))
 
 
-def global_rigidity(model) -> Rigidity | None:
+def global_rigidity(model: Model) -> Rigidity | None:
     """Count mechanisms and states of self-stress; None for models beyond :data:`LARGEST` unknowns. Collective.
 
     The equilibrium matrix A (free unknowns, bars) gives the nodal forces of unit bar forces. With rank r there are

@@ -4,23 +4,28 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..output.units import engineering
+
+if TYPE_CHECKING:
+    from ..case.schema import Case
+    from ..stepping.model import Model
 
 __all__ = ["odd_numbers"]
 
 _HINT = "case files are in SI units (m, kg, s, N, Pa)"
 
 
-def odd_numbers(case, model) -> list[str]:
+def odd_numbers(case: Case, model: Model) -> list[str]:
     """One text for each value that looks wrong: key, value, why. Collective."""
     texts = [*_materials(case), *_sections(case), *_mesh(case, model)]
     return [f"{case.source}: {text}" for text in texts]
 
 
-def _materials(case) -> Iterator[str]:
+def _materials(case: Case) -> Iterator[str]:
     for name, material in case.material.items():
         key = f"material.{name}"
         speed = math.sqrt(material.young_modulus / material.density)
@@ -34,13 +39,13 @@ def _materials(case) -> Iterator[str]:
         yield from material.suspicions(key, _HINT)
 
 
-def _sections(case) -> Iterator[str]:
+def _sections(case: Case) -> Iterator[str]:
     for name, section in case.section.items():
         if not 1e-18 <= section.area <= 10.0:
             yield f"section.{name}.area = {section.area:g} m2: no bar has that; 1 mm2 is 1e-6 m2"
 
 
-def _mesh(case, model) -> Iterator[str]:
+def _mesh(case: Case, model: Model) -> Iterator[str]:
     mesh, comm = model.mesh, model.comm
     rest = model.bars.rest
     longest = max(comm.allgather(float(rest.max(initial=0.0))))

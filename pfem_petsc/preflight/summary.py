@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import resource
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..output.units import engineering
 
+if TYPE_CHECKING:
+    from ..case.schema import Case
+    from ..contact.walls.base import WallKeys
+    from ..stepping.model import Model
+    from ..stepping.prepare import Plan
+
 __all__ = ["summarise"]
 
 
-def summarise(case, model, plan) -> dict[str, str]:
+def summarise(case: Case, model: Model, plan: Plan) -> dict[str, str]:
     """Label and text. Collective."""
     mesh, comm = model.mesh, model.comm
     counts = comm.allgather((mesh.n_owned, mesh.n_local - mesh.n_owned))
@@ -40,6 +47,6 @@ def summarise(case, model, plan) -> dict[str, str]:
     }
 
 
-def _described(wall) -> str:  # noqa: ANN001 - any kind of wall
+def _described(wall: WallKeys) -> str:
     """Name of a wall, and the mass of one that has any."""
     return wall.name if wall.mass is None else f"{wall.name} ({engineering(wall.mass, 'kg')})"

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from ..output.units import engineering
 
+if TYPE_CHECKING:
+    from ..stepping.model import Model
+
 __all__ = ["wall_gaps"]
 
 
-def wall_gaps(model) -> tuple[dict[str, str], list[str]]:
+def wall_gaps(model: Model) -> tuple[dict[str, str], list[str]]:
     """Wall name to the nearest node, gap and approach at the start; and warnings. Collective."""
     contact, mesh, comm = model.contact, model.mesh, model.comm
     told: dict[str, str] = {}

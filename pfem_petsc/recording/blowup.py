@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..energies import SUPPLIED
 from ..errors import SimulationFailure
+
+if TYPE_CHECKING:
+    from ..integrators.base import State
+    from ..stepping.model import Model
 
 __all__ = ["BlowUp"]
 
@@ -19,7 +23,7 @@ _ROUNDING = 1e-12  # strains that are rounding: their energy is the least that c
 class BlowUp:
     """Watches the history rows of a run. Collective where it speaks; the rows are the same on all ranks."""
 
-    def __init__(self, model) -> None:
+    def __init__(self, model: Model) -> None:
         self.model = model
         self._rows = 0
         self._strange = 0
@@ -33,7 +37,7 @@ class BlowUp:
         """Go on as the run that is continued would have."""
         self._rows, self._strange, self._most = int(kept["rows"]), int(kept["strange"]), float(kept["most"])
 
-    def check(self, row: dict[str, Any], state) -> None:
+    def check(self, row: dict[str, Any], state: State) -> None:
         """Look at a row.
 
         Raises
@@ -63,7 +67,7 @@ class BlowUp:
                 f"motion is unstable, fastest at {self._fastest(state)}; reduce time.step"
             )
 
-    def _where(self, state) -> str:
+    def _where(self, state: State) -> str:
         """The first node and bar, by mesh number, whose positions or velocities are not finite."""
         mesh = self.model.mesh
         bad = ~(np.isfinite(state.position).all(axis=1) & np.isfinite(state.v).all(axis=1))
@@ -75,7 +79,7 @@ class BlowUp:
         text = f", first seen at node {node}" if node < mesh.n_nodes else ""
         return text + (f" and bar {bar}" if bar < mesh.n_bars else "")
 
-    def _fastest(self, state) -> str:
+    def _fastest(self, state: State) -> str:
         """Node with the highest speed, and one of its bars."""
         mesh = self.model.mesh
         speed = np.linalg.norm(state.v, axis=1)

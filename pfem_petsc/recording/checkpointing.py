@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from ..analysis import Step
 from ..restart.checkpoints import Checkpoints
 from .history import History
 from .observer import Observer
 from .snapshots import Snapshots
+
+if TYPE_CHECKING:
+    from ..run.synchroniser import Synchroniser
 
 __all__ = ["Checkpointing"]
 
@@ -23,7 +28,9 @@ class Checkpointing(Observer):
 
     needs_agreement = True
 
-    def __init__(self, checkpoints: Checkpoints, history: History, snapshots: Snapshots, synchroniser) -> None:
+    def __init__(
+        self, checkpoints: Checkpoints, history: History, snapshots: Snapshots, synchroniser: Synchroniser
+    ) -> None:
         self.every = checkpoints.case.output.checkpoint_every
         self._checkpoints, self._history, self._snapshots = checkpoints, history, snapshots
         self._synchroniser = synchroniser

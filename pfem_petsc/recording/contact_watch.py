@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..energies import STORED, SUPPLIED
+
+if TYPE_CHECKING:
+    from ..stepping.model import Model
 
 __all__ = ["ContactWatch"]
 
@@ -32,7 +35,7 @@ class ContactWatch:
     explicit : whether the scheme is
     """
 
-    def __init__(self, model, tell: Callable[[str], None], explicit: bool) -> None:
+    def __init__(self, model: Model, tell: Callable[[str], None], explicit: bool) -> None:
         self.tell = tell
         self.told = False
         self.explicit = explicit

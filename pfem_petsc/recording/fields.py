@@ -4,10 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..fields import FIELDS, Field, cell_fields
+
+if TYPE_CHECKING:
+    from ..integrators.base import State
+    from ..stepping.model import Model
 
 __all__ = ["Fields", "Snapshot"]
 
@@ -23,7 +28,7 @@ class Snapshot:
     acceleration : gives the acceleration to record (owned, 3) [m/s2]; collective where the mass is consistent
     """
 
-    def __init__(self, model, state, acceleration: Callable[[], np.ndarray] | None = None) -> None:
+    def __init__(self, model: Model, state: State, acceleration: Callable[[], np.ndarray] | None = None) -> None:
         self.model, self.state, self.acceleration = model, state, acceleration
         self.start = model.mesh.points[: model.mesh.n_owned]
 
@@ -47,7 +52,7 @@ class Fields:
         material laws other than the plastic strain aside
     """
 
-    def __init__(self, model) -> None:
+    def __init__(self, model: Model) -> None:
         self.model = model
         wanted = model.case.output.fields
         taken = [field for field in FIELDS if (field.default(model) if wanted is None else field.name in wanted)]
@@ -59,12 +64,12 @@ class Fields:
         self.points = [field.name for field in self._points]
         self.cells = [field.name for field in self._cells]
 
-    def at_nodes(self, state, acceleration: Callable[[], np.ndarray]) -> dict[str, np.ndarray]:
+    def at_nodes(self, state: State, acceleration: Callable[[], np.ndarray]) -> dict[str, np.ndarray]:
         """Name to (owned, 3). Collective where ``acceleration`` is."""
         now = Snapshot(self.model, state, acceleration)
         return {field.name: field.value(now) for field in self._points}
 
-    def at_bars(self, state) -> dict[str, np.ndarray]:
+    def at_bars(self, state: State) -> dict[str, np.ndarray]:
         """Name to (local bars,)."""
         now = Snapshot(self.model, state)
         return {field.name: field.value(now) for field in self._cells}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,6 +15,10 @@ from .blowup import BlowUp
 from .contact_watch import ContactWatch
 from .observer import NEVER, Observer
 from .recorder import Recorder
+
+if TYPE_CHECKING:
+    from ..run.synchroniser import Synchroniser
+    from ..stepping.stepper import Stepper
 
 __all__ = ["History"]
 
@@ -36,7 +40,7 @@ class History(Observer):
     writer : of the result file
     """
 
-    def __init__(self, stepper, synchroniser, warn: Callable[[str], None]) -> None:
+    def __init__(self, stepper: Stepper, synchroniser: Synchroniser, warn: Callable[[str], None]) -> None:
         model = stepper.model
         self.every = model.case.output.history_every
         self._stepper, self._synchroniser, self._model = stepper, synchroniser, model

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
@@ -12,6 +12,9 @@ from ..energies import BAR_ENERGIES, ENERGIES
 from ..output.row import Row, RowLayout
 from ..output.sums import HEAD, PAIR
 from ..stepping.ledger import Ledger
+
+if TYPE_CHECKING:
+    from ..stepping.stepper import Stepper
 
 __all__ = ["Recorder"]
 
@@ -38,7 +41,7 @@ class Recorder:
     probe_nodes : probe name to the mesh numbers of its nodes, ascending: the order of rows in a probe's columns
     """
 
-    def __init__(self, stepper, ledger: Ledger) -> None:
+    def __init__(self, stepper: Stepper, ledger: Ledger) -> None:
         self.stepper = stepper
         self.ledger = ledger
         self.model = stepper.model

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from ..analysis import Step
 from ..contact.alarm import check_positions
@@ -10,6 +11,9 @@ from ..contact.piercing import Piercing
 from ..output.vtkhdf import ResultWriter
 from .fields import Fields
 from .observer import Observer
+
+if TYPE_CHECKING:
+    from ..stepping.stepper import Stepper
 
 __all__ = ["Snapshots"]
 
@@ -32,7 +36,7 @@ class Snapshots(Observer):
 
     needs_agreement = True
 
-    def __init__(self, stepper, last_step: int, fields: Fields, warn: Callable[[str], None]) -> None:
+    def __init__(self, stepper: Stepper, last_step: int, fields: Fields, warn: Callable[[str], None]) -> None:
         self.every = stepper.model.case.output.fields_every
         self._stepper, self._last_step, self._fields, self._warn = stepper, last_step, fields, warn
         self._piercing = Piercing(stepper.model)

@@ -4,13 +4,22 @@ from __future__ import annotations
 
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..output.checkpoint import NAME
 from ..output.checkpoint_writer import write_checkpoint
 from .compare import check_mesh_is_the_same, mesh_mark
 from .folder import Restart
 from .state import STATE_VERSION, RunState
+
+if TYPE_CHECKING:
+    from ..case.schema import Case
+    from ..output.checkpoint import Checkpoint
+    from ..recording.blowup import BlowUp
+    from ..recording.recorder import Recorder
+    from ..stepping.ledger import Ledger
+    from ..stepping.prepare import Plan
+    from ..stepping.stepper import Stepper
 
 __all__ = ["Checkpoints"]
 
@@ -26,7 +35,7 @@ class Checkpoints:
     folder : Path
     """
 
-    def __init__(self, case, stepper, plan, folder: Path) -> None:
+    def __init__(self, case: Case, stepper: Stepper, plan: Plan, folder: Path) -> None:
         self.case, self.plan, self.path = case, plan, folder / NAME
         self.comm = stepper.model.comm
         self.state = RunState(stepper)
@@ -44,7 +53,7 @@ class Checkpoints:
         every = self.case.output.checkpoint_every
         return bool(every) and step % every == 0
 
-    def write(self, ledger, recorder, blow_up, row: dict[str, Any], snapshot: int) -> None:
+    def write(self, ledger: Ledger, recorder: Recorder, blow_up: BlowUp, row: dict[str, Any], snapshot: int) -> None:
         """Write one, with the last history row and the step of the last snapshot. It becomes the newest. Collective.
 
         Raises
@@ -67,7 +76,7 @@ class Checkpoints:
         write_checkpoint(self.path, self.comm, self.state.arrays(), scalars, attributes)
         self.last_step = scalars["step"]
 
-    def take_back(self, restart: Restart):  # noqa: ANN201 - a Checkpoint
+    def take_back(self, restart: Restart) -> Checkpoint:
         """Set the stepper to a checkpoint, instead of its start; give what was read. Collective.
 
         Raises

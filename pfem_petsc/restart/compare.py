@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
@@ -15,6 +15,9 @@ from ..errors import InputError
 from ..output.integrity import checksum
 from ..parallel.natural import NaturalOrder
 from .state import STATE_VERSION
+
+if TYPE_CHECKING:
+    from ..stepping.model import Model
 
 __all__ = ["changed_keys", "check_mesh_is_the_same", "check_version", "mesh_mark"]
 
@@ -81,7 +84,7 @@ def check_mesh_is_the_same(path: Path, mark: int, attributes: Mapping[str, Any],
         )
 
 
-def mesh_mark(model, node_order: NaturalOrder, bar_order: NaturalOrder, counted: np.ndarray) -> int:
+def mesh_mark(model: Model, node_order: NaturalOrder, bar_order: NaturalOrder, counted: np.ndarray) -> int:
     """A number that any change of a coordinate or a bar's ends changes; the same on any number of ranks. Collective."""
     mesh = model.mesh
     points = node_order.to_slab(mesh.points[: mesh.n_owned])

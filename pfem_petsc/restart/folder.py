@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mpi4py import MPI
 
@@ -18,6 +18,10 @@ from ..output.verify import examine
 from ..parallel.agreement import on_root
 from ..tolerances import TIME
 from .compare import changed_keys, check_version
+
+if TYPE_CHECKING:
+    from ..case.schema import Case
+    from ..stepping.prepare import Plan
 
 __all__ = ["RESULT", "Restart", "find_restart", "finished", "finished_message", "prepare_folder"]
 
@@ -63,7 +67,7 @@ class Restart:
         return int(self.scalars["snapshot"]), int(self.scalars["row"]["step"])
 
 
-def find_restart(case, comm: MPI.Comm, folder: Path, asked: bool | Path | None) -> Restart | str | None:
+def find_restart(case: Case, comm: MPI.Comm, folder: Path, asked: bool | Path | None) -> Restart | str | None:
     """What ``--restart`` means for an output folder. Collective.
 
     Returns
@@ -87,12 +91,12 @@ def find_restart(case, comm: MPI.Comm, folder: Path, asked: bool | Path | None) 
     return Restart(path, file, changed, continues)
 
 
-def finished(case, comm: MPI.Comm, folder: Path, end: float) -> float | None:
+def finished(case: Case, comm: MPI.Comm, folder: Path, end: float) -> float | None:
     """Up to when the output folder holds results of this case [s], None where not up to its end. Collective."""
     return on_root(comm, _finished, case, folder / RESULT, end)
 
 
-def _finished(case, path: Path, end: float) -> float | None:
+def _finished(case: Case, path: Path, end: float) -> float | None:
     if not path.is_file():
         return None
     try:
@@ -116,7 +120,7 @@ def _continues(folder: Path, path: Path) -> bool:
     return (folder / RESULT).is_file() and path.resolve().parent == folder.resolve()
 
 
-def prepare_folder(comm: MPI.Comm, folder: Path, restart: Restart | None, plan) -> Path | None:
+def prepare_folder(comm: MPI.Comm, folder: Path, restart: Restart | None, plan: Plan) -> Path | None:
     """Make the output folder; what it holds is moved aside to a numbered name, unless a restart continues it.
 
     The caller has the folder's lock. ``plan`` says how far the run goes: results beyond that are not cut.
@@ -142,7 +146,7 @@ def _refuse_other(restart: Restart) -> None:
         )
 
 
-def _refuse_loss(path: Path, plan) -> None:
+def _refuse_loss(path: Path, plan: Plan) -> None:
     """Results beyond the end of the run would be cut off."""
     with results.open_result(path) as result:
         steps, times = result.history["step"], result.history["time"]
@@ -171,7 +175,7 @@ def _refuse_gap(path: Path, restart: Restart) -> None:
         )
 
 
-def _prepare(folder: Path, restart: Restart | None, plan) -> Path | None:
+def _prepare(folder: Path, restart: Restart | None, plan: Plan) -> Path | None:
     aside = None
     try:
         if restart is not None and restart.continues:

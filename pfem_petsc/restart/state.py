@@ -21,7 +21,7 @@ wall time) begins anew with each run, and decides nothing of the results.
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -30,6 +30,12 @@ from ..mesh.exchange import Router
 from ..mesh.slab import slab_of
 from ..output.checkpoint import Checkpoint
 from ..parallel.natural import NaturalOrder
+
+if TYPE_CHECKING:
+    from ..recording.blowup import BlowUp
+    from ..recording.recorder import Recorder
+    from ..stepping.ledger import Ledger
+    from ..stepping.stepper import Stepper
 
 __all__ = ["STATE_VERSION", "RunState"]
 
@@ -49,7 +55,7 @@ class RunState:
     stepper : Stepper
     """
 
-    def __init__(self, stepper) -> None:
+    def __init__(self, stepper: Stepper) -> None:
         self.stepper = stepper
         self.model = stepper.model
         mesh, comm = self.model.mesh, self.model.comm
@@ -76,7 +82,9 @@ class RunState:
         bars = {name: (self.bar_order, array[self.counted]) for name, array in self._bar_arrays().items()}
         return {**nodes, **bars}
 
-    def scalars(self, ledger, recorder, blow_up, row: dict[str, Any], snapshot: int) -> dict[str, Any]:
+    def scalars(
+        self, ledger: Ledger, recorder: Recorder, blow_up: BlowUp, row: dict[str, Any], snapshot: int
+    ) -> dict[str, Any]:
         """The numbers; the last history row, and the step of the last snapshot. Collective."""
         stepper, energy, walls = self.stepper, self.stepper.energy, self.stepper.solution.walls
         mine = {
@@ -150,7 +158,9 @@ class RunState:
         self.model.links.restore(scalars)
         self.model.contact.log.load_state(mine["contact_log"], scalars["contact_times"], stepper.touching)
 
-    def put_back_sums(self, checkpoint: Checkpoint, ledger, recorder, blow_up) -> dict[str, Any]:
+    def put_back_sums(
+        self, checkpoint: Checkpoint, ledger: Ledger, recorder: Recorder, blow_up: BlowUp
+    ) -> dict[str, Any]:
         """Set ledger, recorder and watch, made after :meth:`put_back`; gives what is known of the last row."""
         scalars = checkpoint.scalars
         ledger.load_state(self._share(scalars["ranks"])["ledger"])

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import atexit
 import weakref
+from typing import TYPE_CHECKING
 
 import numpy as np
 from petsc4py import PETSc
@@ -17,6 +18,11 @@ from petsc4py import PETSc
 from .linear import set_preconditioner
 from .matrix import HessianMatrix
 from .matrix_free import MatrixFreeHessian
+
+if TYPE_CHECKING:
+    from ..stepping.model import Model
+    from ..stepping.problem import StepProblem
+    from .newton import NewtonSolver
 
 __all__ = ["LaggedPreconditioner", "Preconditioning"]
 
@@ -55,7 +61,7 @@ class LaggedPreconditioner:
     carried : whether it was made for an earlier problem
     """
 
-    def __init__(self, model, kind: str, symmetric: bool, definite: bool, matrix_free: bool) -> None:
+    def __init__(self, model: Model, kind: str, symmetric: bool, definite: bool, matrix_free: bool) -> None:
         mesh = model.mesh
         self.mesh = mesh
         self.kind = kind
@@ -82,7 +88,7 @@ class LaggedPreconditioner:
         self._problem = None
         self.place = self.place[:, :0]
 
-    def renew(self, problem, kept: np.ndarray | None) -> None:
+    def renew(self, problem: StepProblem, kept: np.ndarray | None) -> None:
         """Make it anew if that is due; called at each Newton iteration. Collective.
 
         Parameters
@@ -121,7 +127,7 @@ class LaggedPreconditioner:
         self._problem = problem
         self.count = [*wanted, first, beyond, 0.0]
 
-    def _make_again(self, problem) -> None:
+    def _make_again(self, problem: StepProblem) -> None:
         """After a restart: what was there before, from the operator where it was made."""
         here, owned = problem.x.copy(), self.mesh.n_owned
         held = np.zeros((self.mesh.n_local, 3))
@@ -135,7 +141,7 @@ class LaggedPreconditioner:
         if self.remembers:
             self.bars.put_history(history)
 
-    def _make(self, problem, held: np.ndarray) -> None:
+    def _make(self, problem: StepProblem, held: np.ndarray) -> None:
         matrix = self.matrix
         self.mesh.update_ghosts(held)
 
@@ -166,7 +172,7 @@ class LaggedPreconditioner:
         entries = [solver.getOperators()[1].getInfo()["nz_used"] for solver in solvers]
         return sum(entries[:-1]) / max(entries[-1], 1.0)
 
-    def _set_up(self, matrix: PETSc.Mat, problem) -> None:
+    def _set_up(self, matrix: PETSc.Mat, problem: StepProblem) -> None:
         # from nothing: a hierarchy that was made before would be another one after a restart
         self._new_inner(matrix)
         x = problem.x[: self.mesh.n_owned]
@@ -224,7 +230,7 @@ class LaggedPreconditioner:
 class Preconditioning:
     """What PETSc calls for one nonlinear solver; the preconditioner behind it is the same for all."""
 
-    def __init__(self, shared: LaggedPreconditioner, solver, snes: PETSc.SNES, bounded: bool) -> None:
+    def __init__(self, shared: LaggedPreconditioner, solver: NewtonSolver, snes: PETSc.SNES, bounded: bool) -> None:
         self.shared = shared
         self.first = 3 * shared.mesh.first_node
         # PETSc's solver owns this object

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from petsc4py import PETSc
 
 from ..errors import SimulationFailure
 from .matrix import HessianMatrix
 from .reasons import linear_reason
+
+if TYPE_CHECKING:
+    from ..stepping.model import Model
 
 __all__ = ["MassSolver"]
 
@@ -25,7 +30,7 @@ class MassSolver:
         With consistent mass.
     """
 
-    def __init__(self, model) -> None:
+    def __init__(self, model: Model) -> None:
         self._fixed = model.supports.fixed
         self._matrix = matrix = HessianMatrix(model.mesh, self._fixed, model.supports.any)
 

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 from petsc4py import PETSc
 
 from ..mechanics.compiled import kernel
+
+if TYPE_CHECKING:
+    from ..contact.transform import Transform
+    from ..mesh.distribution import DistributedMesh
+    from ..stepping.problem import StepProblem
 
 __all__ = ["BlockPattern", "HessianMatrix"]
 
@@ -24,7 +30,7 @@ class BlockPattern:
     diagonal : (owned,) int32, the diagonal block of each row
     """
 
-    def __init__(self, mesh) -> None:
+    def __init__(self, mesh: DistributedMesh) -> None:
         owned = mesh.n_owned
         numbers = np.concatenate([mesh.first_node + np.arange(owned, dtype=np.int64), mesh.ghost_numbers])
         a, b = mesh.bars[:, 0].astype(np.int64), mesh.bars[:, 1].astype(np.int64)
@@ -134,7 +140,7 @@ class HessianMatrix:
     bounded : the matrix that steps with bounds take: ``mat``, or with coordinates of links T^T mat T
     """
 
-    def __init__(self, mesh, fixed: np.ndarray, any_fixed: bool, symmetric: bool = True) -> None:
+    def __init__(self, mesh: DistributedMesh, fixed: np.ndarray, any_fixed: bool, symmetric: bool = True) -> None:
         self.mesh = mesh
         self.pattern = BlockPattern(mesh)
         pointers, columns = self.pattern.scalar_rows()
@@ -166,7 +172,7 @@ class HessianMatrix:
         """Local node index (int32) of each block's column; worked out where supports or oblique walls first need it."""
         return local_columns(self.mesh, self.pattern.columns)
 
-    def fill(self, add) -> PETSc.Mat:
+    def fill(self, add: Callable[[np.ndarray], None]) -> PETSc.Mat:
         """Assemble: ``add(values)`` adds the Hessian of the owned rows to the zeroed values."""
         self.values[:] = 0.0
         add(self.values)
@@ -187,13 +193,13 @@ class HessianMatrix:
             self.bounded.setOption(PETSc.Mat.Option.SYMMETRIC, self._symmetric)
             self._chain.append((link, matrix, self.bounded))
 
-    def update(self, problem, w: np.ndarray) -> None:
+    def update(self, problem: StepProblem, w: np.ndarray) -> None:
         """Assemble the Hessian of a problem at ``w``. Collective."""
         self.fill(lambda values: problem.hessian(w, self, values))
         if problem.transform.bounded:
             self._change_coordinates(problem.transform)
 
-    def _change_coordinates(self, transform) -> None:
+    def _change_coordinates(self, transform: Transform) -> None:
         """Make ``bounded`` from ``mat``. Collective."""
         last = self.mat
         for link, matrix, product in self._chain:
@@ -205,7 +211,9 @@ class HessianMatrix:
                 last.copy(product, PETSc.Mat.Structure.DIFFERENT)
             last = product
 
-    def fill_held(self, add, held: np.ndarray, scale: float, transform) -> PETSc.Mat:
+    def fill_held(
+        self, add: Callable[[np.ndarray], None], held: np.ndarray, scale: float, transform: Transform
+    ) -> PETSc.Mat:
         """Assemble in the coordinates of a transform, with rows and columns of components (local nodes, 3) of which
         ``held`` is not zero replaced by ``scale`` on the diagonal. Collective."""
         if not transform.links:
@@ -260,7 +268,7 @@ class HessianMatrix:
         self.mat.destroy()
 
 
-def local_columns(mesh, columns: np.ndarray) -> np.ndarray:
+def local_columns(mesh: DistributedMesh, columns: np.ndarray) -> np.ndarray:
     """Local node indices (int32) of PETSc node numbers that are owned or ghosts here."""
     local = (columns - mesh.first_node).astype(np.int64)
     outside = (local < 0) | (local >= mesh.n_owned)

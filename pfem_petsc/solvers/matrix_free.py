@@ -9,6 +9,7 @@ from __future__ import annotations
 import atexit
 import weakref
 from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
 import numpy as np
 from petsc4py import PETSc
@@ -16,6 +17,10 @@ from petsc4py import PETSc
 from ..mechanics.compiled import kernel
 from ..mechanics.mass import consistent_product
 from .outlive import outlive
+
+if TYPE_CHECKING:
+    from ..stepping.model import Model
+    from ..stepping.problem import StepProblem
 
 __all__ = ["MatrixFreeHessian"]
 
@@ -121,7 +126,9 @@ class _Context:
         """Diagonal of H; called by PETSc."""
         d.setArray(self.operator().diagonal().ravel())
 
-    def createSubMatrix(self, mat, rows, columns, out=None):  # noqa: ANN001, ANN201, N802 - PETSc's name
+    def createSubMatrix(  # noqa: N802 - PETSc's name
+        self, mat: PETSc.Mat, rows: PETSc.IS, columns: PETSc.IS, out: PETSc.Mat | None = None
+    ) -> PETSc.Mat:
         """The restriction of H to some unknowns; called by PETSc."""
         whole = self.operator()
         return _Restriction(whole, rows.getIndices() - 3 * whole.mesh.first_node).matrix()
@@ -169,7 +176,7 @@ class MatrixFreeHessian:
 
     _extension: _Extension | None = None
 
-    def __init__(self, model) -> None:
+    def __init__(self, model: Model) -> None:
         self.model = model
         mesh = model.mesh
         self.mesh = mesh
@@ -185,13 +192,13 @@ class MatrixFreeHessian:
         self._fixed = model.supports.fixed
         self._problem = None
 
-    def update(self, problem, w: np.ndarray) -> None:
+    def update(self, problem: StepProblem, w: np.ndarray) -> None:
         """Linearise at ``w``. Collective."""
         problem.place(problem.increment(w))
         self.linearise(problem)
         self.mat.stateIncrease()
 
-    def linearise(self, problem) -> None:
+    def linearise(self, problem: StepProblem) -> None:
         """As :meth:`update`, at the positions where the problem is placed."""
         self._problem = problem
         self._left = problem.transform.left()

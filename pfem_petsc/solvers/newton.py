@@ -6,7 +6,7 @@ import atexit
 import re
 import weakref
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from petsc4py import PETSc
@@ -19,6 +19,9 @@ from .matrix import HessianMatrix
 from .matrix_free import MatrixFreeHessian
 from .outlive import outlive
 from .reasons import linear_reason, newton_reason
+
+if TYPE_CHECKING:
+    from ..mesh.distribution import DistributedMesh
 
 __all__ = ["NewtonReport", "NewtonSolver", "Problem", "zero_tolerance"]
 
@@ -69,7 +72,7 @@ class NewtonSolver:
 
     def __init__(
         self,
-        mesh,
+        mesh: DistributedMesh,
         hessian: HessianMatrix | MatrixFreeHessian,
         choice: LinearChoice,
         bounded: LinearChoice,

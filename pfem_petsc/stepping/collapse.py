@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from ..output.units import engineering
 from ..tolerances import TIME
+
+if TYPE_CHECKING:
+    from ..case.schema import Case
+    from .stepper import Stepper
 
 __all__ = ["tell_collapse"]
 
@@ -13,7 +19,7 @@ _STRONG = 1.0
 """Speed of an impact over the bars' wave speed from which on it crushes them: the strain behind the wave is v/c."""
 
 
-def tell_collapse(stepper, bar: int) -> str:
+def tell_collapse(stepper: Stepper, bar: int) -> str:
     """Message about a bar (local index) that failed in the step being made. Of this rank alone."""
     model, state = stepper.model, stepper.state
     mesh = model.mesh
@@ -38,7 +44,7 @@ def tell_collapse(stepper, bar: int) -> str:
     )
 
 
-def _cause(stepper, wave: float) -> str:
+def _cause(stepper: Stepper, wave: float) -> str:
     """Impact, load or time integration, and the way out."""
     model = stepper.model
     case = model.case
@@ -66,7 +72,7 @@ def _cause(stepper, wave: float) -> str:
     )
 
 
-def _speed_of_case(case) -> float:
+def _speed_of_case(case: Case) -> float:
     """Upper bound on the speed [m/s] at which bodies and walls of a case start towards each other; turning aside."""
     given = [item.velocity for item in (*case.initial, *case.wall) if item.velocity is not None]
     found = [float(np.linalg.norm(velocity)) for velocity in given]

@@ -4,11 +4,16 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..contact.impact_phases import KNOWN, PHASES, Asked, scan_impacts
 from ..registry import lookup
+
+if TYPE_CHECKING:
+    from ..case.schema import Case
+    from ..case.settings import Time
 
 __all__ = ["BOUND", "contact_gain", "overshoots", "warn_of_gain"]
 
@@ -44,7 +49,7 @@ def overshoots(integrator: str, step: float) -> bool:
     return integrator == "wilson" and step > 1.0
 
 
-def warn_of_gain(case, step: float, across: float = np.inf) -> str:
+def warn_of_gain(case: Case, step: float, across: float = np.inf) -> str:
     """What to tell of a case whose contact gains energy beyond :data:`BOUND`; empty for nothing, and for
     treatments that the small rods do not have.
 
@@ -81,7 +86,7 @@ def warn_of_gain(case, step: float, across: float = np.inf) -> str:
     )
 
 
-def _ways_out(time, asked: Asked) -> str:
+def _ways_out(time: Time, asked: Asked) -> str:
     """What else does not gain energy, nearest first: two at most."""
     parameters = time.scheme.model_dump_json()
     tries = []

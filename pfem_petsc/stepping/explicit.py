@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -12,6 +13,10 @@ from ..integrators.base import Balance
 from ..tolerances import PROJECTED
 from .node_loops import explicit_increments, hold, react
 from .stepper import Solution, Stepper
+
+if TYPE_CHECKING:
+    from ..integrators.base import Scheme
+    from .model import Model
 
 __all__ = ["ExplicitStepper"]
 
@@ -27,7 +32,7 @@ class ExplicitStepper(Stepper):
     renews_forces = True
     steady = True
 
-    def __init__(self, model, scheme, h: float) -> None:
+    def __init__(self, model: Model, scheme: Scheme, h: float) -> None:
         super().__init__(model, scheme, h)
         self._none = np.empty((0, 3))
         self._nobody = np.empty(0, dtype=np.int64)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from ..contact.forces import WallForces
@@ -13,6 +15,13 @@ from ..tolerances import PROJECTED
 from .fused_arrays import BarArrays, Buffers, ImpulseArrays, NodeArrays, ProbeArrays, WallArrays
 from .fused_loop import make_fused_loop
 from .stepper import Solution
+
+if TYPE_CHECKING:
+    from ..recording.history import History
+    from ..recording.recorder import Recorder
+    from .ledger import Ledger
+    from .stepper import Stepper
+    from .time_stepping import TimeStepping
 
 __all__ = ["MOST", "WORTH", "Batch", "Batches"]
 
@@ -34,7 +43,7 @@ class Batch:
     sums : (:data:`MOST`, width) of each step, what :meth:`~pfem_petsc.recording.recorder.Recorder.row` sums up
     """
 
-    def __init__(self, stepper, ledger, recorder) -> None:
+    def __init__(self, stepper: Stepper, ledger: Ledger, recorder: Recorder) -> None:
         self.stepper, self.ledger = stepper, ledger
         model = stepper.model
         self.model = model
@@ -60,7 +69,7 @@ class Batch:
         self._spare = [np.zeros_like(stepper.state.v) for _ in range(4)]
 
     @staticmethod
-    def serves(stepper) -> bool:
+    def serves(stepper: Stepper) -> bool:
         """Whether the steps of this run are so plain that one loop can make several."""
         from petsc4py import PETSc
 
@@ -154,7 +163,7 @@ class Batches:
         self._batch: Batch | None = None
         self._refused = False
 
-    def advance(self, analysis, history, left: int) -> bool:
+    def advance(self, analysis: TimeStepping, history: History, left: int) -> bool:
         """Make steps together, after which nothing is to be done but rows of the history.
 
         Parameters

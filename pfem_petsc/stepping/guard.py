@@ -27,10 +27,13 @@ two to seven times.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from mpi4py import MPI
+
+if TYPE_CHECKING:
+    from .model import Model
 
 __all__ = ["GAIN", "LARGEST", "NOTICEABLE", "OVER", "StepGuard"]
 
@@ -62,7 +65,7 @@ class StepGuard:
     model : Model
     """
 
-    def __init__(self, model) -> None:
+    def __init__(self, model: Model) -> None:
         self.model = model
         mesh = model.mesh
         self._predicted = np.zeros((mesh.n_local, 3))

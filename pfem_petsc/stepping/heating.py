@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from .stepper import Stepper
+
 __all__ = ["Heating"]
 
 
 class Heating:
     """Keeps what the next step must know of the bars."""
 
-    def __init__(self, stepper) -> None:
+    def __init__(self, stepper: Stepper) -> None:
         self.stepper, self.model = stepper, stepper.model
         self.keep()
 

@@ -6,6 +6,7 @@ import atexit
 import gc
 from collections.abc import Callable
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
@@ -26,6 +27,10 @@ from .guard import StepGuard
 from .problem import StepProblem
 from .stepper import Solution, Stepper
 
+if TYPE_CHECKING:
+    from ..integrators.base import Scheme
+    from .model import Model
+
 # What PETSc holds when it is finalised, after Python, cannot call Python any more: matrices and preconditioners of
 # ours that wait in cycles of references are let go before.
 atexit.register(gc.collect)
@@ -43,7 +48,7 @@ class ImplicitStepper(Stepper):
     kept_arrays = (*Stepper.kept_arrays, "held", "lagged_place")
     kept_bars = ("lagged_history",)
 
-    def __init__(self, model, scheme, h: float, choice: LinearChoice) -> None:
+    def __init__(self, model: Model, scheme: Scheme, h: float, choice: LinearChoice) -> None:
         super().__init__(model, scheme, h)
         _free_left_over(model.comm)
         symmetric = scheme.symmetric and model.contact.symmetric

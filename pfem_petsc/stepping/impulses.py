@@ -14,7 +14,7 @@ the support, and so does what a prescribed motion puts in place of the scheme's 
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -22,6 +22,9 @@ from ..integrators.base import State
 from ..mechanics.compiled import kernel
 from ..output.sums import HEAD, PAIR, WALL
 from ..tolerances import RANK
+
+if TYPE_CHECKING:
+    from .stepper import Stepper
 
 __all__ = ["DAMPING", "EXTERNAL", "SUPPORT", "WALLS", "Impulses", "fill_impulses", "wall_shares"]
 
@@ -44,7 +47,7 @@ def fill_impulses(sums, v) -> None:
 pairs, then the jumps of walls and pairs."""
 
 
-def wall_shares(stepper, nodes: np.ndarray, jumps: np.ndarray) -> np.ndarray:
+def wall_shares(stepper: Stepper, nodes: np.ndarray, jumps: np.ndarray) -> np.ndarray:
     """What of vectors (m, 3) at nodes (m,) belongs to which of the walls that they touch: (m, walls, 3)."""
     contact = stepper.model.contact
     touching = stepper.touching[nodes]
@@ -72,7 +75,7 @@ class Impulses:
     force : (rows, 3) of the last balance [N]
     """
 
-    def __init__(self, stepper) -> None:
+    def __init__(self, stepper: Stepper) -> None:
         self.stepper = stepper
         model = stepper.model
         self.links = model.links

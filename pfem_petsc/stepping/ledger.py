@@ -17,7 +17,7 @@ dissipation. Walls with mass are part of the balance: their kinetic energy, and 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -29,6 +29,9 @@ from .impulses import Impulses, wall_shares
 from .moment import Moment, balanced, moment_of
 from .node_loops import WORKS, book_nodes
 from .sum_loops import add_totals, add_works
+
+if TYPE_CHECKING:
+    from .stepper import Stepper
 
 __all__ = ["Ledger"]
 
@@ -48,7 +51,7 @@ class Ledger:
     impacts : Impacts
     """
 
-    def __init__(self, stepper) -> None:
+    def __init__(self, stepper: Stepper) -> None:
         self.stepper = stepper
         self.model = stepper.model
         self.sums = np.zeros(HEAD.width)

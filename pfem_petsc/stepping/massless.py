@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from mpi4py import MPI
 
 from ..contact.forces import WallForces
 from ..tolerances import ON_BOUND, ROUNDING
+
+if TYPE_CHECKING:
+    from .model import Model
 
 __all__ = ["MasslessNodes"]
 
@@ -20,7 +25,7 @@ _SOFTEST = 1e-4  # secant stiffness over the elastic one, or the other way round
 class MasslessNodes:
     """The contact nodes of a model whose mass is redistributed."""
 
-    def __init__(self, model) -> None:
+    def __init__(self, model: Model) -> None:
         self.model = model
         self.moved = model.inertia.redistribution
         self._force = np.zeros((model.mesh.n_local, 3))

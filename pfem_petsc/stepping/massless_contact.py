@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from ..errors import SimulationFailure
 from ..integrators.base import Balance
 from ..tolerances import BEYOND
 from .stepper import Solution, Stepper
+
+if TYPE_CHECKING:
+    from ..integrators.base import Scheme
+    from .model import Model
 
 __all__ = ["RedistributedStepper"]
 
@@ -19,7 +25,7 @@ class RedistributedStepper(Stepper):
     by each one's own secants.
     """
 
-    def __init__(self, model, scheme, h: float) -> None:
+    def __init__(self, model: Model, scheme: Scheme, h: float) -> None:
         super().__init__(model, scheme, h)
         moved = model.inertia.redistribution
         self.moved = moved

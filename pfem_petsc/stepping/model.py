@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from mpi4py import MPI
 
@@ -9,16 +11,20 @@ from ..contact.contact import Contact
 from ..contact.sources import make_links
 from ..contact.start import adjust_start
 from ..errors import InputError
-from ..mechanics.bars import Bars, section_of_bars
+from ..mechanics.bars import Bars
 from ..mechanics.compiled import kernel
 from ..mechanics.loads import ExternalForce
 from ..mechanics.mass import Inertia
+from ..mechanics.sections import section_of_bars
 from ..mechanics.supports import Supports
 from ..mechanics.temperature import Temperatures
 from ..mesh import load_slab
 from ..mesh.distribution import distribute
 from ..mesh.node_sets import resolve_node_sets
 from ..parallel.agreement import agreed
+
+if TYPE_CHECKING:
+    from ..case.schema import Case
 
 __all__ = ["Model"]
 
@@ -45,7 +51,7 @@ class Model:
     can_touch : whether there is anything that nodes can touch: walls, or each other
     """
 
-    def __init__(self, case, comm: MPI.Comm) -> None:
+    def __init__(self, case: Case, comm: MPI.Comm) -> None:
         self.case = case
         self.comm = comm
         try:

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..mechanics.bars import StrainEnergy
+
+if TYPE_CHECKING:
+    from .stepper import Stepper
 
 __all__ = ["Moment", "balanced", "moment_of"]
 
@@ -33,7 +37,7 @@ class Moment:
     energy: StrainEnergy = StrainEnergy()
 
 
-def moment_of(stepper) -> Moment:
+def moment_of(stepper: Stepper) -> Moment:
     """The present moment of a stepper."""
     state, inertia = stepper.state, stepper.model.inertia
     owned = stepper.model.mesh.n_owned
@@ -60,7 +64,7 @@ def moment_of(stepper) -> Moment:
     )
 
 
-def balanced(stepper, before: Moment) -> Moment:
+def balanced(stepper: Stepper, before: Moment) -> Moment:
     """The forces of the last balance, where it does not hold at the ends of steps."""
     inertia, balance = stepper.model.inertia, stepper.balance
     state, u = stepper.state, stepper.solution.u

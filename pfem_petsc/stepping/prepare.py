@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,6 +23,10 @@ from .implicit import ImplicitStepper
 from .massless_contact import RedistributedStepper
 from .stability import Frequency, highest_frequency
 from .stepper import Stepper
+
+if TYPE_CHECKING:
+    from ..case.schema import Case
+    from .model import Model
 
 __all__ = ["Plan", "make_plan", "make_stepper"]
 
@@ -61,7 +65,7 @@ class Plan:
         return {"step": self.step, "frequency": list(self.frequency), "linear": linear}
 
 
-def make_plan(model, recorded: Mapping[str, Any] | None = None) -> Plan:
+def make_plan(model: Model, recorded: Mapping[str, Any] | None = None) -> Plan:
     """Resolve what the case leaves open. Collective.
 
     Parameters
@@ -130,7 +134,7 @@ def make_plan(model, recorded: Mapping[str, Any] | None = None) -> Plan:
     return Plan(scheme, step, steps, critical, frequency, linear, asked)
 
 
-def _check_laws(case, scheme: Scheme) -> None:
+def _check_laws(case: Case, scheme: Scheme) -> None:
     """Refuse material laws that the scheme cannot have."""
     for name, material in case.material.items():
         reason = law_of(material).refuses(scheme)
@@ -141,7 +145,7 @@ def _check_laws(case, scheme: Scheme) -> None:
             )
 
 
-def _linear(model, scheme: Scheme, over: float, steps: int) -> LinearChoice:
+def _linear(model: Model, scheme: Scheme, over: float, steps: int) -> LinearChoice:
     """The choice for steps ``over`` times the limit of central differences."""
     case = model.case
     impact = model.can_touch or not all(law_of(material).smooth for material in case.material.values())
@@ -164,7 +168,7 @@ def _steps_to(end: float, step: float, source: str) -> int:
     return max(int(np.ceil(end / step * (1.0 - 1e-12) - 1e-9)), 1)
 
 
-def make_stepper(model, plan: Plan) -> Stepper:
+def make_stepper(model: Model, plan: Plan) -> Stepper:
     """The stepper of a plan, with the case's treatment of impact. Collective.
 
     Raises
@@ -187,7 +191,7 @@ def make_stepper(model, plan: Plan) -> Stepper:
     return stepper
 
 
-def _treatment(model, plan: Plan) -> type[Treatment] | None:
+def _treatment(model: Model, plan: Plan) -> type[Treatment] | None:
     """What the case asks for; None for the formulas of the scheme, and where nothing can touch."""
     name = model.case.contact.treatment
     if name == "scheme" or not model.can_touch:
@@ -202,7 +206,7 @@ def _treatment(model, plan: Plan) -> type[Treatment] | None:
     return treatment
 
 
-def _warn_of_gain(model, plan: Plan) -> None:
+def _warn_of_gain(model: Model, plan: Plan) -> None:
     """Warn where contact gains energy with this scheme, treatment, mass and step."""
     fastest = plan.frequency.upper / (np.sqrt(3.0) if model.inertia.consistent else 1.0)
     across = 0.5 * fastest * model.length / model.wave_speed
@@ -211,7 +215,7 @@ def _warn_of_gain(model, plan: Plan) -> None:
         model.warnings.append(warning)
 
 
-def _warn_of_damping(model, plan: Plan) -> None:
+def _warn_of_damping(model: Model, plan: Plan) -> None:
     """Warn where damping stops nodes within a few steps: no rule over steps knows then what it dissipates."""
     rate = max(material.damping / material.density for material in model.case.material.values())
     if rate * plan.step > _DAMPED:
@@ -222,7 +226,7 @@ def _warn_of_damping(model, plan: Plan) -> None:
         )
 
 
-def _check_walls(model, plan: Plan, treatment: type[Treatment] | None) -> None:
+def _check_walls(model: Model, plan: Plan, treatment: type[Treatment] | None) -> None:
     """Refuse what a wall asks for and the scheme cannot do."""
     walls = model.case.wall
     if any(wall.mass is not None for wall in walls):
@@ -252,7 +256,7 @@ def _check_serves(treatment: type[Treatment] | None, what: str, key: str) -> Non
     raise InputError(f"{key}: {what} needs contact.treatment = {' or '.join(served)}")
 
 
-def _check_restitution(model, plan: Plan, treatment: type[Treatment] | None, k: int, key: str) -> None:
+def _check_restitution(model: Model, plan: Plan, treatment: type[Treatment] | None, k: int, key: str) -> None:
     if model.inertia.consistent:
         raise InputError(f'{key}: restitution needs time.mass = "lumped": one node\'s velocity jumps')
     if plan.scheme.solves_next_position:
@@ -268,7 +272,7 @@ def _check_restitution(model, plan: Plan, treatment: type[Treatment] | None, k: 
         raise InputError(f"{key}: restitution of a wall with mass needs central_differences")
 
 
-def _stepper(model, plan: Plan) -> Stepper:
+def _stepper(model: Model, plan: Plan) -> Stepper:
     if plan.linear is not None:
         return ImplicitStepper(model, plan.scheme, plan.step, plan.linear)
     explicit = ExplicitStepper if model.inertia.redistribution is None else RedistributedStepper

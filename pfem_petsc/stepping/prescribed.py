@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..integrators.base import Balance, State
+
+if TYPE_CHECKING:
+    from .stepper import Stepper
 
 __all__ = ["PrescribedMotion"]
 
@@ -20,7 +24,7 @@ class PrescribedMotion:
         components (k,) in the last step, by name; empty without such motions
     """
 
-    def __init__(self, stepper) -> None:
+    def __init__(self, stepper: Stepper) -> None:
         self.stepper, self.supports = stepper, stepper.model.supports
         self.moving = self.supports.moving
         self.change: dict[str, np.ndarray] = {}

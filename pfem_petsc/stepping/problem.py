@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from ..contact.transform import Transform
 from ..integrators.base import Balance, State
 from ..solvers.matrix import HessianMatrix
+
+if TYPE_CHECKING:
+    from .model import Model
 
 __all__ = ["StepProblem"]
 
@@ -21,7 +26,7 @@ class StepProblem:
 
     def __init__(
         self,
-        model,
+        model: Model,
         state: State,
         balance: Balance,
         external: np.ndarray,

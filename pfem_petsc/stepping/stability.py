@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+
+if TYPE_CHECKING:
+    from .model import Model
 
 __all__ = ["Frequency", "highest_frequency"]
 
@@ -22,7 +25,7 @@ class Frequency(NamedTuple):
 
 
 @np.errstate(over="ignore", invalid="ignore")
-def highest_frequency(model, x: np.ndarray, steps: int = 60, accuracy: float = 1e-4) -> Frequency:
+def highest_frequency(model: Model, x: np.ndarray, steps: int = 60, accuracy: float = 1e-4) -> Frequency:
     """Highest natural frequency at positions ``x`` by Lanczos' method on M^-1/2 K_t M^-1/2 (lumped mass). Collective.
 
     The bar's own limit l/c is a safe bound on the critical step for unstressed bars only and often too small; the

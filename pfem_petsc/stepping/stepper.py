@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,6 +18,9 @@ from ..tolerances import BEYOND
 from .collapse import tell_collapse
 from .massless import MasslessNodes
 from .prescribed import PrescribedMotion
+
+if TYPE_CHECKING:
+    from .model import Model
 
 __all__ = ["Solution", "Stepper"]
 
@@ -76,7 +80,7 @@ class Stepper(ABC):
     renews_forces = False
     steady = False
 
-    def __init__(self, model, scheme: Scheme, h: float) -> None:
+    def __init__(self, model: Model, scheme: Scheme, h: float) -> None:
         self.model = model
         self.scheme = scheme
         self.h = self.part = self.smallest = h

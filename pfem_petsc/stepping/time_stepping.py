@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 from ..analysis import Analysis, Step
 from ..errors import PfemError
 from ..integrators.base import State
 from .prepare import Plan, make_stepper
+
+if TYPE_CHECKING:
+    from .model import Model
 
 __all__ = ["TimeStepping"]
 
@@ -23,7 +28,7 @@ class TimeStepping(Analysis):
     stepper : Stepper
     """
 
-    def __init__(self, model, plan: Plan) -> None:
+    def __init__(self, model: Model, plan: Plan) -> None:
         self.model, self.plan = model, plan
         self.last_step, self.step_size = plan.steps, plan.step
         self.stepper = make_stepper(model, plan)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -30,7 +31,7 @@ DPI = 130
 def styled(draw: Callable) -> Callable:
     """Decorator: draw in the project's style."""
 
-    def wrapped(*arguments):  # noqa: ANN202, ANN002
+    def wrapped(*arguments: Any) -> Any:
         import matplotlib
 
         with matplotlib.rc_context(STYLE):

@@ -17,6 +17,7 @@ import numpy as np
 
 from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.errors import PfemError
+from pfem_petsc.output.result import Result
 
 from .studies import Study
 
@@ -52,7 +53,7 @@ class Run:
         return self.history["time"]
 
     @property
-    def result(self):  # noqa: ANN201
+    def result(self) -> Result:
         """The result file, for snapshots."""
         return open_result(self.folder)
 

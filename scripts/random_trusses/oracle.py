@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from pfem_petsc.case.schema import Case
+from pfem_petsc.contact.walls.base import WallKeys
 
 from .loading import Loaded
 
@@ -107,7 +108,7 @@ def _members(case: Case, name: str | None, result: Loaded) -> np.ndarray:
     return np.flatnonzero(((points >= low + slack) & (points <= high - slack)).all(axis=1))
 
 
-def _distances(wall, x: np.ndarray) -> np.ndarray:
+def _distances(wall: WallKeys, x: np.ndarray) -> np.ndarray:
     """Distance (m,) of points from the surface, negative beyond it."""
     arm = x - np.array(wall.point)
     if wall.type in ("plane", "rectangle"):
@@ -119,7 +120,15 @@ def _distances(wall, x: np.ndarray) -> np.ndarray:
     return length - wall.radius if wall.side == "outside" else wall.radius - length
 
 
-def _before_rectangle(wall, result: Loaded, i: int, members, at: np.ndarray, moved, rows) -> np.ndarray:
+def _before_rectangle(
+    wall: WallKeys,
+    result: Loaded,
+    i: int,
+    members: np.ndarray,
+    at: np.ndarray,
+    moved: np.ndarray | None,
+    rows: dict[int, int],
+) -> np.ndarray:
     """Nodes that were before the rectangle in the last snapshot and well inside of its edges then and now."""
     if i == 0 or result.steps[i] - result.steps[i - 1] > 1:
         return np.zeros(len(at), dtype=bool)

@@ -8,6 +8,7 @@ import shlex
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -37,7 +38,12 @@ class Point:
 
 
 def points_of(
-    studies: list[str], kinds: list[str], jobs: list[str], sizes: dict[str, list[int]], ranks: list[int], names
+    studies: list[str],
+    kinds: list[str],
+    jobs: list[str],
+    sizes: dict[str, list[int]],
+    ranks: list[int],
+    names: Callable[[str], str],
 ) -> list[Point]:
     """All points, smallest first. ``names``: the integrator of a job."""
     found = [

@@ -7,11 +7,16 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ...integrators.base import Scheme
 from ...tolerances import FREE_PART, RANK
+
+if TYPE_CHECKING:
+    from ...stepping.model import Model
+    from ...stepping.stepper import Stepper
 
 __all__ = ["Jump", "Treatment"]
 
@@ -54,7 +59,7 @@ class Treatment(ABC):
         return None
 
     @classmethod
-    def prepare(cls, model) -> None:
+    def prepare(cls, model: Model) -> None:
         """Change the model before the stepper is made; nothing by default. Collective.
 
         Raises
@@ -63,7 +68,7 @@ class Treatment(ABC):
             On all ranks, for models that cannot have the treatment.
         """
 
-    def __init__(self, stepper) -> None:
+    def __init__(self, stepper: Stepper) -> None:
         self.stepper = stepper
         self.jump: Jump | None = None
 

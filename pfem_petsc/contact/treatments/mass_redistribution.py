@@ -12,6 +12,8 @@ scaled to a unit vector, and the wall is no concern of a node that it cannot mov
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from ...errors import InputError
@@ -20,6 +22,10 @@ from ...parallel.agreement import agreed
 from ...tolerances import FREE_PART
 from .base import Jump
 from .base import Treatment as Base
+
+if TYPE_CHECKING:
+    from ...stepping.model import Model
+    from ..contact import Contact
 
 __all__ = ["Redistribution", "Treatment", "redistribute"]
 
@@ -64,7 +70,7 @@ class Redistribution:
         return np.linalg.pinv(matrices, rcond=1e-10, hermitian=True)
 
 
-def redistribute(model) -> Redistribution:
+def redistribute(model: Model) -> Redistribution:
     """Work out the masses to move. Collective.
 
     Raises
@@ -123,7 +129,7 @@ def redistribute(model) -> Redistribution:
     return Redistribution(nodes, walls, free, across, touched, tensors[touched])
 
 
-def _movable(contact) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _movable(contact: Contact) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Owned wall nodes (m,) that can move off their walls (m,), along which unit vectors (m, 3), how far (m,)."""
     nodes = np.flatnonzero(contact.members.any(axis=1))
     walls = contact.members[nodes].argmax(axis=1)
@@ -149,7 +155,7 @@ class Treatment(Base):
         return None
 
     @classmethod
-    def prepare(cls, model) -> None:
+    def prepare(cls, model: Model) -> None:
         """Take the mass from the nodes. Collective."""
         if model.links:
             raise InputError(

@@ -1,0 +1,48 @@
+"""Implicit steps at walls without friction."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from ..integrators.base import Balance, State
+    from ..stepping.model import Model
+    from .frames import NodalFrames
+
+__all__ = ["NoStepFriction"]
+
+
+class NoStepFriction:
+    """Stands for :class:`~pfem_petsc.contact.implicit_friction.StepFriction` where no wall has friction; see there."""
+
+    def __init__(self, model: Model, state: State, balance: Balance) -> None:
+        self.unsettled = np.empty(0, dtype=np.int64)
+
+    def apply(self, frames: NodalFrames, x: np.ndarray) -> None:
+        """Nothing sticks or slips."""
+
+    def check(
+        self,
+        frames: NodalFrames,
+        x: np.ndarray,
+        reaction: np.ndarray,
+        strengths: np.ndarray,
+        noise: float,
+        tolerance: float,
+    ) -> np.ndarray:
+        """Normal forces as they are."""
+        return strengths
+
+    def jams(self, nodes: np.ndarray, x: np.ndarray, displacements: np.ndarray) -> list[str]:
+        """Nothing jams."""
+        return []
+
+    def relax(self) -> bool:
+        """There is nothing to ask less of."""
+        return False
+
+    def add(self, force: np.ndarray, nodes: np.ndarray, x: np.ndarray) -> float:
+        """No energy."""
+        return 0.0

@@ -29,6 +29,10 @@ if "PYTEST_XDIST_WORKER" in os.environ:
     for _name in [name for name in os.environ if name.startswith(OF_A_LAUNCH)]:
         del os.environ[_name]
 
+# Under nohup, SIGHUP is ignored here and would be in the runs that tests start: these are to stop at it.
+if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
+
 from mpi4py import MPI  # noqa: E402
 
 WORLD = MPI.COMM_WORLD

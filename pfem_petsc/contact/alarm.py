@@ -2,9 +2,9 @@
 
 Positions that a step was solved for keep every wall to rounding, with all schemes and treatments; so they are what is
 looked at. With Wilson's method these are x_tau at t + theta h, not x1, which may lie beyond a wall by no more than the
-way from one to the other, (theta - 1) h v. No wall at all is a rectangle, which nodes pass beside, and a wall whose
-``node_set`` does not contain the node. Supports that prescribe a node along the normal decide over the wall; where
-they take it beyond, both cannot be meant, and that is told as well.
+way from one to the other, (theta - 1) h v. No wall at all is a wall whose ``node_set`` does not contain the node, and a
+rectangle, which nodes pass beside. Supports that prescribe a node along the normal decide over the wall; where
+they take it beyond, both cannot be meant, and that is told as well: of rectangles by the step that crosses them.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from ..stepping.stepper import Stepper
     from .contact import Contact
 
-__all__ = ["check_positions"]
+__all__ = ["CarriedNodes", "check_positions"]
 
 
 def check_positions(stepper: Stepper) -> None:
@@ -60,21 +60,65 @@ def check_positions(stepper: Stepper) -> None:
     depth, node, wall = min(comm.allgather(deepest))
     count = comm.allreduce(int((gaps[:, wall] < -tolerance).sum()))
     carried = comm.allreduce(deepest == (depth, node, wall) and _prescribed(contact, suspects[at], wall, x, time))
+    where = f"step {state.step}, t = {time:.6g} s"
     if carried:
-        raise SimulationFailure(
-            f"step {state.step}, t = {time:.6g} s: node {node} is {-depth:.3g} m beyond wall {contact.names[wall]!r} "
-            f"({count} node{'s' if count > 1 else ''} in all), where its supports take it; let the wall move with "
-            "the supports, name the nodes that it concerns with 'node_set', or do not tie them"
-        )
+        raise SimulationFailure(_told(where, node, -depth, contact.names[wall], count))
     case = model.case
     others = "another contact.treatment or time.integrator"
     if case.contact.treatment != "scheme":
         others = f'contact.treatment = "scheme" instead of "{case.contact.treatment}"'
     raise SimulationFailure(
-        f"step {state.step}, t = {time:.6g} s: node {node} is {-depth:.3g} m beyond wall {contact.names[wall]!r} "
+        f"{where}: node {node} is {-depth:.3g} m beyond wall {contact.names[wall]!r} "
         f"({count} node{'s' if count > 1 else ''} in all), which contact did not prevent: what was computed since it "
         f"passed it is wrong; reduce time.step, or use {others}"
     )
+
+
+def _told(where: str, node: int, depth: float, wall: str, count: int) -> str:
+    """What to tell about nodes that supports carry beyond a wall."""
+    return (
+        f"{where}: node {node} is {depth:.3g} m beyond wall {wall!r} "
+        f"({count} node{'s' if count > 1 else ''} in all), where its supports take it; let the wall move with "
+        "the supports, name the nodes that it concerns with 'node_set', or do not tie them"
+    )
+
+
+class CarriedNodes:
+    """This rank's nodes whose way along the normal of a rectangle supports prescribe: no contact can stop them.
+
+    Only the step in which they cross it tells that they have not come from beside or behind, so that each is looked at.
+
+    Attributes
+    ----------
+    of : index of each rectangle that concerns such nodes, to these nodes (k,)
+    """
+
+    def __init__(self, contact: Contact) -> None:
+        self._contact = contact
+        self.of: dict[int, np.ndarray] = {}
+        for k, wall in enumerate(contact.walls):
+            if wall.partial:
+                free = np.where(contact.fixed, 0.0, wall.normal)
+                nodes = np.flatnonzero(contact.members[:, k] & ((free * free).sum(axis=1) <= FREE_PART))
+                self.of |= {k: nodes} if len(nodes) else {}
+
+    def places(self, x: np.ndarray, time: float) -> dict[int, np.ndarray]:
+        """Where they are (k, 3) [m] relative to the rectangles, from all positions (owned, 3)."""
+        displacements = self._contact.motion.displacements(time)
+        return {k: x[nodes] - displacements[k] for k, nodes in self.of.items()}
+
+    def crossing(self, before: dict[int, np.ndarray], after: dict[int, np.ndarray], where: str) -> str | None:
+        """What to tell of those that cross a rectangle on the way between two :meth:`places`, None for nothing."""
+        contact, tolerance = self._contact, BEYOND * self._contact.length
+        for k, nodes in self.of.items():
+            wall = contact.walls[k]
+            depth = wall.offset - after[k] @ wall.normal
+            crossed = (depth > tolerance) & wall.stops(before[k], after[k], np.full(len(nodes), tolerance))
+            if crossed.any():
+                at = int(np.argmax(np.where(crossed, depth, 0.0)))
+                node = int(contact.mesh.node_ids[nodes[at]])
+                return _told(where, node, float(depth[at]), contact.names[k], int(crossed.sum()))
+        return None
 
 
 def _prescribed(contact: Contact, node: int, wall: int, x: np.ndarray, time: float) -> bool:

@@ -240,6 +240,15 @@ class Contact:
             "walls apart, or free the node"
         )
 
+    def unsettled_message(self) -> str:
+        """What to tell about walls with mass whose place does not follow from the forces on them."""
+        names = ", ".join(repr(self.names[k]) for k in self.motion.bodies.at)
+        return (
+            f"walls with mass ({names}) found no place where the forces of the nodes balance them: nodes change "
+            "between walls that push them the same way; reduce time.step, take one of these walls away, or limit it by "
+            "'node_set'"
+        )
+
     def frames(
         self,
         candidates: np.ndarray,

@@ -99,9 +99,11 @@ class ExplicitContact:
                 np.add.at(slope, at, gives[:, :, None] * np.eye(3))
             return walls.force[free.at], slope[free.at]
 
-        free.solve(forces, FIXED_POINT * self.contact.length)
+        found = free.solve(forces, FIXED_POINT * self.contact.length)
         if failure is not None:
             raise failure
+        if not found:
+            raise SimulationFailure(self.contact.unsettled_message())
 
     def project(
         self, x: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float, booked: bool = True

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 __all__ = ["FreeWalls", "NoFreeWalls"]
 
 _ITERATIONS = 200
+_FULL_MOVES = 20  # Newton's method ends after a few active sets, or goes back and forth between some for good
 
 Answer = tuple[np.ndarray, np.ndarray | None]
 
@@ -92,8 +93,8 @@ class FreeWalls:
         known = 0.0 if balance.a_hat is None else balance.a_hat
         return balance.predictor + (self.weight / self.mass[:, None] - known) / balance.alpha
 
-    def solve(self, forces: Callable[[], Answer], tolerance: float) -> None:
-        """Find the walls' increments. Collective.
+    def solve(self, forces: Callable[[], Answer], tolerance: float) -> bool:
+        """Find the walls' increments; whether they were found, the same on all ranks. Collective.
 
         Parameters
         ----------
@@ -107,12 +108,16 @@ class FreeWalls:
         rest = -self.weight if balance.a_hat is None else self.mass[:, None] * balance.a_hat - self.weight
         u = (-rest / (balance.alpha * self.mass[:, None])).ravel()
         matrix, earlier = np.diag(weight), None
-        for _ in range(_ITERATIONS):
+
+        def evaluate(u: np.ndarray) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
             self._u = u.reshape(-1, 3)
             force, slope = forces()
             force = force.copy()
             self.comm.Allreduce(MPI.IN_PLACE, force)
-            residual = weight * u + rest.ravel() + force.ravel()
+            return force, slope, weight * u + rest.ravel() + force.ravel()
+
+        force, slope, residual = evaluate(u)
+        for iteration in range(_ITERATIONS):
             if slope is not None:
                 slope = slope.copy()
                 self.comm.Allreduce(MPI.IN_PLACE, slope)
@@ -130,8 +135,25 @@ class FreeWalls:
             if np.abs(move).max(initial=0.0) <= tolerance:
                 break
             u = u + move
+            force, slope, residual = evaluate(u)
+            start = -float(move @ earlier[1])
+            if iteration < _FULL_MOVES or start <= 0.0:
+                continue
+            # beyond a change of the set, which the slope before it does not know: half way back to it, and again
+            least, most, part = 0.0, 1.0, 1.0
+            size = np.abs(move).max()
+            while abs(along := float(move @ residual)) > 0.5 * start and not (along < 0.0 and part == 1.0):
+                least, most = (least, part) if along > 0.0 else (part, most)
+                if (most - least) * size <= tolerance:
+                    return False
+                part = 0.5 * (least + most)
+                u = earlier[0] + part * move
+                force, slope, residual = evaluate(u)
+        else:
+            return False
         # momentum is kept to rounding: the acceleration is that of the force, whatever the last digit of the place
         self._u = (-force - rest) / (balance.alpha * self.mass[:, None])
+        return True
 
     def step_changed(self, scheme: Scheme) -> None:
         """Tell the scheme to forget what holds for steps of another size."""
@@ -187,9 +209,10 @@ class NoFreeWalls:
         """None."""
         return self.state.x
 
-    def solve(self, forces: Callable[[], Answer], tolerance: float) -> None:
+    def solve(self, forces: Callable[[], Answer], tolerance: float) -> bool:
         """The forces are found once."""
         forces()
+        return True
 
     def kept(self) -> None:
         """Nothing."""

@@ -168,14 +168,17 @@ class ImplicitStepper(Stepper):
     def solve(self, balance: Balance) -> Solution:
         state, links = self.state, self.model.links
         kept = state.contact, state.support, self.held, links.save()
-        solution = self._with_walls(balance)
-        # an explicit scheme with consistent mass has one solution only
-        if self.guard is not None and balance.weight:
-            reason = self._suspicion(balance, solution)
-            if reason is not None:
-                state.contact, state.support, self.held, forces = kept
-                links.restore(forces)
-                raise NotConverged(f"{self.when(balance)}: {reason}. {_WAY_OUT}")
+        try:
+            solution = self._with_walls(balance)
+            # an explicit scheme with consistent mass has one solution only
+            if self.guard is not None and balance.weight:
+                reason = self._suspicion(balance, solution)
+                if reason is not None:
+                    raise NotConverged(f"{self.when(balance)}: {reason}. {_WAY_OUT}")
+        except NotConverged:
+            state.contact, state.support, self.held, forces = kept
+            links.restore(forces)
+            raise
         return solution
 
     def _suspicion(self, balance: Balance, solution: Solution) -> str | None:
@@ -200,7 +203,8 @@ class ImplicitStepper(Stepper):
             found.append(self._solve(balance, found[-1].u if found else guess))
             return found[-1].walls.force[bodies.at], None
 
-        bodies.solve(forces, ON_BOUND * self.model.length)
+        if not bodies.solve(forces, ON_BOUND * self.model.length):
+            raise NotConverged(f"{self.when(balance)}: {self.model.contact.unsettled_message()}")
         newton, linear = sum(s.newton for s in found), sum(s.linear for s in found)
         return replace(found[-1], newton=newton, linear=linear)
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..contact.alarm import CarriedNodes
 from ..contact.forces import WallForces
 from ..contact.initial_equilibrium import start_at_rest
 from ..errors import SimulationFailure
@@ -108,6 +109,7 @@ class Stepper(ABC):
         self.closed = np.zeros_like(self.touching)
         self.step_changed = False
         self.prescribed = PrescribedMotion(self)
+        self._carried = CarriedNodes(model.contact)
         self.totals_at_start: np.ndarray | None = None
         self.totals_solved: np.ndarray | None = None
         self.velocity_solved = self.zero
@@ -193,8 +195,10 @@ class Stepper(ABC):
 
     def _make_part(self, end: float) -> None:
         """Advance by ``part``, to the time ``end``."""
+        state, carried = self.state, self._carried
         if self.model.temperatures.varying:
             self.model.bars.heat_at_start[:] = self.model.bars.heat
+        places = carried.places(state.position, state.time) if carried.of else {}
         if self.treatment is not None:
             self.treatment.before()
         if self.scheme.solves_next_position:
@@ -212,6 +216,10 @@ class Stepper(ABC):
         if self.treatment is not None:
             self.treatment.after()
         self.booking()
+        if carried.of and self.fault is None:
+            where = f"step {state.step + 1}, t = {end:.6g} s"
+            crossing = carried.crossing(places, carried.places(state.position, end), where)
+            self.fault = SimulationFailure(crossing) if crossing else None
 
     def _arrive(self, end: float) -> None:
         self.model.bars.step = self.part

@@ -67,3 +67,26 @@ def test_supports_that_carry_a_node_through_a_wall_are_told(mass, tied, comm, sh
         run(comm, shared_tmp_path, "output.fields_every=10", *keys)
     message = r"node 20 is 0.0\d+ m beyond wall 'wall' \(1 node in all\), where its supports take it"
     assert all(re.search(message, text) for text in comm.allgather(str(failure.value)))
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("scheme", ["central_differences", "houbolt"])
+@pytest.mark.parametrize("beside, told", [(0.0, True), (0.2, False)])
+def test_supports_that_carry_a_node_through_a_rectangle_are_told(scheme, beside, told, comm, shared_tmp_path):
+    """The step that crosses it is found, whenever results are written; whoever passes beside is not meant."""
+    motion = "motion=[[0.0, 0.0, 0.0, 0.0], [0.7, 0.2, 0.0, 0.0]]"
+    point = f"point=[1.05, {beside}, 0.0], velocity=[-0.1, 0.0, 0.0]"
+    keys = [
+        f'support=[{{node_set="tip", fix="x", {motion}}}]',
+        f'wall=[{{name="plate", type="rectangle", {point}, normal=[-1,0,0], along=[0,1,0], size=[0.1, 0.1]}}]',
+        "output.fields_every=0",
+        f"time.integrator={scheme}",
+        "initial.velocity=[0.0, 0.0, 0.0]",
+    ]
+    if not told:
+        run(comm, shared_tmp_path, *keys)
+        return
+    with pytest.raises(SimulationFailure) as failure:
+        run(comm, shared_tmp_path, *keys)
+    message = r"node 20 is 0.0\d+ m beyond wall 'plate' \(1 node in all\), where its supports take it"
+    assert all(re.search(message, text) for text in comm.allgather(str(failure.value)))

@@ -5,7 +5,7 @@ import pytest
 from helpers.lattices import lattice_case, planes, simulation
 
 from pfem_petsc import Case, Simulation
-from pfem_petsc.errors import InputError
+from pfem_petsc.errors import InputError, SimulationFailure
 
 SCHEMES = [("central_differences", {}), ("chung_lee", {}), ("newmark", {}), ("houbolt", {})]
 SPEED = np.array([1.0, -0.5, -4.0])
@@ -145,3 +145,33 @@ def test_restart_keeps_the_walls(comm, shared_tmp_path):
 @pytest.mark.parametrize("kind, integrator", [("corner", "central_differences"), ("sphere", "newmark")])
 def test_momentum_is_shared_between_ranks(kind, integrator, comm, shared_tmp_path):
     test_momentum_is_shared(kind, integrator, {}, comm, shared_tmp_path)
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("integrator", ["central_differences", "souza_moura", "newmark"])
+def test_a_wall_with_mass_takes_over_from_another(integrator, comm, shared_tmp_path):
+    """A slow ram comes through the wall that a tip is pressed on, a little oblique: for a step both carry the tip, and
+    whether the ram does depends on the last digits of where it is."""
+    rows = _rammed([-1.0, 0.05, 0.0], integrator, comm, shared_tmp_path)
+    assert max(abs(row["energy_imbalance"]) for row in rows) < 1e-10
+    assert any(row["wall/wall/contacts"] and row["wall/ram/contacts"] for row in rows)
+    for row in rows:
+        total = row["momentum"] + 0.5 * row["wall/ram/velocity"] - row["wall/wall/impulse"]
+        np.testing.assert_allclose(total, [0.5 - 0.0025, 0.0, 0.0], atol=1e-9)
+
+
+@pytest.mark.parallel
+def test_parallel_walls_that_carry_a_node_together_are_told(comm, shared_tmp_path):
+    """Which of them carries it is not determined: the run ends, instead of going on with either."""
+    with pytest.raises(SimulationFailure) as failure:
+        _rammed([-1.0, 0.0, 0.0], "central_differences", comm, shared_tmp_path)
+    assert all("walls with mass ('ram') found no place" in text for text in comm.allgather(str(failure.value)))
+
+
+def _rammed(normal, integrator, comm, folder):
+    """The rod and its wall, with a ram of 0.5 kg that comes through the wall at t = 0.2 s, while the tip is on it."""
+    wall = 'type = "plane", node_set = "tip"'
+    ram = f'{wall}, name = "ram", point = [1.051, 0, 0], normal = {normal}, mass = 0.5, velocity = [-0.005, 0, 0]'
+    walls = f'wall=[{{{wall}, name = "wall", point = [1.05, 0, 0], normal = [-1, 0, 0]}}, {{{ram}}}]'
+    case = Case.load("rod_impact", [walls, "output.fields_every=0", "time.end=0.4", f"time.integrator={integrator}"])
+    return [step.row for step in Simulation(case, comm, output=folder / "rod", quiet=True)]

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from random_trusses.draw import draw_case
+from random_trusses.loading import Loaded
 from random_trusses.oracle import check_result
 from random_trusses.running import case_text, run_case
 from random_trusses.schemes import EXACT, MARGIN, _compare, judge_schemes
@@ -153,6 +154,18 @@ def test_the_checks_see_what_they_are_there_for(sound, name, change, cause):
     with h5py.File(sound / "result.vtkhdf", "a", locking=False) as file:
         file[name][...] = change(file[name][...])
     assert cause in [found for found, _ in check_result(sound, [])]
+
+
+def test_the_swing_of_large_explicit_steps_is_no_gain(tmp_path):
+    """A bar between a node at rest and one that is struck: central differences give back what they seem to gain."""
+    held = '[node_set.start]\ngroup = "start"\n[[support]]\nnode_set = "start"\nfix = "xyz"\n'
+    text = FALLING.replace("elements = 4", "elements = 1").replace("end = 0.3", "end = 6.0")
+    text = held + text.replace("step = 0.01", "step = 0.12").replace("[1.05, ", "[3.0, ").replace("[1.0, ", "[0.1, ")
+    assert run_case(text, MPI.COMM_SELF, tmp_path).status == 0
+    result = Loaded(tmp_path)
+    gain = -result.history["numerical_dissipation"][-len(result.history["step"]) // 4 :]
+    assert gain.mean() > 0.1 * result.history["kinetic_energy"][0] > 5.0 * abs(gain.min())
+    assert check_result(tmp_path, []) == []
 
 
 def test_an_exception_is_found_and_told(monkeypatch, tmp_path):

@@ -7,7 +7,7 @@ Each check gives faults, (cause, detail). Tolerances:
 - balance of energy: 1e-7 of the largest energy; above 1e-9 it is counted apart
 - gain of energy from contact and the scheme without a warning, in the mean over the last quarter of the run: 0.05 of
   what was put in (energy at the start, works of loads and temperature; with walls that move, the largest energy).
-  Central differences conserve T + U - h^2/8 a.Ma with velocities in the middle of two half steps: the last term, at most
+  Central differences conserve T + U - h^2/8 a.Ma, with the mean velocity of two half steps: the last term, at most
   (h w/2)^2 U with the highest frequency w, comes and goes, and is no gain
 - dissipations: 1e-9 of the largest energy below zero
 - contact work at walls at rest: with `stick` 1e-3 of what was put in, else 0.05 of it in the last quarter

@@ -21,6 +21,7 @@ __all__ = ["MIN_VOLUME", "NodalFrames", "build_frames"]
 
 MIN_VOLUME = 0.04  # of the rows of B: cond(B) <= 2.6/0.04 = 65; two planes share a node from 2.3 degrees on
 _PARALLEL = 1e-14  # 1 - |cos| of normals that share a row, to which the bound is exact at the given place alone
+_ALONG = 1e-15  # parts of a unit normal off an axis that are none
 
 
 class NodalFrames:
@@ -194,7 +195,8 @@ def _build(
                 for c in range(3):
                     if abs(normal[c]) > abs(normal[axis]):
                         axis = c
-                along = abs(normal[axis]) == 1.0
+                # not by the length along the axis alone, which is 1 to rounding up to 1e-8 off it
+                along = max(abs(normal[(axis + 1) % 3]), abs(normal[(axis + 2) % 3])) <= _ALONG
                 if along and not taken[axis]:
                     slot = axis
                     sign = 1.0 if normal[axis] > 0.0 else -1.0

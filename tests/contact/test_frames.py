@@ -79,3 +79,13 @@ def test_almost_parallel_planes_share_a_bound_that_is_exact_at_the_place(sign):
     assert abs(normals[0, 1] @ moved - offsets[0, 1]) < 1e-15
     same = build_frames(np.array([0]), np.zeros((1, 3), bool), normals[:, [0, 0]], offsets, np.array([[0.0, 1.0]]))
     assert not same.shared.any() and same.bounds.tolist() == offsets.tolist()
+
+
+@pytest.mark.parametrize("off", [1e-8, 1e-12])
+def test_normals_next_to_an_axis_keep_their_direction(off):
+    """Off by 1e-8, the part along the axis is 1 to the last digit; the force has the direction of the row."""
+    normal = np.array([-1.0, off, 0.0])
+    frames = frames_of([normal], [-0.5])
+    np.testing.assert_array_equal(frames.basis[0, 0], normal)
+    assert frames.oblique
+    np.testing.assert_allclose(frames.basis[0] @ frames.inverse[0], np.eye(3), atol=1e-15)

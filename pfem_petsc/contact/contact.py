@@ -110,25 +110,14 @@ class Contact:
     @cached_property
     def nothing(self) -> WallForces:
         """No contact; not to be written to."""
-        n = len(self.walls)
-        nothing = WallForces(
-            np.zeros((n, 3)),
-            np.zeros(n, dtype=np.int64),
-            np.zeros((n, 3)),
-            np.empty(0, dtype=np.int64),
-            np.empty((0, n), dtype=bool),
-            np.empty((0, 3)),
-        )
-        for name in nothing.sums:
-            getattr(nothing, name).flags.writeable = False
-        return nothing
+        return WallForces.none(len(self.walls))
 
     def positions(self, time: float) -> np.ndarray:
         """Where the walls' centres are (walls, 3) [m]."""
         return np.array([wall.centre for wall in self.walls]).reshape(-1, 3) + self.motion.displacements(time)
 
     def gaps(self, x: np.ndarray, time: float, nodes: np.ndarray | None = None) -> np.ndarray:
-        """Distances (m, walls) [m] of owned nodes at (m, 3) from the walls, infinite where a wall is no concern.
+        """Distances (m, walls) [m] of owned nodes at (m, 3) from the walls, infinite for walls that do not apply.
 
         ``nodes`` (m,) says which they are; default: all of them.
         """
@@ -148,7 +137,7 @@ class Contact:
 
     @property
     def steady(self) -> bool:
-        """Whether there are no walls, or flat ones at rest without further features alone."""
+        """Whether there are no walls, or only flat ones at rest without further features."""
         return not self.any or (self.plain and not self.moving.any())
 
     def plane_offsets(self, time: float) -> np.ndarray:
@@ -185,7 +174,7 @@ class Contact:
         return applicable
 
     def planes(self, applicable: np.ndarray, x: np.ndarray, displacements: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Planes (m, w, 3), (m, w) at positions (m, 3); offset -inf where a wall is no concern."""
+        """Planes (m, w, 3), (m, w) at positions (m, 3); offset -inf for walls that do not apply."""
         normals = np.empty((len(x), len(self.walls), 3))
         offsets = np.empty((len(x), len(self.walls)))
         for k, wall in enumerate(self.walls):
@@ -219,7 +208,7 @@ class Contact:
         return WallForces(force.sum(axis=0), touching.sum(axis=0), moment, nodes, touching, x, friction)
 
     def record(self, walls: WallForces, time: float, h: float) -> FreshTies:
-        """Take note of a step of ``h`` [s] whose positions at ``time`` have these forces; what walls tied in it.
+        """Record a step of ``h`` [s] whose positions at ``time`` have these forces; return what walls tied in it.
 
         Collective where many steps have come together.
         """
@@ -232,7 +221,7 @@ class Contact:
         self.ties.calm(*fresh, v, self.motion.rates(time), h)
 
     def infeasible_message(self, node: int, offsets: np.ndarray) -> str:
-        """What to tell about a node (owned index) whose planes contradict each other."""
+        """The message about a node (owned index) whose planes contradict each other."""
         touched = [name for name, offset in zip(self.names, offsets, strict=True) if offset > -np.inf]
         return (
             f"no position of node {self.mesh.node_ids[node]} satisfies all walls "

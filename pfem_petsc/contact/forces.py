@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 
@@ -35,3 +35,18 @@ class WallForces:
     touching: np.ndarray
     places: np.ndarray
     friction: float = 0.0
+
+    @classmethod
+    def none(cls, walls: int) -> Self:
+        """No contact, for all steps without: its sums cannot be written to."""
+        none = cls(
+            np.zeros((walls, 3)),
+            np.zeros(walls, dtype=np.int64),
+            np.zeros((walls, 3)),
+            np.empty(0, dtype=np.int64),
+            np.empty((0, walls), dtype=bool),
+            np.empty((0, 3)),
+        )
+        for name in none.sums:
+            getattr(none, name).flags.writeable = False
+        return none

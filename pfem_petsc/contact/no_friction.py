@@ -15,13 +15,13 @@ __all__ = ["NoStepFriction"]
 
 
 class NoStepFriction:
-    """Stands for :class:`~pfem_petsc.contact.implicit_friction.StepFriction` where no wall has friction; see there."""
+    """Null object for :class:`~pfem_petsc.contact.implicit_friction.StepFriction` if no wall has friction."""
 
     def __init__(self, model: Model, state: State, balance: Balance) -> None:
         self.unsettled = np.empty(0, dtype=np.int64)
 
     def apply(self, frames: NodalFrames, x: np.ndarray) -> None:
-        """Nothing sticks or slips."""
+        """Do nothing: no node sticks or slips."""
 
     def check(
         self,
@@ -32,17 +32,17 @@ class NoStepFriction:
         noise: float,
         tolerance: float,
     ) -> np.ndarray:
-        """Normal forces as they are."""
+        """Return the normal forces unchanged."""
         return strengths
 
     def jams(self, nodes: np.ndarray, x: np.ndarray, displacements: np.ndarray) -> list[str]:
-        """Nothing jams."""
+        """No walls jam."""
         return []
 
     def relax(self) -> bool:
-        """There is nothing to ask less of."""
+        """No friction can be relaxed."""
         return False
 
     def add(self, force: np.ndarray, nodes: np.ndarray, x: np.ndarray) -> float:
-        """No energy."""
+        """Add no force; friction takes no energy."""
         return 0.0

@@ -91,7 +91,7 @@ class ContactPairs:
         time: float,
         tolerance: float,
     ) -> None:
-        """Part the pairs that free positions, predictor + u, break; walls have their turn after them. Collective.
+        """Separate the pairs that the free positions, predictor + u, violate; walls follow. Collective.
 
         Parameters
         ----------
@@ -124,7 +124,7 @@ class ContactPairs:
         return bool(self.mesh.comm.allreduce(bool(self.force.any()), op=MPI.LOR))
 
     def release(self) -> None:
-        """No pair presses."""
+        """Set all forces to zero."""
         self.force = np.zeros(len(self.table))
 
     def part(
@@ -188,7 +188,7 @@ class ContactPairs:
         return 1.0 / np.maximum(gives, 1e-300)
 
     def keep(self, values: np.ndarray, of_pairs: np.ndarray) -> None:
-        """Put values (p,) of pressed pairs into those of owned nodes (owned,), at the second ends."""
+        """Write values (p,) of pairs in contact into those of owned nodes (owned,), at the second ends."""
         here = self.mine[1] & (self.force > 0.0)
         values[self.local[1, here]] = of_pairs[here]
 
@@ -217,7 +217,7 @@ class ContactPairs:
         return dict(zip(self.names, sums, strict=True))
 
     def kept(self) -> dict[str, np.ndarray]:
-        """What a checkpoint keeps of pairs, at their second nodes: name to (owned, tables)."""
+        """The state of pairs for a checkpoint, at their second nodes: name to (owned, tables)."""
         at, found = self.mine[1], {}
         for name, values in (("pairs.force", self.force), ("pairs.closed", self.closed.astype(np.uint8))):
             found[name] = np.zeros((self.mesh.n_owned, len(self.names)), dtype=values.dtype)
@@ -225,7 +225,7 @@ class ContactPairs:
         return found
 
     def load_state(self, name: str, values: np.ndarray) -> None:
-        """Take back what :meth:`kept` gave. Collective."""
+        """Restore what :meth:`kept` returned. Collective."""
         of_pairs = self.gather(values)[1, np.arange(len(self.table)), self.table]
         if name == "pairs.force":
             self.force = of_pairs

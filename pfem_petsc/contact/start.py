@@ -31,7 +31,7 @@ def adjust_start(case: Case, nodes: dict[str, np.ndarray], mesh: DistributedMesh
     InputError
         On all ranks: walls that leave a node no room, or a bar that loses its length.
     """
-    # where nodes come from, and what they do there, is no matter yet
+    # neither the path of the nodes nor what they do at the wall matters here
     plain = {"friction": 0.0, "static_friction": None, "restitution": 0.0, "tied": False}
     walls = [wall.model_copy(update=plain) for wall in case.wall if wall.adjust]
     if not walls:

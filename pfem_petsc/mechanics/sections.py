@@ -1,4 +1,4 @@
-"""Which section each bar of a mesh has."""
+"""The section of each bar of a mesh."""
 
 from __future__ import annotations
 

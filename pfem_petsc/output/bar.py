@@ -56,5 +56,5 @@ class ProgressBar:
         self._bar.console.print(text, style=style, markup=False, highlight=False)
 
     def stop(self) -> None:
-        """Leave the bar as it is on the terminal."""
+        """End the bar; its last state remains on the terminal."""
         self._bar.stop()

@@ -1,4 +1,4 @@
-"""Checkpoints are read back bit for bit on any number of ranks; :mod:`.checkpoint_writer` writes them."""
+"""Reading checkpoints, bit for bit and on any number of ranks; :mod:`.checkpoint_writer` writes them."""
 
 from __future__ import annotations
 
@@ -30,14 +30,14 @@ _ATTEMPTS = 20  # to catch a file between two replacements
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """What a checkpoint holds.
+    """Contents of a checkpoint.
 
     Attributes
     ----------
     path : Path
     arrays : dict of name to this rank's owned rows (n_owned, ...), in the types they were written with
     scalars : dict
-        As it was written; float64 to the last bit.
+        As written; float64 to the last bit.
     attributes : dict
     """
 
@@ -48,10 +48,10 @@ class Checkpoint:
 
 
 class OpenCheckpoint:
-    """A checkpoint opened for reading: the same file on all ranks, and the same from its header to its last array.
+    """A checkpoint opened for reading: one file on all ranks, which does not change between header and last array.
 
-    Every rank opens the file once and reads it through that descriptor, whatever takes its name meanwhile, as when the
-    run that writes it goes on. Construction is collective.
+    Every rank opens the file once and reads it through that descriptor, even if the run that writes checkpoints goes on
+    and replaces it. Construction is collective.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ class OpenCheckpoint:
         self.scalars, self.attributes = on_root(comm, self._header)
 
     def close(self) -> None:
-        """Close the file; again: nothing."""
+        """Close the file; a second call does nothing."""
         raw, self._raw = self._raw, None
         if raw is not None:
             raw.close()
@@ -144,7 +144,7 @@ class OpenCheckpoint:
 
 
 def read_checkpoint(path: Path | str, comm: MPI.Comm, orders: Mapping[str, NaturalOrder]) -> Checkpoint:
-    """Open, read and close a checkpoint, see :class:`OpenCheckpoint`. Collective."""
+    """Open, read and close a checkpoint; see :class:`OpenCheckpoint`. Collective."""
     file = OpenCheckpoint(path, comm)
     try:
         return file.read(orders)
@@ -160,7 +160,7 @@ def read_checkpoint_header(path: Path | str, comm: MPI.Comm) -> tuple[dict[str, 
 
 
 def newest_checkpoint(folder: Path | str) -> Path | None:
-    """The newest checkpoint of an output folder, None where there is none. On one rank."""
+    """The newest checkpoint of an output folder, or None. On one rank."""
     for name in (NAME, PREVIOUS):
         if (Path(folder) / name).is_file():
             return Path(folder) / name

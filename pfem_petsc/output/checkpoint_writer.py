@@ -1,4 +1,4 @@
-"""Checkpoints are written in the mesh's own numbering, so that at any moment there is a complete one."""
+"""Writing checkpoints, in the mesh's own numbering: a complete one exists at any moment."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def write_checkpoint(
 ) -> None:
     """Write a checkpoint so that at any moment there is a complete one.
 
-    It is written under a temporary name, brought onto the disk, and renamed; the one before stays as
+    It is written under a temporary name, flushed to the disk, and renamed; the one before remains as
     ``checkpoint-previous.h5``. Collective.
 
     Parameters
@@ -52,7 +52,7 @@ def write_checkpoint(
     """
     require_parallel_hdf5(comm)
     path = Path(path)
-    # by name: what contact remembers may have come in another order on another rank
+    # by name: the memory of contact may be in another order on another rank
     slabs = {name: arrays[name][0].to_slab(np.asarray(arrays[name][1])) for name in sorted(arrays)}
     shapes = {name: ((arrays[name][0].n_global, *slab.shape[1:]), slab.dtype) for name, slab in slabs.items()}
     n_bytes = sum(dtype.itemsize * int(np.prod(shape, dtype=np.int64)) for shape, dtype in shapes.values())

@@ -1,4 +1,4 @@
-"""The mesh of a result file: nodes at the ends of each bar, written once."""
+"""The mesh in a result file: the two nodes of each bar, written once."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The disk under the output: room for the next write, and files brought onto it."""
+"""Free space for the next write, and files flushed to the disk."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ __all__ = ["fsync_all", "require_room"]
 
 
 def require_room(comm: MPI.Comm, path: Path, n_bytes: int, target: Path | None = None) -> None:
-    """Stop before a write that would not fit, while the file is whole: a disk that runs full inside HDF5 may damage it.
+    """Stop before a write that does not fit, while the file is intact: a disk that fills up within HDF5 may damage it.
 
-    Collective; the numbers of rank 0 count.
+    Rank 0 decides. Collective.
 
     Raises
     ------
@@ -46,7 +46,7 @@ def require_room(comm: MPI.Comm, path: Path, n_bytes: int, target: Path | None =
 
 
 def fsync_all(path: Path) -> None:
-    """Bring a file, or the entries of a folder, onto the disk."""
+    """Flush a file, or the entries of a folder, to the disk."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)

@@ -1,4 +1,4 @@
-"""HDF5 as all writers here use it: growing datasets, rows written by all ranks together, errors that reach the user."""
+"""HDF5 for all writers: datasets that grow, rows written by all ranks together, errors turned into messages."""
 
 from __future__ import annotations
 
@@ -75,10 +75,10 @@ def create_new(
     userblock_size: int = 0,
     checked: bool = False,
 ) -> Path:
-    """Make an HDF5 file with its whole structure on rank 0, under a temporary name, which is given back.
+    """Make an HDF5 file with its whole structure on rank 0 and return its temporary name.
 
-    ``build(file, *arguments)`` fills it; the first ``userblock_size`` bytes are left to the caller; a ``checked`` file
-    is in the formats in which HDF5 keeps checksums of all but the values. Serial creation
+    ``build(file, *arguments)`` fills it; the first ``userblock_size`` bytes belong to the caller; a ``checked`` file
+    has the formats in which HDF5 keeps checksums of everything but the values. Serial creation
     makes the structure the same for any number of ranks, and an unwritable folder the same error on all of them.
     Collective.
 
@@ -120,24 +120,24 @@ def create_new(
 
 
 def create_checked(path: Path, build: Callable[..., None], *arguments: Any) -> None:
-    """Make a file in which HDF5 keeps checksums of all but the values, and fill it: ``build(file, *arguments)``."""
+    """Make a file in which HDF5 keeps checksums of everything but the values; ``build(file, *arguments)`` fills it."""
     h5py.File(path, "w", locking=False, libver=SUPERBLOCK).close()
     with h5py.File(path, "r+", locking=False, libver=OBJECTS) as file:
         build(file, *arguments)
 
 
 def open_shared(path: Path, comm: MPI.Comm) -> h5py.File:
-    """Open an existing file for writing on all ranks; on one rank without locking, so that others may read it."""
+    """Open an existing file for writing on all ranks; on one rank without a lock, so that others can read it."""
     if comm.size == 1:
         return h5py.File(path, "r+", locking=False, rdcc_nbytes=CHUNK_CACHE, libver=OBJECTS)
     return h5py.File(path, "r+", driver="mpio", comm=comm, libver=OBJECTS)
 
 
 def chunk_rows(n_rows: int, row_bytes: int) -> int:
-    """Rows a chunk for blocks of ``n_rows`` rows: whole blocks up to 1 MiB, even parts of a block beyond.
+    """Number of rows per chunk for blocks of ``n_rows`` rows: whole blocks up to 1 MiB, equal parts of larger blocks.
 
     Depends on the global size only, so that files from any number of ranks have the same chunks. A chunk that divides
-    the block is preferred, for then no chunk holds rows of two snapshots.
+    the block is preferred, because then no chunk holds rows of two snapshots.
     """
     most = max(1, CHUNK_BYTES // row_bytes)
     if n_rows <= most:
@@ -152,7 +152,7 @@ def chunk_rows(n_rows: int, row_bytes: int) -> int:
 def create_growing(
     group: h5py.Group, name: str, row_shape: tuple[int, ...], dtype: np.dtype | type, rows_per_chunk: int
 ) -> h5py.Dataset:
-    """An empty dataset (0, *row_shape) that grows by rows; parents are made. Collective where the file is."""
+    """Create an empty dataset (0, *row_shape) that grows by rows, and its parents. Collective where the file is."""
     shape = (0, *row_shape)
     space = h5py.h5s.create_simple(shape, (h5py.h5s.UNLIMITED, *row_shape))
     properties = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
@@ -181,7 +181,7 @@ def dataset_names(group: h5py.Group) -> list[str]:
 
 
 def write_rows(dataset: h5py.Dataset, first: int, rows: np.ndarray | None, collective: bool = False) -> None:
-    """Write rows (n, ...) from row ``first`` on; None or no rows: take part in a collective transfer with nothing."""
+    """Write rows (n, ...) from row ``first`` on; None or no rows: join a collective transfer without data."""
     transfer = h5py.h5p.create(h5py.h5p.DATASET_XFER)
     if collective:
         transfer.set_dxpl_mpio(h5py.h5fd.MPIO_COLLECTIVE)
@@ -209,17 +209,17 @@ def set_text(group: h5py.Group, name: str, text: str) -> None:
 
 
 def set_unit(dataset: h5py.Dataset, unit: str) -> None:
-    """The attribute ``unit`` of a field or history column: "m/s", or "1" for a pure number. Collective."""
+    """Set the attribute ``unit`` of a field or history column: "m/s", or "1" for a pure number. Collective."""
     raw = (unit or "1").encode()
     dataset.attrs.create("unit", raw, dtype=h5py.string_dtype("utf-8", len(raw)))
 
 
 @contextmanager
 def writing(comm: MPI.Comm, path: Path) -> Iterator[None]:
-    """Around one operation of all ranks on an HDF5 file: an error on any becomes a SimulationFailure on all.
+    """Context of one HDF5 operation of all ranks: an error on any rank becomes a SimulationFailure on all.
 
-    When an operation fails on one rank, HDF5 may keep the others waiting in it for ever. So the rank that failed waits
-    for their agreement a few seconds only, and then raises alone; whoever catches that ends the job. Collective.
+    When an operation fails on one rank, the others may wait in HDF5 for ever. So the rank that failed waits for them a
+    few seconds only and then raises the error alone; whoever catches it must end the job. Collective.
     """
     failure: SimulationFailure | None = None
     try:
@@ -249,10 +249,10 @@ def writing(comm: MPI.Comm, path: Path) -> Iterator[None]:
 
 
 def release(file: h5py.File, comm: MPI.Comm) -> None:
-    """Let go of a file that can no longer be written.
+    """Abandon a file that can no longer be written.
 
-    HDF5 1.10 and later crash in a close, or at the end of the process, that cannot write what they still hold. So one
-    process lets them write it to memory. Several leave the file open: closing it together might never end.
+    HDF5 1.10 and later crash when a close, or the end of the process, cannot write what is still in memory. So a single
+    process redirects these writes to memory. Several ranks leave the file open: closing it together might never end.
     """
     if comm.size == 1 and file.id.valid:
         nowhere = os.memfd_create("released")
@@ -262,5 +262,5 @@ def release(file: h5py.File, comm: MPI.Comm) -> None:
 
 
 def first_line(error: BaseException) -> str:
-    """What an error says, without the details HDF5 adds; its type where it says nothing."""
+    """First line of an error message, without the details that HDF5 adds; its type if the message is empty."""
     return str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__

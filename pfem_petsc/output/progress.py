@@ -1,4 +1,4 @@
-"""What a run says while it goes: a summary, a bar or lines, messages, and the same in ``log.txt``."""
+"""The report of a run in progress: a summary, a bar or lines, messages, and the same in ``log.txt``."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ class Progress:
 
     On a terminal a bar is drawn; elsewhere (files, pipes, under ``mpirun``) a line is printed after 2 s and then at
     intervals that stretch to 10 s. ``log.txt`` gets the lines in any case, each with date and level; an existing log
-    is continued.  Between two reports :meth:`update` costs a few additions and one look at the clock.
+    is continued. Between two reports :meth:`update` costs a few additions and one look at the clock.
 
-    A log that cannot be opened at the start is an :class:`~pfem_petsc.errors.InputError` on all ranks (the
-    constructor is collective); for one that is lost on the way see :class:`~pfem_petsc.output.log.LogFile`. A reader
-    of stdout that goes away (``| head``) is noted in the log, and the run goes on.
+    A log that cannot be opened at the start is an :class:`~pfem_petsc.errors.InputError` on all ranks (the constructor
+    is collective); for one that is lost during the run see :class:`~pfem_petsc.output.log.LogFile`. If the reader of
+    stdout goes away (``| head``), the log records it and the run goes on.
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ class Progress:
         contacts: int = 0,
         energy_drift: float | None = None,
     ) -> None:
-        """Take note of a finished step; report it when a report is due.
+        """Record a finished step; report it when a report is due.
 
         Parameters
         ----------
@@ -135,7 +135,7 @@ class Progress:
             self._report(now)
 
     def compiled(self, seconds: float) -> None:
-        """Leave this time out of rates and of the time that remains: the run does not spend it again [s]."""
+        """Exclude this time [s] from rates and from the remaining time: the run does not spend it again."""
         self._compiling += seconds
         self._marked = (self._marked[0] + seconds, *self._marked[1:])
 
@@ -201,7 +201,7 @@ class Progress:
         self._due = self._next_line if self._bar is None else min(self._next_line, now + BAR_REFRESH)
 
     def _measure(self, now: float) -> float:
-        """Update the smoothed rates from the last line on; give the remaining wall time [s] (inf where unknown)."""
+        """Update the smoothed rates since the last line and return the remaining wall time [s] (inf if unknown)."""
         wall = now - self._marked[0]
         step, time, *_ = self._last
         if wall > 0 and step > self._marked[1]:
@@ -223,7 +223,7 @@ class Progress:
         return min(1.0, time / self._end_time) if self._end_time > 0 else 1.0
 
     def _counters(self) -> list[str]:
-        """Iterations a step since the last line, contacts and drift; what does not occur is left out."""
+        """Iterations per step since the last line, contacts and drift; what does not occur is left out."""
         step, _, _, contacts, drift = self._last
         steps = max(1, step - self._marked[1])
         newton, linear = self._newton - self._marked[3], self._linear - self._marked[4]
@@ -253,7 +253,7 @@ class Progress:
             self._let_go_of_stdout()
 
     def _write(self, text: str, level: str = "INFO") -> None:
-        """A line on stdout (above the bar, where there is one) and in the log."""
+        """Write a line to stdout (above the bar, if there is one) and to the log."""
         self._log_line(text, level)
         if self._stream is None:
             return
@@ -266,7 +266,7 @@ class Progress:
             self._let_go_of_stdout()
 
     def _let_go_of_stdout(self) -> None:
-        """The reader, or the terminal, has gone, or the disk behind is full."""
+        """Stop writing to stdout: its reader or terminal has gone, or its disk is full."""
         if self._stream is sys.stdout:
             # what Python itself flushes at exit must find an open end
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

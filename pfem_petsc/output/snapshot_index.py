@@ -1,4 +1,4 @@
-"""What a result file has one row of for each snapshot besides points and fields: offsets, step, time, digests."""
+"""One row per snapshot in a result file, besides points and fields: offsets, step, time, digests."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class SnapshotIndex:
         self._digests = file[CHECKS]["snapshots"] if steps.attrs["NSteps"] else None
 
     def create_checks(self) -> None:
-        """Make the digests' dataset, once the fields exist. Collective."""
+        """Create the dataset of digests, once the fields exist. Collective."""
         self._digests = create_snapshot_checks(self._file)
 
     def append(self, n: int, step: int, time: float, digests: np.ndarray) -> None:
@@ -69,7 +69,7 @@ class SnapshotIndex:
                 write_rows(self._digests, n, np.concatenate([mark, digests])[None])
 
     def publish(self, n: int, time: float) -> None:
-        """Count snapshot n, whose data are on the disk, and then give its time [s], in this order. Collective."""
+        """Count snapshot n, whose data are already flushed, and then write its time [s]. Collective."""
         with writing(self.comm, self.path):
             self._n_steps.write(np.array(n + 1, dtype=np.int64))
             self._file.flush()

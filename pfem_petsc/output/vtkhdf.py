@@ -142,7 +142,7 @@ class ResultWriter:
         point_data: Mapping[str, np.ndarray],
         cell_data: Mapping[str, np.ndarray],
     ) -> None:
-        """Append a snapshot, and the history rows so far.
+        """Append a snapshot, and the history rows that are in memory. Collective.
 
         Parameters
         ----------
@@ -195,7 +195,7 @@ class ResultWriter:
         self.n_snapshots = n + 1
 
     def append_history(self, row: Mapping[str, Any] | None) -> None:
-        """Add a row: rank 0 gives a value for each column, the others None. To be called on all ranks.
+        """Add a row: rank 0 passes a value for each column, the other ranks None. Collective.
 
         Rows are kept in memory until a snapshot, :meth:`flush_history`, :meth:`close`, or a thousand of them.
         """
@@ -219,7 +219,7 @@ class ResultWriter:
             self._publish()
 
     def close(self) -> None:
-        """Write what is in memory and close the file; again: nothing. Collective."""
+        """Write what is in memory and close the file; a second call does nothing. Collective."""
         if self._file is None:
             return
         try:
@@ -260,9 +260,9 @@ class ResultWriter:
             raise
 
     def _publish(self) -> None:
-        """Give the file its own name, the first time: a kill before may leave one that HDF5 cannot open.
+        """Rename the file to its final name at the first flush: HDF5 may be unable to open what a kill before leaves.
 
-        The first flush puts down links to new objects before the superblock that says how far the file reaches.
+        The first flush writes links to new objects before the superblock, which contains the end of the file.
         """
         if self._unpublished is None:
             return

@@ -1,4 +1,4 @@
-"""When an implicit step has converged, and the message about one that has not."""
+"""Tolerance of the residual of an implicit step, and the message about a step that does not converge."""
 
 from __future__ import annotations
 

@@ -12,7 +12,8 @@ from ..errors import SimulationFailure
 from ..integrators.base import Balance
 from ..tolerances import PROJECTED
 from .node_loops import explicit_increments, hold, react
-from .stepper import Solution, Stepper
+from .solution import Solution
+from .stepper import Stepper
 
 if TYPE_CHECKING:
     from ..integrators.base import Scheme

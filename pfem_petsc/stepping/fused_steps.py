@@ -14,7 +14,7 @@ from ..output.sums import HEAD, WALL
 from ..tolerances import PROJECTED
 from .fused_arrays import BarArrays, Buffers, ImpulseArrays, NodeArrays, ProbeArrays, WallArrays
 from .fused_loop import make_fused_loop
-from .stepper import Solution
+from .solution import Solution
 
 if TYPE_CHECKING:
     from ..recording.history import History

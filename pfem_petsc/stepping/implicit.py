@@ -1,4 +1,4 @@
-"""Steps that need a system solved: implicit schemes, and explicit ones with consistent mass."""
+"""Steps that solve a system of equations: implicit schemes, and explicit schemes with consistent mass."""
 
 from __future__ import annotations
 
@@ -25,20 +25,21 @@ from ..tolerances import ON_BOUND
 from .convergence import failure_message, residual_tolerance
 from .guard import StepGuard
 from .problem import StepProblem
-from .stepper import Solution, Stepper
+from .solution import Solution
+from .stepper import Stepper
 
 if TYPE_CHECKING:
     from ..integrators.base import Scheme
     from .model import Model
 
-# What PETSc holds when it is finalised, after Python, cannot call Python any more: matrices and preconditioners of
-# ours that wait in cycles of references are let go before.
+# PETSc is finalised after Python and cannot call it any more, so matrices and preconditioners written in Python that
+# wait in reference cycles are freed before.
 atexit.register(gc.collect)
 
 __all__ = ["ImplicitStepper"]
 
 _HALVINGS = 10  # most halvings of a step: to 1/1024
-_WAY_OUT = "Reduce time.step; if such jumps are intended, set solver.guard = false"
+_REMEDY = "Reduce time.step; if such jumps are intended, set solver.guard = false"
 
 
 class ImplicitStepper(Stepper):
@@ -77,7 +78,7 @@ class ImplicitStepper(Stepper):
         self._mass: MassSolver | None = None
 
     def step(self) -> None:
-        """Advance by one step; where it does not converge, in halves of halves, which grow back step by step.
+        """Advance by one step; a part that does not converge is bisected, and parts grow again from step to step.
 
         Raises
         ------
@@ -174,7 +175,7 @@ class ImplicitStepper(Stepper):
             if self.guard is not None and balance.weight:
                 reason = self._suspicion(balance, solution)
                 if reason is not None:
-                    raise NotConverged(f"{self.when(balance)}: {reason}. {_WAY_OUT}")
+                    raise NotConverged(f"{self.when(balance)}: {reason}. {_REMEDY}")
         except NotConverged:
             state.contact, state.support, self.held, forces = kept
             links.restore(forces)
@@ -182,7 +183,7 @@ class ImplicitStepper(Stepper):
         return solution
 
     def _suspicion(self, balance: Balance, solution: Solution) -> str | None:
-        """What the guard finds wrong with a solution, None for nothing. Collective."""
+        """Why the guard rejects a solution, None if it does not. Collective."""
         state, model = self.state, self.model
         owned, h = model.mesh.n_owned, balance.time - state.time
         self._after[:owned] = balance.predictor + solution.u
@@ -257,7 +258,7 @@ class ImplicitStepper(Stepper):
         return Solution(u, internal, walls, newton, linear, len(held))
 
     def _keep_momentum(self, problem: StepProblem, u: np.ndarray, g: np.ndarray) -> None:
-        """Take the net force that the solver has left from a free truss, by a translation, which strains no bar.
+        """Remove the net residual of a free truss by a translation, which strains no bar.
 
         An iterative solution leaves a residual within the tolerance, whose sum would be a drift of linear momentum.
         """
@@ -267,7 +268,7 @@ class ImplicitStepper(Stepper):
         g -= problem.nodal[:, None] * shift
 
     def _guess(self, balance: Balance) -> np.ndarray:
-        """The acceleration goes on as it was; prescribed components where they will be."""
+        """Increments for an unchanged acceleration; prescribed components at their exact positions."""
         guess = self.state.a / balance.alpha
         supports = self.model.supports
         if supports.any:
@@ -277,9 +278,9 @@ class ImplicitStepper(Stepper):
 
 
 def _free_left_over(comm: MPI.Comm) -> None:
-    """Free what PETSc holds of earlier steppers that nobody has destroyed. Collective.
+    """Free the PETSc objects of earlier steppers that were not destroyed. Collective.
 
-    Python drops objects whenever it likes, which PETSc, whose objects belong to all ranks, only puts aside.
+    Python collects objects at any time; PETSc, whose objects belong to all ranks, only puts them aside then.
     """
     gc.collect()
     if hasattr(PETSc, "garbage_cleanup"):

@@ -9,7 +9,8 @@ import numpy as np
 from ..errors import SimulationFailure
 from ..integrators.base import Balance
 from ..tolerances import BEYOND
-from .stepper import Solution, Stepper
+from .solution import Solution
+from .stepper import Stepper
 
 if TYPE_CHECKING:
     from ..integrators.base import Scheme

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..contact.alarm import CarriedNodes
-from ..contact.forces import WallForces
 from ..contact.initial_equilibrium import start_at_rest
 from ..errors import SimulationFailure
 from ..integrators.base import Balance, Scheme, State
@@ -19,32 +17,12 @@ from ..tolerances import BEYOND
 from .collapse import tell_collapse
 from .massless import MasslessNodes
 from .prescribed import PrescribedMotion
+from .solution import Solution
 
 if TYPE_CHECKING:
     from .model import Model
 
-__all__ = ["Solution", "Stepper"]
-
-
-@dataclass
-class Solution:
-    """The solve of one balance.
-
-    Attributes
-    ----------
-    u : (owned, 3) increment from the predictor [m]
-    internal : (local, 3) internal force in the balance [N]
-    walls : forces per wall, this rank's share
-    newton, linear : iterations
-    contacts : this rank's nodes held by walls
-    """
-
-    u: np.ndarray
-    internal: np.ndarray
-    walls: WallForces
-    newton: int = 0
-    linear: int = 0
-    contacts: int = 0
+__all__ = ["Stepper"]
 
 
 class Stepper(ABC):

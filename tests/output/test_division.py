@@ -7,11 +7,11 @@ import sys
 import h5py
 import numpy as np
 import pytest
+from helpers.grids import assert_history_is
 from helpers.launch import environment
 from helpers.truss import Truss, options, write
 from mpi4py import MPI
 from test_interrupted import HERE, READER
-from test_vtkhdf import assert_history_is
 
 import pfem_petsc.output.vtkhdf as vtkhdf
 from pfem_petsc.output.hdf5 import OBJECTS

@@ -9,10 +9,10 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from helpers.grids import assert_grid_is, assert_history_is, read_with_vtk
 from helpers.launch import environment
 from helpers.truss import Truss, options, write
 from mpi4py import MPI
-from test_vtkhdf import assert_grid_is, assert_history_is, read_with_vtk
 
 from pfem_petsc.errors import InputError, SimulationFailure
 from pfem_petsc.output.repair import repair
@@ -42,7 +42,7 @@ READER = """
 import sys
 sys.path[:0] = sys.argv[1].split(':')
 from mpi4py import MPI
-from test_vtkhdf import assert_grid_is, read_with_vtk
+from helpers.grids import assert_grid_is, read_with_vtk
 from helpers.truss import Truss
 truss = Truss(MPI.COMM_SELF, n_nodes=400, n_bars=900)
 for path in sys.argv[2:]:

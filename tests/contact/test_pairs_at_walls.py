@@ -1,0 +1,106 @@
+"""Contact pairs whose nodes walls stop as well."""
+
+import numpy as np
+import pytest
+from helpers.bodies import two_lattices
+from helpers.lattices import planes, rotation, simulation
+from helpers.rods_that_meet import two_rods
+
+from pfem_petsc.solvers.linear import LinearChoice
+from pfem_petsc.stepping.implicit import ImplicitStepper
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize(
+    "solver", [{"operator": "matrix_free"}, {"linear": "gamg"}, {"linear": "gamg", "operator": "matrix_free"}], ids=str
+)
+def test_lattices_in_a_wedge(solver, comm, shared_tmp_path):
+    """Walls that stop every node, those of pairs as well, against a direct solution in another frame."""
+    turn, found = rotation(6), []
+    for k, (frame, keys) in enumerate([(np.eye(3), {"linear": "mumps"}), (turn, solver)]):
+        options = {"turn": frame, "step": 1e-3, "end": 0.04, "solver": {"rtol": 1e-12, **keys}}
+        case = two_lattices(shared_tmp_path / f"{k}.vtu", "newmark", **options)
+        case["wall"] = planes(np.array([[0.0, 0.3, 1.0], [0.1, 1.0, -0.2]]) @ frame.T, [-0.002, -0.04])
+        run = simulation(case, comm, shared_tmp_path, f"r{k}")
+        rows = [step.row for step in run]
+        assert max(abs(row["energy_imbalance"]) for row in rows) < 1e-10
+        names = ["pair/faces/force", "wall/wall1/force", "wall/wall2/force"]
+        forces = np.array([[row[name] for name in names] for row in rows]) @ frame
+        assert (np.abs(forces).max(axis=2) > 0.0).all(axis=1).any()  # at once
+        found.append((forces, run.gather(run.state.position)))
+    np.testing.assert_allclose(found[1][0], found[0][0], atol=1e-8 * np.abs(found[0][0]).max())
+    if comm.rank == 0:
+        np.testing.assert_allclose(found[1][1] @ turn, found[0][1], atol=1e-10)
+
+
+@pytest.mark.parametrize("linear", ["mumps", "gamg"])
+def test_a_wall_while_pairs_are_apart(linear, comm, shared_tmp_path):
+    """The first rod springs back to a wall behind it, with the second one far away: few iterations, as for the pair."""
+    found = []
+    for name in ("cg", linear):
+        case = two_rods("newmark", linear=name)
+        case["node_set"]["back"] = {"nearest": [0.0, 0, 0]}
+        case["wall"] = [
+            {"name": "back", "type": "plane", "point": [-0.02, 0, 0], "normal": [1.0, 0, 0], "node_set": "back"}
+        ]
+        run = simulation(case, comm, shared_tmp_path, name)
+        rows = [step.row for step in run]
+        apart = [row for row in rows if row["wall/back/force"][0] > 0.0 and row["time"] > 3.0]
+        assert len(apart) > 5 and all(row["pair/faces/force"][0] == 0.0 for row in apart)
+        assert max(row["newton_iterations"] for row in apart) <= 4
+        found.append(run.gather(run.state.position))
+    np.testing.assert_allclose(found[1], found[0], atol=1e-10)
+
+
+WALLS = {
+    "no walls": [],
+    "floor": planes([[0.0, 0.0, 1.0]], [-0.001]),
+    "oblique wall": planes([[0.1, -0.4, 1.0]], [-0.076]),
+    "wedge": planes([[0.0, 0.3, 1.0], [0.1, 1.0, -0.2]], [-0.002, -0.04]),
+    "wall across": [
+        {"type": "plane", "point": [0.09, 0, 0], "normal": [1.0, 0.1, 0.0], "node_set": "left", "velocity": [2.0, 0, 0]}
+    ],
+}
+
+
+@pytest.mark.parametrize("supported", [False, True], ids=["free", "supported"])
+@pytest.mark.parametrize("name", WALLS)
+def test_explicit_steps_solve_the_variational_inequality(name, supported, comm, shared_tmp_path):
+    """Also where walls stop the nodes of pairs: two methods that share nothing, one answer."""
+    supports = [{"node_set": "held", "fix": "y"}, {"node_set": "hinged", "fix": "xz"}] if supported else []
+    options = {"solver": {"rtol": 1e-13}, "supports": supports}
+    case = two_lattices(shared_tmp_path / "m.vtu", "central_differences", **options)
+    case["wall"] = WALLS[name]
+    run = simulation(case, comm, shared_tmp_path)
+    explicit, pairs = run.stepper, run.model.pairs
+    implicit = ImplicitStepper(run.model, explicit.scheme, explicit.h, LinearChoice("preonly", "lu", "test"))
+    implicit.state = run.model.contact.state = explicit.state
+    solve, worst, pressed, crowded = explicit.solve, [], [], []
+
+    def both(balance):
+        kept = explicit.state.contact
+        other = implicit.solve(balance)
+        forces, supported = pairs.force, explicit.state.support
+        explicit.state.contact = kept
+        solution = solve(balance)
+        scale = np.abs(pairs.force).max()
+        worst.append(np.abs(solution.u - other.u).max(initial=0.0))
+        if scale:
+            assert np.abs(forces - pairs.force).max() < 1e-8 * scale
+            np.testing.assert_allclose(explicit.state.support, supported, atol=1e-8 * scale)
+        held = np.intersect1d(pairs.pressed()[0], solution.walls.nodes[solution.walls.touching.any(axis=1)])
+        crowded.append(comm.allreduce(len(held)))
+        pressed.append(int((pairs.force > 0.0).sum()))
+        return solution
+
+    explicit.solve = both
+    assert run.run() == 0
+    implicit.destroy()
+    assert max(pressed) > 8 and max(worst) < 1e-13
+    assert name == "no walls" or max(crowded) > 0
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("name", ["no walls", "wedge"])
+def test_explicit_steps_on_ranks(name, comm, shared_tmp_path):
+    test_explicit_steps_solve_the_variational_inequality(name, True, comm, shared_tmp_path)

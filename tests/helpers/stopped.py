@@ -1,0 +1,96 @@
+"""Cases that are stopped at a step and continued."""
+
+import pytest
+
+from pfem_petsc import Case, Simulation
+from pfem_petsc.errors import EarlyStop
+
+SHORT = ("time.end=1.6", "output.fields_every=7")
+LATTICE = ("mesh.cells=[3,3,3]", "time.end=1.2e-4", "time.step=1e-6")
+TWO_RODS = (
+    "mesh={generator='two_rods', length=1.0, elements=10, gap=0.05}",
+    "node_set={tip={group='first_end'}, other={group='second_start'}, target={box=[[1.04, -1, -1], [3, 1, 1]]}}",
+    "initial={velocity=[0.5, 0.0, 0.0], on=[{node_set='target', velocity=[0.0, 0.0, 0.0]}]}",
+    "wall=[]",
+    "contact_pair=[{name='faces', first='tip', second='other', direction=[1.0, 0.0, 0.0]}]",
+)
+LAGGED = ("mesh.cells=[4,4,4]", "time.end=5e-5", "time.step=1e-6")
+ROWS = "[[0, 0, 0, 0], [0.02, 1e-3, 0, 0], [0.06, 0, 0, 2e-3], [0.1, 0, 0, 0]]"
+MOVED = f"support=[{{node_set='hinge', fix='xyz', motion={ROWS}}}]"
+CASES = {
+    "central differences": ("rod_impact", SHORT),
+    "consistent mass": ("rod_impact", (*SHORT, "time.mass=consistent")),
+    "houbolt": ("rod_impact", (*SHORT, "time.integrator=houbolt")),
+    "newmark": ("rod_impact", (*SHORT, "time.integrator=newmark")),
+    "wilson": ("rod_impact", (*SHORT, "time.integrator=wilson", "time.theta=1.5")),
+    "chung_lee": ("rod_impact", (*SHORT, "time.integrator=chung_lee")),
+    "hulbert_chung": ("rod_impact", (*SHORT, "time.integrator=hulbert_chung")),
+    "souza_moura": ("rod_impact", (*SHORT, "time.integrator=souza_moura")),
+    "generalized_alpha": ("rod_impact", (*SHORT, "time.integrator=generalized_alpha")),
+    "lagged multigrid": (
+        "lattice_drop",
+        (*LAGGED, "time.integrator=newmark", "solver.linear=gamg", "solver.operator=matrix_free"),
+    ),
+    "lagged multigrid, assembled": (
+        "lattice_drop",
+        (*LAGGED, "time.integrator=energy_momentum", "solver.linear=gamg"),
+    ),
+    "lagged factorisation": (
+        "rod_impact",
+        (*SHORT, "time.integrator=newmark", "solver.linear=mumps", "solver.operator=matrix_free"),
+    ),
+    "energy_momentum": ("rod_impact", (*SHORT, "time.integrator=energy_momentum")),
+    "stick": ("rod_impact", (*SHORT, "time.integrator=newmark", "contact.treatment=stick")),
+    "conserving": ("rod_impact", (*SHORT, "time.integrator=newmark", "contact.treatment=conserving")),
+    "mass redistribution": ("rod_impact", (*SHORT, "contact.treatment=mass_redistribution")),
+    "pairs": ("rod_impact", (*SHORT, *TWO_RODS)),
+    # MUMPS, which small models take on several ranks, repeats to rounding only
+    "pairs, implicit": ("rod_impact", (*SHORT, *TWO_RODS, "time.integrator=generalized_alpha", "solver.linear=cg")),
+    "wall with mass": ("rod_impact", (*SHORT, "wall.0.mass=0.5", "wall.0.velocity=[-0.1,0,0]")),
+    "wall with mass, implicit": (
+        "rod_impact",
+        (*SHORT, "wall.0.mass=0.5", "wall.0.velocity=[-0.1,0,0]", "time.integrator=generalized_alpha"),
+    ),
+    "sparse history": ("rod_impact", (*SHORT, "output.history_every=9")),
+    "plastic, explicit": ("bar_collision_plastic", ("time.end=8e-5",)),
+    "plastic, implicit": ("bar_collision_plastic", ("time.end=8e-5", "time.integrator=newmark")),
+    "plastic lattice": ("lattice_drop", LATTICE),
+    "supported, multistep": ("pendulum", ("time.end=0.15", "time.integrator=houbolt")),
+    "moved, explicit": ("pendulum", ("time.end=0.15", MOVED)),
+    "moved, multistep": ("pendulum", ("time.end=0.15", MOVED, "time.integrator=houbolt")),
+    "moved, beyond the step": ("pendulum", ("time.end=0.15", MOVED, "time.integrator=wilson", "time.theta=1.6")),
+    "heated": (
+        "pendulum",
+        ("time.end=0.15", "material.default.thermal_expansion=1e-5")
+        + ("temperature=[{table = [[0.0, 0.0], [0.1, 50.0]]}]", "time.integrator=newmark"),
+    ),
+}
+
+
+class Stopped(Simulation):
+    """A run that is asked to stop after a step, as by a signal."""
+
+    last = -1
+
+    def _advance(self):
+        result = super()._advance()
+        if result.step == self.last and self.comm.rank == self.comm.size - 1:
+            self._stop._signal = 15
+        return result
+
+
+def simulate(case, overrides, folder, comm, stop_after=None, **options):
+    """Run, to the end or to a stop; gives the number of the last step."""
+    simulation = Stopped(Case.load(case, overrides), comm, output=folder, quiet=True, **options)
+    if stop_after is None:
+        assert simulation.run() == 0
+    else:
+        simulation.last = stop_after
+        with pytest.raises(EarlyStop, match="SIGTERM"):
+            simulation.run()
+    return simulation.state.step
+
+
+def everywhere(comm, function, *arguments):
+    """What a function gives on rank 0."""
+    return comm.bcast(function(*arguments) if comm.rank == 0 else None)

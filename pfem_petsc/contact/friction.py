@@ -86,12 +86,12 @@ def add_friction(x, before, way, fixed, normals, offsets, dynamic, static, stiff
                         length += normals[i, k, c] * normals[i, k, c]
                 if length < 1e-12:
                     continue
-                least = min(least, length)
                 # normal
                 old = normal_forces[i, k]
                 new = max(0.0, old - gap * stiffness[i] / length)
                 if new == 0.0 and old == 0.0:
                     continue
+                least = min(least, length)
                 change = max(change, abs(new - old))
                 if part < 1.0:
                     new = old + part * (new - old)

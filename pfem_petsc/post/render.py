@@ -97,7 +97,8 @@ def render(
         style = {"bar_width": bar_width, "nodes": nodes}
         if video != "none" and len(chosen) > 1 and len(chosen) / fps < SHORT:
             slower = max(1, round(len(chosen) / 5.0))
-            note(f"the film of {len(chosen)} frames lasts {len(chosen) / fps:.1f} s; fps = {slower} makes it slower")
+            lasts = f"the film of {len(chosen)} frames lasts {len(chosen) / fps:.1f} s"
+            note(f"{lasts}; with fps = {slower} (--fps {slower}) it lasts about 5 s")
         heading = title if title is not None else (result.case.title or result.case.name)
         pictures = _draw_frames(film, _emptied(folder / "frames"), size, heading, style)
         written = []

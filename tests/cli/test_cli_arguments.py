@@ -69,7 +69,8 @@ def test_list_names_everything_on_offer(capsys):
     assert main(["list"]) == 0
     lines = capsys.readouterr().out.splitlines()
     shown = {line.split()[0]: line.split(maxsplit=1)[1:] for line in lines if line.startswith("  ")}
-    kinds = ("integrators", "mesh.generators", "contact.walls", "contact.treatments")
+    kinds = ("integrators", "mesh.generators", "contact.walls", "contact.constraints", "contact.treatments")
+    kinds += ("mechanics.materials",)
     expected = {*built_in_cases(), *(name for kind in kinds for name in choices(f"pfem_petsc.{kind}"))}
     assert set(shown) == expected
     assert all(text for text in shown.values())

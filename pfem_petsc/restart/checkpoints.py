@@ -76,7 +76,7 @@ class Checkpoints:
         write_checkpoint(self.path, self.comm, self.state.arrays(), scalars, attributes)
         self.last_step = scalars["step"]
 
-    def take_back(self, restart: Restart) -> Checkpoint:
+    def restore(self, restart: Restart) -> Checkpoint:
         """Set the stepper to a checkpoint, instead of its start; give what was read. Collective.
 
         Raises

@@ -158,7 +158,7 @@ class RunState:
         self.model.links.restore(scalars)
         self.model.contact.log.load_state(mine["contact_log"], scalars["contact_times"], stepper.touching)
 
-    def put_back_sums(
+    def load_sums(
         self, checkpoint: Checkpoint, ledger: Ledger, recorder: Recorder, blow_up: BlowUp
     ) -> dict[str, Any]:
         """Set ledger, recorder and watch, made after :meth:`put_back`; gives what is known of the last row."""

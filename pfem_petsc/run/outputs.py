@@ -94,7 +94,7 @@ class Outputs:
         checkpoints = Checkpoints(model.case, stepper, plan, folder)
         if restart is not None:
             # before anything in the folder changes: it may be refused
-            checkpoint = checkpoints.take_back(restart)
+            checkpoint = checkpoints.restore(restart)
         aside = prepare_folder(model.comm, folder, restart, plan)
         notes = [*notes, *([] if aside is None else [f"{folder}: held results, which are in {aside} now"])]
         start = analysis.state.step, analysis.state.time
@@ -113,7 +113,7 @@ class Outputs:
         if restart is not None:
             self._continues = restart.continues
             sums = history.ledger, history.recorder, history.blow_up
-            history.row = checkpoints.state.put_back_sums(checkpoint, *sums)
+            history.row = checkpoints.state.load_sums(checkpoint, *sums)
             self.snapshots.last = restart.last[0]
             history.contact_watch.start = history.recorder.start_energy
             changes = f"; changed: {'; '.join(restart.changed)}" if restart.changed else ""

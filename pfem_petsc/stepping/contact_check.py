@@ -76,17 +76,17 @@ def warn_of_gain(case: Case, step: float, across: float = np.inf) -> str:
         return (
             f"contact: wilson{f' ({named})' if named else ''} with contact and steps of {step:.2g} times the explicit "
             "limit gains energy in impacts: its first steps after a node is stopped overshoot, by more the larger the "
-            f"step, at any theta; take {_ways_out(time, asked)}"
+            f"step, at any theta; take {_remedies(time, asked)}"
         )
     return (
         f'contact: {time.integrator}{f" ({named})" if named else ""} with contact.treatment = "{asked.treatment}", '
         f'{restitution}time.mass = "{time.mass}" and steps of {step:.2g} times the explicit limit gains energy in '
         f"impacts: {size} in the worst of {PHASES} phases of a step at which a rod meets a wall; take "
-        f"{_ways_out(time, asked)}"
+        f"{_remedies(time, asked)}"
     )
 
 
-def _ways_out(time: Time, asked: Asked) -> str:
+def _remedies(time: Time, asked: Asked) -> str:
     """What else does not gain energy, nearest first: two at most."""
     parameters = time.scheme.model_dump_json()
     tries = []

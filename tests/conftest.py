@@ -140,6 +140,8 @@ def pytest_runtest_logfinish(nodeid: str, location: tuple) -> None:
         return
     # PETSc destroys collectively, Python collects whenever it likes: bring the ranks in step between tests.
     gc.collect()
+    # What is alive now is not looked at again: most of it is Numba's, and each look would take as long as a test.
+    gc.freeze()
     petsc4py = sys.modules.get("petsc4py.PETSc")
     if petsc4py is not None and hasattr(petsc4py, "garbage_cleanup"):
         petsc4py.garbage_cleanup()

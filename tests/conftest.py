@@ -29,7 +29,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:
     for _name in [name for name in os.environ if name.startswith(OF_A_LAUNCH)]:
         del os.environ[_name]
 
-# Started in the background, or under nohup, this process ignores signals, and so would the runs that tests stop by them.
+# In the background and under nohup this process ignores signals, and so would the runs that tests stop by them.
 for _number, _handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
     if signal.getsignal(_number) is signal.SIG_IGN:
         signal.signal(_number, _handler)

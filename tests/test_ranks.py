@@ -18,7 +18,8 @@ def outcome(tmp_path, on_ranks):
         (tmp_path / "conftest.py").write_text(CONFTEST.read_text().replace("FAILED: 120.0", "FAILED: 1.0"))
         (tmp_path / "pytest.ini").write_text("[pytest]\nmarkers = parallel\n")
         (tmp_path / "test_it.py").write_text(HEADER + "\n".join(lines) + "\n")
-        done = on_ranks(2, "-m", "pytest", "--color=no", "-p", "no:cacheprovider", cwd=tmp_path, timeout=300)
+        options = ["-p", "no:cacheprovider", "-o", f"pythonpath={CONFTEST.parent}"]
+        done = on_ranks(2, "-m", "pytest", "--color=no", *options, cwd=tmp_path, timeout=300)
         return done.returncode, done.stdout + done.stderr
 
     return run

@@ -29,6 +29,7 @@ def test_case_file_is_the_built_in_one(tmp_path):
     assert shown.to_toml() == built_in.to_toml()
 
 
+@pytest.mark.slow
 def test_python_example_runs(tmp_path):
     (code,) = blocks("python")
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}

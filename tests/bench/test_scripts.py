@@ -38,6 +38,7 @@ def test_peers_lattice_is_the_generators():
     assert len(bars) == len(slab.bars)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["explicit", "explicit_contact"])
 def test_bare_loop_moves_as_the_program_does(mode):
     ours, bare = (driver(name, 4, mode, 60) for name in ("run_ours.py", "run_bare_loop.py"))
@@ -45,6 +46,7 @@ def test_bare_loop_moves_as_the_program_does(mode):
     assert ours["bars"] == bare["bars"]
 
 
+@pytest.mark.slow
 def test_implicit_operators_agree():
     tops = [driver("run_ours.py", 3, "implicit", 4, operator)["top"] for operator in ("matrix_free", "assembled")]
     assert tops[0] == pytest.approx(tops[1], rel=1e-8)
@@ -70,6 +72,7 @@ def test_points_of_both_studies_share_runs():
     assert len({name for _, _, name in files}) == 3
 
 
+@pytest.mark.slow
 def test_a_study_goes_on_where_it_stopped(tmp_path):
     point = Point("strong", "cubic", "explicit", "central_differences", 126, 1)
     launcher = "env pfem_ranks={ranks}"  # alone, without mpirun

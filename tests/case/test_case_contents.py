@@ -122,6 +122,7 @@ VALUES = st.recursive(
 )
 
 
+@pytest.mark.slow
 @given(st.dictionaries(NAMES, VALUES, max_size=5))
 def test_tables_read_back_equal(table):
     read = tomllib.loads(table_text(table))
@@ -169,6 +170,7 @@ def cases(draw):
     }
 
 
+@pytest.mark.slow
 @given(cases())
 def test_any_case_reads_back_equal(data):
     case = Case.from_dict(data)

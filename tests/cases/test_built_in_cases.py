@@ -127,6 +127,7 @@ def pendulum(run):
     assert np.linalg.norm(tension) == pytest.approx(4 * weight, rel=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", built_in_cases())
 def test_promised_numbers(name, run):
     NUMBERS[name](run)

@@ -17,6 +17,7 @@ def run_collectively(on_ranks, tmp_path, ranks, body, timeout=240.0, debug=False
     return on_ranks(ranks, script, timeout=timeout)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ranks", [1, 2])
 @pytest.mark.parametrize(
     ("words", "text"),
@@ -47,6 +48,7 @@ def test_print_comes_from_one_rank(on_ranks, words):
     assert together.stdout == alone.stdout != ""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("failure", "status", "text"),
     [
@@ -70,6 +72,7 @@ def test_failure_of_all_ranks(on_ranks, tmp_path, failure, status, text):
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.slow
 def test_lowest_rank_speaks_for_all(on_ranks, tmp_path):
     done = run_collectively(
         on_ranks, tmp_path, 3, "raise InputError('first') if comm.rank == 0 else SimulationFailure(f'at {comm.rank}')"
@@ -79,6 +82,7 @@ def test_lowest_rank_speaks_for_all(on_ranks, tmp_path):
     assert "error: at" not in done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("failing", "failure"), [(0, "SimulationFailure('disk full')"), (1, "RuntimeError('surprise')")]
 )
@@ -90,6 +94,7 @@ def test_failure_of_one_rank_ends_the_others(on_ranks, tmp_path, failing, failur
     assert done.stderr.count(f"rank {failing}: ") == 1
 
 
+@pytest.mark.slow
 def test_rank_that_ends_early_does_not_hide_a_failure(on_ranks, tmp_path):
     body = "if comm.rank == 1:\n    raise SimulationFailure('late')\nreturn 0"
     done = run_collectively(on_ranks, tmp_path, 2, body)

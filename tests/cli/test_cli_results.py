@@ -96,6 +96,7 @@ def test_info(short_run, capsys):
     assert float(balance.partition("(")[2].split()[0]) == pytest.approx(0.0, abs=1e-12)
 
 
+@pytest.mark.slow
 def test_plot(short_run, tmp_path, capsys):
     assert main(["plot", str(short_run), "-o", str(tmp_path)]) == 0
     written = capsys.readouterr().out.split()
@@ -107,6 +108,7 @@ def test_plot(short_run, tmp_path, capsys):
     assert "did you mean 'wall/wall/force'" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_render(short_run, tmp_path, capsys):
     words = ["render", str(short_run), "-o", str(tmp_path), "--frames", "0,5", "--size", "320x240", "--video", "none"]
     assert main([*words, "--field", "stress", "--clim", "-1e8", "1e8", "--no-poster"]) == 0
@@ -117,6 +119,7 @@ def test_render(short_run, tmp_path, capsys):
     assert "did you mean 'stress'" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("verb", ["info", "plot", "render"])
 def test_result_that_is_none(verb, tmp_path, capsys):
     assert main([verb, str(tmp_path)]) == 2
@@ -132,6 +135,7 @@ def test_refused_option_of_render(words, capsys):
     assert words[1] in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_petsc_takes_its_options(on_ranks, tmp_path):
     done = on_ranks(
         2, "-m", "pfem_petsc", "rod_impact", "--quiet", "--set", "time.end=0.05", "--", "-log_view", cwd=tmp_path

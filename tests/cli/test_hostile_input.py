@@ -67,6 +67,7 @@ def test_a_step_beyond_the_end_is_told(capsys):
     assert "time.step = 0.2 s is longer than time.end = 0.1 s" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["snes_type", "ksp_type", "pc_type", "snes_linesearch_type"])
 def test_solver_types_that_petsc_does_not_have(kind, tmp_path):
     """In a process of its own: PETSc keeps options."""

@@ -18,6 +18,7 @@ def run(comm, folder, *keys):
     return simulation
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("scheme", ["central_differences", "chung_lee", "newmark", "wilson"])
 def test_a_node_beyond_a_wall_is_an_error(scheme, comm, shared_tmp_path):
@@ -45,6 +46,7 @@ def test_wilson_may_leave_x1_beyond(comm, shared_tmp_path):
     assert 1e-4 < depth < 0.4 * 0.01 * 0.6
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 def test_what_is_no_concern_of_a_wall_may_be_beyond_it(comm, shared_tmp_path):
     """Nodes out of its node set, and whoever passed beside a rectangle."""

@@ -58,6 +58,7 @@ SUPPORTS = [{"node_set": "held", "fix": "y"}, {"node_set": "hinged", "fix": "xz"
 SETS = {"held": {"nearest": [0.0, 0.0, 0.0]}, "hinged": {"nearest": [0.2, 0.1, 0.1]}}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("supported", [False, True], ids=["free", "supported"])
 @pytest.mark.parametrize("name", WALLS)
 def test_steps_are_the_same(name, supported, comm, shared_tmp_path):
@@ -99,6 +100,7 @@ def test_steps_are_the_same(name, supported, comm, shared_tmp_path):
     assert max(w[1] for w in worst) < 1e-8  # curved walls are followed to 1e-13 of the length
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("name", ["corner", "twelve", "inside a sphere"])
 def test_steps_are_the_same_on_ranks(name, comm, shared_tmp_path):

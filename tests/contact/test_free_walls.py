@@ -19,6 +19,7 @@ def walls_of(kind):
     return [{"type": "sphere", "point": [0.1, 0.05, -0.12], "radius": 0.1, "mass": 0.03, "velocity": [0.0, 0.1, 1.0]}]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator, parameters", SCHEMES)
 @pytest.mark.parametrize("kind", ["plane", "corner", "sphere"])
 def test_momentum_is_shared(kind, integrator, parameters, comm, shared_tmp_path):
@@ -42,6 +43,7 @@ def test_momentum_is_shared(kind, integrator, parameters, comm, shared_tmp_path)
         assert gaps.min(initial=0.0) > -2e-12 * 0.2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator, parameters", [*SCHEMES, ("generalized_alpha", {}), ("energy_momentum", {})])
 def test_wall_with_weight(integrator, parameters, comm, shared_tmp_path):
     """It falls freely until it meets the truss, and from then on truss and wall have their weight in common."""
@@ -123,6 +125,7 @@ def test_refused(comm, shared_tmp_path):
         simulation(case, comm, shared_tmp_path)
 
 
+@pytest.mark.slow
 def test_restart_keeps_the_walls(comm, shared_tmp_path):
     """A run in two parts is the run in one, bit for bit: walls with mass, restitution and friction included."""
     walls = planes([[0.2, 0.1, 1.0]], [-0.01], mass=0.05, restitution=0.3, name="free")
@@ -141,6 +144,7 @@ def test_restart_keeps_the_walls(comm, shared_tmp_path):
     assert rows["one"]["wall/free/releases"] > 0 and rows["one"]["wall/rough/impulse"][2] > 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("kind, integrator", [("corner", "central_differences"), ("sphere", "newmark")])
 def test_momentum_is_shared_between_ranks(kind, integrator, comm, shared_tmp_path):

@@ -110,6 +110,7 @@ def test_refused(comm, shared_tmp_path):
         simulation(block("newmark", 0.5) | {"contact": {"treatment": "conserving"}}, comm, shared_tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("restitution", [0.0, 0.5, 0.8, 1.0])
 def test_bouncing(restitution, comm, shared_tmp_path):
     """A bar dropped flat from 0.1 m: each bounce reaches e^2 of the height before, at the times of free fall."""
@@ -185,6 +186,7 @@ def test_guided_node_is_stopped_by_any_friction(integrator, friction, comm, shar
     assert abs(rows[-1]["energy_imbalance"]) < 1e-12
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["central_differences", "newmark"])
 def test_wedge_that_locks_itself(integrator, comm, shared_tmp_path):
     """The slope is driven under the node, and drags it down by its friction: it lifts it below cot 60 = 0.577 alone."""

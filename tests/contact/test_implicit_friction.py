@@ -6,6 +6,7 @@ from helpers.lattices import lattice_case, planes
 from helpers.sliding import SCHEMES, G, rod, rows_of, tumbling
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator, parameters", SCHEMES + [("central_differences", {}), ("chung_lee", {})])
 def test_incline(integrator, parameters, comm, shared_tmp_path):
     """Above the angle of friction a rod slides with g (sin - mu cos) from the first step on, below it stays."""
@@ -27,6 +28,7 @@ def test_incline(integrator, parameters, comm, shared_tmp_path):
     assert abs(rows[-1]["contact_work"]) < 1e-14
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator, parameters", SCHEMES)
 def test_sliding_to_a_stop(integrator, parameters, comm, shared_tmp_path):
     """A rod thrown along the floor stops after v^2/(2 mu g), and all its energy went into friction."""
@@ -49,6 +51,7 @@ def test_sliding_to_a_stop(integrator, parameters, comm, shared_tmp_path):
 TRAPEZOID = {"beta": 0.25, "gamma": 0.5}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "integrator, parameters", [("energy_momentum", {}), ("newmark", TRAPEZOID), ("generalized_alpha", {})]
 )
@@ -73,6 +76,7 @@ def test_stick_ends_the_motion(integrator, parameters, comm, shared_tmp_path):
     assert max(abs(row["energy_imbalance"]) for row in rows) < 1e-9 * energy[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator, parameters", [*SCHEMES[:5], ("central_differences", {})])
 def test_breaking_loose(integrator, parameters, comm, shared_tmp_path):
     """Pulled ever harder, a rod at rest starts when the pull is mu_static times its weight, and mu drags it then."""
@@ -108,6 +112,7 @@ def test_oblique_impact(integrator, comm, shared_tmp_path):
         assert max(abs(row["energy_imbalance"]) for row in rows) < 1e-11
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["newmark", "houbolt"])
 def test_wall_with_mass(integrator, comm, shared_tmp_path):
     """Momentum of truss and wall together stays, and the wall is dragged along."""

@@ -19,6 +19,7 @@ WALLS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "integrator", "parameters"),
     [("plane", *scheme) for scheme in SCHEMES]
@@ -67,6 +68,7 @@ def test_law_of_coulomb(name, integrator, parameters, comm, shared_tmp_path):
     assert max(abs(row["energy_imbalance"]) for row in rows) < 1e-9 * most
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("integrator", "keys"),
     [("houbolt", {}), ("newmark", {"static_friction": 0.6}), ("newmark", {"velocity": [0.0, 0.4, 0.0]})],
@@ -100,6 +102,7 @@ def test_implicit_steps_tend_to_the_explicit_ones(keys, integrator, comm, shared
         assert apart[1] < 0.7 * apart[0] and apart[1] < 0.001
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["plane", "static", "corner", "sphere"])
 def test_turned(name, comm, shared_tmp_path):
     """The problem turned about is the same one."""
@@ -114,6 +117,7 @@ def test_turned(name, comm, shared_tmp_path):
         assert np.abs(x["turned"] - x["as it is"] @ turn.T).max() < 1e-9 * 0.2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "solver",
     [{"linear": "cg", "operator": "matrix_free"}, {"linear": "cg", "operator": "assembled"}, {"linear": "gamg"}],
@@ -130,6 +134,7 @@ def test_linear_solvers_agree(solver, comm, shared_tmp_path):
         assert np.abs(x["mumps"] - x["other"]).max() < 1e-8 * 0.2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("operator", ["assembled", "matrix_free"])
 @pytest.mark.parametrize("name", ["plane", "corner", "bowl"])
 def test_derivative_of_the_drag(name, operator, comm, shared_tmp_path):
@@ -164,6 +169,7 @@ def test_derivative_of_the_drag(name, operator, comm, shared_tmp_path):
     assert len(checked) >= 5 and max(checked) < 1e-5
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("name", ["static", "corner", "sphere"])
 def test_any_number_of_ranks(name, comm, shared_tmp_path):

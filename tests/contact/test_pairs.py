@@ -45,23 +45,27 @@ def collide(time, comm, shared_tmp_path, linear="auto", treatment="scheme"):
     return rows
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("time", [*EXPLICIT, *IMPLICIT], ids=label)
 def test_two_rods_are_the_symmetric_model(time, comm, shared_tmp_path):
     collide(time, comm, shared_tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("integrator", ["chung_lee", "newmark", "energy_momentum"])
 def test_two_rods_on_ranks(integrator, comm, shared_tmp_path):
     collide({"integrator": integrator}, comm, shared_tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("integrator", ["generalized_alpha"])
 def test_matrix_free_rods_are_the_symmetric_model(integrator, comm, shared_tmp_path):
     collide({"integrator": integrator}, comm, shared_tmp_path, linear="cg")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("time", IMPLICIT[:-1], ids=label)
 def test_rods_in_any_direction(time, comm, shared_tmp_path):
     straight = two_rods()

@@ -94,6 +94,7 @@ def tumbling(integrator, parameters, restitution, end=0.05, walls=None, **tables
     return case
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("restitution", [0.5, 1.0])
 @pytest.mark.parametrize("integrator, parameters", SCHEMES)
 def test_energy_does_not_grow(integrator, parameters, restitution, comm, shared_tmp_path):
@@ -108,6 +109,7 @@ def test_energy_does_not_grow(integrator, parameters, restitution, comm, shared_
         assert energy[-1] > 0.8 * energy[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["chung_lee", "newmark", "houbolt"])
 def test_turned(integrator, comm, shared_tmp_path):
     """The problem turned about is the same one, at a sphere as well."""
@@ -145,6 +147,7 @@ def test_refused(integrator, wall, tables, message, comm, shared_tmp_path):
         simulation(case | tables, comm, shared_tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("integrator", ["chung_lee", "newmark"])
 def test_any_number_of_ranks(integrator, comm, shared_tmp_path):

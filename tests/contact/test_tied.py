@@ -35,6 +35,7 @@ def columns(run):
     return {name: np.array([row[name] for row in rows]) for name in rows[0]}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator, parameters", SCHEMES)
 def test_rod_stays_and_oscillates(integrator, parameters, comm, shared_tmp_path):
     """After the touch the rod is one with a fixed end: the force is a square wave of period 4 L/c, its first half
@@ -60,6 +61,7 @@ def test_rod_stays_and_oscillates(integrator, parameters, comm, shared_tmp_path)
         assert np.abs(momentum - triangle)[late].max() < 0.05 * speed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["central_differences", "newmark"])
 def test_tip_keeps_its_place(integrator, comm, shared_tmp_path):
     """From the touch on the tip is where it was then, to rounding, on a wall at rest and on one that moves about."""
@@ -107,6 +109,7 @@ def drop(integrator, **keys):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["central_differences", "chung_lee", "newmark", "houbolt"])
 def test_turned(integrator, comm, shared_tmp_path):
     """The problem turned about is the same one."""
@@ -133,6 +136,7 @@ def _normal(turn):
     return normal if turn is None else turn @ normal
 
 
+@pytest.mark.slow
 def test_implicit_steps_tend_to_the_explicit_ones(comm, shared_tmp_path):
     """On a curved wall: the difference of Houbolt's method and central differences falls with the step."""
     wall = {"type": "sphere", "name": "ball", "point": [0.1, 0.05, -0.304], "radius": 0.3, "tied": True}
@@ -155,6 +159,7 @@ def test_implicit_steps_tend_to_the_explicit_ones(comm, shared_tmp_path):
         assert apart[1] < 0.4 * apart[0] and apart[1] < 2e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["central_differences", "newmark", "houbolt"])
 def test_wall_with_mass(integrator, comm, shared_tmp_path):
     """Momentum of truss and wall together stays, and they end up with one velocity on average."""
@@ -223,6 +228,7 @@ def test_refused(comm, shared_tmp_path):
         simulation(case, comm, shared_tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("integrator", ["central_differences", "newmark"])
 def test_restart_is_bitwise(integrator, comm, shared_tmp_path):
@@ -250,6 +256,7 @@ def test_restart_is_bitwise(integrator, comm, shared_tmp_path):
     comm.Barrier()
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("integrator", ["central_differences", "newmark"])
 def test_any_number_of_ranks(integrator, comm, shared_tmp_path):

@@ -39,6 +39,7 @@ def test_no_mass_no_spike_explicit(step, comm, shared_tmp_path):
     assert rows[-1]["wall/wall/releases"] == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("integrator", ["central_differences", "newmark"])
 @pytest.mark.parametrize("fix, normal", [("z", [-1.0, 0.0, 0.0]), ("yz", [-1.0, 0.0, 0.0]), ("z", [-0.8, 0.0, 0.6])])
@@ -148,6 +149,7 @@ def test_mass_redistribution_of_a_lattice(integrator, comm, shared_tmp_path):
     assert max(row["active_contacts"] for row in rows) >= 3
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 def test_mass_redistribution_without_a_matrix(comm, shared_tmp_path):
     """What is chosen beyond 500 unknowns gives what a direct solution does."""

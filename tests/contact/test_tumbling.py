@@ -31,6 +31,7 @@ def tumble(integrator, treatment, steps, comm, folder, **parameters):
     return max(comm.allgather(float(outside))), energy / energy[0], rows
 
 
+@pytest.mark.slow
 def test_ten_thousand_explicit_steps(comm, shared_tmp_path):
     outside, energy, rows = tumble("central_differences", "scheme", 10_000, comm, shared_tmp_path)
     assert outside < 1e-12 * 0.2
@@ -39,6 +40,7 @@ def test_ten_thousand_explicit_steps(comm, shared_tmp_path):
     assert max(abs(row["energy_imbalance"]) for row in rows) < 1e-10
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("treatment", ["stick", "conserving"])
 def test_promised_energy(treatment, comm, shared_tmp_path):
@@ -53,6 +55,7 @@ def test_promised_energy(treatment, comm, shared_tmp_path):
     assert sum(row["active_contacts"] > 0 for row in rows) > 10
 
 
+@pytest.mark.slow
 def test_dissipative_scheme_with_stick(comm, shared_tmp_path):
     outside, energy, _ = tumble("newmark", "stick", 1000, comm, shared_tmp_path)
     assert outside < 1e-12 * 0.2 and np.diff(energy).max() <= 0.0

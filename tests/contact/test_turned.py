@@ -62,6 +62,7 @@ def plastic(integrator, parameters):
     return case
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", SCHEMES)
 @pytest.mark.parametrize("problem", [rod, ring, plastic], ids=lambda f: f.__name__)
 def test_frame_does_not_matter(problem, integrator, comm, shared_tmp_path):
@@ -84,6 +85,7 @@ def test_frame_does_not_matter(problem, integrator, comm, shared_tmp_path):
         assert np.abs(positions[0] - positions[1]).max() < 1e-9 * size
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("integrator", ["central_differences", "newmark"])
 def test_frame_does_not_matter_on_ranks(integrator, comm, shared_tmp_path):

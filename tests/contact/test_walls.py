@@ -56,6 +56,7 @@ def test_rectangle_stops_what_comes_through_it():
     assert wall.stops(before, after, np.full(6, 1e-9)).tolist() == expected
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator, parameters", [EXPLICIT, IMPLICIT])
 def test_rectangle_beside_the_truss(integrator, parameters, comm, shared_tmp_path):
     """A lattice falls on a plate under its left half: only nodes over it are held, the others fall past."""
@@ -102,6 +103,7 @@ def test_ball_stays_on_the_surface(integrator, parameters, comm, shared_tmp_path
     assert most >= 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["central_differences", "chung_lee", "newmark", "houbolt"])
 @pytest.mark.parametrize("kind", ["planes", "sphere", "motion"])
 def test_galilean_equivalence(kind, integrator, comm, shared_tmp_path):
@@ -141,6 +143,7 @@ def test_starting_beyond_a_wall_is_refused(comm, shared_tmp_path):
         simulation(lattice_case(planes([[0.0, 0.0, 1.0]], [0.01])), comm, shared_tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator, parameters", [EXPLICIT, IMPLICIT])
 def test_starting_exactly_on_walls(integrator, parameters, comm, shared_tmp_path):
     """Nodes on a wall at the start stay there under gravity, and the wall carries the weight."""
@@ -201,6 +204,7 @@ def test_reports_of_a_bounce(comm, shared_tmp_path):
     assert touching["wall/wall3/moment"][1] == pytest.approx(-0.1 * touching["wall/wall3/force"][2], rel=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 def test_on_ranks(comm, shared_tmp_path):
     """What needs the ranks to agree: starts, curved walls, walls without room, sums of the reports."""

@@ -33,6 +33,7 @@ def pendulum(integrator: str, steps: int, *keys: str) -> Case:
     return Case.load("rod_impact", [*LOOSE, *own, *keys])
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("integrator, error", [("central_differences", 8e-4), ("chung_lee", 2e-2), ("houbolt", 6e-3)])
 def test_pendulum_on_a_tether(integrator, error, examples, comm, shared_tmp_path):
@@ -63,6 +64,7 @@ def two_rods(integrator: str, rope: str, *keys: str) -> Case:
     return Case.load("rod_impact", [*own, "output.fields_every=1", "solver.rtol=1e-12", *keys])
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize(
     "integrator, keys",
@@ -99,6 +101,7 @@ def test_tether_between_bodies(integrator, keys, examples, comm, shared_tmp_path
     assert np.abs(history["energy_imbalance"]).max() < 1e-9 * history["kinetic_energy"][0]
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("integrator", ["central_differences", "newmark"])
 def test_tether_restarts_to_the_last_bit(integrator, examples, comm, shared_tmp_path):
@@ -115,6 +118,7 @@ def test_tether_restarts_to_the_last_bit(integrator, examples, comm, shared_tmp_
     assert open_result(whole).field("velocity", -1).tobytes() == open_result(parts).field("velocity", -1).tobytes()
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("integrator", ["central_differences", "newmark"])
 def test_strut_is_a_contact_pair_on_a_line(integrator, examples, comm, shared_tmp_path):
@@ -154,6 +158,7 @@ def test_chain_of_tethers_hangs_at_rest(integrator, mass, examples, comm, shared
     assert history["kinetic_energy"].max() < 1e-20
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("integrator", ["central_differences", "houbolt"])
 def test_chain_of_tethers_falls_on_a_floor(integrator, examples, comm, shared_tmp_path):

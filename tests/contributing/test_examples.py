@@ -39,6 +39,7 @@ def test_they_are_listed(examples, capsys):
         assert re.search(rf"^  {name} +{text}", shown, flags=re.MULTILINE), name
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 def test_integrator_follows_its_recursion(examples, comm, shared_tmp_path):
     """One bar with a mass at its end is x'' + w^2 x = 0, whose backward differences are solved here by themselves."""
@@ -59,6 +60,7 @@ def test_integrator_follows_its_recursion(examples, comm, shared_tmp_path):
     assert np.asarray(history["probe/tip/velocity"])[:, 0, 0] == pytest.approx(np.array(v), abs=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 def test_restart_to_the_last_bit(examples, comm, shared_tmp_path):
     """All of the examples in one case, stopped after the impact and continued."""
@@ -92,6 +94,7 @@ def test_field_is_one_entry(comm, shared_tmp_path):
     assert "stretch" not in open_result(shared_tmp_path / "other").cell_fields
 
 
+@pytest.mark.slow
 def test_energy_term_is_one_line(tmp_path):
     """In a copy of the package: the columns of a row are laid out when it is imported."""
     line = re.search(r"^```python\n(Energy\(.*?)^```$", TEXT, flags=re.MULTILINE | re.DOTALL)[1]
@@ -112,6 +115,7 @@ def test_energy_term_is_one_line(tmp_path):
     assert np.abs(history["energy_imbalance"]).max() < 1e-9 * sideways[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("integrator, treatment", [("bdf2", "secant"), ("central_differences", "scheme")])
 def test_wall_pushes_along_its_normal(integrator, treatment, examples, comm, shared_tmp_path):
@@ -165,6 +169,7 @@ def test_polygon_has_its_mass_and_spin(sides, examples, comm, shared_tmp_path):
     assert history["momentum"][0] == pytest.approx([0.0, 0.0, -mass], rel=1e-13, abs=1e-13)
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 def test_treatment_stops_the_chatter_of_the_trapezoidal_rule(examples, comm, shared_tmp_path):
     """With the scheme's own velocities the same rod gains energy tenfold (docs/contact.md)."""

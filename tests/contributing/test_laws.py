@@ -76,6 +76,7 @@ def thrown(integrator, h, steps):
     return np.array(rows)
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("operator", ["assembled", "matrix_free"])
 @pytest.mark.parametrize("integrator", ["central_differences", "newmark", "energy_momentum"])
@@ -99,6 +100,7 @@ def test_law_is_integrated_as_by_itself(integrator, operator, examples, comm, sh
     assert heat == pytest.approx(1e-4 * expected[:, 4], rel=1e-9, abs=1e-12)
 
 
+@pytest.mark.slow
 def test_law_in_the_fused_loop(examples, tmp_path):
     """Many steps in one call are the single steps to the last bit."""
     case, found = one_bar("central_differences", 2e-3, 200), []
@@ -110,6 +112,7 @@ def test_law_in_the_fused_loop(examples, tmp_path):
     assert np.abs(found[0][2]).max() > 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("integrator", ["central_differences", "newmark", "chung_lee", "energy_momentum"])
 def test_law_restarts_to_the_last_bit(integrator, examples, comm, shared_tmp_path):

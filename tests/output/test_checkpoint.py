@@ -195,6 +195,7 @@ while True:
 """
 
 
+@pytest.mark.slow
 def test_a_kill_leaves_a_complete_checkpoint(tmp_path, chance):
     for _ in range(6):
         writer = subprocess.Popen(

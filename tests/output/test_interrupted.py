@@ -240,6 +240,7 @@ except SimulationFailure as error:
 """
 
 
+@pytest.mark.slow
 def test_disk_full_inside_hdf5_is_a_failure_and_no_crash(small_disk):
     path = small_disk / "result.vtkhdf"
     done = subprocess.run(

@@ -153,6 +153,7 @@ for _ in range(60):
 """
 
 
+@pytest.mark.slow
 def test_many_processes_that_leave_it_behind_are_never_two_at_once(folder, tmp_path):
     """Half of the owners end without giving it back; whoever is second finds the marker of the first and fails."""
     processes = [

@@ -142,6 +142,7 @@ def test_going_on_after_a_step_gives_the_same_file(shared_tmp_path, after):
         assert_grid_is(grid, truss, 20)
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 def test_going_on_before_the_first_snapshot(shared_tmp_path):
     path = shared_tmp_path / "result.vtkhdf"
@@ -257,6 +258,7 @@ def test_large_snapshots_do_not_share_chunks_where_sizes_allow(tmp_path):
     assert_grid_is(read_with_vtk(tmp_path / "result.vtkhdf", 1)[0], truss, 5)
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 def test_attributes_of_any_length_come_back(shared_tmp_path):
     path = shared_tmp_path / "result.vtkhdf"

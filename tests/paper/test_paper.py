@@ -68,6 +68,7 @@ def test_study_names_are_distinct():
     assert len(set(names)) == len(names)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scheme", "end", "peak", "releases", "rebound", "energy", "undershoot"),
     [
@@ -188,6 +189,7 @@ def test_pictures_of_the_document_are_there():
         assert 10e3 < (ROOT / "docs" / picture).stat().st_size < 150e3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", list(integrator_tables.TABLES))
 def test_tables_of_integrators_are_up_to_date(name):
     text = integrator_tables.DOCUMENT.read_text(encoding="utf-8")

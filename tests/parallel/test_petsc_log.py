@@ -24,6 +24,7 @@ def count(text, event):
     return sum(int(n) for n in re.findall(rf"^{event}\s+(\d+) ", text, re.MULTILINE))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("integrator", "linear", "events"),
     [("central_differences", "auto", EXPLICIT), ("newmark", "gamg", set(EVENTS))],

@@ -9,6 +9,7 @@ from pfem_petsc import Case
 pytestmark = pytest.mark.parallel
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("strain", ["engineering", "green", "logarithmic"])
 def test_conservation(strain, shared_tmp_path, comm):
     case = Case.load("tumbling_lattice")

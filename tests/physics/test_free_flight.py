@@ -39,6 +39,7 @@ def sizes(case, comm):
     return comm.allreduce(float(mass @ speed)), comm.allreduce(float(mass @ (speed * distance)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("integrator", "linear", "angular"), [("central_differences", 1e-12, 1e-12), ("newmark", 1e-10, None)]
 )
@@ -64,6 +65,7 @@ def test_momentum_over_a_thousand_steps(integrator, linear, angular, comm, share
     print(f"{integrator}: {drift / momentum:.1e} of sum m|v|, {turned / moment:.1e} of sum |x||m v|")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("integrator", "parameters"),
     [("chung_lee", {"beta": 1.0}), ("hulbert_chung", {}), ("houbolt", {}), ("wilson", {}), ("generalized_alpha", {})],
@@ -76,6 +78,7 @@ def test_every_scheme_keeps_linear_momentum(integrator, parameters, comm, shared
     assert imbalance(history) < 1e-9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["newmark", "houbolt", "generalized_alpha", "energy_momentum"])
 def test_a_coarse_solution_keeps_linear_momentum(integrator, comm, shared_tmp_path):
     coarse = Case.from_toml(flight(integrator, 4e-3).to_toml(), MESHES, overrides=["solver.rtol=1e-4"])

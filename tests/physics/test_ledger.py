@@ -150,6 +150,7 @@ def test_pairs_meet(integrator, treatment, shared_tmp_path):
     assert np.abs(history["energy_imbalance"]).max() < 1e-9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mass", ["lumped", "consistent"])
 @pytest.mark.parametrize("integrator", ["wilson", "hulbert_chung", "generalized_alpha", "energy_momentum"])
 def test_damping_only_takes(integrator, mass, shared_tmp_path):

@@ -79,6 +79,7 @@ def relative(history):
     return history["probe/mass/position"][:, 0, 0] - history["probe/base/position"][:, 0, 0] - 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scheme", SECOND_ORDER)
 def test_acceleration_record_against_exact_integration(scheme, comm, shared_tmp_path):
     """Relative displacement to 1e-3 of its peak; the base has the record's acceleration, and its exact integrals."""
@@ -93,6 +94,7 @@ def test_acceleration_record_against_exact_integration(scheme, comm, shared_tmp_
     assert np.abs(history["energy_imbalance"]).max() < 1e-9 * history["kinetic_energy"].max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["trapezoid", "central_differences", "hulbert_chung"])
 def test_displacement_record(scheme, comm, shared_tmp_path):
     """Rows of displacements every 20 ms: the floor's acceleration is the ground's, not that of kinks at the rows."""
@@ -110,6 +112,7 @@ def test_displacement_record(scheme, comm, shared_tmp_path):
 RAMP = [[0.0, 0.0, 0.0, 0.0], [0.1, 0.02, 0.0, 0.0], [0.2, 0.02, 0.0, 0.0]]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("interpolation", ["smooth", "linear"])
 @pytest.mark.parametrize("scheme", ALL)
 def test_nothing_rings_after_the_stop(scheme, interpolation, comm, shared_tmp_path):
@@ -145,6 +148,7 @@ def test_reactions_of_a_body_carried_along(scheme, mass, comm, shared_tmp_path):
     assert total == pytest.approx(expected + 3.0 * speed, abs=1e-9 * np.abs(values).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["trapezoid", "central_differences"])
 def test_tower_against_its_modes(scheme, comm, shared_tmp_path):
     """A braced tower on shaken ground: the top moves on it by the sum of its modes' exact responses."""

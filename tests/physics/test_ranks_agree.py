@@ -45,6 +45,7 @@ def end_of(case, folder, comm):
     return comm.bcast(found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["central_differences", "newmark"])
 @pytest.mark.parametrize("name", CASES)
 def test_run_on_all_ranks_is_the_run_on_one(name, scheme, comm, shared_tmp_path):

@@ -23,6 +23,7 @@ def joined(found, gap):
     return np.array(out)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scheme", "step", "expected", "slack"),
     [
@@ -44,6 +45,7 @@ def test_contacts(scheme, step, expected, slack):
     assert (np.diff(history["plastic_heat"]) >= -1e-12 * history["kinetic_energy"][0]).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("scheme", "step"), [("central_differences", 2e-4), ("newmark", 5e-4)])
 def test_mesh_file_and_generator_give_the_same(scheme, step, tmp_path):
     case = Case.load("ring_impact", [f"time.integrator={scheme}", f"time.step={step}", "time.end=0.04"])

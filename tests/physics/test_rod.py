@@ -58,6 +58,7 @@ def one_dimensional(scheme, speed, gap=0.05, end=5.0):
     return forces, m @ v
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("scheme", "mean", "spike", "last", "back"),
     [("central_differences", 0.9998, 2.500, 2.14, 0.958), ("newmark", 0.9925, 2.693, 2.11, 0.884)],
@@ -73,6 +74,7 @@ def test_numbers_of_two_independent_implementations(scheme, mean, spike, last, b
     assert imbalance(history) < 1e-10
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["central_differences", "newmark"])
 def test_force_history_is_that_of_springs_and_masses_on_a_line(scheme):
     history = rod(0.1, f"time.integrator={scheme}")
@@ -98,6 +100,7 @@ TABLE = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("scheme", "parameters", "last", "largest", "releases", "back", "left"), TABLE)
 def test_table_of_schemes(scheme, parameters, last, largest, releases, back, left):
     keys = [f"time.{name}={value}" for name, value in parameters.items()]
@@ -112,6 +115,7 @@ def test_table_of_schemes(scheme, parameters, last, largest, releases, back, lef
     assert imbalance(history) < 1e-10
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("mass", "scheme", "largest", "left"),
     [("consistent", "newmark", None, 0.811), ("consistent", "houbolt", 3.2, 0.957)],
@@ -123,6 +127,7 @@ def test_consistent_mass(mass, scheme, largest, left):
         assert force(history, "wall").max() / 0.1 == pytest.approx(largest, abs=0.06)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("keys", [("wilson",), ("newmark", "time.beta=0.25", "time.gamma=0.5")])
 def test_unstable_contact_recursions_grow(keys):
     """Wilson at 1.4 (a held node alternates) and the trapezoid (its acceleration grows) chatter and gain energy."""
@@ -136,6 +141,7 @@ def test_unstable_contact_recursions_grow(keys):
     assert imbalance(history) < 1e-8  # the ledger shows where it came from
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["central_differences", "newmark"])
 def test_convergence_under_refinement(scheme):
     """Force, duration and rebound tend to 1, 2 and 1 as bars and step shrink together."""

@@ -99,6 +99,7 @@ def test_steady_spin_stays_steady(mass):
     assert np.abs(length - LENGTH - stretch).max() < 1e-3 * stretch
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("mass", "share"), [("lumped", 4.0), ("consistent", 12.0)])
 def test_stretch_of_a_spinning_bar(mass, share, tmp_path):
     """Steady spin at l = l0/(1 - m omega^2 l0/(4 EA)) lumped, /(12 EA) consistent: started there, the length stays."""
@@ -134,6 +135,7 @@ def elliptic(k):
     return np.pi / (2.0 * a)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("integrator", "mass", "equivalent"),
     [

@@ -28,6 +28,7 @@ def test_reaction_of_a_consistent_mass_at_the_start(integrator, shared_tmp_path)
     assert unexplained(history) < 1e-12
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["chung_lee", "hulbert_chung", "generalized_alpha", "energy_momentum", "wilson"])
 @pytest.mark.parametrize("mass", ["lumped", "consistent"])
 def test_recorded_accelerations_are_of_second_order(integrator, mass, shared_tmp_path):

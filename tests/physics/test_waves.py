@@ -64,6 +64,7 @@ def test_transverse_modes_of_a_taut_chain(mode, tmp_path):
     assert speed == pytest.approx(omega * LENGTH / (mode * np.pi), rel=2e-2)
 
 
+@pytest.mark.slow
 def test_longitudinal_mode_with_consistent_mass(tmp_path):
     """Consistent mass: omega^2 = 6 (c/l)^2 (1 - cos q)/(2 + cos q), q = k pi/N, above the continuum's."""
     size, q = LENGTH / ELEMENTS, 4 * np.pi / ELEMENTS

@@ -23,6 +23,7 @@ def saturated(file) -> np.ndarray:
     return picture[np.ptp(picture, axis=1) > 60]
 
 
+@pytest.mark.slow
 def test_all_pictures_of_a_result_file(tmp_path):
     file = write_result(tmp_path)
     written = plot(file)
@@ -37,6 +38,7 @@ def test_what_a_result_lacks_is_left_out(tmp_path, result):
     assert names == ["energies.png", "momentum.png", "solver.png"]
 
 
+@pytest.mark.slow
 def test_contact_has_no_panel_without_walls(tmp_path, result):
     result.history = {name: values for name, values in result.history.items() if "/" not in name}
     with_contact = Image.open(plot(result, tmp_path)[-1]).height
@@ -64,6 +66,7 @@ def test_empty_history_is_refused(tmp_path, result):
         plot(result, tmp_path)
 
 
+@pytest.mark.slow
 def test_one_row_is_enough(tmp_path, result):
     result.history = {name: values[:1] for name, values in result.history.items()}
     assert len(plot(result, tmp_path)) == 5
@@ -126,6 +129,7 @@ def test_curves_of_an_earlier_call_stay(tmp_path, result):
     assert [first.name, second.name] == ["curves.png", "curves_2.png"]
 
 
+@pytest.mark.slow
 def test_titles_are_no_formulas(tmp_path, result):
     result.case.title = r"a force of $\frac{1}$ N"
     assert len(plot(result, tmp_path)) == 5

@@ -48,6 +48,7 @@ def draw(tmp_path, result=None, **options):
     return render(result, tmp_path / "out", **options)
 
 
+@pytest.mark.slow
 def test_frames_film_and_poster_from_a_result_file(tmp_path):
     file = write_result(tmp_path)
     written = render(file, size=SMALL, fps=10, video="both", note=silent)

@@ -36,6 +36,7 @@ def faults_of(seed, comm, folder, restart):
     return told, [fault for fault in told["faults"] if not fault[0].startswith(COUNTED)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
 def test_any_case_holds_what_all_must(seed, tmp_path):
     told, faults = faults_of(seed, MPI.COMM_SELF, tmp_path, seed % CONTINUED == 0)
@@ -45,6 +46,7 @@ def test_any_case_holds_what_all_must(seed, tmp_path):
     assert not faults, f"seed {seed}: {faults}"
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("part", range(3))
 def test_ranks_do_as_one(comm, shared_tmp_path, part):

@@ -10,6 +10,7 @@ from pfem_petsc.recording.history import History
 from pfem_petsc.recording.snapshots import Snapshots
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("name", CASES)
 def test_restart_on_as_many_ranks_is_bitwise(comm, shared_tmp_path, name):
@@ -33,6 +34,7 @@ ROD = {
 }
 
 
+@pytest.mark.slow
 def test_motion_that_has_come_to_rest_is_not_taken_for_unstable_after_a_restart(tmp_path):
     """What energies are compared with is that of the start; nothing of it is left."""
     folders = tmp_path / "whole", tmp_path / "stopped"
@@ -49,6 +51,7 @@ def _watched(simulation):
     return history.blow_up.kept(), history.recorder.energy_scale, simulation.model.pairs.force.copy()
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 def test_all_that_is_looked_at_in_later_steps_is_put_back(comm, shared_tmp_path):
     """Also what only messages and rows show: the watch, the largest energy, the forces of pairs."""
@@ -79,6 +82,7 @@ EXTENDED = {
 SPARSE = ("output.history_every=4", "output.fields_every=6", "output.checkpoint_every=25")
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize(
     ("name", "end"), [("central differences", 33), ("newmark", 42), ("houbolt", 36), ("plastic lattice", 33)]
@@ -104,6 +108,7 @@ class Killed(Exception):  # noqa: N818
     """In place of a signal that nobody can catch."""
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("lost", ["row", "snapshot"])
 def test_killed_between_the_last_checkpoint_and_the_end_of_the_results(comm, shared_tmp_path, monkeypatch, lost):

@@ -107,6 +107,7 @@ def test_missing_and_damaged_files(copy, capsys):
     np.testing.assert_array_equal(steps(copy)[0], range(91))
 
 
+@pytest.mark.slow
 def test_mesh_file_that_changed(tmp_path, capsys):
     points = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0.1]])
 
@@ -147,6 +148,7 @@ def test_another_folder_gets_results_from_the_checkpoint_on(copy, tmp_path):
     np.testing.assert_array_equal(snapshots, range(40, 91, 10))
 
 
+@pytest.mark.slow
 def test_values_of_set_are_kept_by_a_restart(tmp_path, capsys):
     """But for those given anew; the case file may lack what was given then."""
     (tmp_path / "case.toml").write_text(
@@ -211,6 +213,7 @@ def test_earlier_end_of_a_finished_run_says_what_there_is(copy, capsys):
     assert len(steps(copy)[0]) == 51
 
 
+@pytest.mark.slow
 def test_checkpoint_written_anew_between_set_up_and_start(copy):
     """Another run has continued the folder meanwhile: its rows would be cut."""
     from pfem_petsc import Case, Simulation

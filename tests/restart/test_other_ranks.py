@@ -9,6 +9,7 @@ from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.errors import EarlyStop
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("name", ["central differences", "houbolt", "plastic lattice", "newmark"])
 def test_restart_on_another_number_of_ranks(comm, shared_tmp_path, name):

@@ -54,6 +54,7 @@ def test_two_interrupts_during_start_up(tmp_path, ranks):
     assert (tmp_path / "out" / "checkpoint.h5").is_file()
 
 
+@pytest.mark.slow
 def test_terminal_that_is_closed(tmp_path):
     """SIGHUP, and nothing can be printed any more: the checkpoint is written, the status is that of a stop."""
     out = tmp_path / "out"

@@ -123,6 +123,7 @@ def test_no_convergence(comm, shared_tmp_path):
         assert result.history["step"].tolist() == [0, 1]
 
 
+@pytest.mark.slow
 def test_step_above_the_limit_of_the_deformed_model_is_told(comm, shared_tmp_path):
     """A green-strain rod stiffens as it is stretched: the limit at rest no longer holds, and the run blows up."""
     keys = ["material.default.strain=green", "initial.velocity=[0.0, 0.0, 0.0]", "time.step=0.0495", "time.end=60.0"]

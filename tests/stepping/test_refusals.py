@@ -51,6 +51,7 @@ def test_steps_at_the_limit_are_taken(comm, shared_tmp_path):
         assert Simulation(case, comm, output=shared_tmp_path / str(k), quiet=True).run() == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("what", "ranks"), [("node beyond a wall", 2), ("step above the limit", 1)])
 def test_status_of_the_command_line(what, ranks, tmp_path, on_ranks):
     overrides, parts = REFUSED[what]
@@ -64,6 +65,7 @@ def test_status_of_the_command_line(what, ranks, tmp_path, on_ranks):
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.slow
 def test_status_of_a_failing_run(tmp_path, on_ranks):
     """A bar driven through zero length: status 3."""
     keys = ["--set", "initial.velocity=[3.0, 0.0, 0.0]"]

@@ -256,7 +256,7 @@ class Links:
         return {name: array for link in self.members for name, array in link.arrays().items()}
 
     def load_state(self, name: str, values: np.ndarray) -> None:
-        """See :meth:`Link.put_back`."""
+        """See :meth:`Link.load_state`."""
         for link in self.members:
             if name in link.arrays():
                 link.load_state(name, values)

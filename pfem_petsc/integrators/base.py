@@ -66,7 +66,7 @@ class Balance:
     time : when x_u holds: walls and supports are where they are then [s]
     loads : (weight, time) pairs: the external force of the balance
     weight : w of the module's equation
-    from_start : the internal force is that of the step from x_n to x_u (discrete gradient), not that at x_u
+    discrete_gradient : the internal force is that of the step from x_n to x_u (discrete gradient), not that at x_u
     """
 
     alpha: float
@@ -90,9 +90,9 @@ class Scheme(ABC):
     Attributes
     ----------
     explicit : whether the balance needs no force at the unknown position
-    leads : the scheme solves for x_{n+2} at t_{n+1} (central differences), so x_{n+1} is known before the solve
-    at_ends : the balance holds at the ends of steps, so that works follow the trapezoidal rule; else the forces of the
-        balance work over the whole step
+    solves_next_position : the scheme solves for x_{n+2} at t_{n+1} (central differences), so x_{n+1} is known before the solve
+    balance_at_endpoints : the balance holds at the ends of steps, so that works follow the trapezoidal rule; else the
+        forces of the balance work over the whole step
     solves_end : the position solved for is x_{n+1}
     discrete_gradient : the internal force of its balances is that of the step (``Balance.discrete_gradient``)
     force_acts_once : the contact force of a step acts in that step alone once its acceleration is taken away

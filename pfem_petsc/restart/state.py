@@ -143,7 +143,7 @@ class RunState:
             mine = scalars["memories"][self.comm.rank]
             state.memory = {name: array for name, array in state.memory.items() if name in mine}
         self.model.mesh.update_ghosts(state.x)
-        self._put_back_bars(checkpoint)
+        self._load_bars(checkpoint)
         state.step, state.time = int(scalars["step"]), float(scalars["time"])
         for name, value in scalars["stepper"].items():
             setattr(stepper, name, value)
@@ -158,10 +158,8 @@ class RunState:
         self.model.links.restore(scalars)
         self.model.contact.log.load_state(mine["contact_log"], scalars["contact_times"], stepper.touching)
 
-    def load_sums(
-        self, checkpoint: Checkpoint, ledger: Ledger, recorder: Recorder, blow_up: BlowUp
-    ) -> dict[str, Any]:
-        """Set ledger, recorder and watch, made after :meth:`put_back`; gives what is known of the last row."""
+    def load_sums(self, checkpoint: Checkpoint, ledger: Ledger, recorder: Recorder, blow_up: BlowUp) -> dict[str, Any]:
+        """Set ledger, recorder and watch, made after :meth:`load_state`; gives what is known of the last row."""
         scalars = checkpoint.scalars
         ledger.load_state(self._share(scalars["ranks"])["ledger"])
         recorder.iterations = [int(n) for n in scalars["iterations"]]
@@ -201,7 +199,7 @@ class RunState:
         kept = {_KEPT + name: getattr(self.stepper, name) for name in self.stepper.kept_bars}
         return found | {name: array for name, array in kept.items() if array.shape[1]}
 
-    def _put_back_bars(self, checkpoint: Checkpoint) -> None:
+    def _load_bars(self, checkpoint: Checkpoint) -> None:
         """Bars evaluated on two ranks get the same values on both."""
         mesh, bars = self.model.mesh, self.model.bars
         asking = Router(self.comm, slab_of(mesh.bar_ids, mesh.n_bars, self.comm.size))

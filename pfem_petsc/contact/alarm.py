@@ -15,7 +15,8 @@ import numpy as np
 from mpi4py import MPI
 
 from ..errors import SimulationFailure
-from ..tolerances import BEYOND, FREE_PART
+from ..tolerances import BEYOND
+from .free_parts import held_by_supports
 
 if TYPE_CHECKING:
     from ..stepping.stepper import Stepper
@@ -98,8 +99,7 @@ class CarriedNodes:
         self.of: dict[int, np.ndarray] = {}
         for k, wall in enumerate(contact.walls):
             if wall.partial:
-                free = np.where(contact.fixed, 0.0, wall.normal)
-                nodes = np.flatnonzero(contact.members[:, k] & ((free * free).sum(axis=1) <= FREE_PART))
+                nodes = np.flatnonzero(contact.members[:, k] & held_by_supports(contact.fixed, wall.normal))
                 self.of |= {k: nodes} if len(nodes) else {}
 
     def places(self, x: np.ndarray, time: float) -> dict[int, np.ndarray]:
@@ -128,5 +128,4 @@ def _prescribed(contact: Contact, node: int, wall: int, x: np.ndarray, time: flo
     normals, _ = contact.planes(
         np.ones((1, len(contact.walls)), dtype=bool), x[[node]], contact.motion.displacements(time)
     )
-    free = np.where(contact.fixed[node], 0.0, normals[0, wall])
-    return bool(free @ free <= FREE_PART)
+    return bool(held_by_supports(contact.fixed[node], normals[0, wall]))

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..tolerances import FREE_PART
+from .free_parts import free_squares
 
 if TYPE_CHECKING:
     from .contact import Contact
@@ -31,7 +32,7 @@ def jam(contact: Contact, node: int, normals: np.ndarray) -> str:
     fixed = contact.fixed[node]
     if not fixed.any():
         return ""
-    square = (np.where(fixed, 0.0, normals) ** 2).sum(axis=1)
+    square = free_squares(fixed, normals)
     least = np.sqrt(square / np.maximum(1.0 - square, 1e-300))
     jams = contact.members[node] & (square > FREE_PART) & (contact.static_friction >= least)
     if not jams.any():

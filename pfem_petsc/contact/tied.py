@@ -16,7 +16,8 @@ import numpy as np
 
 from ..errors import SimulationFailure
 from ..parallel.agreement import agreed
-from ..tolerances import BEYOND, FREE_PART
+from ..tolerances import BEYOND
+from .free_parts import held_by_supports
 
 if TYPE_CHECKING:
     from .contact import Contact
@@ -125,7 +126,7 @@ class Ties:
         applicable[np.arange(len(nodes)), walls] = partly
         normals, offsets = contact.planes(applicable, places, displacements)
         gaps = np.einsum("mwi,mi->mw", normals, places) - offsets
-        gaps[(np.where(contact.fixed[nodes][:, None, :], 0.0, normals) ** 2).sum(axis=2) <= FREE_PART] = np.inf
+        gaps[held_by_supports(contact.fixed[nodes][:, None, :], normals)] = np.inf
         node, other = np.unravel_index(np.argmin(gaps), gaps.shape)
         if gaps[node, other] < -BEYOND * contact.length and other == walls[node]:
             raise SimulationFailure(

@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..tolerances import FREE_PART, ON_BOUND
+from ..tolerances import ON_BOUND
 from .candidates import Candidates
 from .frames import NodalFrames
+from .free_parts import held_by_supports
 
 if TYPE_CHECKING:
     from .contact import Contact
@@ -46,8 +47,7 @@ def broken_walls(
     place = place[known]
     broken[known] &= (frames.rows[place] < 0) | frames.shared[place]
     broken &= ~contact.ties.held[beyond][:, None]
-    degenerate = (np.where(contact.fixed[beyond][:, None, :], 0.0, normals) ** 2).sum(axis=2) <= FREE_PART
-    broken &= ~degenerate
+    broken &= ~held_by_supports(contact.fixed[beyond][:, None, :], normals)
     met = broken.any(axis=1)
     return beyond[met], broken[met]
 

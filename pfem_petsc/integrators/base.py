@@ -90,7 +90,7 @@ class Scheme(ABC):
     Attributes
     ----------
     explicit : whether the balance needs no force at the unknown position
-    solves_next_position : the scheme solves for x_{n+2} at t_{n+1} (central differences), so x_{n+1} is known before the solve
+    solves_next_position : the scheme solves for x_{n+2} at t_{n+1} (central differences), so x_{n+1} is known before
     balance_at_endpoints : the balance holds at the ends of steps, so that works follow the trapezoidal rule; else the
         forces of the balance work over the whole step
     solves_end : the position solved for is x_{n+1}

@@ -3,6 +3,7 @@
 import h5py
 import numpy as np
 import pytest
+from helpers.balances import GRAVITY, SCHEMES
 from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation
@@ -10,17 +11,6 @@ from pfem_petsc.output.result import open_result
 
 pytestmark = pytest.mark.parallel
 
-SCHEMES = (
-    "central_differences",
-    "chung_lee",
-    "hulbert_chung",
-    "newmark",
-    "houbolt",
-    "wilson",
-    "generalized_alpha",
-    "energy_momentum",
-)
-GRAVITY = 9.81
 CASE = """
 [mesh]
 generator = "rod"

@@ -37,10 +37,14 @@ class Analysis(ABC):
 
     Attributes
     ----------
-    last_step : number of the last step
+    plan : what the run will do: ``end``, ``steps``, ``linear``, ``entries``, ``beyond``, ``record``
+    stepper : makes the steps
+    last_step : number of the last step; a number beyond all as long as it is not known
     step_size : of the steps, in the unit of the state's time [s]
     """
 
+    plan: Any
+    stepper: Any
     last_step: int
     step_size: float
 

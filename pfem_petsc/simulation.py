@@ -23,14 +23,13 @@ from .preflight.inspection import inspect, warnings_before
 from .preflight.summary import summarise
 from .recording.recorder import Recorder
 from .restart.folder import Restart, find_restart, finished, finished_message
+from .run.analyses import make_analysis
 from .run.compilation import ReportedCompilation
 from .run.outputs import Outputs
 from .run.stop import StopRequest
 from .run.synchroniser import Synchroniser
 from .stepping.fused_steps import WORTH, Batches
 from .stepping.model import Model
-from .stepping.prepare import make_plan
-from .stepping.time_stepping import TimeStepping
 
 __all__ = ["Simulation", "Step"]
 
@@ -98,12 +97,13 @@ class Simulation:
     def _prepare(self) -> None:
         case = self.case
         self.model = Model(case, self.comm)
-        self.plan = make_plan(self.model, self.restart.attributes["plan"] if self.restart is not None else None)
+        recorded = self.restart.attributes["plan"] if self.restart is not None else None
+        self.analysis = make_analysis(self.model, recorded)
+        self.plan = self.analysis.plan
         self._reached: float | None = None
         if self.restart is not None and self.restart.continues or self.notes:
-            self._reached = finished(case, self.comm, self.folder, self.plan.step * self.plan.steps)
+            self._reached = finished(case, self.comm, self.folder, self.plan.end)
         check_start(self.model.contact, self.model.mesh.points[: self.model.mesh.n_owned], self.model.length)
-        self.analysis = TimeStepping(self.model, self.plan)
         self.mesh, self.stepper = self.model.mesh, self.analysis.stepper
         self._started = False
         minutes = case.output.checkpoint_minutes
@@ -224,7 +224,7 @@ class Simulation:
             yield from self._steps(Batches(min_steps))
 
     def _steps(self, batches: Batches | None = None) -> Iterator[Step]:
-        if self._started and not self.outputs.is_open and self.state.step < self.plan.steps:
+        if self._started and not self.outputs.is_open and self.state.step < self.analysis.last_step:
             raise InputError(
                 f"{self.folder}: the results of this simulation were closed at step {self.state.step}, when its "
                 "iteration ended; continue with a new Simulation with restart=True, from a checkpoint"
@@ -233,7 +233,7 @@ class Simulation:
             self.start()
             self._synchroniser.synchronise()
             self.outputs.stop_early()
-            while self.state.step < self.plan.steps:
+            while self.state.step < self.analysis.last_step:
                 if batches is not None:
                     self.outputs.advance_together(batches)
                 yield self._advance()
@@ -267,7 +267,7 @@ class Simulation:
             On all ranks; what was recorded before is in the result file.
         """
         if self.finished and self.comm.rank == 0 and not self.quiet:
-            print(finished_message(self.folder, self._reached, self.plan.step * self.plan.steps))
+            print(finished_message(self.folder, self._reached, self.plan.end))
         for _ in self.batches():
             pass
         return 0

@@ -26,6 +26,7 @@ FLOORS = (
     ("output",),
     ("contact",),
     ("stepping",),
+    ("statics",),
     ("restart",),
     ("preflight",),
     ("recording",),

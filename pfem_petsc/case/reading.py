@@ -24,6 +24,7 @@ GENERATORS = "pfem_petsc.mesh.generators"
 INTEGRATORS = "pfem_petsc.integrators"
 WALLS = "pfem_petsc.contact.walls"
 CONSTRAINTS = "pfem_petsc.contact.constraints"
+STATIC_METHODS = "pfem_petsc.statics.methods"
 
 M = TypeVar("M", bound=StrictModel)
 
@@ -33,7 +34,8 @@ _LONG_KEY = re.compile(r"""(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*)""" +
 
 KEYS = [
     *("title", "mesh", "node_set", "material", "section", "initial", "support"),
-    *("load", "gravity", "temperature", "wall", "contact_pair", "constraint", "contact", "time", "output", "solver"),
+    *("load", "gravity", "temperature", "wall", "contact_pair", "constraint", "contact"),
+    *("time", "static", "modes", "output", "solver"),
 ]
 """Keys of a case file at its top."""
 
@@ -96,7 +98,7 @@ def read_tables(data: Mapping[str, Any], folder: Path, problems: Problems) -> di
             data.get("constraint"), "constraint", "kind", CONSTRAINTS, "a constraint of kind", problems
         ),
         "contact": problems.read(s.ContactSettings, data.get("contact", {}), ("contact",)),
-        "time": _time(data, problems),
+        **_analyses(data, problems),
         "output": _output(data.get("output", {}), problems),
         "solver": problems.read(s.Solver, data.get("solver", {}), ("solver",)),
     }
@@ -245,6 +247,36 @@ def _pairs(data: Any, problems: Problems) -> list[t.ContactPair]:
     rows = _rows(data, ("contact_pair",), problems)
     named = [{"name": f"pair{i + 1}", **row} if isinstance(row, Mapping) else row for i, row in enumerate(rows)]
     return _listed(t.ContactPair, named, ("contact_pair",), problems)
+
+
+def _analyses(data: Mapping[str, Any], problems: Problems) -> dict[str, Any]:
+    """The tables that say what is computed, of which a case has at least one."""
+    if "time" in data and "static" in data:
+        problems.add((), "expected one of the tables [time], [static], not both")
+    if not any(key in data for key in ("time", "static", "modes")):
+        problems.add((), "expected one of the tables [time], [static], [modes]: what is to be computed")
+    return {
+        "time": _time(data, problems) if "time" in data else None,
+        "static": _static(data, problems) if "static" in data else None,
+        "modes": problems.read(s.Modes, data["modes"], ("modes",)) if "modes" in data else None,
+    }
+
+
+def _static(data: Mapping[str, Any], problems: Problems) -> s.Static | None:
+    table = _required(data, "static", problems)
+    if table is None:
+        return None
+    own, others = _split(s.StaticKeys, table)
+    keys = problems.read(s.StaticKeys, own, ("static",))
+    if keys is None:
+        return None
+    model = _parameters_model(STATIC_METHODS, keys.method, ("static", "method"), problems)
+    if model is None:
+        return None
+    parameters = problems.read(
+        model, others, ("static",), known=["method"], taker=keys.method, siblings=lambda: _siblings(STATIC_METHODS)
+    )
+    return None if parameters is None else s.Static(method=keys.method, parameters=parameters)
 
 
 def _time(data: Mapping[str, Any], problems: Problems) -> s.Time | None:

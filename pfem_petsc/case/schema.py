@@ -34,7 +34,8 @@ class Case:
     node_set, material, section : tables by name, in the file's order
     initial, support, load, temperature, wall, contact_pair, constraint : lists of tables
     gravity : :class:`~pfem_petsc.case.tables.Gravity` or None
-    contact, time, output, solver : tables of :mod:`~pfem_petsc.case.settings`
+    contact, output, solver : tables of :mod:`~pfem_petsc.case.settings`
+    time, static, modes : what is computed, None for what is not; ``time`` and ``static`` exclude each other
 
     Notes
     -----
@@ -59,6 +60,18 @@ class Case:
 
     def __repr__(self) -> str:
         return f"<Case {self.name}: {self.title}>"
+
+    @property
+    def end(self) -> float:
+        """End of the analysis: a time [s], or a load factor; 0 without one."""
+        if self.time is not None:
+            return self.time.end
+        return getattr(self.static.parameters, "end", 0.0) if self.static is not None else 0.0
+
+    @property
+    def mass(self) -> str:
+        """The mass matrix, ``lumped`` or ``consistent``."""
+        return self.time.mass if self.time is not None else "lumped"
 
     @classmethod
     def load(cls, path_or_name: str | Path, overrides: Iterable[str] = ()) -> Case:
@@ -124,7 +137,6 @@ class Case:
         everywhere = [entry for entry in self.initial if entry.node_set is None]
         initial = _table(everywhere[0]) if everywhere else {}
         on = [_table(entry) for entry in self.initial if entry.node_set is not None]
-        time = _table(self.time)
         mesh = _table(self.mesh)
         data = {
             "title": self.title,
@@ -141,7 +153,9 @@ class Case:
             "contact_pair": [_table(entry) for entry in self.contact_pair],
             "constraint": [_table(entry) for entry in self.constraint],
             "contact": _table(self.contact),
-            "time": {**time, **_table(self.time.scheme)},
+            "time": {**_table(self.time), **_table(self.time.scheme)} if self.time is not None else {},
+            "static": {**_table(self.static), **_table(self.static.parameters)} if self.static is not None else {},
+            "modes": _table(self.modes),
             "output": _table(self.output),
             "solver": _table(self.solver),
         }

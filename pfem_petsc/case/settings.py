@@ -15,7 +15,10 @@ __all__ = [
     "Output",
     "OutputKeys",
     "Probe",
+    "Modes",
     "Solver",
+    "Static",
+    "StaticKeys",
     "Time",
     "TimeKeys",
 ]
@@ -65,6 +68,28 @@ class Time(TimeKeys):
     """The time integration: scheme, its parameters, step and end."""
 
     scheme: InstanceOf[StrictModel]
+
+
+class StaticKeys(StrictModel):
+    """The keys of [static] that are not a method's own."""
+
+    method: str = "newton"
+    """name of a method that finds equilibria"""
+
+
+class Static(StaticKeys):
+    """The static analysis: method and its parameters."""
+
+    parameters: InstanceOf[StrictModel]
+
+
+class Modes(StrictModel):
+    """Modes of the state at the end of the analysis, or of the initial state where the case has none."""
+
+    count: PositiveInt = 10
+    """number of modes"""
+    kind: Literal["vibration", "buckling"] = "vibration"
+    """natural frequencies, or linear buckling factors of the load"""
 
 
 class Probe(StrictModel):

@@ -39,7 +39,7 @@ class Impacts:
         self.model = stepper.model
         contact = self.model.contact
         self.met = np.flatnonzero(stepper.closed.any(axis=1))
-        self.active = self.model.can_touch
+        self.active = self.model.can_touch and stepper.scheme.inertial
         free = contact.motion.free
         self.counted = np.ones(len(contact.names), dtype=bool)
         if free is not None:

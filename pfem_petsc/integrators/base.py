@@ -104,9 +104,11 @@ class Scheme(ABC):
     turns_held : x1 - x0 = h (v0 + v1)/2 and nothing else ties velocity to position: a node that is held in place from
         one step to the next has its velocity turned round
     notice : what users must be told when they choose it; empty for nothing
+    inertial : whether its balance has inertia; without it there are no velocities, impulses and impacts
     """
 
     explicit = False
+    inertial = True
     solves_next_position = False
     balance_at_endpoints = True
     solves_end = True
@@ -125,6 +127,10 @@ class Scheme(ABC):
     def limit(self, damping_ratio: float = 0.0) -> float:
         """Largest stable Omega = omega h at a damping ratio; infinite where unconditionally stable."""
         return np.inf
+
+    def expected_move(self, state: State, h: float) -> np.ndarray:
+        """Displacement (owned, 3) of a step if the motion so far goes on [m]."""
+        return h * state.v
 
     def start(self, state: State, h: float) -> None:
         """Set memory up from the complete state at the start (x, v, a); nothing by default."""

@@ -32,6 +32,7 @@ class ExternalForce:
 
     Attributes
     ----------
+    ramped : whether gravity and loads without a table are multiplied by the time, which is a load factor then
     active : whether anything acts at all (on any rank, at any time)
     steady : whether the forces are constant
     """
@@ -44,12 +45,14 @@ class ExternalForce:
         gravity = case.gravity.acceleration if case.gravity is not None else (0.0, 0.0, 0.0)
         self.gravity = np.array(gravity, dtype=np.float64)
         self.inertia = inertia
+        self.ramped = case.static is not None
         self.active = bool(case.load) or bool(self.gravity.any())
-        self.steady = not any(table is not None for _, _, table in self.loads)
+        self.steady = not self.ramped and not any(table is not None for _, _, table in self.loads)
 
     def at(self, time: float, out: np.ndarray) -> np.ndarray:
-        """``out`` (owned, 3) [N] at a time [s]."""
-        np.multiply(self.inertia.mass[:, None], self.gravity, out=out)
+        """``out`` (owned, 3) [N] at a time [s], or at a load factor."""
+        full = time if self.ramped else 1.0
+        np.multiply(self.inertia.mass[:, None], full * self.gravity, out=out)
         for indices, force, table in self.loads:
-            out[indices] += force * (table(time)[0] if table is not None else 1.0)
+            out[indices] += force * (table(time)[0] if table is not None else full)
         return out

@@ -36,7 +36,7 @@ def bars_larger_than_walls(case: Case, model: Model) -> list[str]:
     v = model.initial_velocity()
     drift = model.comm.allreduce(model.inertia.mass @ v) / model.total_mass
     gravity = np.zeros(3) if case.gravity is None else np.array(case.gravity.acceleration)
-    times = np.linspace(0.0, case.time.end, _SAMPLES)
+    times = np.linspace(0.0, case.end, _SAMPLES)
     told = []
     for k in small:
         wall, keys = contact.walls[k], case.wall[k]

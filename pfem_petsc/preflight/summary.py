@@ -5,8 +5,6 @@ from __future__ import annotations
 import resource
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from ..output.units import engineering
 
 if TYPE_CHECKING:
@@ -22,8 +20,6 @@ def summarise(case: Case, model: Model, plan: Plan) -> dict[str, str]:
     """Label and text. Collective."""
     mesh, comm = model.mesh, model.comm
     counts = comm.allgather((mesh.n_owned, mesh.n_local - mesh.n_owned))
-    critical = engineering(plan.critical_step, "s") if np.isfinite(plan.critical_step) else "none (implicit)"
-    parameters = ", ".join(f"{k} = {v:g}" for k, v in case.time.scheme.model_dump().items())
     # kibibytes on Linux
     peak = comm.allreduce(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024.0)
     ranks = f"{comm.size}"
@@ -35,12 +31,9 @@ def summarise(case: Case, model: Model, plan: Plan) -> dict[str, str]:
         "bars": f"{mesh.n_bars:,}",
         "ranks": ranks,
         "extent": " x ".join(engineering(float(d), "m") for d in model.high - model.low),
-        "mass": engineering(model.total_mass, "kg") + f" ({case.time.mass})",
+        "mass": engineering(model.total_mass, "kg") + f" ({case.mass})",
         "wave speed": engineering(model.wave_speed, "m/s"),
-        "integrator": case.time.integrator + (f" ({parameters})" if parameters else ""),
-        "critical step": critical,
-        "time step": f"{engineering(plan.step, 's', 6)}, {plan.steps:,} steps to "
-        f"{engineering(plan.step * plan.steps, 's')}",
+        **plan.entries(case),
         "linear solver": plan.linear.why if plan.linear is not None else "none: every node on its own",
         "walls": ", ".join(map(_described, case.wall)) or "none",
         "memory": f"{engineering(peak, 'B', 3)} in use on all ranks",

@@ -12,7 +12,7 @@ from ..output.row import Row
 from ..output.vtkhdf import ResultWriter
 from ..stepping.ledger import Ledger
 from .blowup import BlowUp
-from .contact_watch import ContactWatch
+from .contact_watch import ContactWatch, NoContactWatch
 from .observer import NEVER, Observer
 from .recorder import Recorder
 
@@ -47,7 +47,8 @@ class History(Observer):
         self.ledger = Ledger(stepper)
         self.recorder = Recorder(stepper, self.ledger)
         self.blow_up = BlowUp(model)
-        self.contact_watch = ContactWatch(model, warn, stepper.scheme.explicit)
+        scheme = stepper.scheme
+        self.contact_watch = ContactWatch(model, warn, scheme.explicit) if scheme.inertial else NoContactWatch()
         self.row: dict[str, Any] | None = None
         self.writer: ResultWriter | None = None
         stepper.booking = self._book

@@ -51,6 +51,7 @@ class Recorder:
         self.iterations = [0, 0]
         case, mesh, comm = self.model.case, self.model.mesh, self.model.comm
         self.columns: dict[str, tuple[int, ...]] = {"time": (), "step": (), "step_size": ()}
+        self.columns |= dict.fromkeys(stepper.columns, ())
         self.columns |= {name: () for name in ("newton_iterations", "linear_iterations", "active_contacts")}
         self.columns |= {energy.name: () for energy in ENERGIES} | {"energy_imbalance": ()}
         self.columns |= {name: (3,) for name, size in HEAD.sizes.items() if size == 3}
@@ -147,7 +148,9 @@ class Recorder:
         stepper, state = self.stepper, self.stepper.state
         vector, at = np.empty(self.layout.width), self._at
         vector[self._to] = sums[self._from]
-        vector[at["time"]], vector[at["step"]], vector[at["step_size"]] = state.time, state.step, stepper.smallest
+        vector[at["time"]], vector[at["step"]], vector[at["step_size"]] = stepper.clock, state.step, stepper.smallest
+        for name in stepper.columns:
+            vector[at[name]] = getattr(stepper, name)
         vector[at["newton_iterations"]], vector[at["linear_iterations"]] = self.iterations
         for term in _DERIVED:
             vector[at[term.name]] = sum(sums[HEAD.first(name)] for name in term.parts)

@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
-from ..analysis import Step
+from ..analysis import Analysis, Step
 from ..contact.alarm import check_positions
 from ..contact.piercing import Piercing
 from ..output.vtkhdf import ResultWriter
 from .fields import Fields
 from .observer import Observer
-
-if TYPE_CHECKING:
-    from ..stepping.stepper import Stepper
 
 __all__ = ["Snapshots"]
 
@@ -23,8 +19,7 @@ class Snapshots(Observer):
 
     Parameters
     ----------
-    stepper : Stepper
-    last_step : number of the last step of the run
+    analysis : Analysis
     fields : Fields
     warn : takes a warning
 
@@ -36,9 +31,10 @@ class Snapshots(Observer):
 
     needs_agreement = True
 
-    def __init__(self, stepper: Stepper, last_step: int, fields: Fields, warn: Callable[[str], None]) -> None:
+    def __init__(self, analysis: Analysis, fields: Fields, warn: Callable[[str], None]) -> None:
+        stepper = analysis.stepper
         self.every = stepper.model.case.output.fields_every
-        self._stepper, self._last_step, self._fields, self._warn = stepper, last_step, fields, warn
+        self._analysis, self._stepper, self._fields, self._warn = analysis, stepper, fields, warn
         self._piercing = Piercing(stepper.model)
         self.last = -1
         self.writer: ResultWriter | None = None
@@ -50,11 +46,11 @@ class Snapshots(Observer):
     def write(self) -> None:
         """A snapshot of the present state, once nodes are known to keep the walls."""
         state, fields = self._stepper.state, self._fields
-        if not self.every and 0 < state.step < self._last_step:
+        if not self.every and 0 < state.step < self._analysis.last_step:
             return
         check_positions(self._stepper)
         at_nodes = fields.at_nodes(state, self._stepper.acceleration)
-        self.writer.write_snapshot(state.time, state.step, state.position, at_nodes, fields.at_bars(state))
+        self.writer.write_snapshot(self._stepper.clock, state.step, state.position, at_nodes, fields.at_bars(state))
         self.last = state.step
         for text in self._piercing.look(state.x, state.time):
             self._warn(text)

@@ -150,13 +150,13 @@ def _refuse_loss(path: Path, plan: Plan) -> None:
     """Results beyond the end of the run would be cut off."""
     with results.open_result(path) as result:
         steps, times = result.history["step"], result.history["time"]
-        snapshots = int((result.steps > plan.steps).sum())
-    rows = int((steps > plan.steps).sum())
+        snapshots = int(plan.beyond(result.steps, result.times).sum())
+    rows = int(plan.beyond(steps, times).sum())
     if rows or snapshots:
         reached = max([*times[-1:], *result.times[-1:]])
         raise InputError(
             f"{path}: the results reach t = {engineering(reached, 's')}, beyond time.end = "
-            f"{engineering(plan.step * plan.steps, 's')}: to continue from the checkpoint up to there would cut off "
+            f"{engineering(plan.end, 's')}: to continue from the checkpoint up to there would cut off "
             f"{rows} rows of the history and {snapshots} snapshots; take a later end (--set time.end={reached:.6g} or "
             "more), another folder (-o), or start without --restart, which moves the results aside"
         )

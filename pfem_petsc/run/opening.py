@@ -32,7 +32,7 @@ def open_progress(
         model.comm,
         printable(case.title),
         plan.steps,
-        plan.step * plan.steps,
+        plan.end or 0.0,
         quiet,
         folder / "log.txt",
         start_step=start[0],
@@ -77,7 +77,7 @@ def _attributes(model: Model, plan: Plan, recorder: Recorder) -> dict[str, Any]:
         "folder": str(case.folder.resolve()),
         "overrides": list(case.overrides),
         "time_step": plan.step,
-        "steps": plan.steps,
+        "steps": plan.steps if plan.steps is not None else -1,
         "linear_solver": plan.linear.why if plan.linear is not None else "none",
         "partitioner": model.mesh.partitioner,
     }

@@ -107,7 +107,7 @@ class Outputs:
         self.history = history = History(stepper, self._synchroniser, warn)
         if hasattr(stepper, "message"):
             stepper.message = warn
-        self.snapshots = Snapshots(stepper, plan.steps, self.fields, warn)
+        self.snapshots = Snapshots(analysis, self.fields, warn)
         self.checkpointing = Checkpointing(checkpoints, history, self.snapshots, self._synchroniser)
         self._report = ProgressReport(self.progress, analysis, history)
         if restart is not None:

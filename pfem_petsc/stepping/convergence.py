@@ -28,7 +28,7 @@ def residual_tolerance(model: Model, state: State, balance: Balance, step: float
     solver, owned = model.case.solver, model.mesh.n_owned
     sums = np.array(
         [
-            ((model.inertia.mass[:, None] * state.v) ** 2).sum() / step**2,
+            ((model.inertia.mass[:, None] * state.v) ** 2).sum() / step**2 if state.v.any() else 0.0,
             (state.external**2).sum(),
             (state.f[:owned] ** 2).sum(),
         ]

@@ -39,7 +39,6 @@ atexit.register(gc.collect)
 __all__ = ["ImplicitStepper"]
 
 _HALVINGS = 10  # most halvings of a step: to 1/1024
-_REMEDY = "Reduce time.step; if such jumps are intended, set solver.guard = false"
 
 
 class ImplicitStepper(Stepper):
@@ -48,6 +47,7 @@ class ImplicitStepper(Stepper):
     kept_numbers = (*Stepper.kept_numbers, "level", "lagged_count")
     kept_arrays = (*Stepper.kept_arrays, "held", "lagged_place")
     kept_bars = ("lagged_history",)
+    remedy = "reduce time.step; if such jumps are intended, set solver.guard = false"
 
     def __init__(self, model: Model, scheme: Scheme, h: float, choice: LinearChoice) -> None:
         super().__init__(model, scheme, h)
@@ -175,7 +175,7 @@ class ImplicitStepper(Stepper):
             if self.guard is not None and balance.weight:
                 reason = self._suspicion(balance, solution)
                 if reason is not None:
-                    raise NotConverged(f"{self.when(balance)}: {reason}. {_REMEDY}")
+                    raise NotConverged(f"{self.when(balance)}: {reason}; {self.remedy}")
         except NotConverged:
             state.contact, state.support, self.held, forces = kept
             links.restore(forces)
@@ -192,7 +192,7 @@ class ImplicitStepper(Stepper):
         momentum = model.inertia.mass_times(state.v, np.empty_like(state.v))
         work = state.external + state.contact + state.support
         energy = 0.5 * float((momentum * state.v).sum()) + 0.5 * float(np.abs(work * move).sum())
-        return self.guard.check(state.x, self._after, state.position + h * state.v, energy)
+        return self.guard.check(state.x, self._after, state.position + self.scheme.expected_move(state, h), energy)
 
     def _with_walls(self, balance: Balance) -> Solution:
         """Solve a balance together with the motion of walls with mass. Collective."""

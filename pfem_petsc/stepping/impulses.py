@@ -26,7 +26,7 @@ from ..tolerances import RANK
 if TYPE_CHECKING:
     from .stepper import Stepper
 
-__all__ = ["DAMPING", "EXTERNAL", "SUPPORT", "WALLS", "Impulses", "fill_impulses", "wall_shares"]
+__all__ = ["DAMPING", "EXTERNAL", "SUPPORT", "WALLS", "Impulses", "NoImpulses", "fill_impulses", "wall_shares"]
 
 SUPPORT, EXTERNAL, DAMPING, WALLS = 0, 1, 2, 3
 
@@ -173,3 +173,16 @@ class Impulses:
                 self.state.memory[name.removeprefix("memory.")] = array
             else:
                 setattr(self.state, name, array)
+
+
+class NoImpulses(Impulses):
+    """For balances without inertia, where no time passes: all impulses are zero."""
+
+    def start(self, totals: np.ndarray) -> None:
+        """Nothing."""
+
+    def step(self, totals: np.ndarray) -> None:
+        """Nothing."""
+
+    def jump(self) -> None:
+        """Nothing."""

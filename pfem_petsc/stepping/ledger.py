@@ -25,7 +25,7 @@ from ..contact.impact import Impacts
 from ..energies import ENERGIES
 from ..output.sums import HEAD
 from .heating import Heating
-from .impulses import Impulses, wall_shares
+from .impulses import Impulses, NoImpulses, wall_shares
 from .moment import Moment, balanced, moment_of
 from .node_loops import WORKS, book_nodes
 from .sum_loops import add_totals, add_works
@@ -67,7 +67,8 @@ class Ledger:
         self._book(self._before, self._before, self._before, self.stepper.state.position)
         self._heating = Heating(stepper)
         self._walls_before()
-        self.impacts, self.impulses = Impacts(stepper), Impulses(stepper)
+        self.impacts = Impacts(stepper)
+        self.impulses = (Impulses if stepper.scheme.inertial else NoImpulses)(stepper)
         self._pending = [0.0, 0.0]  # what impact and friction take in the step that a scheme has solved in advance
         if stepper.totals_at_start is not None:
             self.impulses.start(stepper.totals_at_start)

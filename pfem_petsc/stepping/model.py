@@ -70,7 +70,7 @@ class Model:
         if adjusted:
             self.warnings.append(f"{adjusted} node{'s' * (adjusted > 1)} that started beyond walls moved onto them")
         self.bars = Bars(mesh, case)
-        self.inertia = Inertia(mesh, self.bars, case.time.mass == "consistent")
+        self.inertia = Inertia(mesh, self.bars, case.mass == "consistent")
         self.external = ExternalForce(case, self.nodes, self.inertia)
         with agreed(comm):
             self.supports = Supports(case, self.nodes, mesh)

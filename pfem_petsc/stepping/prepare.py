@@ -14,6 +14,7 @@ from ..contact.restitution import Treatment as Restitution
 from ..contact.treatments.base import Treatment
 from ..errors import InputError
 from ..integrators.base import Scheme
+from ..output.units import engineering
 from ..registry import choices, lookup
 from ..solvers.linear import LinearChoice, choose_linear
 from ..tolerances import TIME
@@ -58,6 +59,25 @@ class Plan:
     frequency: Frequency
     linear: LinearChoice | None
     asked: tuple[str, str] = ("auto", "auto")
+
+    @property
+    def end(self) -> float:
+        """Time of the last step [s]."""
+        return self.step * self.steps
+
+    def beyond(self, steps: np.ndarray, times: np.ndarray) -> np.ndarray:
+        """Which of recorded steps with their times lie beyond the end."""
+        return steps > self.steps
+
+    def entries(self, case: Case) -> dict[str, str]:
+        """Label and text of what a user checks before a run."""
+        parameters = ", ".join(f"{k} = {v:g}" for k, v in case.time.scheme.model_dump().items())
+        critical = engineering(self.critical_step, "s") if np.isfinite(self.critical_step) else "none (implicit)"
+        return {
+            "integrator": case.time.integrator + (f" ({parameters})" if parameters else ""),
+            "critical step": critical,
+            "time step": f"{engineering(self.step, 's', 6)}, {self.steps:,} steps to {engineering(self.end, 's')}",
+        }
 
     def record(self) -> dict[str, Any]:
         """What a restart must not work out anew, in numbers that keep their last bit."""

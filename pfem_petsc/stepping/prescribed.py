@@ -12,7 +12,7 @@ from ..integrators.base import Balance, State
 if TYPE_CHECKING:
     from .stepper import Stepper
 
-__all__ = ["PrescribedMotion"]
+__all__ = ["NoRates", "PrescribedMotion"]
 
 
 class PrescribedMotion:
@@ -78,3 +78,11 @@ class PrescribedMotion:
         ruled, given = self._ruled, {"v": state.v, "a": state.a, **state.memory}
         made = {"v": ruled.v, "a": ruled.a, **ruled.memory}
         self.change = {name: given[name][supports.at] - array[:, 0] for name, array in made.items()}
+
+
+class NoRates(PrescribedMotion):
+    """For balances without inertia, where supports prescribe positions alone: these are part of the guess."""
+
+    def __init__(self, stepper: Stepper) -> None:
+        super().__init__(stepper)
+        self.moving = False

@@ -43,7 +43,7 @@ class StepProblem:
         self.u = np.zeros((mesh.n_owned, 3))
         self._work = np.zeros((mesh.n_owned, 3))
         self.nodal = balance.alpha * inertia.mass + balance.eta * inertia.damping
-        self.scale = float(self.nodal.max(initial=0.0))
+        self.scale = float((self.nodal if balance.alpha else model.nodal_stiffness).max(initial=0.0))
         # what does not change with u: M a_hat + C v_hat + (1 - w) f_n - f_ext
         known = -external
         if balance.a_hat is not None:

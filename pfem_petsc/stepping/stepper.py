@@ -51,11 +51,13 @@ class Stepper(ABC):
     steady : the loop over many steps (``stepping/fused_loop.py``) makes the same steps, where all else allows it
     kept_numbers, kept_arrays, kept_bars : names of attributes that, with the state, determine what comes: numbers,
         arrays with a row for each owned node, and for each local bar
+    columns : names of attributes, numbers, that are columns of the history
     """
 
     kept_numbers: tuple[str, ...] = ("part", "smallest")
     kept_arrays: tuple[str, ...] = ("touching", "closed")
     kept_bars: tuple[str, ...] = ()
+    columns: tuple[str, ...] = ()
     renews_forces = False
     steady = False
 
@@ -165,6 +167,11 @@ class Stepper(ABC):
         state, inertia = self.state, self.model.inertia
         damping = -inertia.damping_times(state.v, np.empty_like(state.v))
         return np.array([state.support.sum(axis=0), state.external.sum(axis=0), damping.sum(axis=0)])
+
+    @property
+    def clock(self) -> float:
+        """Time of the state in the results, which increases from step to step."""
+        return self.state.time
 
     def step(self) -> None:
         """Advance from t_n to t_{n+1}; the state is complete at both. Collective where the solve is."""

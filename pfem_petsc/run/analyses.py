@@ -1,0 +1,26 @@
+"""Which analysis a case asks for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from ..analysis import Analysis
+from ..statics.analysis import StaticAnalysis
+from ..stepping.prepare import make_plan
+from ..stepping.time_stepping import TimeStepping
+
+if TYPE_CHECKING:
+    from ..stepping.model import Model
+
+__all__ = ["make_analysis"]
+
+
+def make_analysis(model: Model, recorded: Mapping[str, Any] | None) -> Analysis:
+    """The analysis of a model's case. Collective.
+
+    ``recorded``: record of the plan of the run that is continued, None for a new run
+    """
+    if model.case.static is not None:
+        return StaticAnalysis(model, recorded)
+    return TimeStepping(model, make_plan(model, recorded))

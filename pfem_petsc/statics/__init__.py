@@ -1,0 +1,1 @@
+"""Static analyses: equilibria under loads, supports, temperatures and walls that follow a load factor."""

@@ -1,0 +1,150 @@
+"""The static analysis of a case with a table ``[static]``: its plan, what it refuses, and its steps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..analysis import Analysis, Step
+from ..case.materials import law_name, law_of
+from ..errors import InputError, PfemError
+from ..integrators.base import Scheme, State
+from ..registry import lookup
+from ..solvers.linear import LinearChoice, choose_linear
+from ..tolerances import TIME
+from .scheme import Equilibrium
+
+if TYPE_CHECKING:
+    from ..case.schema import Case
+    from ..stepping.model import Model
+
+__all__ = ["METHODS", "StaticAnalysis", "StaticPlan"]
+
+METHODS = "pfem_petsc.statics.methods"
+NEVER = 2**62
+
+_DIRECT_UP_TO = 30_000  # unknowns; beyond, multigrid takes less time and memory than a factorisation
+
+
+@dataclass(frozen=True)
+class StaticPlan:
+    """What a static run will do.
+
+    Attributes
+    ----------
+    scheme : the balance without inertia
+    step : first increment of the load factor
+    end : last load factor; None where the path ends by other limits
+    linear : linear solver
+    steps : number of steps, which is not known before
+    """
+
+    scheme: Scheme
+    step: float
+    end: float | None
+    linear: LinearChoice
+    steps: int | None = None
+
+    def beyond(self, steps: np.ndarray, times: np.ndarray) -> np.ndarray:
+        """Which of recorded steps with their times lie beyond the end."""
+        return times > (np.inf if self.end is None else self.end * (1.0 + TIME))
+
+    def entries(self, case: Case) -> dict[str, str]:
+        """Label and text of what a user checks before a run."""
+        given = case.static.parameters.model_dump(exclude_none=True)
+        words = ", ".join(f"{key} = {value}" for key, value in given.items())
+        return {"static analysis": f"{case.static.method} ({words})"}
+
+    def record(self) -> dict[str, Any]:
+        """What a restart must not work out anew."""
+        return {}
+
+
+class StaticAnalysis(Analysis):
+    """Advances a state from equilibrium to equilibrium. Construction is collective.
+
+    Parameters
+    ----------
+    model : Model
+    recorded : ``StaticPlan.record`` of the run that is continued
+
+    Raises
+    ------
+    InputError
+        On all ranks, where the case asks for what a static analysis does not have.
+    """
+
+    def __init__(self, model: Model, recorded: Mapping[str, Any] | None = None) -> None:
+        case = model.case
+        _check(model)
+        self.model = model
+        parameters = case.static.parameters
+        choice = _linear(model)
+        self.plan = StaticPlan(Equilibrium(), parameters.step, getattr(parameters, "end", None), choice)
+        self.step_size = parameters.step
+        self.stepper = lookup(METHODS, case.static.method, "static.method").make_stepper(model, parameters, choice)
+
+    @property
+    def last_step(self) -> int:
+        """Number of the last step once it is reached, before that a number beyond all."""
+        return self.stepper.state.step if self.stepper.done else NEVER
+
+    @property
+    def state(self) -> State:
+        return self.stepper.state
+
+    @property
+    def fault(self) -> PfemError | None:
+        return self.stepper.fault
+
+    def start(self) -> None:
+        self.stepper.start()
+
+    def advance(self) -> Step:
+        self.stepper.step()
+        state, solution = self.stepper.state, self.stepper.solution
+        return Step(state.step, self.stepper.clock, solution.newton, solution.linear, None)
+
+    def close(self) -> None:
+        self.stepper.destroy()
+
+
+def _linear(model: Model) -> LinearChoice:
+    """The linear solver: a factorisation where it is affordable, which needs no definiteness; else multigrid."""
+    solver, unknowns = model.case.solver, 3 * model.mesh.n_nodes
+    request = solver.linear
+    if request == "auto":
+        request = "mumps" if unknowns <= _DIRECT_UP_TO and solver.operator != "matrix_free" else "gamg"
+    return choose_linear(request, unknowns, np.inf, True, solver.operator)
+
+
+def _check(model: Model) -> None:
+    """Refuse what only makes sense over time."""
+    case = model.case
+    source = case.source
+    if any(any(entry.velocity) or any(entry.angular_velocity) for entry in case.initial):
+        raise InputError(f"{source}: initial: a static analysis has no velocities; remove the table [initial]")
+    if case.contact.treatment != "scheme":
+        raise InputError(
+            f'{source}: contact.treatment = "{case.contact.treatment}" treats impacts, and a static analysis has none; '
+            "remove the key"
+        )
+    for wall in case.wall:
+        if wall.mass is not None:
+            raise InputError(
+                f"{source}: wall {wall.name!r}: mass: a wall with mass moves over time; remove mass, or give the wall "
+                "a motion"
+            )
+    for name, material in case.material.items():
+        if law_of(material).rate:
+            raise InputError(
+                f'{source}: material.{name}.law = "{law_name(dict(material))}" depends on the rate of strain, and a '
+                "static analysis has no time; take another law"
+            )
+    if not model.supports.any and not model.can_touch:
+        raise InputError(
+            f"{source}: static: nothing holds the truss: its rigid-body motions are free; give a [[support]]"
+        )

@@ -1,0 +1,1 @@
+"""Methods that find equilibria, one module each: ``static.method`` names it."""

@@ -1,0 +1,57 @@
+"""Equilibria at increasing load factors by Newton's method; walls and pairs are bounds on positions."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from pydantic import model_validator
+
+from ...case.base import PositiveFloat, StrictModel
+from ...errors import InputError
+
+if TYPE_CHECKING:
+    from ...solvers.linear import LinearChoice
+    from ...stepping.model import Model
+    from ..stepper import StaticStepper
+
+__all__ = ["Parameters", "make_stepper"]
+
+_SMALLEST = 2.0**-10  # of the first increment
+
+
+class Parameters(StrictModel):
+    """Increments of the load factor."""
+
+    step: PositiveFloat = 0.1
+    """first increment of the load factor"""
+    end: PositiveFloat = 1.0
+    """last load factor"""
+    min_step: PositiveFloat | None = None
+    """smallest increment; default: a 1024th of ``step``"""
+    max_step: PositiveFloat | None = None
+    """largest increment, to which they grow after increments of few Newton iterations; default: ``step``"""
+
+    @property
+    def smallest(self) -> float:
+        """The smallest increment."""
+        return _SMALLEST * self.step if self.min_step is None else self.min_step
+
+    @property
+    def largest(self) -> float:
+        """The largest increment."""
+        return self.step if self.max_step is None else self.max_step
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Parameters:
+        if self.smallest > self.step:
+            raise InputError(f"min_step = {self.min_step!r} is larger than step = {self.step!r}")
+        if self.largest < self.step:
+            raise InputError(f"max_step = {self.max_step!r} is smaller than step = {self.step!r}")
+        return self
+
+
+def make_stepper(model: Model, parameters: Parameters, choice: LinearChoice) -> StaticStepper:
+    """The stepper of a case. Collective."""
+    from ..stepper import StaticStepper
+
+    return StaticStepper(model, choice, parameters)

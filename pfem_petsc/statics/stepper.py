@@ -1,0 +1,130 @@
+"""Increments of the load factor, each an equilibrium found by Newton's method, or by bounds where walls are near."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from ..errors import NotConverged, SimulationFailure
+from ..integrators.base import Balance
+from ..solvers.linear import LinearChoice
+from ..stepping.implicit import ImplicitStepper
+from ..stepping.prescribed import NoRates
+from ..tolerances import TIME
+from .scheme import Equilibrium
+
+if TYPE_CHECKING:
+    from ..stepping.model import Model
+
+__all__ = ["StaticStepper"]
+
+_FEW = 5  # Newton iterations up to which the next increment is larger
+_GROWTH = 1.5
+
+
+class Increments(Protocol):
+    """First, smallest and largest increment of the load factor, and the last load factor."""
+
+    step: float
+    smallest: float
+    largest: float
+    end: float
+
+
+class StaticStepper(ImplicitStepper):
+    """Advances the equilibrium from one load factor to the next; the state's time is the load factor.
+
+    An increment that does not converge, or that the guard rejects, is halved; after one that took few Newton
+    iterations the next is larger, up to ``largest``.
+
+    Parameters
+    ----------
+    model : Model
+    choice : LinearChoice
+    limits : first, smallest and largest increment of the load factor, and the last load factor
+
+    Attributes
+    ----------
+    increment : that is tried next
+    """
+
+    kept_numbers = (*ImplicitStepper.kept_numbers, "increment")
+    columns = ("load_factor",)
+    remedy = "reduce static.max_step or static.step; if such jumps are intended, set solver.guard = false"
+
+    def __init__(self, model: Model, choice: LinearChoice, limits: Increments) -> None:
+        super().__init__(model, Equilibrium(), limits.step, choice)
+        self.prescribed = NoRates(self)
+        self.limits, self.increment, self.end = limits, limits.step, limits.end
+
+    @property
+    def load_factor(self) -> float:
+        """Load factor of the state."""
+        return self.state.time
+
+    @property
+    def done(self) -> bool:
+        """Whether the last load factor is reached."""
+        return self.state.time >= self.end * (1.0 - TIME)
+
+    def start(self) -> None:
+        """The state at load factor zero, as the mesh is: equilibrium begins with the first increment. Collective."""
+        state, model = self.state, self.model
+        state.v = np.zeros_like(self.zero)
+        state.a = np.zeros_like(self.zero)
+        if model.supports.any:
+            state.position[model.supports.at] = model.supports.positions(0.0)
+        self.evaluate(commit=True)
+        if model.external.active:
+            state.external = model.external.at(0.0, np.empty_like(state.v))
+        self.totals_at_start = self._totals()
+        self.scheme.start(state, self.h)
+        model.contact.motion.start(self.h)
+
+    def step(self) -> None:
+        """Find the equilibrium at the next load factor.
+
+        Raises
+        ------
+        NotConverged
+            On all ranks, when the smallest increment does not converge either.
+        """
+        state, left = self.state, self.end - self.state.time
+        size = self.increment if self.increment < left * (1.0 - TIME) else left
+        while True:
+            self._set_part(size)
+            self.smallest = size
+            end = self.end if size == left else state.time + size
+            try:
+                self._make_part(end)
+                break
+            except NotConverged as failure:
+                if self.model.temperatures.varying:
+                    # the failed solve has heated the bars to its own end
+                    self.model.temperatures.apply(state.time)
+                if 0.5 * size < self.limits.smallest:
+                    raise self._no_further(failure) from failure
+                size *= 0.5
+                self.message(f"{failure}; halving the increment, to {size:.4g}")
+        self.increment = size
+        if self.solution.newton <= _FEW:
+            self.increment = max(size, min(_GROWTH * size, self.limits.largest))
+        state.step += 1
+
+    def _no_further(self, failure: NotConverged) -> SimulationFailure:
+        """What to tell of the load factor beyond which no equilibrium was found."""
+        return SimulationFailure(
+            f"no equilibrium found beyond load factor {self.state.time:.6g} with increments down to "
+            f"{self.limits.smallest:.3g}: it is a limit point, or part of the truss is a mechanism; static.method = "
+            f'"arc_length" follows the path beyond a limit point, "relaxation" finds the equilibrium of slack '
+            f"structures. The last attempt: {failure}"
+        )
+
+    def _guess(self, balance: Balance) -> np.ndarray:
+        """The increment in proportion to the last one; prescribed components at their exact positions."""
+        guess = self.scheme.expected_move(self.state, balance.time - self.state.time)
+        supports = self.model.supports
+        if supports.any:
+            guess[supports.at] = supports.positions(balance.time) - balance.predictor[supports.at]
+        return guess

@@ -267,7 +267,7 @@ class Simulation:
             On all ranks; what was recorded before is in the result file.
         """
         if self.finished and self.comm.rank == 0 and not self.quiet:
-            print(finished_message(self.folder, self._reached, self.plan.end))
+            print(finished_message(self.folder, self._reached, self.plan))
         for _ in self.batches():
             pass
         return 0

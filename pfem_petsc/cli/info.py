@@ -45,20 +45,18 @@ def run(arguments: argparse.Namespace) -> int:
 
 def describe(result: Result) -> list[str]:
     """Lines about a result."""
-    from ..output.units import engineering
-
     lines = [result.case.title]
     rows = {"file": str(result.path), "mesh": f"{result.n_nodes:,} nodes, {result.n_bars:,} bars"}
     rows.update({key: str(value) for key, value in result.attributes.items() if value not in ("", {}, [])})
-    times = result.times
-    span = f": {engineering(times[0], 's')} to {engineering(times[-1], 's')}" if len(times) else ""
+    times, axis = result.times, result.axis
+    span = f": {axis.span(times[0], times[-1])}" if len(times) else ""
     rows["snapshots"] = f"{len(times)}{span}"
     history = result.history
     names = list(history)
     count = len(history["time"]) if "time" in names else 0
     if count:
         time = history["time"]
-        rows["history"] = f"{count} rows: {engineering(time[0], 's')} to {engineering(time[-1], 's')}"
+        rows["history"] = f"{count} rows: {axis.span(time[0], time[-1])}"
     else:
         rows["history"] = "0 rows"
     width = max(map(len, rows))

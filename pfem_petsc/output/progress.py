@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Self, TextIO
 from ..parallel.agreement import agreed
 from .bar import ProgressBar, is_terminal
 from .log import LogFile
-from .units import duration, engineering
+from .units import TIME, Axis, duration
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -44,10 +44,11 @@ class Progress:
     ----------
     title : what the bar and the log are headed with
     n_steps : number of the last step, None where unknown (then progress is measured by time)
-    end_time : [s]
+    end_time : [s], or in the unit of the axis
     quiet : nothing on stdout; the log is written nevertheless, and warnings still go to stderr
     log_path : file of the log, None for no log
     start_step, start_time : where a restarted run begins; rates and remaining time count from there
+    axis : of the times
     stream, clock : stdout and the wall clock [s], to be replaced in tests
     """
 
@@ -62,10 +63,12 @@ class Progress:
         *,
         start_step: int = 0,
         start_time: float = 0.0,
+        axis: Axis = TIME,
         stream: TextIO | None = None,
         clock: Callable[[], float] = perf_counter,
     ) -> None:
         self._root = comm.rank == 0
+        self._axis = axis
         self._title, self._n_steps, self._end_time = title, n_steps, end_time
         self._stream = None if quiet else (stream or sys.stdout)
         self._bar: ProgressBar | None = None
@@ -179,7 +182,7 @@ class Progress:
             text += f", of it {duration(self._compiling)} for compiling"
         if steps and wall > self._compiling:
             text += f" ({_speed(steps / (wall - self._compiling))})"
-        text += f", t = {engineering(time, 's')}"
+        text += f", {self._axis.place(time)}"
         if self._newton:
             text += f", {self._newton:,} Newton and {self._linear:,} linear iterations"
         self._write(text)
@@ -238,7 +241,9 @@ class Progress:
         total = f"/{self._n_steps}" if self._n_steps is not None else ""
         width = len(str(self._n_steps)) if self._n_steps is not None else 8
         parts = [f"step {step:>{width}}{total} {100 * self._done():3.0f} %"]
-        parts += [f"t = {engineering(time, 's')}", f"dt = {engineering(dt, 's', 3)}", *self._counters()]
+        parts += [self._axis.place(time)]
+        parts += [f"d{self._axis.place(dt, 3)}"] if self._axis.unit else []
+        parts += self._counters()
         parts += [_speed(self._rate[0])] if self._rate is not None else []
         return "  ".join([*parts, f"ETA {duration(remaining)}"])
 
@@ -246,7 +251,7 @@ class Progress:
         step, time, _, contacts, _ = self._last
         total = f"/{self._n_steps}" if self._n_steps is not None else ""
         # must fit into 80 columns; the lines of the log have the rest
-        state = f"{step}{total}  t = {engineering(time, 's')}" + (f"  contacts {contacts:,}" if contacts else "")
+        state = f"{step}{total}  {self._axis.place(time)}" + (f"  contacts {contacts:,}" if contacts else "")
         try:
             self._bar.draw(self._done(), state)
         except OSError:

@@ -16,6 +16,7 @@ from ..registry import nearest
 from .hdf5 import HDF5_ERRORS, dataset_names
 from .layout import complete_rows, complete_snapshots
 from .provenance import read_attributes
+from .units import AXES, TIME, Axis
 
 if TYPE_CHECKING:
     import pyvista
@@ -103,6 +104,11 @@ class Result:
         self.attributes: dict[str, Any] = read_attributes(file["case"])
         self._n_rows = complete_rows(file)
         self._columns = dataset_names(file["history"])
+
+    @property
+    def axis(self) -> Axis:
+        """What its times are: time, load factor, or points of a path."""
+        return AXES[self.attributes.get("axis", TIME.symbol)]
 
     @property
     def history(self) -> History:

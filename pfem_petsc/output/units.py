@@ -4,12 +4,25 @@ from __future__ import annotations
 
 import math
 from functools import cache
+from typing import NamedTuple
 
 from ..case.materials import LAWS
 from ..fields import FIELDS
 from ..registry import choices, lookup
 
-__all__ = ["PREFIXES", "duration", "engineering", "field_unit", "prefix_for", "unit_of"]
+__all__ = [
+    "AXES",
+    "LOAD_FACTOR",
+    "POINT",
+    "PREFIXES",
+    "TIME",
+    "Axis",
+    "duration",
+    "engineering",
+    "field_unit",
+    "prefix_for",
+    "unit_of",
+]
 
 PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G", 12: "T"}
 
@@ -29,6 +42,44 @@ _UNITS = {
     "momentum": "kg m/s",
     "angular_momentum": "kg m²/s",
 }
+
+
+class Axis(NamedTuple):
+    """What the times of results are: how a place on it is told, and the key that ends it.
+
+    Attributes
+    ----------
+    symbol, unit : of a place on the axis, ``t = 1.000 s``; the unit is empty for pure numbers
+    key : of the case file that says where it ends
+    """
+
+    symbol: str
+    unit: str
+    key: str
+
+    def place(self, value: float, digits: int = 4) -> str:
+        """Text of a place."""
+        return f"{self.symbol} = {engineering(value, self.unit, digits)}" if self.unit else f"{self.symbol} {value:.6g}"
+
+    def span(self, first: float, last: float) -> str:
+        """Text of a part of the axis."""
+        if self.unit:
+            return f"{engineering(first, self.unit)} to {engineering(last, self.unit)}"
+        return f"{self.symbol} {first:.6g} to {last:.6g}"
+
+    def label(self, unit: str) -> str:
+        """Label of an axis whose numbers are in a unit that :func:`prefix_for` gave."""
+        return f"{'time' if self.symbol == 't' else self.symbol} [{unit}]" if unit else self.symbol
+
+    def exact(self, value: float) -> str:
+        """The same with a plain number, for messages."""
+        return f"{self.symbol} = {value:.6g} {self.unit}" if self.unit else f"{self.symbol} {value:.6g}"
+
+
+TIME = Axis("t", "s", "time.end")
+LOAD_FACTOR = Axis("load factor", "", "static.end")
+POINT = Axis("point", "", "static.max_points")
+AXES = {axis.symbol: axis for axis in (TIME, LOAD_FACTOR, POINT)}
 
 
 def unit_of(name: str) -> str:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
-from ..output.units import prefix_for
+from ..output.units import TIME, Axis, prefix_for
 
 __all__ = ["COLOURS", "STYLE", "Chart", "literal", "thinned", "window_mean"]
 
@@ -91,14 +91,21 @@ class Chart:
 
     Parameters
     ----------
-    time : (n,) [s]
+    time : (n,) [s], or in the unit of the axis
     title : of the figure
     rows, columns : of panels
     heights : relative heights of the rows
+    axis : what the times are
     """
 
     def __init__(
-        self, time: np.ndarray, title: str, rows: int, columns: int = 1, heights: Sequence[float] | None = None
+        self,
+        time: np.ndarray,
+        title: str,
+        rows: int,
+        columns: int = 1,
+        heights: Sequence[float] | None = None,
+        axis: Axis = TIME,
     ) -> None:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
@@ -110,9 +117,9 @@ class Chart:
         self.axes = self.figure.subplots(rows, columns, sharex=True, squeeze=False, height_ratios=relative)
         self.figure.suptitle(literal(title), x=0.01, ha="left", fontsize=13, fontweight="bold", color="#1f242c")
         self.time = np.asarray(time, dtype=float)
-        self.factor, self.unit = prefix_for(float(np.abs(self.time).max()) if self.time.size else 0.0, "s")
+        self.factor, self.unit = prefix_for(float(np.abs(self.time).max()) if self.time.size else 0.0, axis.unit)
         for axes in self.axes[-1]:
-            axes.set_xlabel(f"time [{self.unit}]")
+            axes.set_xlabel(axis.label(self.unit))
 
     def curves(
         self,

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..energies import LOST, STORED, SUPPLIED
 from ..errors import InputError
-from ..output.units import engineering, unit_of
+from ..output.units import TIME, engineering, unit_of
 from ..registry import nearest
 from .chart import COLOURS, STYLE, Chart, window_mean
 
@@ -59,7 +59,7 @@ def plot(
             return [_named(history, list(curves), title, _free(folder / "curves.png"))]
         drawn = [
             _energies(history, title, folder / "energies.png"),
-            _momentum(history, title, folder / "momentum.png"),
+            _momentum(history, title, folder / "momentum.png") if result.axis is TIME else None,
             _probes(history, title, folder / "probes.png"),
             _walls(history, case.wall, title, folder / "walls.png"),
             _solver(history, title, folder / "solver.png"),
@@ -85,6 +85,11 @@ def _read(history: History, name: str) -> np.ndarray:
     return np.asarray(history[name], dtype=float)
 
 
+def _chart(history: History, title: str, rows: int, columns: int = 1, heights: Sequence[float] | None = None) -> Chart:
+    axis = getattr(history, "axis", TIME)
+    return Chart(_read(history, "time"), title, rows, columns, heights, axis)
+
+
 def _words(name: str) -> str:
     return name.replace("_", " ")
 
@@ -107,7 +112,7 @@ def _energies(history: History, title: str, file: Path) -> Path | None:
     largest = max(float(np.nanmax(np.abs(values))) for values in held.values())
     moving = {name: values for name, values in held.items() if np.abs(values).max() > 1e-12 * largest}
     still = [_words(name) for name in held if name not in moving]
-    chart = Chart(_read(history, "time"), title, 2, heights=(1.7, 0.8))
+    chart = _chart(history, title, 2, heights=(1.7, 0.8))
     upper, lower = chart.axes[:, 0]
     total = sum(values for name, values in held.items() if name in (*STORED, *LOST))
     curves = [(_words(name), values) for name, values in moving.items()]
@@ -154,7 +159,7 @@ def _momentum(history: History, title: str, file: Path) -> Path | None:
     names = [name for name in ("momentum", "angular_momentum", "centre_of_mass") if name in history]
     if not names:
         return None
-    chart = Chart(_read(history, "time"), title, len(names), heights=[0.9] * len(names))
+    chart = _chart(history, title, len(names), heights=[0.9] * len(names))
     for axes, name in zip(chart.axes[:, 0], names, strict=True):
         values, label, scale = _read(history, name), _words(name), 0.0
         if name == "centre_of_mass":
@@ -178,7 +183,7 @@ def _probes(history: History, title: str, file: Path) -> Path | None:
         return None
     # a support's reaction is worth a column only where there is one; accelerations of impacts are mostly noise
     columns = [q for q in quantities if q != "acceleration" and any(_wanted(q, held) for held in probes.values())]
-    chart = Chart(_read(history, "time"), title, len(probes), len(columns))
+    chart = _chart(history, title, len(probes), len(columns))
     labels = {"position": "displacement"}
     for row, (probe, held) in zip(chart.axes, probes.items(), strict=True):
         for axes, quantity in zip(row, columns, strict=True):
@@ -225,7 +230,7 @@ def _walls(history: History, walls: Iterable[Any], title: str, file: Path) -> Pa
         return None
     time = _read(history, "time")
     normals = {wall.name: np.asarray(wall.normal, dtype=float) for wall in walls if hasattr(wall, "normal")}
-    chart = Chart(time, title, 3 * len(names), heights=[0.9, 0.9, 0.5] * len(names))
+    chart = _chart(history, title, 3 * len(names), heights=[0.9, 0.9, 0.5] * len(names))
     width = WINDOW * float(time[-1] - time[0])
     for number, name in enumerate(names):
         # peaks (the inertia of a node that is stopped within a step) and means need scales of their own
@@ -258,7 +263,7 @@ def _solver(history: History, title: str, file: Path) -> Path | None:
     names = [name for name in names if (walls and name == "active_contacts") or np.any(history[name])]
     if not names:
         return None
-    chart = Chart(_read(history, "time"), title, len(names), heights=[0.7] * len(names))
+    chart = _chart(history, title, len(names), heights=[0.7] * len(names))
     for number, (axes, name) in enumerate(zip(chart.axes[:, 0], names, strict=True)):
         chart.counts(axes, labels[name], history[name], COLOURS[number])
     return chart.save(file)
@@ -270,7 +275,7 @@ def _named(history: History, names: list[str], title: str, file: Path) -> Path:
     for name in names:
         if name not in list(history):
             raise InputError(f"plot: the history holds no column '{name}'{nearest(name, list(history))}")
-    chart = Chart(_read(history, "time"), title, len(names), heights=[0.9] * len(names))
+    chart = _chart(history, title, len(names), heights=[0.9] * len(names))
     for axes, name in zip(chart.axes[:, 0], names, strict=True):
         values = _read(history, name)
         label, unit = _words(name.rsplit("/", 1)[-1]), unit_of(name)

@@ -181,7 +181,7 @@ class _Film:
         self.normals = [np.asarray(wall.normal, dtype=float) for wall in walls if hasattr(wall, "normal")]
         self.normals = [normal / np.linalg.norm(normal) for normal in self.normals]
         times = np.asarray(self.result.times, dtype=float)
-        self.time_factor, self.time_unit = prefix_for(float(np.abs(times).max()), "s")
+        self.time_factor, self.time_unit = prefix_for(float(np.abs(times).max()), self.result.axis.unit)
 
     def _moved(self, walls: Sequence[Any]) -> dict[int, list[Surface]]:
         """Frame to the surfaces of the walls where they are then; a wall at rest has the same one in all."""
@@ -212,7 +212,8 @@ class _Film:
         return points if self.scale == 1.0 else self.start + self.scale * (points - self.start)
 
     def time(self, frame: int) -> str:
-        return f"t = {self.result.times[frame] * self.time_factor:.2f} {self.time_unit}"
+        axis, time = self.result.axis, self.result.times[frame]
+        return f"{axis.symbol} = {time * self.time_factor:.2f} {self.time_unit}" if axis.unit else axis.place(time)
 
     def camera(self, aspect: float) -> Camera:
         corners = np.array(np.meshgrid(*self.bounds.T)).reshape(3, -1).T

@@ -91,9 +91,9 @@ def find_restart(case: Case, comm: MPI.Comm, folder: Path, asked: bool | Path | 
     return Restart(path, file, changed, continues)
 
 
-def finished(case: Case, comm: MPI.Comm, folder: Path, end: float) -> float | None:
+def finished(case: Case, comm: MPI.Comm, folder: Path, end: float | None) -> float | None:
     """Up to when the output folder holds results of this case [s], None where not up to its end. Collective."""
-    return on_root(comm, _finished, case, folder / RESULT, end)
+    return None if end is None else on_root(comm, _finished, case, folder / RESULT, end)
 
 
 def _finished(case: Case, path: Path, end: float) -> float | None:
@@ -110,10 +110,11 @@ def _finished(case: Case, path: Path, end: float) -> float | None:
     return max(reached) if reached and min(reached) >= end * (1.0 - TIME) else None
 
 
-def finished_message(folder: Path, reached: float, end: float) -> str:
+def finished_message(folder: Path, reached: float, plan: Plan) -> str:
     """The message about a run whose results have ``reached`` its end [s]."""
-    beyond = f", beyond time.end = {engineering(end, 's')}" if reached > end * (1.0 + TIME) else ""
-    return f"{folder}: finished already: the results have t = {engineering(reached, 's')}{beyond}"
+    axis = plan.axis
+    beyond = f", beyond {axis.key} = {engineering(plan.end, axis.unit)}" if reached > plan.end * (1.0 + TIME) else ""
+    return f"{folder}: finished already: the results have {axis.place(reached)}{beyond}"
 
 
 def _continues(folder: Path, path: Path) -> bool:
@@ -155,10 +156,11 @@ def _refuse_loss(path: Path, plan: Plan) -> None:
     if rows or snapshots:
         reached = max([*times[-1:], *result.times[-1:]])
         raise InputError(
-            f"{path}: the results reach t = {engineering(reached, 's')}, beyond time.end = "
-            f"{engineering(plan.end, 's')}: to continue from the checkpoint up to there would cut off "
-            f"{rows} rows of the history and {snapshots} snapshots; take a later end (--set time.end={reached:.6g} or "
-            "more), another folder (-o), or start without --restart, which moves the results aside"
+            f"{path}: the results reach {plan.axis.place(reached)}, beyond {plan.axis.key} = "
+            f"{engineering(plan.end, plan.axis.unit)}: to continue from the checkpoint up to there would cut off "
+            f"{rows} rows of the history and {snapshots} snapshots; take a later end (--set "
+            f"{plan.axis.key}={reached:.6g} or more), another folder (-o), or start without --restart, which moves the "
+            "results aside"
         )
 
 

@@ -37,6 +37,7 @@ def open_progress(
         folder / "log.txt",
         start_step=start[0],
         start_time=start[1],
+        axis=plan.axis,
     )
     progress.summary(summarise(case, model, plan))
     for warning in model.warnings + warnings_before(case, model, plan):
@@ -76,11 +77,13 @@ def _attributes(model: Model, plan: Plan, recorder: Recorder) -> dict[str, Any]:
         "name": case.name,
         "folder": str(case.folder.resolve()),
         "overrides": list(case.overrides),
+        "axis": plan.axis.symbol,
         "time_step": plan.step,
-        "steps": plan.steps if plan.steps is not None else -1,
         "linear_solver": plan.linear.why if plan.linear is not None else "none",
         "partitioner": model.mesh.partitioner,
     }
+    if plan.steps is not None:
+        attributes["steps"] = plan.steps
     for name, nodes in recorder.probe_nodes.items():
         attributes[f"probe_nodes/{name}"] = nodes.tolist()
     return attributes

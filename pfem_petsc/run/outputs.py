@@ -8,7 +8,6 @@ from pathlib import Path
 from ..analysis import Step
 from ..errors import EarlyStop, SimulationFailure
 from ..output.progress import Progress
-from ..output.units import engineering
 from ..output.vtkhdf import ResultWriter
 from ..recording.checkpointing import Checkpointing
 from ..recording.fields import Fields
@@ -117,7 +116,7 @@ class Outputs:
             self.snapshots.last = restart.last[0]
             history.contact_watch.start = history.recorder.start_energy
             changes = f"; changed: {'; '.join(restart.changed)}" if restart.changed else ""
-            place = f"step {start[0]}, t = {engineering(start[1], 's')}"
+            place = f"step {start[0]}, {plan.axis.place(start[1])}"
             self.progress.message(f"restart from {restart.path}: {place}{changes}")
         self._writer = open_result_file(model, plan, history.recorder, self.fields, folder, restart, start[0])
         history.writer = self.snapshots.writer = self._writer
@@ -180,9 +179,10 @@ class Outputs:
         if not code or state.step >= self._analysis.last_step:
             return
         self.checkpointing.write()
+        place = self._analysis.plan.axis.exact(self._analysis.stepper.clock)
         raise EarlyStop(
-            f"{self._synchroniser.stop.reason(code)}; step {state.step} is finished, t = {state.time:.6g} s, and a "
-            f"checkpoint written: continue with --restart (results in {self._folder})"
+            f"{self._synchroniser.stop.reason(code)}; step {state.step} is finished, {place}, and "
+            f"a checkpoint written: continue with --restart (results in {self._folder})"
         )
 
     def complete(self) -> None:

@@ -12,6 +12,7 @@ from ..analysis import Analysis, Step
 from ..case.materials import law_name, law_of
 from ..errors import InputError, PfemError
 from ..integrators.base import Scheme, State
+from ..output.units import LOAD_FACTOR, Axis
 from ..registry import lookup
 from ..solvers.linear import LinearChoice, choose_linear
 from ..tolerances import TIME
@@ -40,6 +41,7 @@ class StaticPlan:
     end : last load factor; None where the path ends by other limits
     linear : linear solver
     steps : number of steps, which is not known before
+    axis : of the times in the results
     """
 
     scheme: Scheme
@@ -47,6 +49,7 @@ class StaticPlan:
     end: float | None
     linear: LinearChoice
     steps: int | None = None
+    axis: Axis = LOAD_FACTOR
 
     def beyond(self, steps: np.ndarray, times: np.ndarray) -> np.ndarray:
         """Which of recorded steps with their times lie beyond the end."""

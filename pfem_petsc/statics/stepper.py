@@ -51,7 +51,7 @@ class StaticStepper(ImplicitStepper):
 
     kept_numbers = (*ImplicitStepper.kept_numbers, "increment")
     columns = ("load_factor",)
-    remedy = "reduce static.max_step or static.step; if such jumps are intended, set solver.guard = false"
+    remedy = "reduce static.step"
 
     def __init__(self, model: Model, choice: LinearChoice, limits: Increments) -> None:
         super().__init__(model, Equilibrium(), limits.step, choice)
@@ -67,6 +67,12 @@ class StaticStepper(ImplicitStepper):
     def done(self) -> bool:
         """Whether the last load factor is reached."""
         return self.state.time >= self.end * (1.0 - TIME)
+
+    def when(self, balance: Balance) -> str:
+        return f"step {self.state.step + 1}, load factor {balance.time:.6g}"
+
+    def arrived(self) -> str:
+        return f"step {self.state.step + 1}, load factor {self.state.time:.6g}"
 
     def start(self) -> None:
         """The state at load factor zero, as the mesh is: equilibrium begins with the first increment. Collective."""

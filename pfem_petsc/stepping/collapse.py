@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..output.units import engineering
-from ..tolerances import TIME
 
 if TYPE_CHECKING:
     from ..case.schema import Case
@@ -24,14 +23,12 @@ def tell_collapse(stepper: Stepper, bar: int) -> str:
     model, state = stepper.model, stepper.state
     mesh = model.mesh
     a, b = mesh.bars[bar]
-    # the step is counted when it is complete, its time is set on arrival
-    step = state.step + (state.time > (state.step + TIME) * stepper.h)
-    when = f"step {step}, t = {state.time:.6g} s"
+    when = stepper.arrived()
     name = f"bar {mesh.bar_ids[bar]} between nodes {mesh.node_ids[a]} and {mesh.node_ids[b]}"
     way = state.x[b] - state.x[a]
     length, rest = float(np.linalg.norm(way)), float(model.bars.rest[bar])
     if not np.isfinite(length):
-        return f"{when}: the positions of {name} are not finite: the motion diverged; reduce time.step"
+        return f"{when}: the positions of {name} are not finite: the motion diverged; {stepper.remedy}"
     how = f"collapsed to {length:.3g} m" if bar == stepper.energy.failed else "gone through zero length"
     past = stepper.before[b] - stepper.before[a]
     speed = float(np.linalg.norm(way - past)) / stepper.part
@@ -54,9 +51,9 @@ def _cause(stepper: Stepper, wave: float) -> str:
             f"at {engineering(fastest, 'm/s')} the impact is too strong for a truss model: take a lower speed, a "
             "stronger material, or a smaller time.step"
         )
-    others = ["reduce time.step"]
+    others = [stepper.remedy]
     touch = model.can_touch
-    if touch and case.contact.treatment == "scheme" and not stepper.scheme.explicit:
+    if touch and case.contact.treatment == "scheme" and not stepper.scheme.explicit and stepper.scheme.inertial:
         grows = ", which gains energy in impacts" * any("gains energy in impacts" in text for text in model.warnings)
         others.append(
             f'use contact.treatment = "stick" instead of the formulas of {case.time.integrator} at impact{grows}'

@@ -45,6 +45,7 @@ def failure_message(
     bounds: tuple[np.ndarray, np.ndarray] | None,
     report: NewtonReport,
     tolerance: float,
+    remedy: str,
 ) -> str:
     """Iterations, reason, worst node and remedy of a solve that did not converge. Collective.
 
@@ -55,6 +56,7 @@ def failure_message(
     bounds : (lower, upper) of w, None where there are none
     report : NewtonReport
     tolerance : of the residual's 2-norm [N]
+    remedy : what the user can do
     """
     model = problem.model
     g = np.empty_like(w)
@@ -70,5 +72,5 @@ def failure_message(
     return (
         f"no convergence after {report.newton} Newton iterations: {report.why}; residual {report.norm:.3g} N, "
         f"required {tolerance:.3g} N; worst at node {node} ({residual:.3g} N). "
-        'Reduce time.step, or set solver.linear = "mumps"'
+        f'{remedy[0].upper()}{remedy[1:]}, or set solver.linear = "mumps"'
     )

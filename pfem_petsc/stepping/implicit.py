@@ -47,7 +47,6 @@ class ImplicitStepper(Stepper):
     kept_numbers = (*Stepper.kept_numbers, "level", "lagged_count")
     kept_arrays = (*Stepper.kept_arrays, "held", "lagged_place")
     kept_bars = ("lagged_history",)
-    remedy = "reduce time.step; if such jumps are intended, set solver.guard = false"
 
     def __init__(self, model: Model, scheme: Scheme, h: float, choice: LinearChoice) -> None:
         super().__init__(model, scheme, h)
@@ -175,7 +174,8 @@ class ImplicitStepper(Stepper):
             if self.guard is not None and balance.weight:
                 reason = self._suspicion(balance, solution)
                 if reason is not None:
-                    raise NotConverged(f"{self.when(balance)}: {reason}; {self.remedy}")
+                    remedy = f"{self.remedy}; if such jumps are intended, set solver.guard = false"
+                    raise NotConverged(f"{self.when(balance)}: {reason}; {remedy}")
         except NotConverged:
             state.contact, state.support, self.held, forces = kept
             links.restore(forces)
@@ -237,7 +237,7 @@ class ImplicitStepper(Stepper):
             if relaxed:
                 continue
             if not report.converged:
-                text = failure_message(problem, w, bounds.arrays, report, tolerance)
+                text = failure_message(problem, w, bounds.arrays, report, tolerance, self.remedy)
                 raise NotConverged(f"{self.when(balance)}: {text}")
             bounds.project(w, 2.0 * zero_tolerance(model.length))
             u = problem.increment(w).copy()

@@ -14,7 +14,8 @@ from ..contact.restitution import Treatment as Restitution
 from ..contact.treatments.base import Treatment
 from ..errors import InputError
 from ..integrators.base import Scheme
-from ..output.units import engineering
+from ..output.units import TIME as AXIS
+from ..output.units import Axis, engineering
 from ..registry import choices, lookup
 from ..solvers.linear import LinearChoice, choose_linear
 from ..tolerances import TIME
@@ -50,6 +51,7 @@ class Plan:
     frequency : bounds on the highest natural frequency [rad/s]
     linear : linear solver, None where every node is solved on its own
     asked : what the case asks for of it, ``solver.linear`` and ``solver.operator``
+    axis : of the times in the results
     """
 
     scheme: Scheme
@@ -59,6 +61,7 @@ class Plan:
     frequency: Frequency
     linear: LinearChoice | None
     asked: tuple[str, str] = ("auto", "auto")
+    axis: Axis = AXIS
 
     @property
     def end(self) -> float:

@@ -13,7 +13,7 @@ from ..contact.initial_equilibrium import start_at_rest
 from ..errors import SimulationFailure
 from ..integrators.base import Balance, Scheme, State
 from ..mechanics.bars import StrainEnergy
-from ..tolerances import BEYOND
+from ..tolerances import BEYOND, TIME
 from .collapse import tell_collapse
 from .massless import MasslessNodes
 from .prescribed import PrescribedMotion
@@ -52,12 +52,14 @@ class Stepper(ABC):
     kept_numbers, kept_arrays, kept_bars : names of attributes that, with the state, determine what comes: numbers,
         arrays with a row for each owned node, and for each local bar
     columns : names of attributes, numbers, that are columns of the history
+    remedy : what the user can do against steps that are too large
     """
 
     kept_numbers: tuple[str, ...] = ("part", "smallest")
     kept_arrays: tuple[str, ...] = ("touching", "closed")
     kept_bars: tuple[str, ...] = ()
     columns: tuple[str, ...] = ()
+    remedy = "reduce time.step"
     renews_forces = False
     steady = False
 
@@ -167,6 +169,12 @@ class Stepper(ABC):
         state, inertia = self.state, self.model.inertia
         damping = -inertia.damping_times(state.v, np.empty_like(state.v))
         return np.array([state.support.sum(axis=0), state.external.sum(axis=0), damping.sum(axis=0)])
+
+    def arrived(self) -> str:
+        """The step whose end the state is at, complete or not, and its time, for messages."""
+        # the step is counted when it is complete, its time is set on arrival
+        step = self.state.step + (self.state.time > (self.state.step + TIME) * self.h)
+        return f"step {step}, t = {self.state.time:.6g} s"
 
     @property
     def clock(self) -> float:

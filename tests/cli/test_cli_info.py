@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from pfem_petsc.cli.info import describe
+from pfem_petsc.output.units import TIME
 
 
 def result(history, times=(0.0, 0.5, 1.0), **attributes):
@@ -15,6 +16,7 @@ def result(history, times=(0.0, 0.5, 1.0), **attributes):
         n_nodes=1234,
         n_bars=5,
         times=np.array(times),
+        axis=TIME,
         attributes=attributes,
         history={name: np.array(values) for name, values in history.items()},
     )

@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from pfem_petsc.mesh.distribution import DistributedMesh
+from pfem_petsc.output.units import TIME
 
 AT_REST = {"velocity": None, "motion": None, "mass": None}
 WALL = SimpleNamespace(
@@ -42,6 +43,8 @@ def lattice(n: int = 5) -> tuple[np.ndarray, np.ndarray]:
 
 class SyntheticResult:
     """Interface of :func:`pfem_petsc.open_result` over made-up motion along -``normal`` and back."""
+
+    axis = TIME
 
     def __init__(self, path, points, bars, walls=(WALL,), snapshots=13, end=0.05, title="Ring against a rigid wall"):
         self.path = Path(path)

@@ -18,7 +18,7 @@ DOCS = Path(__file__).parents[1] / "docs"
 TEXT = (DOCS / "case_file.md").read_text()
 MODELS = [
     *(tables.MeshKeys, tables.NodeSet, tables.Section, tables.Initial, tables.Support, tables.Load),
-    *(tables.Gravity, tables.Temperature, settings.TimeKeys, settings.OutputKeys, settings.Probe, settings.Solver),
+    *(tables.Gravity, tables.Temperature, settings.TimeKeys, settings.StaticKeys, settings.OutputKeys, settings.Probe, settings.Solver),
     *(lookup(LAWS, name, "").Parameters for name in choices(LAWS)),
     *(lookup("pfem_petsc.mesh.generators", name, "").Parameters for name in choices("pfem_petsc.mesh.generators")),
 ]
@@ -47,3 +47,10 @@ def test_example_is_read(tmp_path):
     assert {"left", "right"} <= set(mesh.node_groups)
     assert {"chords"} <= set(mesh.bar_groups)
     assert case.temperature[0].bars == case.section["chord"].bars == "chords"
+
+
+def test_every_key_of_static_methods_is_named():
+    text = "".join(path.read_text() for path in sorted(DOCS.glob("statics*.md")))
+    for method in choices("pfem_petsc.statics.methods"):
+        parameters = lookup("pfem_petsc.statics.methods", method, "").Parameters
+        assert set(parameters.model_fields) <= named(text), method

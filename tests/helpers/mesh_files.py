@@ -17,9 +17,10 @@ def case_of(tmp_path, comm, points, bars, fixed=(), **tables):
         "mesh": {"file": "mesh.h5"},
         "material": {"steel": {"young_modulus": 2.1e11, "density": 7850.0}},
         "section": {"default": {"area": 1e-4, "material": "steel"}},
-        "time": {"integrator": "newmark", "step": 1e-4, "end": 1e-2},
         **tables,
     }
+    if "static" not in tables:
+        data = {"time": {"integrator": "newmark", "step": 1e-4, "end": 1e-2}} | data
     if fixed:
         data["node_set"] = {"base": {"indices": list(fixed)}}
         data["support"] = [{"node_set": "base", "fix": "xyz"}]

@@ -1,0 +1,177 @@
+"""Equilibria at increasing load factors against closed forms; automatic increments, contact, restarts, refusals."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.mesh_files import case_of
+
+from pfem_petsc import Case, Simulation, open_result
+from pfem_petsc.errors import InputError, SimulationFailure
+
+HALF, HEIGHT, YOUNG, AREA = 1.0, 0.2, 1e9, 1e-4
+STEEL = {"steel": {"young_modulus": YOUNG, "density": 1000.0}}
+RESULTANT = {  # axial force times dl/dz over E A: (strain, derivative of the strain by the length) of l over l0
+    "engineering": lambda s: s - 1.0,
+    "green": lambda s: 0.5 * (s * s - 1.0) * s,
+    "logarithmic": lambda s: np.log(s) / s,
+}
+
+
+def truss(folder, comm, push=(0.0, 0.0, -100.0), strain="engineering", **tables):
+    """Two bars that meet in a crown, which moves up and down."""
+    points = [[0.0, 0.0, 0.0], [HALF, 0.0, HEIGHT], [2.0 * HALF, 0.0, 0.0]]
+    material = {"steel": {"young_modulus": YOUNG, "density": 1000.0, "strain": strain}}
+    given = {
+        "node_set": {"feet": {"indices": [0, 2]}, "crown": {"indices": [1]}},
+        "material": material,
+        "section": {"all": {"area": AREA, "material": "steel"}},
+        "support": [{"node_set": "feet", "fix": "xyz"}, {"node_set": "crown", "fix": "y"}],
+        "load": [{"node_set": "crown", "force": list(push)}],
+        "static": {"step": 0.1},
+        "output": {"fields_every": 1, "probe": [{"name": "crown", "node_set": "crown"}]},
+    } | tables
+    return case_of(folder, comm, points, [[0, 1], [1, 2]], **given)
+
+
+def history_of(case, comm, folder, **options):
+    with Simulation(case, comm, output=folder / "out", quiet=True, **options) as simulation:
+        simulation.run()
+    return open_result(folder / "out" / "result.vtkhdf").history
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("strain", RESULTANT)
+def test_every_point_is_on_the_closed_form(shared_tmp_path, comm, strain):
+    history = history_of(truss(shared_tmp_path, comm, strain=strain), comm, shared_tmp_path)
+    z, factor = history["probe/crown/position"][:, 0, 2], history["load_factor"]
+    rest, length = np.hypot(HALF, HEIGHT), np.hypot(HALF, z)
+    force = -2.0 * YOUNG * AREA * RESULTANT[strain](length / rest) * z / length
+    np.testing.assert_allclose(factor, np.linspace(0.0, 1.0, 11), rtol=1e-12)
+    np.testing.assert_array_equal(history["time"], factor)
+    np.testing.assert_allclose(force, 100.0 * factor, rtol=1e-9, atol=1e-9)
+    assert abs(history["energy_imbalance"]).max() < 1e-10 * history["elastic_energy"].max()
+
+
+def test_a_limit_point_ends_the_run_with_the_load_factor_that_was_reached(shared_tmp_path, comm):
+    case = truss(shared_tmp_path, comm, push=(0.0, 0.0, -600.0))
+    with pytest.raises(SimulationFailure, match=r"no equilibrium found beyond load factor 0\.49.*arc_length"):
+        history_of(case, comm, shared_tmp_path)
+    history = open_result(shared_tmp_path / "out" / "result.vtkhdf").history
+    z = np.linspace(0.0, HEIGHT, 200001)
+    length, rest = np.hypot(HALF, z), np.hypot(HALF, HEIGHT)
+    limit = (2.0 * YOUNG * AREA * (1.0 - length / rest) * z / length).max() / 600.0
+    assert limit - 2e-4 < history["load_factor"][-1] <= limit
+
+
+def test_increments_grow_up_to_the_largest(shared_tmp_path, comm):
+    case = truss(shared_tmp_path, comm, static={"step": 0.01, "max_step": 0.2})
+    steps = np.diff(history_of(case, comm, shared_tmp_path)["load_factor"])
+    assert steps[0] == pytest.approx(0.01)
+    np.testing.assert_allclose(steps[:5], 0.01 * 1.5 ** np.arange(5))
+    assert steps.max() == pytest.approx(0.2)
+
+
+def test_loads_and_gravity_grow_with_the_load_factor_and_tables_are_over_it(shared_tmp_path, comm):
+    tables = {
+        "gravity": {"acceleration": [0.0, 0.0, -9.81]},
+        "load": [
+            {"node_set": "crown", "force": [0.0, 0.0, -100.0]},
+            {"node_set": "crown", "force": [0.0, 0.0, -50.0], "table": [[0.0, 0.0], [0.5, 1.0], [1.0, 0.0]]},
+        ],
+    }
+    case = truss(shared_tmp_path, comm, **tables)
+    with Simulation(case, comm, output=shared_tmp_path / "out", quiet=True) as simulation:
+        simulation.run()
+        mass = simulation.model.total_mass
+    history = open_result(shared_tmp_path / "out" / "result.vtkhdf").history
+    factor = history["load_factor"]
+    expected = 100.0 * factor + 50.0 * (1.0 - abs(2.0 * factor - 1.0)) + mass * 9.81 * factor
+    np.testing.assert_allclose(history["support_force"][1:, 2], expected[1:], rtol=1e-9)
+
+
+def test_yielding_and_unloading_of_three_bars(shared_tmp_path, comm):
+    """VM11 of the Ansys verification manual: three bars, loaded beyond the first yield, and unloaded."""
+    inch, pound = 0.0254, 4.4482216152605
+    long = 100.0 * inch
+    aside = long * np.tan(np.pi / 6.0)
+    points = [[-aside, 0.0, 0.0], [0.0, 0.0, 0.0], [aside, 0.0, 0.0], [0.0, 0.0, -long]]
+    psi = pound / inch**2
+    steel = {"young_modulus": 30e6 * psi, "density": 7850.0, "yield_stress": 30e3 * psi, "kinematic_hardening": 1e-3}
+    tables = {
+        "node_set": {"top": {"indices": [0, 1, 2]}, "tip": {"indices": [3]}},
+        "material": {"steel": steel},
+        "section": {"all": {"area": inch**2, "material": "steel"}},
+        "support": [{"node_set": "top", "fix": "xyz"}, {"node_set": "tip", "fix": "y"}],
+        "load": [{"node_set": "tip", "force": [0.0, 0.0, -51961.5 * pound], "table": [[0.0, 0.0], [1.0, 1.0]]}],
+        "static": {"step": 0.05},
+        "output": {"fields_every": 1, "probe": [{"name": "tip", "node_set": "tip"}]},
+    }
+    case = case_of(shared_tmp_path, comm, points, [[0, 3], [1, 3], [2, 3]], **tables)
+    history = history_of(case, comm, shared_tmp_path)
+    sag = (history["probe/tip/position"][-1, 0, 2] + long) / inch
+    assert sag == pytest.approx(-0.07533, abs=5e-5)
+
+
+def test_a_wall_presses_a_truss(shared_tmp_path, comm):
+    """A plate moves onto the crown by a table over the load factor: force and positions of the closed form."""
+    down = 0.15 * HEIGHT
+    plate = {
+        "name": "plate",
+        "type": "plane",
+        "point": [0.0, 0.0, HEIGHT],
+        "normal": [0.0, 0.0, -1.0],
+        "node_set": "crown",
+        "motion": [[0.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0, -down]],
+        "interpolation": "linear",
+    }
+    case = truss(shared_tmp_path, comm, push=(0.0, 0.0, 0.0), wall=[plate])
+    history = history_of(case, comm, shared_tmp_path)
+    z = HEIGHT - down * history["load_factor"]
+    rest, length = np.hypot(HALF, HEIGHT), np.hypot(HALF, z)
+    np.testing.assert_allclose(history["probe/crown/position"][:, 0, 2], z, rtol=1e-10)
+    expected = 2.0 * YOUNG * AREA * (length / rest - 1.0) * z / length
+    np.testing.assert_allclose(history["wall/plate/force"][1:, 2], expected[1:], rtol=1e-7)
+    assert abs(history["energy_imbalance"]).max() < 1e-9 * history["elastic_energy"].max()
+
+
+@pytest.mark.parallel
+def test_a_restart_goes_on_to_the_last_bit(shared_tmp_path, comm):
+    tables = {"output": {"fields_every": 1, "checkpoint_every": 3}, "static": {"step": 0.03, "max_step": 0.1}}
+    whole = history_of(truss(shared_tmp_path, comm, **tables), comm, shared_tmp_path)
+    whole = {name: whole[name] for name in whole}
+    part = truss(shared_tmp_path, comm, **tables)
+    folder = shared_tmp_path / "parts"
+    with Simulation(part, comm, output=folder / "out", quiet=True) as simulation:
+        for step in simulation:
+            if step.step == 4:
+                break
+    again = history_of(part, comm, folder, restart=True)
+    assert set(again) == set(whole)
+    for name, values in whole.items():
+        np.testing.assert_array_equal(again[name], values, err_msg=name)
+
+
+@pytest.mark.parametrize(
+    ("tables", "words"),
+    [
+        ({"initial": {"velocity": [1.0, 0.0, 0.0]}}, ["initial", "no velocities"]),
+        ({"contact": {"treatment": "stick"}}, ["contact.treatment", "impacts"]),
+        ({"support": []}, ["rigid-body motions", "[[support]]"]),
+        ({"static": {"step": 0.1, "max_step": 0.01}}, ["max_step", "smaller than step"]),
+        ({"static": {"method": "newtons"}}, ["static.method", "did you mean 'newton'"]),
+        ({"static": {}, "time": {"integrator": "newmark", "step": 1.0, "end": 1.0}}, ["[time], [static]", "not both"]),
+    ],
+)
+def test_what_a_static_analysis_does_not_have_is_refused(shared_tmp_path, comm, tables, words):
+    with pytest.raises(InputError) as refused:
+        Simulation(truss(shared_tmp_path, comm, **tables), comm, output=shared_tmp_path / "out", quiet=True)
+    for word in words:
+        assert word in str(refused.value)
+
+
+def test_a_case_needs_an_analysis(shared_tmp_path, comm):
+    data = truss(shared_tmp_path, comm).to_dict()
+    del data["static"]
+    with pytest.raises(InputError, match=r"\[time\], \[static\]"):
+        Case.from_dict(data, folder=shared_tmp_path)

@@ -18,7 +18,15 @@ DOCS = Path(__file__).parents[1] / "docs"
 TEXT = (DOCS / "case_file.md").read_text()
 MODELS = [
     *(tables.MeshKeys, tables.NodeSet, tables.Section, tables.Initial, tables.Support, tables.Load),
-    *(tables.Gravity, tables.Temperature, settings.TimeKeys, settings.StaticKeys, settings.OutputKeys, settings.Probe, settings.Solver),
+    *(
+        tables.Gravity,
+        tables.Temperature,
+        settings.TimeKeys,
+        settings.StaticKeys,
+        settings.OutputKeys,
+        settings.Probe,
+        settings.Solver,
+    ),
     *(lookup(LAWS, name, "").Parameters for name in choices(LAWS)),
     *(lookup("pfem_petsc.mesh.generators", name, "").Parameters for name in choices("pfem_petsc.mesh.generators")),
 ]

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Sets up and runs all tests: serial, then those marked parallel on 2 and on 3 ranks.
+# Sets up and runs the tests (--all-sets: all of them): serial, then those marked parallel on 2 and on 3 ranks.
 #
 # usage: scripts/test.sh [--build-petsc] [PYTEST ARGUMENTS...]
 # All three stages run whatever the others say; the status is 0 when all passed. TEST_LIMIT [s] ends a stage

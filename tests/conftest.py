@@ -4,7 +4,8 @@ All ranks run the same tests in step. The outcome of each phase of a test (set-u
 failure on one rank is a failure everywhere, with that rank's report. A rank that waits for the others too long, as
 when one of them left a collective call early by an exception, says so and ends the run. Only rank 0 prints.
 
-On several ranks, which share two cores, tests with many sets of parameters run a part of them (``--all-sets``: all).
+Of tests that take long or have many sets of parameters a part is run, and those marked ``thorough`` are left out;
+``--all-sets`` runs everything.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption(
         "--all-sets",
         action="store_true",
-        help="on several ranks: all sets of parameters of each test, not every second or third",
+        help="all sets of parameters of each test, and the tests marked thorough",
     )
 
 
@@ -83,10 +84,11 @@ def pytest_unconfigure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    if AGREEMENT is None:
-        return
-    kept = [item for item in items if item.get_closest_marker("parallel") is not None]
-    if not config.option.all_sets:
+    kept = items
+    if AGREEMENT is not None:
+        kept = [item for item in items if item.get_closest_marker("parallel") is not None]
+    # tests that are asked for by name are run, all of them
+    if not config.option.all_sets and not any("::" in word for word in config.args):
         kept = thinned(kept, WORLD.size)
     chosen = set(kept)
     config.hook.pytest_deselected(items=[item for item in items if item not in chosen])
@@ -94,12 +96,23 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def thinned(items: list[pytest.Item], ranks: int) -> list[pytest.Item]:
-    """Every test function; of those with many sets of parameters every second on 2 ranks, every third on 3."""
+    """Every test function but the thorough ones, with some of its sets of parameters.
+
+    Of slow ones every fourth set; of the others, on several ranks, every third or fifth where they have more than three.
+    Which sets these are differs from one number of ranks to the next.
+    """
     sets: dict[tuple[Path, str], list[pytest.Item]] = {}
     for item in items:
-        sets.setdefault((item.path, getattr(item, "originalname", item.name)), []).append(item)
-    stride = min(ranks, 3)
-    chosen = {item for group in sets.values() for item in (group if len(group) <= 3 else group[stride - 2 :: stride])}
+        if item.get_closest_marker("thorough") is None:
+            sets.setdefault((item.path, getattr(item, "originalname", item.name)), []).append(item)
+    stride = {1: 1, 2: 3}.get(ranks, 5)
+    chosen: set[pytest.Item] = set()
+    for group in sets.values():
+        slow = group[0].get_closest_marker("slow") is not None
+        if slow or len(group) > 3:
+            every = 4 * stride if slow else stride
+            group = group[(ranks - 1) % min(every, len(group)) :: every]
+        chosen |= set(group)
     return [item for item in items if item in chosen]
 
 

@@ -38,6 +38,7 @@ def test_peers_lattice_is_the_generators():
     assert len(bars) == len(slab.bars)
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", ["explicit", "explicit_contact"])
 def test_bare_loop_moves_as_the_program_does(mode):
@@ -72,6 +73,7 @@ def test_points_of_both_studies_share_runs():
     assert len({name for _, _, name in files}) == 3
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_a_study_goes_on_where_it_stopped(tmp_path):
     point = Point("strong", "cubic", "explicit", "central_differences", 126, 1)

@@ -52,6 +52,7 @@ def test_restrictions_to_inactive_unknowns_are_freed(comm, shared_tmp_path):
     assert restrictions() <= before
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 @pytest.mark.parametrize("linear, destroyed", [("mumps", True), ("mumps", False), ("gamg", True)])
 def test_one_simulation_after_the_other_takes_no_more_memory(linear, destroyed, comm, shared_tmp_path):

@@ -55,6 +55,7 @@ def states_before_each_write(path, truss, snapshots, monkeypatch):
     return found
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_killed_before_any_write_of_a_snapshot_that_grows_the_index_nothing_is_lost(tmp_path, monkeypatch):
     truss = Truss(MPI.COMM_SELF, n_nodes=400, n_bars=900)

@@ -68,6 +68,7 @@ def killed_writer(path, seconds):
         writer.stdout.close()
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_killed_at_any_moment_the_file_is_readable_and_can_be_continued(tmp_path, chance):
     truss = Truss(MPI.COMM_SELF, n_nodes=400, n_bars=900)

@@ -38,6 +38,7 @@ node_set = "tip"
 """
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["central_differences", "newmark"])
 def test_five_nodes_on_eight_ranks(scheme, tmp_path, on_ranks):

@@ -12,6 +12,7 @@ from pfem_petsc.cli.main import main
 from pfem_petsc.errors import InputError
 
 
+@pytest.mark.thorough
 @pytest.mark.slow
 def test_three_starts_and_two_restarts(tmp_path):
     """Two rounds of the script; more by hand."""

@@ -48,8 +48,8 @@ def write_mesh(
     Raises
     ------
     InputError
-        On all ranks: arrays of another shape or kind; a mesh that cannot be simulated (coordinates that are not finite, bars
-        of zero length, two bars between the same nodes, nodes without bars); a file that cannot be written.
+        On all ranks: arrays of another shape or kind; a mesh that cannot be simulated (coordinates that are not finite,
+        bars of zero length, two bars between the same nodes, nodes without bars); a file that cannot be written.
     """
     if comm is None:
         from mpi4py import MPI

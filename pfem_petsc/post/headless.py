@@ -16,8 +16,8 @@ VARIABLE = "VTK_DEFAULT_OPENGL_WINDOW"
 # Nothing is shown, so a display is not asked first: it may be gone, or far away behind ssh.
 _HEADLESS = ("vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow")
 
-# Draw a red square where a library is there at all: a crash, a hang or an empty image all count as "does not work", and
-# so does a window of another kind than asked for, which VTK takes where the library is missing, with warnings each time.
+# Draw a red square where a library is there at all: a crash, a hang or an empty image all count as "does not work". So
+# does a window of another kind than asked for, which VTK takes where the library is missing, with warnings each time.
 _PROBE = """
 import os
 import vtkmodules.vtkRenderingOpenGL2

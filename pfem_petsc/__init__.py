@@ -1,6 +1,7 @@
 """Dynamics of large trusses that fly, hit things, buckle and yield: positional finite elements on PETSc over MPI.
 
-``from pfem_petsc import Case, Simulation, open_result``; nothing heavy is imported before one of them is used.
+``from pfem_petsc import Case, Simulation, open_result, write_mesh``; nothing heavy is imported before one of
+them is used.
 """
 
 from __future__ import annotations
@@ -10,14 +11,20 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from .case.schema import Case
+    from .mesh.writing import write_mesh
     from .output.result import open_result
     from .simulation import Simulation
 
-__all__ = ["Case", "Simulation", "__version__", "open_result"]
+__all__ = ["Case", "Simulation", "__version__", "open_result", "write_mesh"]
 
 __version__ = "0.2.0"
 
-_HOMES = {"Case": ".case.schema", "Simulation": ".simulation", "open_result": ".output.result"}
+_HOMES = {
+    "Case": ".case.schema",
+    "Simulation": ".simulation",
+    "open_result": ".output.result",
+    "write_mesh": ".mesh.writing",
+}
 
 
 def __getattr__(name: str) -> Any:

@@ -48,7 +48,8 @@ class Simulation:
     output : Path or None
         Folder of the results; default ``results/<case name>``. Results found there are moved aside.
     restart : None, True or Path
-        Continue from the newest checkpoint of the output folder, or from a file; bit for bit on as many ranks.
+        Continue from the newest checkpoint of the output folder, of another one, or from a file; bit for bit on as many
+        ranks.
     quiet : bool
         Print nothing on stdout.
     wall_time : float, optional
@@ -74,6 +75,11 @@ class Simulation:
         wall_time: float | None = None,
         check_only: bool = False,
     ) -> None:
+        if not isinstance(case, Case):
+            raise InputError(
+                f"Simulation: expected a Case, got {case!r:.80}; Case.load reads one from a file, "
+                "Case.from_dict from tables"
+            )
         self._stop = StopRequest(wall_time)
         self.case = case
         self.comm = comm if comm is not None else MPI.COMM_WORLD

@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from pfem_petsc.case.schema import Case
@@ -31,7 +32,7 @@ def test_case_file_is_the_built_in_one(tmp_path):
 
 @pytest.mark.slow
 def test_python_example_runs(tmp_path):
-    (code,) = blocks("python")
+    code = blocks("python")[0]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     done = subprocess.run(
         [sys.executable, "-c", code + "\nprint('shape', force.shape, grid.n_cells)"],
@@ -45,6 +46,23 @@ def test_python_example_runs(tmp_path):
     assert "shape (301, 3) 20" in done.stdout
     time, energy = done.stdout.strip().splitlines()[-2].split()
     assert float(time) == pytest.approx(3.0) and 0.1 < float(energy) < 0.125
+
+
+@pytest.mark.slow
+def test_python_example_of_arrays_runs(tmp_path):
+    """The peaks of elastic impacts grow in proportion to the speed."""
+    code = blocks("python")[1]
+    done = subprocess.run(
+        [sys.executable, "-c", code + "\nprint([peaks[speed] / speed for speed in peaks])"],
+        cwd=tmp_path,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        timeout=200,
+    )
+    assert done.returncode == 0, done.stderr
+    ratios = eval(done.stdout.strip().splitlines()[-1], {"np": np})
+    assert len(ratios) == 5 and ratios == pytest.approx([ratios[0]] * 5, rel=0.1)
 
 
 @pytest.mark.parametrize(

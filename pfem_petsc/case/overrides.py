@@ -17,6 +17,7 @@ LISTS = {
     ("temperature",),
     ("wall",),
     ("contact_pair",),
+    ("constraint",),
     ("initial", "on"),
     ("output", "probe"),
 }

@@ -118,6 +118,11 @@ class Case:
         NumPy numbers and arrays, tuples and paths stand for what TOML has. ``folder`` is what ``mesh.file`` is relative
         to, ``name`` the default folder of the results.
         """
+        if not isinstance(data, Mapping):
+            raise InputError(
+                f"{source}: expected nested tables, got {data!r:.80}; Case.load reads a case file, "
+                "Case.from_toml its text"
+            )
         try:
             data, overrides = plain(dict(data)), tuple(overrides)
         except RecursionError as error:
@@ -186,5 +191,9 @@ def _read_text(path: Path) -> str:
         near = difflib.get_close_matches(str(path), names, n=1)
         hint = f"did you mean '{near[0]}'?" if near else f"the built-in cases are {', '.join(names)}"
         raise InputError(f"{path}: there is no such case file or built-in case; {hint}") from error
+    except IsADirectoryError as error:
+        raise InputError(
+            f"{path}: this is a folder; name a case file or a built-in case, and the folder of its results by -o"
+        ) from error
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: this case file cannot be read: {error}") from error

@@ -61,7 +61,8 @@ class MeshKeys(StrictModel):
     @model_validator(mode="after")
     def _exactly_one(self) -> MeshKeys:
         if (self.generator is None) == (self.file is None):
-            raise ValueError("expected exactly one of the keys generator, file")
+            hint = "" if self.file else " (a file is made from arrays by pfem_petsc.write_mesh)"
+            raise ValueError(f"expected exactly one of the keys generator, file{hint}")
         return self
 
 

@@ -14,10 +14,10 @@ __all__ = ["plain", "table_text", "value_text"]
 
 
 def plain(value: Any) -> Any:
-    """A copy of nested tables and lists in Python's own types, those of NumPy, tuples and paths resolved."""
+    """A copy of nested tables and lists in Python's own types, those of NumPy, tuples, ranges and paths resolved."""
     if isinstance(value, Mapping):
         return {key: plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
+    if isinstance(value, list | tuple | range):
         return [plain(item) for item in value]
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()

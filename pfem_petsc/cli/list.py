@@ -39,9 +39,9 @@ def run(arguments: argparse.Namespace) -> int:
         sections[kind] = {name: _first_line(f"{package}.{name}") for name in choices(package)}
     width = max(len(name) for lines in sections.values() for name in lines)
     for kind, lines in sections.items():
-        if not lines:
-            continue
         print(f"{kind}:")
+        if not lines:
+            print("  none is built in; CONTRIBUTING.md has one, and says how to add it")
         for name, text in lines.items():
             print(f"  {name:{width}}  {text}")
     return 0

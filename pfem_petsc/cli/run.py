@@ -40,7 +40,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         nargs="?",
         const=True,
-        help="continue from a checkpoint; default: the newest of the output folder; earlier --set values stay in force",
+        help="continue from a checkpoint, or the newest of a folder; default: of the output folder; earlier "
+        "--set values stay in force",
     )
     parser.add_argument("--quiet", action="store_true", help="no progress on the screen")
     parser.add_argument(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..errors import InputError
-from ..registry import nearest
+from ..mesh.node_sets import group_hint
 
 if TYPE_CHECKING:
     from ..case.schema import Case
@@ -29,7 +29,7 @@ def section_of_bars(case: Case, slab: MeshSlab) -> np.ndarray:
         if section.bars is None:
             continue
         if section.bars not in slab.bar_groups:
-            hint = nearest(section.bars, sorted(slab.bar_groups)) if slab.bar_groups else "; the mesh has no bar groups"
+            hint = group_hint(case, section.bars, sorted(slab.bar_groups), "Curve")
             raise InputError(
                 f"{case.source}: section.{name}.bars = {section.bars!r}: no such bar group in {slab.source}{hint}"
             )

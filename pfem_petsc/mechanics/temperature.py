@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..errors import InputError
-from ..registry import nearest
+from ..mesh.node_sets import group_hint
 from .loads import Table
 
 if TYPE_CHECKING:
@@ -37,8 +37,7 @@ class Temperatures:
             members = slice(None)
             if entry.bars is not None:
                 if entry.bars not in mesh.bar_groups:
-                    known = sorted(mesh.bar_groups)
-                    hint = nearest(entry.bars, known) if known else "; the mesh has no bar groups"
+                    hint = group_hint(case, entry.bars, sorted(mesh.bar_groups), "Curve")
                     raise InputError(
                         f"{case.source}: temperature[{index}].bars = {entry.bars!r}: no such group of bars{hint}"
                     )

@@ -19,6 +19,11 @@ LARGE = 1e150
 
 _SHOWN = 5
 
+_NO_LINES = (
+    "; where there are physical groups, Gmsh saves nothing else: put the lines into one "
+    '(Physical Curve("bars") = {:}), or save all (Mesh.SaveAll = 1)'
+)
+
 
 def check_mesh(slab: MeshSlab, comm: MPI.Comm) -> list[str]:
     """Refuse a mesh that cannot be simulated. Collective.
@@ -42,7 +47,8 @@ def check_mesh(slab: MeshSlab, comm: MPI.Comm) -> list[str]:
     if slab.structured:
         return warnings
     if slab.n_nodes == 0 or slab.n_bars == 0:
-        raise InputError(f"{slab.source}: {slab.n_nodes} nodes and {slab.n_bars} bars: nothing to simulate")
+        hint = _NO_LINES if slab.source.endswith(".msh") and slab.n_nodes else ""
+        raise InputError(f"{slab.source}: {slab.n_nodes} nodes and {slab.n_bars} bars: nothing to simulate{hint}")
     _check_points(slab, comm)
     _check_ends(slab, comm)
     # The bars of a node meet at the rank whose slab holds it: there both ends of each bar are known to be used.
@@ -80,7 +86,10 @@ def _check_bare_nodes(slab: MeshSlab, comm: MPI.Comm, used: np.ndarray) -> None:
     lines = [f"node {slab.first_node + i}" for i in bad[:_SHOWN]]
     remedy = "remove them: a node without bars has neither mass nor stiffness"
     if slab.source.endswith(".msh"):
-        remedy += " (Gmsh saves the nodes of physical groups alone where there are any: put only the bars in them)"
+        remedy += (
+            " (Gmsh saves each point of a physical group: these are points that no line in a group ends at; points at "
+            "the same place are merged by `Coherence;`)"
+        )
     _refuse(slab, comm, lines, len(bad), "nodes belong to no bar", remedy)
 
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from ..case.tables import NodeSet
     from .distribution import DistributedMesh
 
-__all__ = ["resolve_node_sets"]
+__all__ = ["group_hint", "resolve_node_sets"]
 
 
 def resolve_node_sets(case: Case, mesh: DistributedMesh) -> dict[str, np.ndarray]:
@@ -28,14 +28,22 @@ def resolve_node_sets(case: Case, mesh: DistributedMesh) -> dict[str, np.ndarray
     sets = {}
     for name, node_set in case.node_set.items():
         where = f"{case.source}: node_set.{name}"
-        members = _members(where, node_set, mesh)
+        members = _members(case, where, node_set, mesh)
         if mesh.comm.allreduce(len(members)) == 0:
             raise InputError(f"{where}: no node of the mesh is in this set; correct the box or the group")
         sets[name] = members.astype(np.int64)
     return sets
 
 
-def _members(where: str, node_set: NodeSet, mesh: DistributedMesh) -> np.ndarray:
+def group_hint(case: Case, name: str, known: list[str], entity: str = "Point") -> str:
+    """What follows the message about a group that the mesh lacks: the nearest known one, or how to make one."""
+    if known:
+        return nearest(name, known)
+    example = f' (in Gmsh: Physical {entity}("{name}") = {{...}};)' if str(case.mesh.file).endswith(".msh") else ""
+    return ("; the mesh has no groups" if entity == "Point" else "; the mesh has no bar groups") + example
+
+
+def _members(case: Case, where: str, node_set: NodeSet, mesh: DistributedMesh) -> np.ndarray:
     points = mesh.points[: mesh.n_owned]
     ids = mesh.node_ids[: mesh.n_owned]
     if node_set.nearest is not None:
@@ -58,7 +66,7 @@ def _members(where: str, node_set: NodeSet, mesh: DistributedMesh) -> np.ndarray
             ends = np.unique(mesh.bars[bars])
             return ends[ends < mesh.n_owned]
         known = groups + sorted(mesh.bar_groups)
-        hint = nearest(node_set.group, known) if known else "; the mesh has no groups"
+        hint = group_hint(case, node_set.group, known)
         raise InputError(f"{where}.group = {node_set.group!r}: no such group in the mesh{hint}")
     if node_set.indices is not None:
         wanted = np.array(node_set.indices, dtype=np.int64)

@@ -21,7 +21,14 @@ from ..parallel.natural import NaturalOrder
 from .hdf5 import HDF5_ERRORS, first_line
 from .integrity import check_seal, checksum, remedy
 
-__all__ = ["Checkpoint", "OpenCheckpoint", "newest_checkpoint", "read_checkpoint", "read_checkpoint_header"]
+__all__ = [
+    "asked_checkpoint",
+    "Checkpoint",
+    "OpenCheckpoint",
+    "newest_checkpoint",
+    "read_checkpoint",
+    "read_checkpoint_header",
+]
 
 NAME, PREVIOUS = "checkpoint.h5", "checkpoint-previous.h5"
 
@@ -165,6 +172,24 @@ def newest_checkpoint(folder: Path | str) -> Path | None:
         if (Path(folder) / name).is_file():
             return Path(folder) / name
     return None
+
+
+def asked_checkpoint(folder: Path | str, asked: bool | Path | str) -> Path | None:
+    """The checkpoint of a restart: the newest of the output folder or of another one, or a file. On one rank.
+
+    Raises
+    ------
+    InputError
+        Another folder, without a checkpoint.
+    """
+    if asked is True:
+        return newest_checkpoint(folder)
+    path = Path(asked)
+    if not path.is_dir():
+        return path
+    if (newest := newest_checkpoint(path)) is None:
+        raise InputError(f"{path}: there is no checkpoint in this folder; name another, or start without --restart")
+    return newest
 
 
 def _open(path: Path) -> BinaryIO:

@@ -16,8 +16,10 @@ VARIABLE = "VTK_DEFAULT_OPENGL_WINDOW"
 # Nothing is shown, so a display is not asked first: it may be gone, or far away behind ssh.
 _HEADLESS = ("vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow")
 
-# Draw a red square where a library is there at all: a crash, a hang or an empty image all count as "does not work".
+# Draw a red square where a library is there at all: a crash, a hang or an empty image all count as "does not work". So
+# does a window of another kind than asked for, which VTK takes where the library is missing, with warnings each time.
 _PROBE = """
+import os
 import vtkmodules.vtkRenderingOpenGL2
 from vtkmodules.vtkRenderingCore import vtkRenderer, vtkRenderWindow, vtkWindowToImageFilter
 renderer, window, grab = vtkRenderer(), vtkRenderWindow(), vtkWindowToImageFilter()
@@ -26,6 +28,7 @@ window.SetOffScreenRendering(1)
 window.SetSize(16, 16)
 window.AddRenderer(renderer)
 window.Render()
+assert os.environ.get("VTK_DEFAULT_OPENGL_WINDOW") in (None, window.GetClassName())
 grab.SetInput(window)
 grab.Update()
 assert grab.GetOutput().GetPointData().GetScalars().GetTuple(100)[0] > 200

@@ -27,7 +27,7 @@ History = Mapping[str, np.ndarray]
 def plot(
     result_path: Path | str | Any, output: Path | str | None = None, *, curves: Iterable[str] | None = None
 ) -> list[Path]:
-    """Draw the history: ``energies.png``, ``momentum.png``, ``probes.png``, ``walls.png``, ``solver.png``.
+    """Draw the history: ``energies.png``, ``momentum.png``, ``probes.png``, ``walls.png``, ``solver.png`` and others.
 
     Parameters
     ----------
@@ -38,7 +38,8 @@ def plot(
 
     Returns
     -------
-    The files written; there is none for what the result lacks (probes, walls).
+    The files written; there is none for what the result lacks (probes, walls, ``pairs.png``, ``constraints.png``,
+    iterations).
 
     Raises
     ------
@@ -61,7 +62,9 @@ def plot(
             _energies(history, title, folder / "energies.png"),
             _momentum(history, title, folder / "momentum.png") if result.axis is TIME else None,
             _probes(history, title, folder / "probes.png"),
-            _walls(history, case.wall, title, folder / "walls.png"),
+            _forces(history, "wall", case.wall, title, folder / "walls.png"),
+            _forces(history, "pair", (), title, folder / "pairs.png"),
+            _forces(history, "constraint", (), title, folder / "constraints.png"),
             _solver(history, title, folder / "solver.png"),
         ]
     return [file for file in drawn if file is not None]
@@ -223,31 +226,33 @@ def _range(chart: Chart, axes: Any, quantity: str, values: np.ndarray) -> None:
         axes.fill_between(time, low, high, color=COLOURS[k], alpha=0.15, linewidth=0)
 
 
-def _walls(history: History, walls: Iterable[Any], title: str, file: Path) -> Path | None:
-    names = [name.removeprefix("wall/").removesuffix("/force") for name in history if name.endswith("/force")]
-    names = [name for name in names if f"wall/{name}/force" in history]
+def _forces(history: History, source: str, walls: Iterable[Any], title: str, file: Path) -> Path | None:
+    """Forces of all walls, or of all pairs or constraints, and the nodes in contact where they are counted."""
+    names = [name.removeprefix(f"{source}/").removesuffix("/force") for name in history if name.endswith("/force")]
+    names = [name for name in names if f"{source}/{name}/force" in history]
     if not names:
         return None
     time = _read(history, "time")
     normals = {wall.name: np.asarray(wall.normal, dtype=float) for wall in walls if hasattr(wall, "normal")}
-    chart = _chart(history, title, 3 * len(names), heights=[0.9, 0.9, 0.5] * len(names))
+    counted = [f"{source}/{name}/contacts" in history for name in names]
+    rows, heights = sum(3 if c else 2 for c in counted), [h for c in counted for h in (0.9, 0.9, 0.5)[: 2 + c]]
+    chart = _chart(history, title, rows, heights=heights)
+    panels = iter(chart.axes[:, 0])
     width = WINDOW * float(time[-1] - time[0])
-    for number, name in enumerate(names):
+    for name, counts in zip(names, counted, strict=True):
         # peaks (the inertia of a node that is stopped within a step) and means need scales of their own
-        upper, middle, lower = chart.axes[3 * number : 3 * number + 3, 0]
-        force = _read(history, f"wall/{name}/force")
+        force = _read(history, f"{source}/{name}/force")
         if name in normals:
             values, label = force @ normals[name] / np.linalg.norm(normals[name]), "normal force"
         else:
             values, label = np.linalg.norm(force, axis=1), "force"
         smooth = window_mean(time, values, width)
-        chart.curves(upper, label, "N", [("as computed", values)], f"Wall '{name}'", [{"linewidth": 0.9}])
+        heading = f"{source.capitalize()} '{name}'"
+        chart.curves(next(panels), label, "N", [("as computed", values)], heading, [{"linewidth": 0.9}])
         mean = f"{label},\nmean of the\n{engineering(width, 's', 3)} before"
-        chart.curves(middle, mean, "N", [("mean", smooth)], styles=[{"linewidth": 1.6}])
-        if f"wall/{name}/contacts" in history:
-            chart.counts(lower, "nodes in\ncontact", history[f"wall/{name}/contacts"], COLOURS[1])
-        else:
-            lower.set_axis_off()
+        chart.curves(next(panels), mean, "N", [("mean", smooth)], styles=[{"linewidth": 1.6}])
+        if counts:
+            chart.counts(next(panels), "nodes in\ncontact", history[f"{source}/{name}/contacts"], COLOURS[1])
     return chart.save(file)
 
 
@@ -261,12 +266,18 @@ def _solver(history: History, title: str, file: Path) -> Path | None:
     # an explicit scheme iterates nowhere, and a truss without walls touches nothing: these panels would be empty
     walls = any(name.startswith("wall/") for name in history)
     names = [name for name in names if (walls and name == "active_contacts") or np.any(history[name])]
-    if not names:
+    if not names or (names == ["active_contacts"] and _is_shown(history)):
         return None
     chart = _chart(history, title, len(names), heights=[0.7] * len(names))
     for number, (axes, name) in enumerate(zip(chart.axes[:, 0], names, strict=True)):
         chart.counts(axes, labels[name], history[name], COLOURS[number])
     return chart.save(file)
+
+
+def _is_shown(history: History) -> bool:
+    """Whether the nodes in contact are those of a single wall: their number is in the picture of the walls."""
+    walls = [name for name in history if name.startswith("wall/") and name.endswith("/contacts")]
+    return len(walls) == 1 and np.array_equal(history[walls[0]], history["active_contacts"])
 
 
 def _named(history: History, names: list[str], title: str, file: Path) -> Path:

@@ -47,7 +47,8 @@ def forecast(
     held = model.comm.allreduce(_needed(model, plan))
     entries = {
         "memory needed": f"about {engineering(held, 'B', 3)} on all ranks",
-        "run time": f"about {duration(_seconds(model, plan))} of steps, output aside",
+        "run time": f"about {duration(_seconds(model, plan))} of steps on idle cores, to a factor of 3; start, "
+        "compiling and output come on top",
         "result file": f"about {engineering(size, 'B', 3)}",
     }
     if case.output.checkpoint_every or case.output.checkpoint_minutes:

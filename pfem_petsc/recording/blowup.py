@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..energies import SUPPLIED
+from ..energies import STORED, SUPPLIED
 from ..errors import SimulationFailure
 
 if TYPE_CHECKING:
@@ -56,7 +56,8 @@ class BlowUp:
             raise SimulationFailure(
                 f"{when}: the energy is not finite: the motion diverged{self._where(state)}; reduce time.step"
             )
-        start = held + row["plastic_dissipation"] if self._rows == 0 else 0.0
+        # walls with mass as well: a truss at rest has no other energy than that of what hits it
+        start = sum(row[name] for name in STORED) + row["plastic_dissipation"] if self._rows == 0 else 0.0
         self._most = max(self._most, abs(start), *(abs(row[name]) for name in SUPPLIED))
         self._rows += 1
         created = -row["numerical_dissipation"]

@@ -11,7 +11,7 @@ from mpi4py import MPI
 
 from ..errors import InputError
 from ..output import result as results
-from ..output.checkpoint import NAME, PREVIOUS, OpenCheckpoint, newest_checkpoint
+from ..output.checkpoint import NAME, PREVIOUS, OpenCheckpoint, asked_checkpoint
 from ..output.integrity import check_seal
 from ..output.units import engineering
 from ..output.verify import examine
@@ -81,7 +81,7 @@ def find_restart(case: Case, comm: MPI.Comm, folder: Path, asked: bool | Path | 
     """
     if asked is None or asked is False:
         return None
-    path = on_root(comm, newest_checkpoint, folder) if asked is True else Path(asked)
+    path = on_root(comm, asked_checkpoint, folder, asked)
     if path is None:
         return f"{folder}: no checkpoint there to restart from: starting from zero"
     file = OpenCheckpoint(path, comm)

@@ -9,7 +9,7 @@ from mpi4py import MPI
 
 from ..case.overrides import split_key
 from ..errors import InputError
-from ..output.checkpoint import newest_checkpoint, read_checkpoint_header
+from ..output.checkpoint import asked_checkpoint, read_checkpoint_header
 from ..output.result import open_result
 from .folder import RESULT
 
@@ -23,14 +23,14 @@ def kept_overrides(name: str, folder: Path, restart: bool | Path) -> list[str]:
     ----------
     name : of the case; a run of another one has nothing to keep
     folder : of the output
-    restart : True for the newest checkpoint of the folder, else its file
+    restart : True for the newest checkpoint of the folder, else its file or folder
 
     Raises
     ------
     InputError
         The checkpoint is missing or damaged.
     """
-    path = newest_checkpoint(folder) if restart is True else Path(restart)
+    path = asked_checkpoint(folder, restart)
     if path is not None:
         _, found = read_checkpoint_header(path, MPI.COMM_SELF)
     else:

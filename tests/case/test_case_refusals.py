@@ -255,7 +255,7 @@ def test_file_that_cannot_be_read(tmp_path):
         Case.load("rod_impct")
     with pytest.raises(InputError, match=r"nothing\.toml: .*built-in cases are .*rod_impact"):
         Case.load(tmp_path / "nothing.toml")
-    with pytest.raises(InputError, match="cannot be read"):
+    with pytest.raises(InputError, match=r"this is a folder; name a case file .* results by -o"):
         Case.load(tmp_path)
     with pytest.raises(InputError, match="cannot be read"):
         Case.load("zero\0byte")
@@ -284,3 +284,29 @@ def test_parameter_of_another_scheme_is_refused_with_the_way_out():
         InputError, match=r"time.beta: a key of chung_lee, newmark, not of houbolt, which takes no parameters(\n|$)"
     ):
         Case.from_dict(data)
+
+
+@pytest.mark.parametrize("given", ["rod_impact", "mesh = 1", [1.0], None, 3])
+def test_what_is_no_table_is_refused_with_what_reads_it(given):
+    with pytest.raises(InputError, match=r"^case: expected nested tables, got .*; Case\.load reads a case file"):
+        Case.from_dict(given)
+
+
+@pytest.mark.parametrize("given", ["rod_impact", {"title": "a table"}, None])
+def test_a_simulation_is_of_a_case(given):
+    from pfem_petsc import Simulation
+
+    with pytest.raises(InputError, match=r"expected a Case, got .*Case\.load .*Case\.from_dict"):
+        Simulation(given)
+
+
+def test_ranges_stand_for_lists():
+    data = Case.load("rod_impact").to_dict()
+    data["node_set"]["tip"] = {"indices": range(2, 8, 2)}
+    assert Case.from_dict(data).node_set["tip"].indices == (2, 4, 6)
+
+
+def test_set_makes_the_first_of_a_list_of_constraints():
+    """``constraint.0`` where the case has none is refused for its kind, not for the key."""
+    with pytest.raises(InputError, match=r"constraint\[0\]\.kind = \"thether\" \(given by --set\): unknown value"):
+        Case.load("rod_impact", ["constraint.0.kind=thether"])

@@ -179,3 +179,41 @@ def _rammed(normal, integrator, comm, folder):
     walls = f'wall=[{{{wall}, name = "wall", point = [1.05, 0, 0], normal = [-1, 0, 0]}}, {{{ram}}}]'
     case = Case.load("rod_impact", [walls, "output.fields_every=0", "time.end=0.4", f"time.integrator={integrator}"])
     return [step.row for step in Simulation(case, comm, output=folder / "rod", quiet=True)]
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("integrator", ["central_differences", "chung_lee", "hulbert_chung"])
+def test_what_hits_a_truss_at_rest_brings_energy_into_it(integrator, comm, shared_tmp_path):
+    """A truss without load has no energy but that of the wall with mass: the run is not taken for unstable.
+
+    A stop of mass M at v on a fixed bar of stiffness k and end mass m, M >> m: it leaves after half a period, and the
+    bar's end has moved by v sqrt((M + m)/k) at most.
+    """
+    mass, speed, area = 50.0, 0.5, 1e-4
+    case = Case.from_dict(
+        {
+            "mesh": {"generator": "rod", "length": 1.0, "elements": 1},
+            "node_set": {"foot": {"group": "start"}, "tip": {"group": "end"}},
+            "material": {"steel": {"young_modulus": 210e9, "density": 7850.0}},
+            "section": {"bar": {"area": area, "material": "steel"}},
+            "support": [{"node_set": "foot", "fix": "xyz"}, {"node_set": "tip", "fix": "yz"}],
+            "wall": [
+                {
+                    "name": "stop",
+                    "type": "plane",
+                    "point": [1.001, 0.0, 0.0],
+                    "normal": [-1.0, 0.0, 0.0],
+                    "mass": mass,
+                    "velocity": [-speed, 0.0, 0.0],
+                }
+            ],
+            "time": {"integrator": integrator, "step": "auto", "end": 0.008},
+            "output": {"probe": [{"name": "tip", "node_set": "tip"}]},
+        }
+    )
+    run = Simulation(case, comm, output=shared_tmp_path / "out", quiet=True)
+    rows = [step.row for step in run]
+    assert min(row["numerical_dissipation"] for row in rows) < -1e-6  # what the watch of the energy looks at
+    reach = speed * np.sqrt((mass + 0.5 * 7850.0 * area) / (210e9 * area))
+    assert 1.0 - min(row["probe/tip/position"][0, 0] for row in rows) == pytest.approx(reach, rel=0.03)
+    assert rows[-1]["wall/stop/velocity"][0] == pytest.approx(speed, rel=0.03)

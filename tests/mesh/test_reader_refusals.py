@@ -77,7 +77,20 @@ def test_gmsh_nodes_without_bars_say_the_way_out(tmp_path):
     path = tmp_path / "points.msh"
     path.write_text(TEXT["2.2"].replace("$Nodes\n4\n", "$Nodes\n5\n77 9 9 9\n"))
     assert "1 nodes belong to no bar: node 0; remove them" in refusal(path)
-    assert "physical groups" in refusal(path)
+    assert "each point of a physical group" in refusal(path)
+
+
+def test_gmsh_points_without_lines_say_what_gmsh_saves(tmp_path):
+    """A physical group of points and none of lines: Gmsh saves the points alone."""
+    path = tmp_path / "points.msh"
+    path.write_text(
+        "$MeshFormat\n2.2 0 8\n$EndMeshFormat\n$Nodes\n1\n1 0 0 0\n$EndNodes\n"
+        "$Elements\n1\n1 15 2 1 1 1\n$EndElements\n"
+    )
+    assert refusal(path) == (
+        "FILE: 1 nodes and 0 bars: nothing to simulate; where there are physical groups, Gmsh saves nothing else: put "
+        'the lines into one (Physical Curve("bars") = {:}), or save all (Mesh.SaveAll = 1)'
+    )
 
 
 @pytest.mark.parametrize(

@@ -138,10 +138,12 @@ def test_the_other_meshes_in_the_repository_are_braced_trusses(comm, name, nodes
         ("house.vtu", "there is no file .*house.vtu; that folder has ring.msh"),
         ("sub/ring.msh", "there is no file .*sub/ring.msh: there is no folder .*sub"),
         ("ring.stl", "no reader for 'ring.stl'; known.*.msh"),
+        ("ring.geo", "no reader for 'ring.geo'; .*; this is a geometry: mesh it by `gmsh -1 ring.geo -o ring.msh`"),
+        ("ring.vtk", "no reader for 'ring.vtk'; .*; convert it by `meshio convert ring.vtk ring.vtu`"),
     ],
 )
 def test_files_that_are_not_there_or_not_known(comm, shared_tmp_path, name, text):
-    for there in ("ring.msh", "ring.stl"):
+    for there in ("ring.msh", "ring.stl", "ring.geo", "ring.vtk"):
         written(comm, shared_tmp_path, there, b"solid")
     with pytest.raises(InputError, match=text):
         read_slab(shared_tmp_path / name, comm)

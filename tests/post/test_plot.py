@@ -47,6 +47,27 @@ def test_contact_has_no_panel_without_walls(tmp_path, result):
     assert without.name == "solver.png" and Image.open(without).height < with_contact
 
 
+def test_a_picture_is_not_a_panel_of_another(tmp_path, result):
+    """Without iterations, the nodes in contact with a single wall are in walls.png alone."""
+    for name in ("newton_iterations", "linear_iterations"):
+        result.history[name] = 0 * result.history[name]
+    assert [path.name for path in plot(result, tmp_path)][-1] == "walls.png"
+    other = 3 - result.history["active_contacts"]  # of two walls, the sum is in no other picture
+    result.history["wall/other/force"], result.history["wall/other/contacts"] = result.history["wall/wall/force"], other
+    result.history["active_contacts"] = result.history["active_contacts"] + other
+    assert [path.name for path in plot(result, tmp_path)][-1] == "solver.png"
+
+
+def test_pairs_and_constraints_have_pictures(tmp_path, result):
+    force = result.history.pop("wall/wall/force")
+    del result.history["wall/wall/contacts"]
+    result.history |= {"pair/faces/force": force, "pair/a/b/force": force, "constraint/rope/force": force}
+    written = {path.name: path for path in plot(result, tmp_path)}
+    assert "walls.png" not in written
+    assert Image.open(written["pairs.png"]).height > 1.5 * Image.open(written["constraints.png"]).height
+    assert len(saturated(written["pairs.png"])) > 500
+
+
 def test_named_curves(tmp_path, result):
     written = plot(result, tmp_path, curves=["kinetic_energy", "momentum", "probe/tip/velocity", "wall/wall/contacts"])
     assert [path.name for path in written] == ["curves.png"] and len(saturated(written[0])) > 500

@@ -206,3 +206,28 @@ def test_a_display_that_is_not_there_does_not_matter(tmp_path):
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=200)
     assert done.returncode == 0, done.stderr
     assert done.stdout.strip() in ("vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow")
+
+
+def test_a_window_of_another_kind_than_asked_for_does_not_count(tmp_path, monkeypatch):
+    """Without an EGL library VTK draws by OSMesa all the same, and warns twice of every window: OSMesa is asked for."""
+    fake = tmp_path / "vtkmodules"
+    fake.mkdir()
+    (fake / "__init__.py").write_text("")
+    (fake / "vtkRenderingOpenGL2.py").write_text("")
+    (fake / "vtkRenderingCore.py").write_text(
+        "class Anything:\n"
+        "    def __getattr__(self, name):\n"
+        "        return lambda *arguments: self\n"
+        "    def GetTuple(self, k):\n"
+        "        return (255, 0, 0)\n"
+        "    def GetClassName(self):\n"
+        "        return 'vtkOSOpenGLRenderWindow'\n"
+        "vtkRenderer = vtkRenderWindow = vtkWindowToImageFilter = Anything\n"
+    )
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setenv(headless.VARIABLE, "")  # so that the end of the test takes away what is set below
+    monkeypatch.delenv(headless.VARIABLE)
+    assert not headless._works("vtkEGLRenderWindow")
+    assert headless._works("vtkOSOpenGLRenderWindow")
+    headless.require_rendering.__wrapped__()
+    assert os.environ[headless.VARIABLE] == "vtkOSOpenGLRenderWindow"

@@ -233,3 +233,14 @@ def test_checkpoint_says_what_it_was_written_by(copy):
     assert re.fullmatch(r"\d+\.\d+\.\d+.*|not installed", state["attributes"]["pfem_petsc"])
     assert state["attributes"]["case"]["mesh"]["elements"] == 20
     assert state["scalars"]["step"] == 50
+
+
+def test_folder_of_checkpoints_stands_for_its_newest(copy, tmp_path, capsys):
+    new = tmp_path / "new"
+    assert main(rod(new, "--restart", str(copy), end=0.6)) == 0
+    assert steps(new)[0][[0, -1]].tolist() == [50, 60]
+    (copy / "checkpoint.h5").unlink()
+    assert main(rod(copy, "--restart", str(copy), end=0.6)) == 0  # continued in its own place
+    np.testing.assert_array_equal(steps(copy)[0], range(61))
+    assert main(rod(new, "--restart", str(tmp_path))) == 2
+    assert f"{tmp_path}: there is no checkpoint in this folder" in capsys.readouterr().err

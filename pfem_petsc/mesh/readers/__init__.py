@@ -17,6 +17,14 @@ __all__ = ["SUFFIXES", "read_slab"]
 SUFFIXES = {".msh": "gmsh", ".vtu": "vtk", ".vtkhdf": "vtk", ".h5": "hdf5"}
 """Reader module for each suffix; each has ``read(path, comm) -> MeshSlab``, collective."""
 
+_GEOMETRY = "; this is a geometry: mesh it by `gmsh -1 {name} -o {stem}.msh`"
+_MESHIO = "; convert it by `meshio convert {name} {stem}.vtu`"
+_CONVERT = {
+    **dict.fromkeys((".geo", ".geo_unrolled", ".step", ".stp", ".brep"), _GEOMETRY),
+    **dict.fromkeys((".vtk", ".inp", ".med", ".bdf", ".nas", ".fem", ".xdmf", ".mesh", ".unv"), _MESHIO),
+}
+"""How to make a file that is read out of another; meshio is installed with the program."""
+
 
 def read_slab(path: Path, comm: MPI.Comm) -> MeshSlab:
     """This rank's part of the mesh in a file. Collective.
@@ -32,7 +40,8 @@ def read_slab(path: Path, comm: MPI.Comm) -> MeshSlab:
     on_root(comm, _check_file, path)
     reader = SUFFIXES.get(path.suffix.lower())
     if reader is None:
-        raise InputError(f"mesh.file: no reader for {path.name!r}; known suffixes: {', '.join(SUFFIXES)}")
+        hint = _CONVERT.get(path.suffix.lower(), "").format(name=path.name, stem=path.stem)
+        raise InputError(f"mesh.file: no reader for {path.name!r}; known suffixes: {', '.join(SUFFIXES)}{hint}")
     return importlib.import_module(f"{__name__}.{reader}").read(path, comm)
 
 

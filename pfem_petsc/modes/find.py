@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Protocol
 
@@ -27,6 +28,8 @@ _ROUNDING = 1e-13  # of the largest eigenvalue: smaller ones are zero
 _MORE = 4  # modes computed beyond those asked for, so that repeated ones are whole
 _AGAIN = 3  # modes asked for in a search for those that were missed
 _SEARCHES = 40
+_NOTHING = 1e-10  # of the largest theta: others are those of directions in which A is zero
+_DEPENDENT = 1e-10  # eigenvalue of a Gram matrix of unit vectors, below which they depend on each other
 _NO_LOAD = 1e-9  # of the axial stiffness: axial forces that are none
 
 
@@ -114,7 +117,7 @@ def _vibration(
     # a shift near zero where that is below all eigenvalues, else one that certainly is
     shifts = [-small] if low == 0.0 else [-small, low - small]
     for shift in shifts:
-        pencil = Pencil(mass, join(stiffness, -shift, mass), state.position, free)
+        pencil = Pencil(mass, join(stiffness, -shift, mass), state.position, holds.held, free)
         solver = solver_module(name).Solver(pencil)
         if solver.definite or shift == shifts[-1]:
             break
@@ -155,6 +158,7 @@ def _buckling(
         matrices.stiffness(geometric, 0.0),
         matrices.stiffness(material, float(largest[1])),
         state.position,
+        holds.held,
         free,
     )
     solver = solver_module(name).Solver(pencil)
@@ -165,26 +169,18 @@ def _buckling(
                 "stiffness is singular, and no factor of the load is defined; brace and support it, or take "
                 'kind = "vibration", whose eigenvalues have the state\'s stresses in them'
             )
-        theta, shapes = _lowest(model, holds, pencil, solver, _basis(model, state), count, _inverse, 0.0)
+        theta, shapes = _lowest(model, holds, pencil, solver, _basis(model, state), count, np.reciprocal, 0.0, _NOTHING)
     finally:
         solver.destroy()
         pencil.destroy()
-    # of what is not loaded in compression theta is zero but for rounding
-    buckles = theta > 1e-10 * np.abs(theta).max(initial=0.0)
-    if not buckles.any():
+    if not len(theta):
         raise SimulationFailure(
             f"{source}: modes: no positive factor of the state's axial forces makes the truss buckle: it is in tension"
         )
-    shapes = shapes[buckles]
-    peaks = np.abs(shapes).reshape(len(shapes), -1).max(axis=1, initial=0.0)
+    peaks = np.abs(shapes).max(axis=(1, 2), initial=0.0)
     model.comm.Allreduce(MPI.IN_PLACE, peaks, op=MPI.MAX)
     shapes /= peaks[:, None, None]
-    return Found("buckling", 1.0 / theta[buckles], shapes, 0, solver.name, solver.iterations, holds.at_walls)
-
-
-def _inverse(theta: np.ndarray) -> np.ndarray:
-    with np.errstate(divide="ignore"):
-        return np.where(theta > 0.0, 1.0 / theta, np.inf)
+    return Found("buckling", 1.0 / theta, shapes, 0, solver.name, solver.iterations, holds.at_walls)
 
 
 def _basis(model: Model, state: State) -> Basis:
@@ -199,40 +195,42 @@ def _lowest(
     solver: _Solver,
     basis: Basis,
     count: int,
-    values_of: object,
+    values_of: Callable[[np.ndarray], np.ndarray],
     zero: float,
+    nothing: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The ``count`` largest theta (k,), and unique vectors (k, owned, 3) with x^T B x = 1. Collective."""
-    wanted, known = min(count + _MORE, pencil.free), np.empty((0, 3 * model.mesh.n_owned))
-    theta = np.empty(0)
-    search = 0
-    while True:
-        ask = wanted - len(known) if len(known) < wanted else min(_AGAIN, pencil.free - len(known))
+    """The ``count`` largest positive theta (k,), and unique vectors (k, owned, 3) with x^T B x = 1. Collective.
+
+    An iteration may find a repeated eigenvalue less often than it is there, so searches are repeated in the complement
+    of what was found, until one changes nothing.
+    """
+    wanted = min(count + _MORE, pencil.free)
+    theta, known = np.empty(0), np.empty((0, 3 * model.mesh.n_owned))
+    for search in range(_SEARCHES):
+        before = theta[:wanted]
+        ask = min(max(wanted - len(known), _AGAIN), pencil.free - len(known))
         if ask > 0:
             found = solver.largest(ask, _start(model, holds, search), known)
-            before = theta[:wanted]
+            found = np.where(holds.held.ravel(), 0.0, found[:ask])
             theta, known = _ritz(model.comm, pencil, np.concatenate([known, found]))
-            known = _held_to_zero(holds, known)
-        complete = ask <= 0 or (len(before) >= wanted and np.allclose(theta[:wanted], before, rtol=1e-9, atol=0.0))
-        if solver.finds_all or complete:
-            values = values_of(theta)
-            whole = len(values) == pencil.free or not same(values[wanted - 1], values[count - 1], zero)
-            if whole or wanted > count + 8 * _MORE or solver.finds_all:
-                break
-            wanted = min(wanted + 2 * _MORE, pencil.free)
-        search += 1
-        if search > _SEARCHES:
-            raise SimulationFailure(
-                f"modes: after {search} searches more repeated eigenvalues are still found ({solver.name}); ask for "
-                "fewer modes (modes.count)"
-            )
-    theta, known = theta[:wanted], known[:wanted]
-    shapes = basis.unique(values_of(theta), holds.to_axes(known.reshape(len(known), -1, 3)), zero)
-    return theta[:count].copy(), shapes[:count]
-
-
-def _held_to_zero(holds: Holds, vectors: np.ndarray) -> np.ndarray:
-    return np.where(holds.held.ravel(), 0.0, vectors)
+            positive = theta > nothing * np.abs(theta).max(initial=0.0)
+            theta, known = theta[positive], known[positive]
+        now = theta[:wanted]
+        if not (solver.finds_all or (len(now) == len(before) and np.allclose(now, before, rtol=1e-9, atol=0.0))):
+            continue
+        values = values_of(now)
+        cut = len(now) == wanted < pencil.free and same(values[-1], values[min(count, wanted) - 1], zero)
+        if not cut or wanted > count + 8 * _MORE:
+            break
+        wanted = min(wanted + 2 * _MORE, pencil.free)
+    else:
+        raise SimulationFailure(
+            f"modes: after {_SEARCHES} searches more repeated eigenvalues are still found ({solver.name}); ask for "
+            "fewer modes (modes.count)"
+        )
+    shapes = holds.to_axes(known[: len(now)].reshape(len(now), model.mesh.n_owned, 3))
+    shapes = basis.unique(values_of(now), shapes, zero)
+    return now[:count].copy(), shapes[:count]
 
 
 def _start(model: Model, holds: Holds, search: int) -> np.ndarray:
@@ -243,17 +241,19 @@ def _start(model: Model, holds: Holds, search: int) -> np.ndarray:
 
 
 def _ritz(comm: MPI.Comm, pencil: Pencil, vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Theta (k,), descending, and vectors orthonormal in B, from the space of vectors (k, components). Collective."""
+    """Theta (k,), descending, and vectors orthonormal in B, from the space of vectors (m, components). Collective."""
     a, b = _products(pencil.a, vectors), _products(pencil.b, vectors)
     grams = comm.allreduce(np.stack([vectors @ a.T, vectors @ b.T]))
     first, second = 0.5 * (grams + grams.transpose(0, 2, 1))
-    scale = 1.0 / np.sqrt(np.diag(second))
+    norms = np.sqrt(np.diag(second))
+    scale = np.divide(1.0, norms, out=np.zeros_like(norms), where=norms > 0.0)
     first, second = first * np.outer(scale, scale), second * np.outer(scale, scale)
-    lower = np.linalg.cholesky(second)
-    reduced = np.linalg.solve(lower, np.linalg.solve(lower, first).T)
+    sizes, axes = np.linalg.eigh(second)
+    kept = sizes > _DEPENDENT
+    whitened = axes[:, kept] / np.sqrt(sizes[kept])
+    reduced = whitened.T @ first @ whitened
     theta, turn = np.linalg.eigh(0.5 * (reduced + reduced.T))
-    turn = np.linalg.solve(lower.T, turn[:, ::-1]).T * scale
-    return theta[::-1].copy(), turn @ vectors
+    return theta[::-1].copy(), (whitened @ turn[:, ::-1]).T * scale @ vectors
 
 
 def _products(matrix: PETSc.Mat, vectors: np.ndarray) -> np.ndarray:

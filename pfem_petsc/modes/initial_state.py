@@ -10,6 +10,7 @@ import numpy as np
 from ..analysis import Analysis, Step
 from ..errors import InputError, PfemError
 from ..integrators.base import Balance, NoParameters, Scheme, State
+from ..output.units import TIME, Axis
 from ..stepping.prescribed import NoRates
 from ..stepping.solution import Solution
 from ..stepping.stepper import Stepper
@@ -67,7 +68,7 @@ class InitialStatePlan:
 
     Attributes
     ----------
-    scheme, step, end, steps, linear : as of other plans
+    scheme, step, end, steps, linear, axis : as of other plans
     """
 
     scheme: Scheme = field(default_factory=_Nothing)
@@ -75,6 +76,7 @@ class InitialStatePlan:
     end: float = 0.0
     steps: int = 0
     linear: None = None
+    axis: Axis = TIME
 
     def beyond(self, steps: np.ndarray, times: np.ndarray) -> np.ndarray:
         """Which of recorded steps with their times lie beyond the end."""

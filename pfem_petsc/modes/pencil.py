@@ -5,7 +5,7 @@ Both problems are brought into the form A x = theta B x with B positive definite
 - vibration, (K - lambda M) x = 0: A = M, B = K - shift M with a shift below all lambda, theta = 1/(lambda - shift);
 - buckling, (K0 + lambda Kg) x = 0: A = -Kg, B = K0, theta = 1/lambda.
 
-Components that are held stay in the matrices, without coupling, and with a theta below all others.
+Components that are held stay in the matrices without coupling; their theta is positive and below all others, or zero.
 """
 
 from __future__ import annotations
@@ -38,12 +38,14 @@ class Pencil:
     ----------
     a, b : PETSc matrices; b is positive definite if the shift lies below all eigenvalues
     points : (owned, 3) positions of the nodes [m], for multigrid
+    held : (owned, 3) bool, components that are held
     free : number of components that nothing holds, of the whole model
     """
 
     a: PETSc.Mat
     b: PETSc.Mat
     points: np.ndarray
+    held: np.ndarray
     free: int
 
     def destroy(self) -> None:

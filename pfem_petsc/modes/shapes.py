@@ -77,13 +77,14 @@ class Basis:
     def _peak(self, space: np.ndarray, rows: list[np.ndarray]) -> np.ndarray:
         """Coefficients (k,) of the vector without parts in ``rows`` with the largest component. Collective."""
         left = np.eye(len(space)) - sum((np.outer(row, row) for row in rows), np.zeros((len(space),) * 2))
-        components = np.einsum("ij,jnc->inc", left, space).reshape(len(space), -1)
+        components = left @ space.reshape(len(space), len(self._places))
         at = self._first_largest(np.sqrt((components**2).sum(axis=0)))
         return self._comm.allreduce(components[:, at].copy() if at >= 0 else np.zeros(len(space)))
 
     def _signs(self, shapes: np.ndarray) -> np.ndarray:
         signs = np.zeros(len(shapes))
-        for k, shape in enumerate(shapes.reshape(len(shapes), -1)):
+        for k in range(len(shapes)):
+            shape = shapes[k].ravel()
             at = self._first_largest(np.abs(shape))
             signs[k] = np.sign(shape[at]) if at >= 0 else 0.0
         self._comm.Allreduce(MPI.IN_PLACE, signs)
@@ -103,6 +104,8 @@ class Basis:
 
 def same(one: float, other: float, zero: float) -> bool:
     """Whether two eigenvalues are the same but for rounding."""
+    if not np.isfinite(one) or not np.isfinite(other):
+        return one == other
     return abs(other - one) <= max(zero, _EQUAL * max(abs(one), abs(other)))
 
 

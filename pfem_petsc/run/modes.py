@@ -9,6 +9,7 @@ import numpy as np
 
 from ..modes.find import Found, find_modes
 from ..output.modes import NAMES
+from ..output.units import MODE
 from ..output.vtkhdf import ResultWriter
 from ..parallel.agreement import on_root
 
@@ -78,7 +79,7 @@ def _write_file(stepper: Stepper, found: Found, folder: Path) -> None:
         columns=columns,
         column_types={"step": np.int64},
         case_text=case.to_toml(),
-        attributes={"name": case.name, "folder": str(case.folder.resolve()), "kind": found.kind},
+        attributes={"name": case.name, "folder": str(case.folder.resolve()), "kind": found.kind, "axis": MODE.symbol},
     ) as writer:
         for k, (value, eigenvalue) in enumerate(zip(found.values, found.eigenvalues, strict=True)):
             row = {"time": float(k + 1), "step": k + 1, name: value, "eigenvalue": eigenvalue}

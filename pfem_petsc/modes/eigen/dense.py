@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..gathered import gathered_rows, scattered
+from ..gathered import Gathered
 from ..pencil import Pencil
 
 __all__ = ["Solver"]
+
+
+_SINGULAR = 1e-13  # of the largest entry: a pivot that is zero but for rounding
 
 
 class Solver:
@@ -18,19 +21,21 @@ class Solver:
     """whether repeated eigenvalues are found as often as they are there"""
 
     def __init__(self, pencil: Pencil) -> None:
-        self.pencil, self.iterations = pencil, 0
-        self._comm = pencil.a.comm.tompi4py()
+        self.iterations = 0
+        self._gathered = Gathered(pencil)
         self._vectors: np.ndarray | None = None
-        rows = gathered_rows(pencil.a), gathered_rows(pencil.b)
         definite = None
-        if self._comm.rank == 0:
-            definite = self._solve(*(_dense(*each) for each in rows))
-        self.definite: bool | None = self._comm.bcast(definite)
+        if self._gathered.comm.rank == 0:
+            definite = self._solve(self._dense(self._gathered.a), self._dense(self._gathered.b))
+        self.definite: bool | None = self._gathered.comm.bcast(definite)
 
     def _solve(self, a: np.ndarray, b: np.ndarray) -> bool:
         try:
             lower = np.linalg.cholesky(b)
         except np.linalg.LinAlgError:
+            return False
+        pivots = np.diag(lower) ** 2
+        if pivots.min() <= _SINGULAR * np.diag(b).max():
             return False
         reduced = np.linalg.solve(lower, np.linalg.solve(lower, a).T)
         _, vectors = np.linalg.eigh(0.5 * (reduced + reduced.T))
@@ -38,18 +43,14 @@ class Solver:
         return True
 
     def largest(self, count: int, start: np.ndarray, known: np.ndarray) -> np.ndarray:
-        """See :mod:`pfem_petsc.modes.eigen`; nothing but the first call finds any."""
-        if len(known):
-            return np.empty((0, known.shape[1]))
-        vectors = self._vectors[:count] if self._comm.rank == 0 else None
-        return scattered(self.pencil.a, vectors)
+        """See :mod:`pfem_petsc.modes.eigen`."""
+        vectors = None if self._vectors is None else self._vectors[len(known) : len(known) + count]
+        return self._gathered.scattered(vectors)
 
     def destroy(self) -> None:
         """Nothing to free."""
 
-
-def _dense(pointers: np.ndarray, columns: np.ndarray, values: np.ndarray) -> np.ndarray:
-    n = len(pointers) - 1
-    full = np.zeros((n, n))
-    full[np.repeat(np.arange(n), np.diff(pointers)), columns] = values
-    return full
+    def _dense(self, entries: tuple[np.ndarray, ...]) -> np.ndarray:
+        full = np.zeros((self._gathered.size,) * 2)
+        np.add.at(full, entries[:2], entries[2])
+        return full

@@ -8,12 +8,13 @@ import numpy as np
 
 from ...errors import SimulationFailure
 from ...parallel.agreement import on_root
-from ..gathered import gathered_rows, scattered
+from ..gathered import Gathered
 from ..pencil import Pencil
 
 __all__ = ["Solver"]
 
 _TOLERANCE = 1e-11  # relative, of theta
+_SINGULAR = 1e-13  # of the largest entry: a pivot that is zero but for rounding
 
 
 class Solver:
@@ -23,21 +24,22 @@ class Solver:
     finds_all = False
 
     def __init__(self, pencil: Pencil) -> None:
-        self.pencil, self.iterations = pencil, 0
-        self._comm = pencil.a.comm.tompi4py()
-        rows = gathered_rows(pencil.a), gathered_rows(pencil.b)
+        self.iterations = 0
+        self._gathered = Gathered(pencil)
+        self._comm = self._gathered.comm
         self._a = self._b = self._factor = None
-        self.definite: bool | None = on_root(self._comm, self._prepare, rows)
+        self.definite: bool | None = on_root(self._comm, self._prepare)
 
-    def _prepare(self, rows: tuple) -> bool | None:
-        from scipy.sparse import csc_matrix, csr_matrix
+    def _prepare(self) -> bool | None:
+        from scipy.sparse import csc_matrix
         from scipy.sparse.linalg import splu
 
-        n = len(rows[0][0]) - 1
-        self._a, self._b = (csr_matrix((each[2], each[1], each[0]), shape=(n, n)) for each in rows)
+        n = self._gathered.size
+        entries = self._gathered.a, self._gathered.b
+        self._a, self._b = (csc_matrix((each[2], each[:2]), shape=(n, n)) for each in entries)
         try:
             self._factor = splu(
-                csc_matrix(self._b),
+                self._b,
                 permc_spec="MMD_AT_PLUS_A",
                 diag_pivot_thresh=0.0,
                 options={"SymmetricMode": True},
@@ -47,21 +49,18 @@ class Solver:
         if not np.array_equal(self._factor.perm_r, self._factor.perm_c):
             return None
         # L D L^T without exchange of rows: by Sylvester's law the signs of D are those of the eigenvalues
-        return bool((self._factor.U.diagonal() > 0.0).all())
+        return bool((self._factor.U.diagonal() > _SINGULAR * self._b.diagonal().max()).all())
 
     def largest(self, count: int, start: np.ndarray, known: np.ndarray) -> np.ndarray:
         """See :mod:`pfem_petsc.modes.eigen`."""
-        parts = self._comm.gather((start, known))
-        whole = None
-        if parts is not None:
-            whole = tuple(np.concatenate([part[k] for part in parts], axis=-1) for k in (0, 1))
+        whole = self._gathered.whole(np.concatenate([start[None], known]))
         vectors, self.iterations = on_root(self._comm, self._iterate, count, whole)
-        return scattered(self.pencil.a, vectors)
+        return self._gathered.scattered(vectors if self._comm.rank == 0 else None)
 
-    def _iterate(self, count: int, whole: tuple) -> tuple[np.ndarray, int]:
+    def _iterate(self, count: int, whole: np.ndarray) -> tuple[np.ndarray, int]:
         from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh
 
-        start, known = whole
+        start, known = whole[0], whole[1:]
         n, solves = len(start), [self.iterations]
         products = self._b @ known.T
         gram = known @ products if len(known) else np.eye(0)

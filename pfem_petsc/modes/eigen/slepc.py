@@ -75,12 +75,17 @@ class Solver:
         pc = self._ksp.getPC()
         if not self.direct or pc.getType() != "cholesky":
             return None
-        try:
-            self._ksp.setOperators(self.pencil.b)
-            self._ksp.setUp()
-            negative, zero, _ = pc.getFactorMatrix().getInertia()
-        except PETSc.Error:
+        self._ksp.setOperators(self.pencil.b)
+        if pc.getFactorSolverType() == "mumps":
+            pc.setFactorSetUpSolverType()
+            factor = pc.getFactorMatrix()
+            factor.setMumpsIcntl(24, 1)  # pivots that are zero are counted
+            factor.setMumpsIcntl(13, 1)  # and the signs of those of the last front, which several ranks may share
+        self._ksp.setUp()
+        factor = pc.getFactorMatrix()
+        if pc.getFactorSolverType() == "mumps" and factor.getMumpsInfog(1) < 0:
             return False
+        negative, zero, _ = factor.getInertia()
         return negative == 0 and zero == 0
 
     def largest(self, count: int, start: np.ndarray, known: np.ndarray) -> np.ndarray:

@@ -246,6 +246,7 @@ class Simulation:
                 self.outputs.stop_early()
             # where a run that was killed after its last checkpoint had not got to it
             self.outputs.complete()
+            self.outputs.record_modes()
             self.outputs.tell_remarks()
             self._finish("done")
         except (GeneratorExit, EarlyStop):

@@ -109,6 +109,13 @@ petsc_package() {
     apt-cache --names-only search '^python3-petsc4py-real[0-9.]+$' | awk '{print $1}' | sort -V | tail -n 1
 }
 
+# SLEPc for modes of large models, of the same build as PETSc; optional: where it is missing, or cannot be installed,
+# smaller models are solved without.
+slepc_package() {
+    local package=${1/petsc4py/slepc4py}
+    if apt-cache show "$package" >/dev/null 2>&1; then echo "$package"; fi
+}
+
 # An environment that stands on another Python or PETSc than asked for is made anew.
 make_venv() {
     local made_from
@@ -156,7 +163,7 @@ need_python() {
 from_distribution() {
     [[ ! -x /usr/bin/python3 ]] || need_python /usr/bin/python3
     command -v apt-get >/dev/null || fail "no apt-get here: activate a Python with petsc4py, or set PETSC_DIR"
-    local package drawing updated=no
+    local package slepc drawing updated=no
     package=$(petsc_package)
     if [[ -z $package ]]; then
         apt_get update
@@ -166,10 +173,13 @@ from_distribution() {
     [[ -n $package ]] || fail "no package python3-petsc4py-real here: activate a Python with petsc4py, set PETSC_DIR," \
         "or use --build-petsc"
     mapfile -t drawing < <(drawing_packages)
-    apt_install "$package" python3-mpi4py python3-h5py-mpi openmpi-bin python3-venv libopenblas0-pthread "${drawing[@]}"
+    slepc=$(slepc_package "$package")
+    apt_install "$package" ${slepc:+"$slepc"} python3-mpi4py python3-h5py-mpi openmpi-bin python3-venv \
+        libopenblas0-pthread "${drawing[@]}"
     need_python /usr/bin/python3
     make_venv /usr/bin/python3 --system-site-packages
-    dpkg -L "$package" | grep '/dist-packages/petsc4py$' | xargs dirname > "$(site_packages)/petsc.pth"
+    dpkg -L "$package" ${slepc:+"$slepc"} | grep -E '/dist-packages/(petsc4py|slepc4py)$' | xargs -n 1 dirname \
+        > "$(site_packages)/petsc.pth"
     install_rest "$(numpy_limit /usr/bin/python3)"
 }
 

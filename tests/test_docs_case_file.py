@@ -23,6 +23,7 @@ MODELS = [
         tables.Temperature,
         settings.TimeKeys,
         settings.StaticKeys,
+        settings.Modes,
         settings.OutputKeys,
         settings.Probe,
         settings.Solver,

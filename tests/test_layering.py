@@ -26,7 +26,7 @@ FLOORS = (
     ("output",),
     ("contact",),
     ("stepping",),
-    ("statics",),
+    ("statics", "modes"),
     ("restart",),
     ("preflight",),
     ("recording",),

@@ -70,8 +70,10 @@ class Case:
 
     @property
     def mass(self) -> str:
-        """The mass matrix, ``lumped`` or ``consistent``."""
-        return self.time.mass if self.time is not None else "lumped"
+        """The mass matrix of the analysis, ``lumped`` or ``consistent``."""
+        if self.time is not None:
+            return self.time.mass
+        return (self.modes is not None and self.modes.mass) or "lumped"
 
     @classmethod
     def load(cls, path_or_name: str | Path, overrides: Iterable[str] = ()) -> Case:

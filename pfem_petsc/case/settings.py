@@ -90,6 +90,10 @@ class Modes(StrictModel):
     """number of modes"""
     kind: Literal["vibration", "buckling"] = "vibration"
     """natural frequencies, or linear buckling factors of the load"""
+    mass: Literal["lumped", "consistent"] | None = None
+    """mass matrix; default: that of [time], lumped without it"""
+    solver: Literal["auto", "dense", "scipy", "slepc"] = "auto"
+    """library that solves the eigenvalue problem"""
 
 
 class Probe(StrictModel):

@@ -1,8 +1,9 @@
 """Checksums of what a result file holds: one a snapshot and field, one a history row, one of the mesh.
 
 They stand in the group ``checks`` of the file itself: ``snapshots`` (snapshots, 1 + fields), whose first column is of
-step and time, the others of points and fields in the order of their names; ``history`` (rows,); ``mesh`` (1,). Rows are
-cut off with the data that they belong to, so that a file that is continued keeps those of what it keeps.
+step and time, the others of points and fields in the order of their names; ``history`` (rows,); ``mesh`` (1,); and
+``modes`` (modes,) in a case that asks for them. Rows are cut off with the data that they belong to, so that a file that
+is continued keeps those of what it keeps.
 """
 
 from __future__ import annotations
@@ -16,7 +17,16 @@ from mpi4py import MPI
 
 from .integrity import BLOCK, word_sum
 
-__all__ = ["CHECKS", "damages", "mark_digest", "mesh_digest", "row_digests", "snapshot_digests"]
+__all__ = [
+    "CHECKS",
+    "damages",
+    "mark_digest",
+    "mesh_digest",
+    "numbers_digest",
+    "row_digests",
+    "snapshot_digests",
+    "stored_digest",
+]
 
 CHECKS = "checks"
 _ODD = 0x9E3779B97F4A7C15
@@ -36,6 +46,16 @@ def snapshot_digests(comm: MPI.Comm, slabs: Mapping[str, tuple[np.ndarray, int]]
 def mark_digest(n: int, step: int, time: float) -> int:
     """Checksum of the step and time [s] of snapshot n."""
     return _number(np.array([n, step], dtype=np.int64).tobytes() + np.float64(time).tobytes())
+
+
+def numbers_digest(index: int, *numbers: float) -> int:
+    """Checksum of an index and numbers."""
+    return _number(np.int64(index).tobytes() + np.array(numbers, dtype=np.float64).tobytes())
+
+
+def stored_digest(name: str, values: np.ndarray) -> int:
+    """What :func:`snapshot_digests` gives for an array of this name that is here as a whole."""
+    return _seeded(name, word_sum(values, 0))
 
 
 def mesh_digest(comm: MPI.Comm, total: int) -> np.ndarray:
@@ -68,6 +88,7 @@ def damages(file: h5py.File, deep: bool = True) -> Iterator[str]:
     """
     # the layout needs what writes rows, which needs this module
     from .layout import PER_STEP, complete_rows, complete_snapshots, field_datasets
+    from .modes import mode_damages
 
     vtk, steps, checks = file["VTKHDF"], file["VTKHDF/Steps"], file[CHECKS]
     n_nodes, n_bars = int(vtk["NumberOfPoints"][0]), int(vtk["NumberOfCells"][0])
@@ -92,6 +113,7 @@ def damages(file: h5py.File, deep: bool = True) -> Iterator[str]:
                     if _seeded(name, _stored_sum(dataset, i * size, size)) != int(digests[i, 1 + k]):
                         yield f"{name} of snapshot {i} (t = {times[i]:.6g} s) does not match its checksum"
     yield from _history_damages(file["history"], checks["history"], complete_rows(file))
+    yield from mode_damages(file, deep)
     if zlib.crc32(file["case/text"][()]) != int(file["case/text"].attrs["checksum"]):
         yield "the text of the case does not match its checksum"
 

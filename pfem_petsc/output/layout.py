@@ -11,6 +11,7 @@ import numpy as np
 from .digests import CHECKS
 from .hdf5 import chunk_rows, create_growing, dataset_names, set_unit
 from .history import ROWS_PER_CHUNK, create_history
+from .modes import create_modes
 from .provenance import write_case
 from .units import field_unit
 
@@ -38,10 +39,12 @@ def create_result(
     column_types: Mapping[str, Any],
     case_text: str,
     attributes: Mapping[str, Any],
+    modes: str | None = None,
 ) -> None:
     """Make the whole structure of a result file but its fields: VTKHDF 2.0 with no step yet, history, case.
 
     The mesh is one part, whatever the number of ranks, and all steps use the same connectivity (offset 0).
+    ``modes`` is the kind of those that there will be.
     """
     vtk = file.create_group("VTKHDF")
     vtk.attrs["Version"] = np.array([2, 0], dtype=np.int64)
@@ -76,6 +79,8 @@ def create_result(
     create_growing(checks, "history", (), np.uint64, ROWS_PER_CHUNK)
     create_history(file, columns, column_types)
     write_case(file, case_text, attributes)
+    if modes is not None:
+        create_modes(file, modes, n_nodes)
 
 
 def create_field(vtk: h5py.Group, kind: str, name: str, row_shape: tuple[int, ...], dtype: np.dtype) -> h5py.Dataset:

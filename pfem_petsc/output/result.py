@@ -15,6 +15,7 @@ from ..errors import InputError
 from ..registry import nearest
 from .hdf5 import HDF5_ERRORS, dataset_names
 from .layout import complete_rows, complete_snapshots
+from .modes import MODES, NAMES, complete_modes
 from .provenance import read_attributes
 from .units import AXES, TIME, Axis
 
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 
     from ..case.schema import Case
 
-__all__ = ["History", "Result", "open_result", "readable", "result_file"]
+__all__ = ["History", "Modes", "Result", "open_result", "readable", "result_file"]
 
 RESULT_NAME = "result.vtkhdf"
 # A file that is being written may be caught between two states; how often, and after how many seconds, to look again.
@@ -83,6 +84,8 @@ class Result:
         The resolved case.
     attributes : dict
         Versions, ranks and options of the run.
+    n_modes : int
+        Number of modes, 0 without.
     """
 
     def __init__(self, path: Path) -> None:
@@ -104,6 +107,8 @@ class Result:
         self.attributes: dict[str, Any] = read_attributes(file["case"])
         self._n_rows = complete_rows(file)
         self._columns = dataset_names(file["history"])
+        self.n_modes = complete_modes(file)
+        self._names = sorted(file[MODES]) if self.n_modes else []
 
     @property
     def axis(self) -> Axis:
@@ -114,6 +119,19 @@ class Result:
     def history(self) -> History:
         """The history's columns: ``result.history["wall/floor/force"]``, (rows, 3)."""
         return History(self, self._columns, self._n_rows)
+
+    @property
+    def modes(self) -> Modes:
+        """The modes of the state at the end of the run.
+
+        Raises
+        ------
+        InputError
+            When the file has none.
+        """
+        if not self.n_modes:
+            raise InputError(f"{self.path}: has no modes: give the case a table [modes], and let it run to its end")
+        return Modes(self, self._names)
 
     @property
     def case(self) -> Case:
@@ -227,3 +245,55 @@ class History(Mapping[str, np.ndarray]):
 
     def __len__(self) -> int:
         return len(self._names)
+
+
+class Modes:
+    """Natural vibrations or buckling modes, the lowest first; read when asked for.
+
+    Attributes
+    ----------
+    kind : "vibration" or "buckling"
+    """
+
+    def __init__(self, result: Result, names: list[str]) -> None:
+        self._result, self._kept = result, names
+        self.kind = next(kind for kind, (name, _) in NAMES.items() if name in names)
+
+    def __len__(self) -> int:
+        return self._result.n_modes
+
+    @property
+    def frequency(self) -> np.ndarray:
+        """(modes,) [Hz]; negative where the state is unstable: minus the growth rate over 2 pi."""
+        return self._read("frequency")
+
+    @property
+    def load_factor(self) -> np.ndarray:
+        """(modes,) factors of the state's axial forces at which the truss buckles."""
+        return self._read("load_factor")
+
+    @property
+    def eigenvalue(self) -> np.ndarray:
+        """(modes,) squared circular frequencies [1/s2], or load factors."""
+        return self._read("eigenvalue")
+
+    @property
+    def values(self) -> np.ndarray:
+        """(modes,) :attr:`frequency` or :attr:`load_factor`."""
+        return self._read(NAMES[self.kind][0])
+
+    @property
+    def shape(self) -> np.ndarray:
+        """(modes, nodes, 3): with x^T M x = 1 [kg^-1/2], of buckling with a largest component of 1."""
+        return self._read("shape")
+
+    def label(self, k: int) -> str:
+        """Text of mode k, from 0: ``"mode 3: 149.4 Hz"``."""
+        name, unit = NAMES[self.kind]
+        text = f"{self.values[k]:.6g} {unit}".rstrip()
+        return f"mode {k + 1}: {text}" if unit else f"mode {k + 1}: {name.replace('_', ' ')} {text}"
+
+    def _read(self, name: str) -> np.ndarray:
+        if name not in self._kept:
+            raise InputError(f"{self._result.path}: modes of {self.kind} have no {name}{nearest(name, self._kept)}")
+        return self._result.read(f"{MODES}/{name}", slice(0, self._result.n_modes))

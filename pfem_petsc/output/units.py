@@ -28,6 +28,8 @@ PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G",
 
 _UNITS = {
     "time": "s",
+    "frequency": "Hz",
+    "eigenvalue": "1/s²",
     "step_size": "s",
     "position": "m",
     "centre_of_mass": "m",
@@ -79,7 +81,8 @@ class Axis(NamedTuple):
 TIME = Axis("t", "s", "time.end")
 LOAD_FACTOR = Axis("load factor", "", "static.end")
 POINT = Axis("point", "", "static.max_points")
-AXES = {axis.symbol: axis for axis in (TIME, LOAD_FACTOR, POINT)}
+MODE = Axis("mode", "", "modes.count")
+AXES = {axis.symbol: axis for axis in (TIME, LOAD_FACTOR, POINT, MODE)}
 
 
 def unit_of(name: str) -> str:

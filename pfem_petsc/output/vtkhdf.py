@@ -28,6 +28,7 @@ from .hdf5 import (
 )
 from .history import HistoryWriter
 from .layout import create_field, create_result, field_datasets
+from .modes import prepare_modes, write_modes
 from .provenance import describe_run
 from .repair import reopen
 from .snapshot_index import SnapshotIndex
@@ -72,6 +73,8 @@ class ResultWriter:
         Continue an existing file: what is later than this step is dropped.
     last : (int, int), optional
         Steps of the last snapshot and of the last history row that are kept then, where not all up to that step are.
+    modes : "vibration" or "buckling", optional
+        Kind of the modes that :meth:`write_modes` will write.
 
     Raises
     ------
@@ -95,6 +98,7 @@ class ResultWriter:
         precision: str = "float64",
         append_after_step: int | None = None,
         last: tuple[int, int] | None = None,
+        modes: str | None = None,
     ) -> None:
         require_parallel_hdf5(comm)
         self.path, self.comm = Path(path), comm
@@ -114,14 +118,14 @@ class ResultWriter:
         described = describe_run(comm, attributes)
         sizes = (self.n_nodes, self.n_bars)
         if append_after_step is None:
-            self._unpublished = create_new(
-                self.path, comm, create_result, *sizes, columns, column_types, case_text, described, checked=True
-            )
+            structure = (*sizes, columns, column_types, case_text, described, modes)
+            self._unpublished = create_new(self.path, comm, create_result, *structure, checked=True)
         else:
             last = last or (append_after_step, append_after_step)
             on_root(
                 comm, reopen, self.path, append_after_step, last, sizes, self._fields, columns, case_text, described
             )
+            on_root(comm, prepare_modes, self.path, modes, self.n_nodes)
         with writing(comm, self.path):
             self._file = open_shared(self._unpublished or self.path, comm)
         vtk = self._file["VTKHDF"]
@@ -216,6 +220,15 @@ class ResultWriter:
             self._history.commit()
             with writing(self.comm, self.path):
                 file.flush()
+            self._publish()
+
+    def write_modes(self, eigenvalues: np.ndarray, values: np.ndarray, shapes: np.ndarray) -> None:
+        """Write all modes; see :func:`~pfem_petsc.output.modes.write_modes`. Collective."""
+        self.flush_history()
+        file = self._ready()
+        self._require_room(24 * self.n_nodes * len(values))
+        with self._whole_or_failed():
+            write_modes(file, self.comm, self.path, self.node_order, eigenvalues, values, shapes)
             self._publish()
 
     def close(self) -> None:

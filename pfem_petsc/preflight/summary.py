@@ -5,6 +5,7 @@ from __future__ import annotations
 import resource
 from typing import TYPE_CHECKING
 
+from ..modes.choice import describe_modes
 from ..output.units import engineering
 
 if TYPE_CHECKING:
@@ -34,6 +35,7 @@ def summarise(case: Case, model: Model, plan: Plan) -> dict[str, str]:
         "mass": engineering(model.total_mass, "kg") + f" ({case.mass})",
         "wave speed": engineering(model.wave_speed, "m/s"),
         **plan.entries(case),
+        **describe_modes(model),
         "linear solver": plan.linear.why if plan.linear is not None else "none: every node on its own",
         "walls": ", ".join(map(_described, case.wall)) or "none",
         "memory": f"{engineering(peak, 'B', 3)} in use on all ranks",

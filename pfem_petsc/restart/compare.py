@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = ["changed_keys", "check_mesh_is_the_same", "check_version", "mesh_mark"]
 
-FREE = ("title", "time.end", "static.end", "output", "solver")
+FREE = ("title", "time.end", "static.end", "modes", "output", "solver")
 """Keys and tables that a restart may change: they do not change what is simulated."""
 
 

@@ -103,7 +103,10 @@ def _finished(case: Case, path: Path, end: float) -> float | None:
         examine(path)
         with results.open_result(path) as result:
             reached = [float(times[-1]) for times in (result.history["time"], result.times) if len(times)]
-            changed_keys(path, result.case.to_dict(), case.to_dict(), case.source)
+            before, now = result.case.to_dict(), case.to_dict()
+            changed_keys(path, before, now, case.source)
+            if case.modes is not None and (not result.n_modes or before.get("modes") != now["modes"]):
+                return None
     except InputError:
         # of another case, or not readable: it is moved aside
         return None
@@ -112,6 +115,8 @@ def _finished(case: Case, path: Path, end: float) -> float | None:
 
 def finished_message(folder: Path, reached: float, plan: Plan) -> str:
     """The message about a run whose results have ``reached`` its end [s]."""
+    if not plan.end:
+        return f"{folder}: finished already: the results have the modes of the initial state"
     axis = plan.axis
     beyond = f", beyond {axis.key} = {engineering(plan.end, axis.unit)}" if reached > plan.end * (1.0 + TIME) else ""
     return f"{folder}: finished already: the results have {axis.place(reached)}{beyond}"

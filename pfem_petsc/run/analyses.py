@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from ..analysis import Analysis
+from ..modes.choice import describe_modes
+from ..modes.initial_state import InitialState
 from ..statics.analysis import StaticAnalysis
 from ..stepping.prepare import make_plan
 from ..stepping.time_stepping import TimeStepping
@@ -21,6 +23,9 @@ def make_analysis(model: Model, recorded: Mapping[str, Any] | None) -> Analysis:
 
     ``recorded``: record of the plan of the run that is continued, None for a new run
     """
+    describe_modes(model)  # what cannot be computed at the end is refused at the start
     if model.case.static is not None:
         return StaticAnalysis(model, recorded)
+    if model.case.time is None:
+        return InitialState(model)
     return TimeStepping(model, make_plan(model, recorded))

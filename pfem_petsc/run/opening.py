@@ -68,6 +68,7 @@ def open_result_file(
         precision=case.output.precision,
         append_after_step=step if continues else None,
         last=restart.last if continues else None,
+        modes=case.modes.kind if case.modes is not None else None,
     )
 
 

@@ -20,6 +20,7 @@ from ..restart.folder import Restart, prepare_folder
 from ..stepping.fused_steps import Batches
 from ..stepping.time_stepping import TimeStepping
 from .compilation import ReportedCompilation
+from .modes import record_modes, remove_modes
 from .opening import open_progress, open_result_file
 from .synchroniser import Synchroniser
 
@@ -118,6 +119,8 @@ class Outputs:
             changes = f"; changed: {'; '.join(restart.changed)}" if restart.changed else ""
             place = f"step {start[0]}, {plan.axis.place(start[1])}"
             self.progress.message(f"restart from {restart.path}: {place}{changes}")
+        if restart is not None:
+            remove_modes(folder, model.comm)
         self._writer = open_result_file(model, plan, history.recorder, self.fields, folder, restart, start[0])
         history.writer = self.snapshots.writer = self._writer
 
@@ -193,6 +196,17 @@ class Outputs:
         """
         for observer in (self.checkpointing, self.history, self.snapshots):
             observer.complete()
+
+    def record_modes(self) -> None:
+        """Find and write the modes of the state at the end, where the case asks for them. Collective.
+
+        Raises
+        ------
+        PfemError
+            On all ranks.
+        """
+        if self._analysis.model.case.modes is not None and self.is_open:
+            record_modes(self._analysis.stepper, self._writer, self._folder, self.progress)
 
     def tell_remarks(self) -> None:
         """Tell what became of the walls, where it may not be what was meant. Collective."""

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
 
 from petsc4py import PETSc
 
 from ..errors import InputError
 
-__all__ = ["DIRECT", "LinearChoice", "choose_linear", "configure", "set_preconditioner", "unsymmetric"]
+__all__ = ["DIRECT", "LinearChoice", "choose_linear", "configure", "has_mumps", "set_preconditioner", "unsymmetric"]
 
 DIRECT = ("lu", "mumps")
 """Preconditioners that solve: PETSc's own factorisation, for small matrices, and MUMPS where PETSc has it."""
@@ -139,7 +140,7 @@ def set_preconditioner(pc: PETSc.PC, kind: str, reduced: bool = False) -> None:
     if kind in DIRECT:
         pc.setType("lu")
         # PETSc's own takes 57 s for a lattice of 101,706 bars and MUMPS 2.3 s, but 0.5 ms less for one of 200
-        if (kind == "mumps" or comm.size > 1) and _has_mumps():
+        if (kind == "mumps" or comm.size > 1) and has_mumps():
             pc.setFactorSolverType("mumps")
         elif comm.size > 1:
             pc.setType("redundant")
@@ -164,7 +165,9 @@ def _default(pc: PETSc.PC, name: str, value: str) -> None:
         options[name] = value
 
 
-def _has_mumps() -> bool:
+@cache
+def has_mumps() -> bool:
+    """Whether PETSc has MUMPS."""
     mat = PETSc.Mat().createAIJ((1, 1), nnz=1, comm=PETSc.COMM_SELF)
     mat[0, 0] = 1.0
     mat.assemble()

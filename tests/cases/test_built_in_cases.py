@@ -127,6 +127,16 @@ def pendulum(run):
     assert np.linalg.norm(tension) == pytest.approx(4 * weight, rel=0.01)
 
 
+@number
+def taut_cable(run):
+    """One row of the initial state, whose only force is the tension; the frequencies: tests/modes/test_vibration.py."""
+    history = run("taut_cable")
+    assert history["step"].tolist() == [0]
+    tension = 2.06842719e11 * 1.979325e-6 * 543.228e-5
+    assert tension == pytest.approx(500 * 4.4482216, rel=1e-4)
+    assert history["elastic_energy"] == pytest.approx(0.5 * tension * 543.228e-5 * 2.54, rel=1e-9)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", built_in_cases())
 def test_promised_numbers(name, run):

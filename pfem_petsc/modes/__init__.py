@@ -1,0 +1,1 @@
+"""Natural vibrations and linear buckling of a state: matrices, eigenvalue solvers, shapes."""

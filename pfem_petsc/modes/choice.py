@@ -1,0 +1,98 @@
+"""Which library solves the eigenvalue problem."""
+
+from __future__ import annotations
+
+import importlib
+from functools import cache
+from types import ModuleType
+from typing import TYPE_CHECKING
+
+from ..errors import InputError
+from ..registry import lookup
+
+if TYPE_CHECKING:
+    from ..stepping.model import Model
+
+__all__ = ["SOLVERS", "available", "choose", "describe_modes", "solver_module"]
+
+SOLVERS = "pfem_petsc.modes.eigen"
+LIBRARIES = {"slepc": "slepc4py.SLEPc", "scipy": "scipy.sparse.linalg"}
+DENSE_UP_TO = 600
+"""Components up to which all eigenvalues are computed by NumPy, which takes less time than an iteration is worth."""
+DENSE_AT_MOST = 6_000
+"""Components up to which NumPy serves where no library for sparse matrices is there: about 2 minutes and 1 GB."""
+GATHERED_AT_MOST = 300_000
+"""Components up to which matrices are gathered on one rank for SciPy."""
+
+
+@cache
+def available(package: str) -> bool:
+    """Whether a library is there and can be loaded; PETSc must be initialised before."""
+    try:
+        importlib.import_module(package)
+    except ImportError:
+        return False
+    return True
+
+
+def describe_modes(model: Model) -> dict[str, str]:
+    """Label and text of the modes that a case asks for; none if it does not. Collective.
+
+    Raises
+    ------
+    InputError
+        On all ranks, where no library is there for them.
+    """
+    case = model.case
+    if case.modes is None:
+        return {}
+    free = 3 * model.mesh.n_nodes - model.comm.allreduce(int(model.supports.fixed.sum()))
+    name = choose(case.modes.solver, free, case.source)
+    what = "natural vibrations" if case.modes.kind == "vibration" else "buckling modes"
+    mass = f", {case.modes.mass or case.mass} mass" if case.modes.kind == "vibration" else ""
+    return {"modes": f"{min(case.modes.count, free)} {what} of the state at the end{mass}, solver {name}"}
+
+
+def choose(asked: str, free: int, source: str) -> str:
+    """The name of the solver for so many free components.
+
+    Parameters
+    ----------
+    asked : ``modes.solver``
+    free : components that nothing holds
+    source : file of the case, for the message
+
+    Raises
+    ------
+    InputError
+        Where no library is there that can solve a problem of this size.
+    """
+    if asked == "auto":
+        if free <= DENSE_UP_TO:
+            return "dense"
+        if available(LIBRARIES["slepc"]):
+            return "slepc"
+        if free <= GATHERED_AT_MOST and available(LIBRARIES["scipy"]):
+            return "scipy"
+        if free <= DENSE_AT_MOST:
+            return "dense"
+        raise InputError(
+            f"{source}: modes: {free:,} free components need slepc4py, which is not installed (Debian, Ubuntu: "
+            "python3-slepc4py-real and the version of PETSc; scripts/setup.sh installs it), or up to "
+            f"{GATHERED_AT_MOST:,} of them scipy (pip install scipy)"
+        )
+    limits = {"dense": DENSE_AT_MOST, "scipy": GATHERED_AT_MOST}
+    if asked in limits and free > limits[asked]:
+        raise InputError(
+            f'{source}: modes.solver = "{asked}": {free:,} free components are too many, it takes up to '
+            f'{limits[asked]:,}; take "slepc" or "auto"'
+        )
+    if asked in LIBRARIES and not available(LIBRARIES[asked]):
+        package = LIBRARIES[asked].partition(".")[0]
+        raise InputError(f'{source}: modes.solver = "{asked}": {package} is not installed; install it, or take "auto"')
+    return asked
+
+
+def solver_module(name: str) -> ModuleType:
+    """The module of a solver, with ``largest(problem, count, start)`` and ``definite(problem)``."""
+    return lookup(SOLVERS, name, "modes.solver")

@@ -1,0 +1,122 @@
+"""Krylov-Schur iterations by SLEPc: with a factorisation by MUMPS, for large models with multigrid.
+
+Options: prefix ``pfem_modes_``, of the eigensolver (``eps_...``) and of its linear solver (``st_ksp_...``).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from petsc4py import PETSc
+
+from ...errors import SimulationFailure
+from ...solvers.linear import has_mumps
+from ..pencil import Pencil
+
+__all__ = ["DIRECT_UP_TO", "Solver"]
+
+DIRECT_UP_TO = 400_000
+"""Components up to which B is factorised."""
+_PREFIX = "pfem_modes_"
+_TOLERANCE = 1e-11  # relative, of theta; its square is the error of the eigenvalue
+_LINEAR = 1e-12  # of solves with multigrid: the iterations take them to be exact
+
+
+class Solver:
+    """See :mod:`pfem_petsc.modes.eigen`."""
+
+    finds_all = False
+
+    def __init__(self, pencil: Pencil) -> None:
+        from slepc4py import SLEPc
+
+        self.pencil, self.iterations = pencil, 0
+        self._library = SLEPc
+        comm = pencil.b.comm
+        size = pencil.b.getSize()[0]
+        self.direct = (has_mumps() or comm.size == 1) and size <= DIRECT_UP_TO
+        self._eps = eps = SLEPc.EPS().create(comm)
+        eps.setOptionsPrefix(_PREFIX)
+        eps.setOperators(pencil.a, pencil.b)
+        eps.setProblemType(SLEPc.EPS.ProblemType.GHEP)
+        eps.setType(SLEPc.EPS.Type.KRYLOVSCHUR)
+        eps.setWhichEigenpairs(SLEPc.EPS.Which.LARGEST_REAL)
+        eps.setTolerances(_TOLERANCE, 500)
+        self._ksp = eps.getST().getKSP()
+        self.name = "Krylov-Schur iterations (SLEPc), "
+        if self.direct:
+            self.name += "factorisation by MUMPS" if has_mumps() else "factorisation"
+            self._factorise()
+        else:
+            self.name += "conjugate gradients with multigrid"
+            self._multigrid()
+        eps.setFromOptions()
+        self.definite: bool | None = self._definite()
+
+    def _factorise(self) -> None:
+        self._ksp.setType("preonly")
+        pc = self._ksp.getPC()
+        pc.setType("cholesky")
+        if has_mumps():
+            pc.setFactorSolverType("mumps")
+
+    def _multigrid(self) -> None:
+        self._ksp.setType("cg")
+        self._ksp.setTolerances(rtol=_LINEAR, max_it=2000)
+        self._ksp.setErrorIfNotConverged(False)
+        pc = self._ksp.getPC()
+        pc.setType("gamg")
+        pc.setOperators(self.pencil.b)
+        points = self.pencil.points
+        total = self.pencil.b.comm.tompi4py().allreduce(np.append(points.sum(axis=0), float(len(points))))
+        pc.setCoordinates(points - total[:3] / total[3])
+
+    def _definite(self) -> bool | None:
+        """By the signs of the factors, which are those of the eigenvalues (Sylvester)."""
+        pc = self._ksp.getPC()
+        if not self.direct or pc.getType() != "cholesky":
+            return None
+        self._ksp.setOperators(self.pencil.b)
+        if pc.getFactorSolverType() == "mumps":
+            pc.setFactorSetUpSolverType()
+            factor = pc.getFactorMatrix()
+            factor.setMumpsIcntl(24, 1)  # pivots that are zero are counted
+            factor.setMumpsIcntl(13, 1)  # and the signs of those of the last front, which several ranks may share
+        self._ksp.setUp()
+        factor = pc.getFactorMatrix()
+        if pc.getFactorSolverType() == "mumps" and factor.getMumpsInfog(1) < 0:
+            return False
+        negative, zero, _ = factor.getInertia()
+        return negative == 0 and zero == 0
+
+    def largest(self, count: int, start: np.ndarray, known: np.ndarray) -> np.ndarray:
+        """See :mod:`pfem_petsc.modes.eigen`."""
+        eps, b = self._eps, self.pencil.b
+        eps.setDeflationSpace([_vector(b, each) for each in known])
+        eps.setInitialSpace([_vector(b, start)])
+        size = b.getSize()[0]
+        eps.setDimensions(min(count, size), min(size, 2 * count + 20))
+        eps.solve()
+        self.iterations += self._ksp.getTotalIterations() if hasattr(self._ksp, "getTotalIterations") else 0
+        found = eps.getConverged()
+        if found < min(count, size - len(known)):
+            raise SimulationFailure(
+                f"modes: {found} of {count} eigenvalues converged after {eps.getIterationNumber()} restarts of SLEPc's "
+                f"iterations ({self.name}); ask for fewer modes, or give other options -{_PREFIX}eps_..."
+            )
+        vectors = np.empty((found, len(start)))
+        x = b.createVecRight()
+        for k in range(found):
+            eps.getEigenvector(k, x)
+            vectors[k] = x.getArray(readonly=True)
+        x.destroy()
+        return vectors
+
+    def destroy(self) -> None:
+        """Free SLEPc's objects."""
+        self._eps.destroy()
+
+
+def _vector(matrix: PETSc.Mat, values: np.ndarray) -> PETSc.Vec:
+    vector = matrix.createVecRight()
+    vector.setArray(values)
+    return vector

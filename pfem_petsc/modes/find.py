@@ -1,0 +1,268 @@
+"""Natural frequencies, or linear buckling factors, of the state of a model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from ..errors import SimulationFailure
+from .choice import choose, solver_module
+from .holds import Holds
+from .pencil import Pencil, StateMatrices, bar_stiffness, buckling_bars, join
+from .shapes import Basis, same
+
+if TYPE_CHECKING:
+    from ..case.settings import Modes as Settings
+    from ..integrators.base import State
+    from ..stepping.model import Model
+
+__all__ = ["Found", "find_modes"]
+
+_SHIFT = 1e-4  # of the squared frequency wave speed / length, by which the shift lies below zero
+_ROUNDING = 1e-13  # of the largest eigenvalue: smaller ones are zero
+_MORE = 4  # modes computed beyond those asked for, so that repeated ones are whole
+_AGAIN = 3  # modes asked for in a search for those that were missed
+_SEARCHES = 40
+_NOTHING = 1e-10  # of the largest theta: others are those of directions in which A is zero
+_DEPENDENT = 1e-10  # eigenvalue of a Gram matrix of unit vectors, below which they depend on each other
+_NO_LOAD = 1e-9  # of the axial stiffness: axial forces that are none
+
+
+@dataclass(frozen=True)
+class Found:
+    """Modes of a state.
+
+    Attributes
+    ----------
+    kind : "vibration" or "buckling"
+    eigenvalues : (k,) squares of the circular frequencies [1/s2], or load factors; ascending
+    shapes : (k, owned, 3): of vibrations [kg^-1/2], with x^T M x = 1; of buckling with a largest component of 1
+    negative : number of negative eigenvalues among those of vibrations
+    solver : in words
+    iterations : solves with the matrix B
+    at_walls : nodes that walls hold
+    """
+
+    kind: str
+    eigenvalues: np.ndarray
+    shapes: np.ndarray
+    negative: int
+    solver: str
+    iterations: int
+    at_walls: int
+
+    @property
+    def values(self) -> np.ndarray:
+        """(k,) frequencies [Hz], minus the growth rate over 2 pi where the eigenvalue is negative; or load factors."""
+        if self.kind == "buckling":
+            return self.eigenvalues
+        return np.sign(self.eigenvalues) * np.sqrt(np.abs(self.eigenvalues)) / (2.0 * np.pi)
+
+
+class _Solver(Protocol):
+    """See :mod:`pfem_petsc.modes.eigen`."""
+
+    name: str
+    finds_all: bool
+    definite: bool | None
+    iterations: int
+
+    def largest(self, count: int, start: np.ndarray, known: np.ndarray) -> np.ndarray: ...
+
+    def destroy(self) -> None: ...
+
+
+def find_modes(model: Model, state: State, settings: Settings, consistent: bool) -> Found:
+    """The lowest modes of a state. Collective.
+
+    Parameters
+    ----------
+    model : Model
+    state : State, complete
+    settings : table ``[modes]``
+    consistent : whether the mass is
+
+    Raises
+    ------
+    InputError, SimulationFailure
+        On all ranks: no solver, no free component, a state whose contact is not known, no axial forces for buckling.
+    """
+    holds = Holds(model, state)
+    free = 3 * model.mesh.n_nodes - holds.number
+    if free == 0:
+        raise SimulationFailure(f"{model.case.source}: modes: supports and walls hold all nodes: nothing can move")
+    matrices = StateMatrices(model, holds, consistent)
+    name = choose(settings.solver, free, model.case.source)
+    count = min(settings.count, free)
+    if settings.kind == "buckling":
+        return _buckling(model, state, holds, matrices, name, count, free)
+    return _vibration(model, state, holds, matrices, name, count, free)
+
+
+def _vibration(
+    model: Model, state: State, holds: Holds, matrices: StateMatrices, name: str, count: int, free: int
+) -> Found:
+    bars = bar_stiffness(model, state.x)
+    low, high = matrices.bounds(bars, holds.curvature)
+    top = 2.0 * high + abs(low)
+    stiffness = matrices.stiffness(bars, top * matrices.inertia.mass, holds.curvature)
+    mass = matrices.mass()
+    zero = _ROUNDING * top
+    small = max(_SHIFT * (model.wave_speed / model.length) ** 2, 10.0 * zero)
+    # a shift near zero where that is below all eigenvalues, else one that certainly is
+    shifts = [-small] if low == 0.0 else [-small, low - small]
+    for shift in shifts:
+        pencil = Pencil(mass, join(stiffness, -shift, mass), state.position, holds.held, free)
+        solver = solver_module(name).Solver(pencil)
+        if solver.definite or shift == shifts[-1]:
+            break
+        solver.destroy()
+        pencil.b.destroy()
+    basis = _basis(model, state)
+
+    def values_of(theta: np.ndarray) -> np.ndarray:
+        return shift + 1.0 / theta
+
+    try:
+        theta, shapes = _lowest(model, holds, pencil, solver, basis, count, values_of, zero)
+    finally:
+        solver.destroy()
+        pencil.destroy()
+        stiffness.destroy()
+    values = values_of(theta)
+    values[np.abs(values) <= zero] = 0.0
+    shapes /= np.sqrt(theta)[:, None, None]
+    negative = int((values < 0.0).sum())
+    return Found("vibration", values, shapes, negative, solver.name, solver.iterations, holds.at_walls)
+
+
+def _buckling(
+    model: Model, state: State, holds: Holds, matrices: StateMatrices, name: str, count: int, free: int
+) -> Found:
+    source = model.case.source
+    material, geometric = buckling_bars(model, state.x)
+    largest = np.array([np.abs(geometric[:, 4]).max(initial=0.0), np.abs(material[:, 3]).max(initial=0.0)])
+    model.comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
+    if largest[0] <= _NO_LOAD * 1e-3 * largest[1]:
+        raise SimulationFailure(
+            f'{source}: modes: kind = "buckling" takes the axial forces of the state as the reference load, and the '
+            "state has none: give the case an analysis that loads the truss ([static] with a small load)"
+        )
+    geometric[:, 3:] *= -1.0
+    pencil = Pencil(
+        matrices.stiffness(geometric, 0.0),
+        matrices.stiffness(material, float(largest[1])),
+        state.position,
+        holds.held,
+        free,
+    )
+    solver = solver_module(name).Solver(pencil)
+    try:
+        if solver.definite is False:
+            raise SimulationFailure(
+                f'{source}: modes: kind = "buckling": the unstressed truss is a mechanism or is not held: its '
+                "stiffness is singular, and no factor of the load is defined; brace and support it, or take "
+                'kind = "vibration", whose eigenvalues have the state\'s stresses in them'
+            )
+        theta, shapes = _lowest(model, holds, pencil, solver, _basis(model, state), count, np.reciprocal, 0.0, _NOTHING)
+    finally:
+        solver.destroy()
+        pencil.destroy()
+    if not len(theta):
+        raise SimulationFailure(
+            f"{source}: modes: no positive factor of the state's axial forces makes the truss buckle: it is in tension"
+        )
+    peaks = np.abs(shapes).max(axis=(1, 2), initial=0.0)
+    model.comm.Allreduce(MPI.IN_PLACE, peaks, op=MPI.MAX)
+    shapes /= peaks[:, None, None]
+    return Found("buckling", 1.0 / theta, shapes, 0, solver.name, solver.iterations, holds.at_walls)
+
+
+def _basis(model: Model, state: State) -> Basis:
+    owned = model.mesh.n_owned
+    return Basis(model.comm, model.mesh.node_ids[:owned], state.position, model.inertia.mass)
+
+
+def _lowest(
+    model: Model,
+    holds: Holds,
+    pencil: Pencil,
+    solver: _Solver,
+    basis: Basis,
+    count: int,
+    values_of: Callable[[np.ndarray], np.ndarray],
+    zero: float,
+    nothing: float = 0.0,
+) -> tuple[np.ndarray, np.ndarray]:
+    """The ``count`` largest positive theta (k,), and unique vectors (k, owned, 3) with x^T B x = 1. Collective.
+
+    An iteration may find a repeated eigenvalue less often than it is there, so searches are repeated in the complement
+    of what was found, until one changes nothing.
+    """
+    wanted = min(count + _MORE, pencil.free)
+    theta, known = np.empty(0), np.empty((0, 3 * model.mesh.n_owned))
+    for search in range(_SEARCHES):
+        before = theta[:wanted]
+        ask = min(max(wanted - len(known), _AGAIN), pencil.free - len(known))
+        if ask > 0:
+            found = solver.largest(ask, _start(model, holds, search), known)
+            found = np.where(holds.held.ravel(), 0.0, found[:ask])
+            theta, known = _ritz(model.comm, pencil, np.concatenate([known, found]))
+            positive = theta > nothing * np.abs(theta).max(initial=0.0)
+            theta, known = theta[positive], known[positive]
+        now = theta[:wanted]
+        if not (solver.finds_all or (len(now) == len(before) and np.allclose(now, before, rtol=1e-9, atol=0.0))):
+            continue
+        values = values_of(now)
+        cut = len(now) == wanted < pencil.free and same(values[-1], values[min(count, wanted) - 1], zero)
+        if not cut or wanted > count + 8 * _MORE:
+            break
+        wanted = min(wanted + 2 * _MORE, pencil.free)
+    else:
+        raise SimulationFailure(
+            f"modes: after {_SEARCHES} searches more repeated eigenvalues are still found ({solver.name}); ask for "
+            "fewer modes (modes.count)"
+        )
+    shapes = holds.to_axes(known[: len(now)].reshape(len(now), model.mesh.n_owned, 3))
+    shapes = basis.unique(values_of(now), shapes, zero)
+    return now[:count].copy(), shapes[:count]
+
+
+def _start(model: Model, holds: Holds, search: int) -> np.ndarray:
+    """A vector (3 owned,) that depends on the mesh alone, and on the number of the search. Collective."""
+    numbers = model.mesh.node_ids[: model.mesh.n_owned].astype(np.float64)[:, None] * 3.0 + np.arange(3)
+    start = np.sin(12.9898 * (numbers + 1.0) + 78.233 * (search + 1.0) + 0.37 * np.sqrt(numbers * (search + 2.0)))
+    return holds.to_own(start[None])[0].ravel()
+
+
+def _ritz(comm: MPI.Comm, pencil: Pencil, vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Theta (k,), descending, and vectors orthonormal in B, from the space of vectors (m, components). Collective."""
+    a, b = _products(pencil.a, vectors), _products(pencil.b, vectors)
+    grams = comm.allreduce(np.stack([vectors @ a.T, vectors @ b.T]))
+    first, second = 0.5 * (grams + grams.transpose(0, 2, 1))
+    norms = np.sqrt(np.diag(second))
+    scale = np.divide(1.0, norms, out=np.zeros_like(norms), where=norms > 0.0)
+    first, second = first * np.outer(scale, scale), second * np.outer(scale, scale)
+    sizes, axes = np.linalg.eigh(second)
+    kept = sizes > _DEPENDENT
+    whitened = axes[:, kept] / np.sqrt(sizes[kept])
+    reduced = whitened.T @ first @ whitened
+    theta, turn = np.linalg.eigh(0.5 * (reduced + reduced.T))
+    return theta[::-1].copy(), (whitened @ turn[:, ::-1]).T * scale @ vectors
+
+
+def _products(matrix: PETSc.Mat, vectors: np.ndarray) -> np.ndarray:
+    x, y = matrix.createVecs()
+    products = np.empty_like(vectors)
+    for k, vector in enumerate(vectors):
+        x.setArray(vector)
+        matrix.mult(x, y)
+        products[k] = y.getArray(readonly=True)
+    x.destroy()
+    y.destroy()
+    return products

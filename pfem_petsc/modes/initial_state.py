@@ -1,0 +1,141 @@
+"""The state of a case without an analysis: the mesh as it is, at time zero."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..analysis import Analysis, Step
+from ..errors import InputError, PfemError
+from ..integrators.base import Balance, NoParameters, Scheme, State
+from ..output.units import TIME, Axis
+from ..stepping.prescribed import NoRates
+from ..stepping.solution import Solution
+from ..stepping.stepper import Stepper
+
+if TYPE_CHECKING:
+    from ..case.schema import Case
+    from ..stepping.model import Model
+
+__all__ = ["InitialState", "InitialStatePlan"]
+
+
+class _Nothing(Scheme):
+    """A scheme that makes no steps."""
+
+    inertial = False
+
+    def __init__(self) -> None:
+        super().__init__(NoParameters())
+
+    def balance(self, state: State, h: float) -> Balance:
+        raise NotImplementedError
+
+    def finish(self, state: State, balance: Balance, u: np.ndarray, h: float) -> None:
+        raise NotImplementedError
+
+
+class _InitialStepper(Stepper):
+    """Completes the initial state: internal forces, loads, supports at time zero; it makes no steps."""
+
+    def __init__(self, model: Model) -> None:
+        super().__init__(model, _Nothing(), 0.0)
+        self.prescribed = NoRates(self)
+
+    def start(self) -> None:
+        state, model = self.state, self.model
+        state.v = np.zeros_like(self.zero)
+        state.a = np.zeros_like(self.zero)
+        if model.supports.any:
+            state.position[model.supports.at] = model.supports.positions(0.0)
+        self.evaluate(commit=True)
+        if model.external.active:
+            state.external = model.external.at(0.0, np.empty_like(state.v))
+        self.totals_at_start = self._totals()
+
+    def accelerate(self, load: np.ndarray) -> np.ndarray:
+        return np.zeros_like(load)
+
+    def solve(self, balance: Balance) -> Solution:
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class InitialStatePlan:
+    """What a run without an analysis will do: no step.
+
+    Attributes
+    ----------
+    scheme, step, end, steps, linear, axis : as of other plans
+    """
+
+    scheme: Scheme = field(default_factory=_Nothing)
+    step: float = 0.0
+    end: float = 0.0
+    steps: int = 0
+    linear: None = None
+    axis: Axis = TIME
+
+    def beyond(self, steps: np.ndarray, times: np.ndarray) -> np.ndarray:
+        """Which of recorded steps with their times lie beyond the end."""
+        return steps > 0
+
+    def entries(self, case: Case) -> dict[str, str]:
+        """Label and text of what a user checks before a run."""
+        return {"analysis": "none: modes of the initial state"}
+
+    def record(self) -> dict[str, Any]:
+        """What a restart must not work out anew."""
+        return {}
+
+
+class InitialState(Analysis):
+    """The initial state, which is the last one. Construction is collective.
+
+    Parameters
+    ----------
+    model : Model
+
+    Raises
+    ------
+    InputError
+        On all ranks, where the case has initial velocities.
+    """
+
+    last_step = 0
+    step_size = 0.0
+
+    def __init__(self, model: Model) -> None:
+        case = model.case
+        if any(any(entry.velocity) or any(entry.angular_velocity) for entry in case.initial):
+            raise InputError(
+                f"{case.source}: initial: a case with [modes] alone has no velocities; remove the table [initial], or "
+                "give the case a table [time]"
+            )
+        if case.contact.treatment != "scheme":
+            raise InputError(
+                f'{case.source}: contact.treatment = "{case.contact.treatment}" treats impacts, and a case with '
+                "[modes] alone has none; remove the key"
+            )
+        self.model = model
+        self.plan = InitialStatePlan()
+        self.stepper = _InitialStepper(model)
+
+    @property
+    def state(self) -> State:
+        return self.stepper.state
+
+    @property
+    def fault(self) -> PfemError | None:
+        return self.stepper.fault
+
+    def start(self) -> None:
+        self.stepper.start()
+
+    def advance(self) -> Step:
+        raise NotImplementedError("the initial state has no steps")
+
+    def close(self) -> None:
+        self.stepper.destroy()

@@ -122,7 +122,7 @@ class PseudoMotion:
 
     @property
     def load(self) -> float:
-        """What the residual is compared with [N]: 2-norm of loads or reactions, or of bar forces where there are none."""
+        """What the residual is compared with [N]: 2-norm of loads or reactions, of bar forces where there are none."""
         acting = max(self._external_norm, float(np.sqrt(self.sums[SUPPORTS] + self.sums[WALLS])))
         bars = float(np.sqrt(self.sums[BARS]))
         return acting if acting > _SELF_STRESS * bars else bars
@@ -172,9 +172,7 @@ class PseudoMotion:
         """Correct increments (owned, 3) from ``x`` as walls ask, and keep the forces that this takes."""
         owned, contact = self.model.mesh.n_owned, self.model.contact
         try:
-            self.held, force, self.walls = contact.explicit(
-                self.x[:owned], u, self.mass, self.time, self._tolerance
-            )
+            self.held, force, self.walls = contact.explicit(self.x[:owned], u, self.mass, self.time, self._tolerance)
         except SimulationFailure as failure:
             self._failure = self._failure or failure
             return

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+
 from pfem_petsc import Case, Simulation
 from pfem_petsc.output.result import open_result
 

@@ -23,7 +23,7 @@ class Parameters(StrictModel):
     """increment of the load factor"""
     end: PositiveFloat = 1.0
     """last load factor"""
-    damping: Literal["fire", "kinetic"] = "fire"
+    damping: Literal["kinetic", "fire"] = "kinetic"
     """what takes the energy of the pseudo-motion"""
     tolerance: Annotated[float, Field(gt=0.0, lt=1.0)] = 1e-9
     """residual over the load, in 2-norms, at which relaxation ends"""

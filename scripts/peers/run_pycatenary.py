@@ -3,9 +3,9 @@
     python scripts/peers/run_pycatenary.py [BARS [EA]]
 
 Prints horizontal and vertical tension at the fairlead [N] and the length on the floor [m]. The line is 6.98 m long,
-weighs 1.036 N/m and goes from (0, 0, 0) to (5.2, 1, 2.65) m; the floor is at z = 0. The chain of bars starts straight on
-the floor, and its end is lifted (``static.method = "relaxation"``). pycatenary 1.0.0 has, for E A = 560 kN, 0.7552163 N,
-3.4181715 N and 3.6806067 m.
+weighs 1.036 N/m and goes from (0, 0, 0) to (5.2, 1, 2.65) m; the floor is at z = 0. The chain of bars starts straight
+on the floor, and its end is lifted (``static.method = "relaxation"``). pycatenary 1.0.0 has, for E A = 560 kN,
+0.7552163 N, 3.4181715 N and 3.6806067 m.
 """
 
 from __future__ import annotations

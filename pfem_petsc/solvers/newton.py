@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
 __all__ = ["NewtonReport", "NewtonSolver", "Problem", "zero_tolerance"]
 
+_EXTERNAL_LIBRARY = 76  # PETSC_ERR_LIB
 _STAGNATION = 100.0  # a residual within this many rounding floors that no longer falls has converged
 
 
@@ -127,6 +128,9 @@ class NewtonSolver:
         report = self._attempt(snes, start)
         if not report.converged and self.lagged is not None and self.lagged.carried:
             self.lagged.drop()
+            snes = self._solver(bounds is not None)
+            if bounds is not None:
+                snes.setVariableBounds(self._lower, self._upper)
             report = report.then(self._attempt(snes, start))
         if not report.converged and "INDEFINITE" in report.why or "BREAKDOWN" in report.why:
             report = self._without_definiteness(snes, start, report)
@@ -163,7 +167,16 @@ class NewtonSolver:
     def _attempt(self, snes: PETSc.SNES, start: np.ndarray) -> NewtonReport:
         self._u.array[:] = start.ravel()
         self._previous = np.inf
-        snes.solve(None, self._u)
+        try:
+            snes.solve(None, self._u)
+        except PETSc.Error as error:
+            # MUMPS on several ranks: PETSc 3.18 goes on to solve with what could not be factorised
+            if error.ierr != _EXTERNAL_LIBRARY or "MUMPS" not in str(error):
+                raise
+            why = "a linear solve failed; linear solver: MUMPS could not factorise the matrix (a singular matrix)"
+            report = NewtonReport(False, snes.getIterationNumber(), 0, self._g.norm(), why)
+            self._drop(snes)
+            return report
         reason = snes.getConvergedReason()
         norm = snes.getFunctionNorm()
         converged = reason > 0 or norm <= _STAGNATION * self._floor
@@ -174,6 +187,13 @@ class NewtonSolver:
             if linear < 0:
                 why += f"; linear solver: {linear_reason(linear)}"
         return NewtonReport(converged, snes.getIterationNumber(), snes.getLinearSolveIterations(), norm, why)
+
+    def _drop(self, snes: PETSc.SNES) -> None:
+        """Destroy a solver that an error has left in the middle of a solve; the next makes another. Collective."""
+        key = next(key for key, solver in self._solvers.items() if solver is snes)
+        del self._solvers[key]
+        self._ours.pop(key, None)
+        snes.destroy()
 
     def _without_definiteness(self, snes: PETSc.SNES, start: np.ndarray, first: NewtonReport) -> NewtonReport:
         """Conjugate gradients met an indefinite tangent: the same step with a method that needs no definiteness."""

@@ -137,6 +137,26 @@ def taut_cable(run):
     assert history["elastic_energy"] == pytest.approx(0.5 * tension * 543.228e-5 * 2.54, rel=1e-9)
 
 
+@number
+def hanging_net(run):
+    """Corners carry a quarter of the weight each."""
+    history = run("hanging_net")
+    weight = 1000.0 * 1e-4 * 9.81 * 2 * 11 * 10.0
+    assert history["probe/corners/reaction"][-1, :, 2] == pytest.approx(weight / 4.0, rel=1e-7)
+    assert history["probe/centre/position"][-1, 0, 2] == pytest.approx(-2.6431, abs=1e-4)
+
+
+@number
+def tensegrity_prism(run):
+    """The head of a strut is 150 degrees beyond its foot."""
+    history = run("tensegrity_prism")
+    feet, heads = (history[f"probe/{name}/position"][-1, :, :2] for name in ("bottom", "top"))
+    feet, heads = feet - feet.mean(axis=0), heads - heads.mean(axis=0)
+    angles = [np.degrees(np.arctan2(arms[:, 1], arms[:, 0])) for arms in (feet, heads)]
+    assert (angles[1] - angles[0]) % 360.0 == pytest.approx(150.0, abs=1e-6)
+    assert history["elastic_energy"][-1] == pytest.approx(6.0589, rel=1e-3)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", built_in_cases())
 def test_promised_numbers(name, run):

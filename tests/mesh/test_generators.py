@@ -7,7 +7,7 @@ from pydantic import ValidationError
 
 from pfem_petsc.errors import InputError
 from pfem_petsc.mesh.checks import check_mesh
-from pfem_petsc.mesh.generators import lattice, ring, rod
+from pfem_petsc.mesh.generators import lattice, net, prism, ring, rod
 
 pytestmark = pytest.mark.parallel
 
@@ -21,6 +21,10 @@ GENERATED = {
     "cubic": (lattice, {"kind": "cubic", "cells": [2, 3, 4], "pitch": 0.1}),
     "octet": (lattice, {"kind": "octet", "cells": [3, 2, 2], "pitch": 0.1}),
     "bcc": (lattice, {"kind": "bcc", "cells": [2, 2, 3], "pitch": 0.1}),
+    "net": (net, {"size": [3.0, 2.0], "cells": [4, 3]}),
+    "one_mesh": (net, {"size": [1.0, 1.0], "cells": [1, 1]}),
+    "prism": (prism, {"radius": 0.5, "height": 1.0}),
+    "prism_of_five": (prism, {"radius": 0.5, "height": 1.0, "sides": 5, "twist": 100.0}),
     "one_cell": (lattice, {"kind": "cubic", "cells": [1, 1, 1], "pitch": 1.0}),
 }
 

@@ -1,0 +1,63 @@
+"""A rectangular net of square or rectangular meshes in the x-y plane: chains of bars in both directions."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+
+from ...case.base import PositiveFloat, PositiveInt, StrictModel, listed
+from ..slab import MeshSlab, check_length, check_size, index_type, slab_range
+
+__all__ = ["Parameters", "generate"]
+
+
+class Parameters(StrictModel):
+    """Keys of ``[mesh]`` with ``generator = "net"``."""
+
+    size: Annotated[tuple[PositiveFloat, PositiveFloat], listed]
+    """Extents along x and y [m]."""
+    cells: Annotated[tuple[PositiveInt, PositiveInt], listed]
+    """Number of meshes along x and y."""
+
+
+def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
+    """This rank's part: node i + j (nx + 1) at (i lx/nx, j ly/ny, 0), first the bars along x, then those along y.
+
+    Node groups ``corners``, ``edges`` (corners included) and ``centre`` (the node next to the middle); bar groups
+    ``warp`` (along x) and ``weft`` (along y).
+    """
+    nx, ny = parameters.cells
+    across, along = nx + 1, nx * (ny + 1)
+    n_nodes, n_bars = across * (ny + 1), along + across * ny
+    check_size(n_nodes, "mesh.cells")
+    for length, cells in zip(parameters.size, parameters.cells, strict=True):
+        check_length(length / cells, "mesh.size (over mesh.cells)")
+    first_node, last_node = slab_range(n_nodes, rank, size)
+    first_bar, last_bar = slab_range(n_bars, rank, size)
+    numbers = np.arange(first_node, last_node)
+    j, i = np.divmod(numbers, across)
+    points = np.zeros((len(numbers), 3))
+    points[:, 0] = parameters.size[0] * i / nx
+    points[:, 1] = parameters.size[1] * j / ny
+    bars = np.arange(first_bar, last_bar)
+    warp = bars < along
+    start = np.where(warp, bars + bars // nx, bars - along)
+    ends = np.stack([start, start + np.where(warp, 1, across)], axis=1)
+    side = ((i == 0) | (i == nx)).astype(int) + ((j == 0) | (j == ny))
+    return MeshSlab(
+        n_nodes=n_nodes,
+        n_bars=n_bars,
+        first_node=first_node,
+        points=points,
+        first_bar=first_bar,
+        bars=ends.astype(index_type(n_nodes)),
+        node_groups={
+            "corners": numbers[side == 2],
+            "edges": numbers[side > 0],
+            "centre": numbers[numbers == nx // 2 + (ny // 2) * across],
+        },
+        bar_groups={"warp": bars[warp], "weft": bars[~warp]},
+        source="generator net",
+        structured=True,
+    )

@@ -1,0 +1,50 @@
+"""Equilibria by dynamic relaxation: form finding, mechanisms, slack nets, tensegrities, cables that start straight."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from pydantic import Field
+
+from ...case.base import PositiveFloat, PositiveInt, StrictModel
+
+if TYPE_CHECKING:
+    from ...solvers.linear import LinearChoice
+    from ...stepping.model import Model
+    from ..relaxation import RelaxationStepper
+
+__all__ = ["Parameters", "make_stepper"]
+
+
+class Parameters(StrictModel):
+    """Increments of the load factor, and when their relaxation ends."""
+
+    step: PositiveFloat = 1.0
+    """increment of the load factor"""
+    end: PositiveFloat = 1.0
+    """last load factor"""
+    damping: Literal["kinetic", "fire"] = "kinetic"
+    """what takes the energy of the pseudo-motion"""
+    tolerance: Annotated[float, Field(gt=0.0, lt=1.0)] = 1e-9
+    """residual over the load, in 2-norms, at which relaxation ends"""
+    max_iterations: PositiveInt = 200_000
+    """pseudo-steps allowed in an increment"""
+    newton: bool = True
+    """whether Newton's method takes over for the last digits, where it finds the same equilibrium"""
+
+    @property
+    def smallest(self) -> float:
+        """The smallest increment: they are not halved."""
+        return self.step
+
+    @property
+    def largest(self) -> float:
+        """The largest increment: they do not grow."""
+        return self.step
+
+
+def make_stepper(model: Model, parameters: Parameters, choice: LinearChoice) -> RelaxationStepper:
+    """The stepper of a case. Collective."""
+    from ..relaxation import RelaxationStepper
+
+    return RelaxationStepper(model, choice, parameters)

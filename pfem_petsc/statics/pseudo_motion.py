@@ -1,0 +1,309 @@
+"""The pseudo-motion of dynamic relaxation: nodes with fictitious mass move towards equilibrium, losing their energy.
+
+Explicit steps of length 1 with a mass chosen for them. Of bars with axial stiffness k and geometric stiffness g >= 0
+the energy of a displacement is at most twice that of their ends on their own, u.K u <= 2 sum_i u_i.K_ii u_i, so that
+the highest frequency of masses m_i = s K_i/2, with K_i the largest eigenvalue of the diagonal block K_ii, is at most
+2/sqrt(s): the limit of central differences at s = 1. That is the choice m = dt^2/2 S of Barnes (1999) with the least S
+that is safe. K_i is bounded anew every few steps, as bars turn and tighten.
+
+Two ways to take the energy:
+
+- ``kinetic``: when the kinetic energy has passed a peak, the nodes go back to where it was, by half a step less than
+  two, and start again from rest (Cundall 1976; Topping & Ivanyi 2008, section 2.6; Barnes 1999).
+- ``fire``: velocities are turned towards the forces, and stopped when they point uphill; the step adapts (Bitzek et al.
+  2006, doi:10.1103/PhysRevLett.97.170201, in the form of Guenole et al. 2020, doi:10.1016/j.commatsci.2020.109584).
+  Norms are those of the masses, as if the coordinates were sqrt(m) x.
+
+Walls: positions are projected onto what the walls allow in each step, as in explicit steps in time. The residual of a
+node is what is left of it once the walls push: m (P(x + r/m) - x).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from mpi4py import MPI
+
+from ..errors import SimulationFailure
+from ..mechanics.bars import StrainEnergy
+from ..parallel.agreement import agreed
+from ..tolerances import PROJECTED
+from .relaxation_loops import add_up, free_residual, move_freely, node_stiffness, shortest_bars
+
+if TYPE_CHECKING:
+    from ..integrators.base import State
+    from ..stepping.model import Model
+
+__all__ = ["DAMPINGS", "FireDamping", "KineticDamping", "PseudoMotion"]
+
+_SAFETY = 1.1  # s of the mass: bars turn and tighten between two estimates
+_ESTIMATE_EVERY = 10  # pseudo-steps
+_REACH = 0.1  # of its shortest bar: no node moves farther in a pseudo-step, so that none passes through another
+_UNHURRIED = 10.0  # pseudo-steps in which a support moves as far as a node may in one: bars must turn out of its way
+_SELF_STRESS = 1e-6  # of bar forces: smaller loads and reactions are none, the structure stresses itself
+
+RESIDUAL, WEIGHTED, POWER, KINETIC, SUPPORTS, WALLS, BARS, FAILED, WIDTH = range(9)
+"""Sums over all nodes: squares of the residual [N2], the same over masses, power, twice the kinetic energy, squares of
+the forces of supports, of walls, of bars [N2], ranks that failed."""
+
+
+class PseudoMotion:
+    """Moves positions of their own towards an equilibrium of the model. Construction is collective.
+
+    Attributes
+    ----------
+    x : (local, 3) positions with ghosts [m]
+    f : (local, 3) internal force there [N]
+    v : (owned, 3) pseudo-velocity [m per step]
+    residual : (owned, 3) force that nothing balances [N]
+    contact : (owned, 3) force of walls [N]; ``walls`` their sums, ``held`` the nodes that they push
+    mass : (owned,) [N/m]: the pseudo-step is 1
+    energy : StrainEnergy at ``x``
+    sums : (9,) see :data:`RESIDUAL`
+    steps : pseudo-steps since :meth:`begin`
+    """
+
+    def __init__(self, model: Model, damping: str) -> None:
+        self.model = model
+        mesh = model.mesh
+        owned, local = mesh.n_owned, mesh.n_local
+        self.x, self.f = np.zeros((local, 3)), np.zeros((local, 3))
+        self.v, self.residual = np.zeros((owned, 3)), np.zeros((owned, 3))
+        self.contact, self.walls = np.zeros((owned, 3)), model.contact.nothing
+        self.held = np.empty(0, dtype=np.int64)
+        self.external = np.zeros((owned, 3))
+        self.mass = np.ones(owned)
+        self.energy = StrainEnergy()
+        self.steps = 0
+        self.time = 0.0
+        self.sums = np.zeros(WIDTH)
+        self.damping = DAMPINGS[damping]()
+        self._u = np.zeros((owned, 3))
+        self._stored = np.zeros((len(mesh.bars), 5))
+        self._axial = np.empty(len(mesh.bars))
+        for block in model.bars.blocks:
+            part = slice(block.start, block.stop)
+            self._axial[part] = block.area * block.modulus / model.bars.rest[part]
+        self._counted = np.zeros(len(mesh.bars), dtype=bool)
+        self._counted[mesh.counted] = True
+        self._blocks = np.zeros((local, 6))
+        reach = np.full(local, np.inf)
+        shortest_bars(mesh.bars, model.bars.rest, _REACH, reach)
+        self._reach = reach[:owned].copy()
+        self._tolerance = PROJECTED * model.length
+        self._failure: SimulationFailure | None = None
+        self._external_norm = 0.0
+
+    def begin(self, state: State, time: float, external: np.ndarray) -> None:
+        """Start from the positions of a state, at rest, for the loads (owned, 3) [N] of a load factor. Collective."""
+        owned, supports = self.model.mesh.n_owned, self.model.supports
+        self.x[:owned] = state.position
+        self.time, self.external, self.steps = time, external, 0
+        self._lead_supports(state.position[supports.at], supports.positions(time))
+        self.v[:] = 0.0
+        self._external_norm = float(np.sqrt(self.model.comm.allreduce(float((external**2).sum()))))
+        self.damping.begin(self)
+        self._evaluate()
+
+    def _lead_supports(self, start: np.ndarray, end: np.ndarray) -> None:
+        """Take prescribed components (k,) to their places in as many pseudo-steps as keep bars from being crushed."""
+        supports = self.model.supports
+        self._start, self._end, self._arrival = start, end, 0
+        if supports.any:
+            needed = float((np.abs(end - start) / self._reach[supports.nodes]).max(initial=0.0))
+            self._arrival = int(np.ceil(_UNHURRIED * self.model.comm.allreduce(needed, op=MPI.MAX)))
+            self._place_supports()
+
+    def _place_supports(self) -> None:
+        part = min(self.steps / self._arrival, 1.0) if self._arrival else 1.0
+        places = self._end if part == 1.0 else self._start + part * (self._end - self._start)
+        self.x[: self.model.mesh.n_owned][self.model.supports.at] = places
+
+    @property
+    def load(self) -> float:
+        """What the residual is compared with [N]: 2-norm of loads or reactions, of bar forces where there are none."""
+        acting = max(self._external_norm, float(np.sqrt(self.sums[SUPPORTS] + self.sums[WALLS])))
+        bars = float(np.sqrt(self.sums[BARS]))
+        return acting if acting > _SELF_STRESS * bars else bars
+
+    @property
+    def norm(self) -> float:
+        """2-norm of the residual [N]."""
+        return float(np.sqrt(self.sums[RESIDUAL]))
+
+    def required(self, tolerance: float) -> float:
+        """2-norm of the residual [N] that counts as equilibrium: a share of the load, or rounding."""
+        return max(tolerance * self.load, self.model.rounding)
+
+    def relax(self, tolerance: float, most: int) -> bool:
+        """Move until the residual is ``tolerance`` of the load, or ``most`` pseudo-steps are made. Collective.
+
+        Raises
+        ------
+        SimulationFailure
+            On all ranks: bars collapsed, walls leave a node no place, or positions are not finite.
+        """
+        while self.steps < self._arrival or not self.norm <= self.required(tolerance):
+            if self.steps >= most:
+                return False
+            self.damping.move(self)
+            self.steps += 1
+            if self.steps <= self._arrival:
+                self._place_supports()
+            self._evaluate()
+        return True
+
+    def shift(self, keep: float, push: float, step: float) -> None:
+        """v = keep v + push residual/m, x = x + step v, and both as walls allow."""
+        owned = self.model.mesh.n_owned
+        u = self._u
+        move_freely(self.residual, self.mass, keep, push, step, self._reach, self.v, u)
+        if self.model.contact.any:
+            self._project(u)
+            np.divide(u, step, out=self.v)
+        self.x[:owned] += u
+
+    def go_back(self, u: np.ndarray) -> None:
+        """Subtract (owned, 3) from the positions [m]; the next step brings them back onto the walls' allowed side."""
+        self.x[: self.model.mesh.n_owned] -= u
+
+    def _project(self, u: np.ndarray) -> None:
+        """Correct increments (owned, 3) from ``x`` as walls ask, and keep the forces that this takes."""
+        owned, contact = self.model.mesh.n_owned, self.model.contact
+        try:
+            self.held, force, self.walls = contact.explicit(self.x[:owned], u, self.mass, self.time, self._tolerance)
+        except SimulationFailure as failure:
+            self._failure = self._failure or failure
+            return
+        self.contact[:] = 0.0
+        self.contact[self.held] = force
+
+    def _evaluate(self) -> None:
+        """Forces, residual and sums at the positions."""
+        model = self.model
+        model.mesh.update_ghosts(self.x)
+        self.energy = model.bars.forces(self.x, self.f, commit=False)
+        sums = np.zeros(WIDTH)
+        if self.steps % _ESTIMATE_EVERY == 0:
+            self._estimate()
+        sums[BARS] = self._bar_forces
+        sums[SUPPORTS] = free_residual(self.external, self.f, model.supports.fixed, self.residual)
+        if model.contact.any:
+            u = self.residual / self.mass[:, None]
+            self._project(u)
+            np.multiply(u, self.mass[:, None], out=self.residual)
+            sums[WALLS] = (self.contact**2).sum()
+        add_up(self.residual, self.v, self.mass, sums[:SUPPORTS])
+        sums[FAILED] = self.energy.failed >= 0 or self._failure is not None or not np.isfinite(sums).all()
+        if model.comm.size > 1:
+            model.comm.Allreduce(MPI.IN_PLACE, sums)
+        self.sums = sums
+        if sums[FAILED]:
+            self._fail()
+
+    def _estimate(self) -> None:
+        """Masses for the present positions."""
+        model = self.model
+        bars = model.bars
+        bars.linearise(self.x, 1.0, self._stored)
+        self._bar_forces = node_stiffness(
+            self.x, bars.ends, self._stored, self._axial, self._counted, self._blocks, self.mass
+        )
+        self.mass *= 0.5 * _SAFETY
+        # a node without bars has no stiffness of its own
+        self.mass[self.mass == 0.0] = 1.0
+
+    def _fail(self) -> None:
+        """Raise on all ranks what one has met."""
+        model, when = self.model, f"load factor {self.time:.6g}, pseudo-step {self.steps}"
+        with agreed(model.comm):
+            if self._failure is not None:
+                raise SimulationFailure(f"{when}: {self._failure}")
+            if self.energy.failed >= 0:
+                bar = model.mesh.bar_ids[self.energy.failed]
+                raise SimulationFailure(
+                    f"{when}: bar {bar} collapsed to no length: the load crushes it; reduce the load or static.step"
+                )
+            if not np.isfinite(self.x).all() or not np.isfinite(self.f).all():
+                raise SimulationFailure(f"{when}: positions or forces are not finite; reduce static.step")
+        raise SimulationFailure(f"{when}: sums of forces overflow double precision; correct loads and stiffness")
+
+    def worst(self) -> tuple[float, int]:
+        """Largest residual of a node [N], and its mesh number. Collective."""
+        size = np.linalg.norm(self.residual, axis=1)
+        mine = (0.0, -1)
+        if len(size):
+            at = int(np.argmax(size))
+            mine = (float(size[at]), int(self.model.mesh.node_ids[at]))
+        return max(self.model.comm.allgather(mine))
+
+    def potential(self, x: np.ndarray, energy: StrainEnergy) -> tuple[float, float]:
+        """Strain energy less work of the loads from the present positions to ``x`` (owned, 3), and the sum of their
+        magnitudes [J]. Collective."""
+        works = self.external * (x - self.x[: len(x)])
+        sums = np.array([energy.total - works.sum(), abs(energy.total) + np.abs(works).sum()])
+        self.model.comm.Allreduce(MPI.IN_PLACE, sums)
+        return float(sums[0]), float(sums[1])
+
+
+class KineticDamping:
+    """Nodes start again from rest where their kinetic energy has a peak."""
+
+    def begin(self, motion: PseudoMotion) -> None:
+        """From rest."""
+        self._before = np.zeros_like(motion.residual)
+        self._rest()
+
+    def _rest(self) -> None:
+        self._energy, self._resting = 0.0, True
+
+    def move(self, motion: PseudoMotion) -> None:
+        """One pseudo-step. Velocities are those half a step before the positions."""
+        energy = motion.sums[KINETIC]
+        if energy < self._energy:
+            # x - 3/2 v + r/(2 m) of the step before: where the peak was, by a parabola through three energies
+            motion.go_back(1.5 * motion.v - 0.5 * self._before / motion.mass[:, None])
+            motion.v[:] = 0.0
+            self._rest()
+            return
+        self._energy = energy
+        self._before[:] = motion.residual
+        push = 0.5 if self._resting else 1.0
+        self._resting = False
+        motion.shift(1.0, push, 1.0)
+
+
+class FireDamping:
+    """Velocities are turned towards the forces; uphill they are stopped, half a step back."""
+
+    start, grows, shrinks, fades, delay = 0.02, 1.1, 0.5, 0.99, 5
+    first, largest, smallest = 0.5, 0.9, 0.02
+
+    def begin(self, motion: PseudoMotion) -> None:
+        """From rest."""
+        self._step, self._turn, self._downhill = self.first, self.start, 0
+
+    def move(self, motion: PseudoMotion) -> None:
+        """One pseudo-step: semi-implicit Euler, then the turn."""
+        power, weighted, square = motion.sums[POWER], motion.sums[WEIGHTED], motion.sums[KINETIC]
+        if power > 0.0 or square == 0.0:
+            self._downhill += 1
+            if self._downhill > self.delay:
+                self._step = min(self._step * self.grows, self.largest)
+                self._turn *= self.fades
+        else:
+            motion.go_back(0.5 * self._step * motion.v)
+            motion.v[:] = 0.0
+            power = square = 0.0
+            self._downhill, self._turn = 0, self.start
+            self._step = max(self._step * self.shrinks, self.smallest)
+        h = self._step
+        square += 2.0 * h * power + h * h * weighted  # of the velocities once the forces have acted
+        keep = 1.0 - self._turn
+        push = keep * h + (self._turn * float(np.sqrt(square / weighted)) if weighted > 0.0 else 0.0)
+        motion.shift(keep, push, h)
+
+
+DAMPINGS = {"fire": FireDamping, "kinetic": KineticDamping}
+"""By the name in ``static.damping``."""

@@ -1,0 +1,155 @@
+"""Increments of the load factor by dynamic relaxation, the last digits by Newton's method."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..errors import InputError, NotConverged, SimulationFailure
+from ..integrators.base import Balance
+from ..stepping.solution import Solution
+from ..tolerances import TIME
+from .pseudo_motion import PseudoMotion
+from .stepper import StaticStepper
+
+if TYPE_CHECKING:
+    from ..solvers.linear import LinearChoice
+    from ..stepping.model import Model
+    from .methods.relaxation import Parameters
+
+__all__ = ["RelaxationStepper"]
+
+_HANDOVERS = (1e-2, 1e-4, 1e-6)  # residuals over the load at which Newton's method is tried
+_NEAR = 0.05  # of the model's length: a solution farther from the relaxed positions is another equilibrium
+_DOWN = 1e-10  # of the energies: what a solution may lie above the relaxed positions by rounding
+
+
+class RelaxationStepper(StaticStepper):
+    """Finds each equilibrium from the positions of the one before, however far it is, by a pseudo-motion.
+
+    Internal variables of bars go once from the equilibrium before to the one found: what the pseudo-motion passes
+    through leaves no trace in them. Newton's method, tried from the relaxed positions, has the last word where it
+    stays near and does not climb; else relaxation goes on to its own tolerance.
+
+    Attributes
+    ----------
+    pseudo_steps : of the last increment
+    residual : over the load, of the last increment when relaxation ended
+    """
+
+    kept_numbers = (*StaticStepper.kept_numbers, "pseudo_steps", "residual")
+    columns = (*StaticStepper.columns, "pseudo_steps", "residual")
+
+    def __init__(self, model: Model, choice: LinearChoice, parameters: Parameters) -> None:
+        _check(model)
+        super().__init__(model, choice, parameters)
+        self.parameters = parameters
+        self.guard = None  # large rotations are what it is for
+        self.motion = PseudoMotion(model, parameters.damping)
+        self.pseudo_steps, self.residual = 0, 0.0
+
+    def step(self) -> None:
+        """Find the equilibrium at the next load factor.
+
+        Raises
+        ------
+        SimulationFailure
+            On all ranks, when relaxation does not converge in ``max_iterations`` pseudo-steps.
+        """
+        state, left = self.state, self.end - self.state.time
+        last = left <= self.limits.step * (1.0 + TIME)
+        size = left if last else self.limits.step
+        self._set_part(size)
+        self.smallest = size
+        self._make_part(self.end if last else state.time + size)
+        state.step += 1
+
+    def solve(self, balance: Balance) -> Solution:
+        """See :meth:`~pfem_petsc.stepping.stepper.Stepper.solve`."""
+        model, motion, parameters = self.model, self.motion, self.parameters
+        if model.temperatures.varying:
+            model.temperatures.apply(balance.time)
+        motion.begin(self.state, balance.time, self.state.external)
+        stages = [share for share in _HANDOVERS if share > parameters.tolerance] if parameters.newton else []
+        newton = 0
+        for share in (*stages, parameters.tolerance):
+            done = motion.relax(share, parameters.max_iterations)
+            if not done:
+                raise self._unfinished()
+            self.pseudo_steps, self.residual = motion.steps, motion.norm / (motion.load or 1.0)
+            if parameters.newton:
+                solution = self._polish(balance)
+                if solution is not None:
+                    return replace(solution, newton=newton + solution.newton, linear=solution.linear)
+        return self._relaxed(balance)
+
+    def _polish(self, balance: Balance) -> Solution | None:
+        """The solution of Newton's method from the relaxed positions, None where there is none near. Collective."""
+        state, model, motion = self.state, self.model, self.motion
+        kept = state.contact, state.support, self.held
+        self.held = np.zeros_like(self.held)
+        self.held[motion.held] = True
+        try:
+            solution = super().solve(balance)
+        except NotConverged:
+            state.contact, state.support, self.held = kept
+            return None
+        x = balance.predictor + solution.u
+        away = np.linalg.norm(x - motion.x[: len(x)], axis=1).max(initial=0.0)
+        self._after[: len(x)] = x
+        model.mesh.update_ghosts(self._after)
+        energy = model.bars.forces(self._after, np.empty_like(self._after), commit=False)
+        here, size = motion.potential(motion.x[: len(x)], motion.energy)
+        there, _ = motion.potential(x, energy)
+        reached = max(model.comm.allgather(float(away)))
+        if reached > _NEAR * model.length or there > here + _DOWN * size or energy.failed >= 0:
+            state.contact, state.support, self.held = kept
+            return None
+        return solution
+
+    def _relaxed(self, balance: Balance) -> Solution:
+        """The relaxed positions as the solution."""
+        state, model, motion = self.state, self.model, self.motion
+        owned, fixed = model.mesh.n_owned, model.supports.fixed
+        state.contact = motion.contact.copy()
+        state.support = np.zeros_like(state.contact)
+        state.support[fixed] = (motion.f[:owned] - state.external - state.contact)[fixed]
+        pushed = (motion.contact[motion.held] != 0.0).any(axis=1)
+        self.held = np.zeros_like(self.held)
+        self.held[motion.held[pushed]] = True
+        u = motion.x[:owned] - balance.predictor
+        return Solution(u, motion.f.copy(), motion.walls, contacts=int(pushed.sum()))
+
+    def _unfinished(self) -> SimulationFailure:
+        """What to tell when the pseudo-steps are used up."""
+        motion, most = self.motion, self.parameters.max_iterations
+        size, node = motion.worst()
+        return SimulationFailure(
+            f"load factor {motion.time:.6g}: relaxation has not converged in {most} pseudo-steps: residual "
+            f"{motion.norm:.3g} N, required {motion.required(self.parameters.tolerance):.3g} N; worst at node {node} "
+            f"({size:.3g} N). Increase static.max_iterations or static.tolerance; if the residual does not fall, "
+            "nothing balances the load there"
+        )
+
+    def _guess(self, balance: Balance) -> np.ndarray:
+        """The relaxed positions."""
+        return self.motion.x[: self.model.mesh.n_owned] - balance.predictor
+
+
+def _check(model: Model) -> None:
+    """Refuse what relaxation does not have."""
+    case = model.case
+    if model.links:
+        what = "contact_pair" if case.contact_pair else "constraint"
+        raise InputError(
+            f'{case.source}: static.method = "relaxation" does not know [[{what}]]; use static.method = "newton"'
+        )
+    for k, name in enumerate(model.contact.names):
+        if model.contact.static_friction[k]:
+            raise InputError(
+                f'{case.source}: wall {name!r}: friction: with static.method = "relaxation" walls are frictionless: '
+                'the pseudo-motion is not a way along which friction could act; use static.method = "newton", or '
+                "remove friction"
+            )

@@ -98,8 +98,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 def thinned(items: list[pytest.Item], ranks: int) -> list[pytest.Item]:
     """Every test function but the thorough ones, with some of its sets of parameters.
 
-    Of slow ones every fourth set; of the others, on several ranks, every third or fifth where they have more than three.
-    Which sets these are differs from one number of ranks to the next.
+    Of slow ones every fourth set; of the others, on several ranks, every third or fifth where there are more than
+    three. Which sets these are differs from one number of ranks to the next.
     """
     sets: dict[tuple[Path, str], list[pytest.Item]] = {}
     for item in items:

@@ -54,8 +54,8 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
     @inlined
     def sweep_forces(x, heads, starts, chunks, counted, far, rest, heat, p, area, step, history, commit, f, energies):
         """Add internal forces to ``f``, and sums over counted bars to ``energies``, see
-        :data:`~pfem_petsc.energies.BAR_ENERGIES` [J]; return the first failed bar or -1, and whether any bar is so short
-        that it may be inverted.
+        :data:`~pfem_petsc.energies.BAR_ENERGIES` [J]; return the first failed bar or -1, and whether any bar is so
+        short that it may be inverted.
 
         ``heads``, ``starts``, ``chunks``, ``counted``: a :class:`~pfem_petsc.mechanics.sweep.Sweep`; ``far`` (b,) the
         other end of each bar. One sum is kept per position in a chunk, so vector instructions need no reordering.

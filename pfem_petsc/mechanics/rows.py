@@ -15,7 +15,7 @@ __all__ = ["accumulate", "differ", "put", "take"]
 
 
 def _places(context: Any, builder: Any, signature: Any, args: Any, first: int, column: int, count: int) -> list[Any]:
-    """Return pointers to ``count`` rows of a column; ``first``, ``column``: argument indices, ``first`` -1 for row 0."""
+    """Return pointers to ``count`` rows of a column; ``first``, ``column``: argument indices, -1 for row 0."""
     array_type = signature.args[0]
     array = context.make_array(array_type)(context, builder, args[0])
     at = context.cast(builder, args[column], signature.args[column], types.intp)

@@ -49,8 +49,8 @@ class LaggedPreconditioner:
     kind : of preconditioner, ``gamg``, ``lu`` or ``mumps``
     symmetric : whether the Hessian, including friction, is symmetric
     definite : whether the Hessian without friction is symmetric, and thus has a definite part
-    matrix_free : whether multigrid smooths on the finest level with matrix-free products of the same matrix, which saves
-        a third of the time
+    matrix_free : whether multigrid smooths on the finest level with matrix-free products of the same matrix, which
+        saves a third of the time
 
     Attributes
     ----------
@@ -159,7 +159,8 @@ class LaggedPreconditioner:
         final = matrix.fill_held(add, held, problem.scale, problem.transform)
         self._set_up(final, problem)
         if self._inner.getType() == "gamg" and self._fill() > _DENSE:
-            # the independent sets of PETSc 3.18 hardly coarsen a body-centred lattice: set-up and steps take 5 x as long
+            # the independent sets of PETSc 3.18 hardly coarsen a body-centred lattice: set-up and steps take 5 x as
+            # long
             options = PETSc.Options(_PREFIX)
             if not options.hasName("mat_coarsen_type"):
                 options["mat_coarsen_type"] = "hem"

@@ -15,7 +15,8 @@ DIRECT = ("lu", "mumps")
 """Direct solvers: PETSc's own factorisation, for small matrices, and MUMPS if PETSc has it."""
 
 _DIRECT_BELOW = 500  # unknowns; a lattice of 3,993 takes 0.06 s to factorise, and 1 to 4 ms with conjugate gradients
-# Step, relative to the explicit limit, up to which each is chosen; see scripts/linear_solvers.py, docs/linear_solvers.md
+# Step, relative to the explicit limit, up to which each is chosen; see scripts/linear_solvers.py,
+# docs/linear_solvers.md
 _JACOBI_FREE_UP_TO = 30.0
 _MULTIGRID_FROM = 10  # steps after which the first set-up pays off
 # with an assembled matrix

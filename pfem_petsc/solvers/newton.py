@@ -209,7 +209,7 @@ class NewtonSolver:
         )
 
     def _with_full_steps(self, start: np.ndarray, first: NewtonReport) -> NewtonReport:
-        """Repeat the solve with full steps: in oblique coordinates the residual may grow until the active set is found."""
+        """Repeat the solve with full steps: in oblique coordinates the residual may grow before it decreases."""
         snes = self._solver(True, full_steps=True)
         snes.setVariableBounds(self._lower, self._upper)
         return first.then(self._attempt(snes, start))

@@ -63,8 +63,8 @@ class Law:
     response : compiled (``register_jitable``) function of (strain, rate, step, temperature, p, q): strain minus the
         thermal strain; its rate over the step [1/s]; the step [s], 0 at the start of a run; temperature above reference
         [K]; the packed parameters; and the internal variables at the start of the step, a tuple. It returns (stress
-        [Pa], tangent [Pa], internal variables at the end of the step, energy densities [J/m3]). The tangent is the total
-        derivative of the stress with respect to the strain at the end, including that of the rate (1/step)
+        [Pa], tangent [Pa], internal variables at the end of the step, energy densities [J/m3]). The tangent is the
+        total derivative of the stress with respect to the strain at the end, including that of the rate (1/step)
     internal : name and unit of each internal variable of a bar, zero at the start; the unit ``""`` is a pure number.
         They are fields of the snapshots if a case selects them, and arrays of the checkpoints
     energies : names of the energy densities, of :data:`~pfem_petsc.energies.BAR_ENERGIES`: functions of strain and
@@ -72,9 +72,9 @@ class Law:
     rate : whether the law depends on the rate or on the step; strain and stress at the end of the last step are then
         kept as well. Otherwise rate and step are zero
     smooth : whether the tangent is constant
-    mean_stress : compiled function of (stress0, strain0, strain, rate, step, temperature, p, q): returns the mean stress
-        [Pa] over the step from stress0 and strain0 to strain, whose work is the change of energies, and its derivative
-        with respect to strain. The energy-momentum scheme requires it; None: the law is refused there
+    mean_stress : compiled function of (stress0, strain0, strain, rate, step, temperature, p, q): returns the mean
+        stress [Pa] over the step from stress0 and strain0 to strain, whose work is the change of energies, and its
+        derivative with respect to strain. The energy-momentum scheme requires it; None: the law is refused there
     mean_correction : ``mean_stress`` minus the mean of both ends [Pa], as a function of p, the change of stress and the
         internal variables before and after, (variables, bars), for the work of changing temperatures; None for zero
     """

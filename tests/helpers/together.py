@@ -22,7 +22,7 @@ SHARED = ("mesh.elements=8", "time.step=0.02", "output.fields_every=100", "outpu
 FIRST, LATER = 1000, 1500  # steps of the runs, and of those that continue them
 LONGEST = 0.4  # seconds between the first start and the last
 REFUSED = "another run is writing into this folder"
-CHANGED = "another run has written this checkpoint anew"
+CHANGED = "another run has overwritten this checkpoint"
 
 
 def words(folder: Path, steps: int, *more: str) -> list[str]:

@@ -162,7 +162,7 @@ def test_going_on_with_another_case_is_refused(shared_tmp_path):
     truss = write_all(path)
     columns = {name: shape for name, shape in options()["columns"].items() if name != "momentum"}
     for changes, message in (
-        ({"cell_fields": ["strain"]}, "has the fields section, stress .CellData., the case asks for strain"),
+        ({"cell_fields": ["strain"]}, "has the fields section, stress .CellData., the case requests strain"),
         ({"columns": {**columns, "momentum": (4,)}}, r"history/momentum: the run records rows of shape \(4,\)"),
         (
             {"columns": {**options()["columns"], "wall/roof/force": (3,)}},

@@ -44,6 +44,6 @@ SINGULAR_ROW = 1e-10
 """relative to the diagonal of a row in a Gram matrix: remainder after elimination of the other rows, below which the
 row depends on them"""
 RANK = 1e-8
-"""singular values of unit normals relative to the largest, below which normals are dependent"""
+"""relative to the largest singular value of unit normals: below it, normals are dependent; the root of rounding"""
 TIME = 1e-9
 """relative to a step or an end time: largest difference between the sum of steps and the requested time"""

@@ -155,7 +155,7 @@ def _alone(mesh: DistributedMesh, slab: MeshSlab, section: np.ndarray) -> None:
 
 
 def _among_ranks(mesh: DistributedMesh, slab: MeshSlab, section: np.ndarray, owners: np.ndarray) -> None:
-    """Distribute over several ranks: send nodes to their owners and number them, then send bars to their ends' owners."""
+    """Distribute over several ranks: number nodes on their owners, then send bars to the owners of their ends."""
     comm = mesh.comm
     to_owner = Router(comm, owners)
     ids = to_owner.send(np.arange(slab.first_node, slab.first_node + len(slab.points)))

@@ -16,7 +16,7 @@ VARIABLE = "VTK_DEFAULT_OPENGL_WINDOW"
 # Nothing is shown, so a display is not tried first: it may be closed, or remote over ssh.
 _HEADLESS = ("vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow")
 
-# Draw a red square where a library is there at all: a crash, a hang or an empty image all count as "does not work". So
+# Draw a red square if there is a library: a crash, a hang or an empty image all count as "does not work". So
 # does a window of another kind than asked for, which VTK takes where the library is missing, with warnings each time.
 _PROBE = """
 import os

@@ -240,7 +240,7 @@ def _forces(history: History, source: str, walls: Iterable[Any], title: str, fil
     panels = iter(chart.axes[:, 0])
     width = WINDOW * float(time[-1] - time[0])
     for name, counts in zip(names, counted, strict=True):
-        # peaks (the inertia of a node that is stopped within a step) and means need scales of their own
+        # peaks (the inertia of a node that is stopped within a step) and means need different scales
         force = _read(history, f"{source}/{name}/force")
         if name in normals:
             values, label = force @ normals[name] / np.linalg.norm(normals[name]), "normal force"

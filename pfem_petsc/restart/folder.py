@@ -114,7 +114,7 @@ def _finished(case: Case, path: Path, end: float) -> float | None:
 
 
 def finished_message(folder: Path, reached: float, plan: Plan) -> str:
-    """The message about a run whose results have ``reached`` its end [s]."""
+    """Return the message about a run whose results have ``reached`` its end [s]."""
     if not plan.end:
         return f"{folder}: finished already: the results have the modes of the initial state"
     axis = plan.axis

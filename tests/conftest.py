@@ -97,10 +97,10 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def thinned(items: list[pytest.Item], ranks: int) -> list[pytest.Item]:
-    """Every test function but the thorough ones, with some of its sets of parameters.
+    """Return all tests except the thorough ones, with some of their sets of parameters.
 
-    Of slow ones every fourth set; of the others, on several ranks, every third or fifth where they have more than three.
-    Which sets these are differs from one number of ranks to the next.
+    Slow tests run with every fourth set; on several ranks the others run with every third or fifth set if they have
+    more than three. The selection depends on the number of ranks.
     """
     sets: dict[tuple[Path, str], list[pytest.Item]] = {}
     for item in items:

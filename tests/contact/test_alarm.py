@@ -1,4 +1,4 @@
-"""The alarm of contact: a node beyond a wall ends the run, and what schemes legitimately leave does not."""
+"""Check of positions: a node beyond a wall ends the run, except by the margin that a scheme legitimately leaves."""
 
 import re
 

@@ -1,4 +1,4 @@
-"""Tied walls: nodes that touch them stay, whatever pulls at them."""
+"""Tied walls: nodes that touch them stay, whatever the forces."""
 
 import numpy as np
 import pytest

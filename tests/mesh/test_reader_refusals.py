@@ -1,4 +1,4 @@
-"""Whatever a mesh file holds, it is read or refused with a message that names it."""
+"""Any mesh file is read, or refused with a message that names the file."""
 
 import numpy as np
 import pytest

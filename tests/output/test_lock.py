@@ -1,4 +1,4 @@
-"""The lock of an output folder: one owner, left behind by kills, and recognised as that."""
+"""The lock of an output folder: one owner, and locks left behind by kills are recognised."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""The result file: values, structure, and that VTK and ``open_result`` read it, in the same way from any rank count."""
+"""The result file: values, structure, and reading by VTK and ``open_result``, the same for any number of ranks."""
 
 import h5py
 import numpy as np

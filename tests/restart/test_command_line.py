@@ -1,4 +1,4 @@
-"""What --restart does on the command line."""
+"""The option --restart of the command line."""
 
 import json
 import re

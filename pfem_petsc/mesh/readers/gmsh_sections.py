@@ -182,7 +182,7 @@ def _parse(where: str, text: bytes) -> np.ndarray:
                     float(word)
                 except ValueError:
                     raise InputError(f"{where}, line {number}: {_shown(word)!r} is not a number") from None
-        raise InputError(f"{where}: holds something else than numbers") from None
+        raise InputError(f"{where}: contains text other than numbers") from None
 
 
 def _shown(text: bytes) -> str:

@@ -1,4 +1,4 @@
-"""What advances the state of a model: one interface, whatever the analysis."""
+"""The interface of all analyses, which advance the state of a model."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ __all__ = ["Analysis", "Step"]
 
 
 class Step(NamedTuple):
-    """What a finished step reports.
+    """Report of a finished step.
 
     Attributes
     ----------
-    step, time : number and time [s] of the state that was reached
-    newton, linear : iterations
-    row : of the history, None where the step has none
+    step, time : number and time [s] of the state after the step
+    newton, linear : numbers of iterations
+    row : of the history, None if the step has none
     """
 
     step: int
@@ -31,15 +31,14 @@ class Step(NamedTuple):
 class Analysis(ABC):
     """Advances a state step by step to its last step.
 
-    Time stepping is one; a static path (whose time is the load factor), a relaxation and the modes of vibration of a
-    state are others. Recording, checkpoints, requests to stop and progress know nothing but this interface, so that
-    none of them asks which analysis runs. All methods are collective.
+    Examples are time stepping and static paths, whose time is the load factor. Recording, checkpoints, requests to stop
+    and progress use this interface only and do not depend on the analysis. All methods are collective.
 
     Attributes
     ----------
-    plan : what the run will do: ``end``, ``steps``, ``linear``, ``entries``, ``beyond``, ``record``
+    plan : resolved settings of the run: ``end``, ``steps``, ``linear``, ``entries``, ``beyond``, ``record``
     stepper : makes the steps
-    last_step : number of the last step; a number beyond all as long as it is not known
+    last_step : number of the last step; larger than any step while it is unknown
     step_size : of the steps, in the unit of the state's time [s]
     """
 
@@ -51,16 +50,16 @@ class Analysis(ABC):
     @property
     @abstractmethod
     def state(self) -> State:
-        """The state of this rank's nodes: complete after :meth:`start` and after each step."""
+        """The state of this rank's nodes, complete after :meth:`start` and after each step."""
 
     @property
     @abstractmethod
     def fault(self) -> PfemError | None:
-        """A failure that only this rank knows of yet; raised on all ranks when they next synchronise."""
+        """A failure that only this rank knows; raised on all ranks at the next synchronisation."""
 
     @abstractmethod
     def start(self) -> None:
-        """Complete the state at the start; not called where a checkpoint is restored instead.
+        """Initialise the state; not called if a checkpoint is restored instead.
 
         Raises
         ------
@@ -70,14 +69,14 @@ class Analysis(ABC):
 
     @abstractmethod
     def advance(self) -> Step:
-        """Make one step; its ``row`` is None, which only recording knows.
+        """Make one step; its ``row`` is None, because rows are made by recording.
 
         Raises
         ------
         SimulationFailure
-            On all ranks; the state is the last one that was complete, or lost.
+            On all ranks; the state is the last complete one, or undefined.
         """
 
     @abstractmethod
     def close(self) -> None:
-        """Free what is not freed by itself; the state can still be looked at."""
+        """Free resources that are not freed automatically; the state remains accessible."""

@@ -1,4 +1,4 @@
-"""The energies of the history, one line each: name, side of the balance, and source."""
+"""The energies of the history, one line each: name, side of the energy balance, and source."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ class Energy(NamedTuple):
     Attributes
     ----------
     side : ``stored``, ``lost`` or ``supplied``: stored + lost - supplied is constant; ``part`` of another column
-    source : ``bars``, sums that material laws give; ``state``, at the moment of the row; ``ledger``, sums accumulated
-        over the steps; ``derived``, the sum of other columns
-    parts : columns that a derived one adds up
+    source : ``bars``, sums of the material laws; ``state``, at the time of the row; ``ledger``, sums accumulated over
+        the steps; ``derived``, the sum of other columns
+    parts : columns that a derived one sums
     value : this rank's share of a term of the source ``state`` [J], from a
-        :class:`~pfem_petsc.stepping.stepper.Stepper`; None where the ledger has its own place for it
+        :class:`~pfem_petsc.stepping.stepper.Stepper`; None if the ledger computes it
     """
 
     name: str
@@ -28,7 +28,7 @@ class Energy(NamedTuple):
     value: Callable[[Any], float] | None = None
 
 
-# one more energy is one more line here
+# to add an energy, add one line here
 ENERGIES = (
     Energy("kinetic_energy", "stored", "state"),
     Energy("elastic_energy", "stored", "bars"),
@@ -48,4 +48,4 @@ ENERGIES = (
 STORED, LOST, SUPPLIED = (tuple(e.name for e in ENERGIES if e.side == side) for side in ("stored", "lost", "supplied"))
 
 BAR_ENERGIES = tuple(energy.name for energy in ENERGIES if energy.source == "bars")
-"""Energies that material laws give densities of, in the order of their sums."""
+"""Energies whose densities material laws return, in the order of their sums."""

@@ -1,4 +1,4 @@
-"""The errors that end a run, each with the exit status that the command line returns for it."""
+"""The errors that end a run, each with its exit status on the command line."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ __all__ = ["EarlyStop", "InputError", "NotConverged", "PfemError", "SimulationFa
 
 
 def printable(text: str) -> str:
-    """A text without control characters but line breaks and tabs: a terminal would obey them."""
+    """Return a text without control characters, except line breaks and tabs; a terminal would interpret them."""
     return "".join(c if c.isprintable() or c in "\n\t" else ascii(c)[1:-1] for c in text)
 
 
 class PfemError(Exception):
-    """A run cannot go on, and the message says why to the user.
+    """Base class of errors that are reported to the user.
 
-    The message names what is wrong, where (file and key, or step, node and bar), the value, and the way out.
+    The message states what is wrong, where (file and key, or step, node and bar), the value, and the remedy.
     """
 
     exit_status = 1
@@ -26,13 +26,13 @@ class InputError(PfemError):
 
 
 class SimulationFailure(PfemError):
-    """The simulation failed on its way: no convergence, collapsed bar, instability, disk full."""
+    """Failure during the simulation: no convergence, collapsed bar, instability, disk full."""
 
     exit_status = 3
 
 
 class NotConverged(SimulationFailure):
-    """A solve failed before anything of the state was changed: a smaller step may do. Raised on all ranks."""
+    """A solve failed before the state was changed, so a smaller step may succeed. Raised on all ranks."""
 
 
 class EarlyStop(PfemError):

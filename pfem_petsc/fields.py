@@ -1,6 +1,6 @@
-"""The fields of snapshots, one entry each: name, where its values are, unit, and how they are found.
+"""The fields of snapshots, one entry each: name, place of its values, unit, and their computation.
 
-Internal variables of a case's material laws can be asked for as well; the laws name them, and nothing here does.
+Internal variables of a case's material laws are fields too; they are named by the laws and not here.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ class Field(NamedTuple):
     ----------
     place : ``nodes``, values (owned, 3), or ``bars``, values (local bars,)
     unit : SI unit, empty for a pure number
-    value : its values, from a :class:`~pfem_petsc.recording.fields.Snapshot`; called by all ranks
-    default : whether it is written where a case does not name fields, from a :class:`~pfem_petsc.stepping.model.Model`
+    value : returns its values from a :class:`~pfem_petsc.recording.fields.Snapshot`; called by all ranks
+    default : whether it is written if a case does not name fields, from a :class:`~pfem_petsc.stepping.model.Model`
     """
 
     name: str
@@ -35,7 +35,7 @@ class Field(NamedTuple):
     default: Callable[[Any], bool] = _always
 
 
-# one more field is one more entry here
+# to add a field, add one entry here
 FIELDS = [
     Field("displacement", "nodes", "m", lambda now: now.state.position - now.start),
     Field("velocity", "nodes", "m/s", lambda now: now.state.v),
@@ -50,10 +50,10 @@ FIELDS = [
 
 
 def point_fields() -> list[str]:
-    """Names of the fields of nodes."""
+    """Return the names of the fields at nodes."""
     return [field.name for field in FIELDS if field.place == "nodes"]
 
 
 def cell_fields() -> list[str]:
-    """Names of the fields of bars."""
+    """Return the names of the fields at bars."""
     return [field.name for field in FIELDS if field.place == "bars"]

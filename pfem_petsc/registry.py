@@ -1,4 +1,4 @@
-"""Find the classes that case files name: one class in one module, and the module's name is the case file's name."""
+"""Finds the classes that case files name: one class per module, with the name of the module."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ __all__ = ["choices", "lookup", "nearest"]
 
 
 def choices(package: str) -> list[str]:
-    """Names on offer in a package: its modules, without importing any (``base`` and private ones excluded)."""
+    """Return the names of the modules of a package without importing them, except ``base`` and private ones."""
     path = importlib.import_module(package).__path__
     return sorted(m.name for m in pkgutil.iter_modules(path) if not m.name.startswith("_") and m.name != "base")
 
 
 def nearest(name: str, known: list[str]) -> str:
-    """Hint for a misspelt name: ``", did you mean 'x'?"``, or the known names where none is near."""
+    """Return a hint for a misspelt name: ``", did you mean 'x'?"``, or the known names if none is similar."""
     if not known:
         return "; there is none"
     match = difflib.get_close_matches(str(name), known, n=1, cutoff=0.6)
@@ -32,7 +32,7 @@ def lookup(package: str, name: str, where: str) -> ModuleType:
     Raises
     ------
     InputError
-        When there is no such module; the message names the key ``where`` and the nearest known name.
+        If there is no such module; the message names the key ``where`` and the nearest known name.
     """
     known = choices(package)
     if name not in known:

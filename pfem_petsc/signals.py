@@ -1,6 +1,6 @@
-"""Signals that ask a run to stop, noted from the first moment of the program on.
+"""Signals that request a run to stop, recorded from the start of the program.
 
-Imports next to nothing: ``python -m pfem_petsc`` takes the signals over before it imports what takes a second.
+Imports very little: ``python -m pfem_petsc`` installs the handlers before the other imports, which take a second.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ _PATIENCE = 10.0  # seconds after which a third signal of any kind ends the proc
 
 
 class SignalNotes:
-    """Takes note of signals, so that a run can end at the end of a step.
+    """Records signals, so that a run can stop at the end of a step.
 
-    The first and the second change nothing else. After the second one SIGINT has its default action again, and the
-    others after some seconds: a third one ends the process at once, also inside of compiled code.
+    The first and the second signal are only recorded. After the second one SIGINT has its default action again, and the
+    others after some seconds: a third one ends the process at once, even inside compiled code.
     """
 
     def __init__(self) -> None:
@@ -31,9 +31,9 @@ class SignalNotes:
         self._before: dict[int, object] = {}
 
     def watch(self) -> None:
-        """Take the signals over. Nothing outside of the main thread, where Python cannot.
+        """Install the signal handlers, in the main thread only, as Python requires.
 
-        A hang-up that is ignored, as under ``nohup``, stays ignored.
+        An ignored hang-up signal, as under ``nohup``, stays ignored.
         """
         if threading.current_thread() is not threading.main_thread() or self._before:
             return
@@ -42,13 +42,13 @@ class SignalNotes:
                 self._before[number] = signal.signal(number, self._note)
 
     def release(self) -> None:
-        """Give the signals back to who had them."""
+        """Restore the previous signal handlers."""
         before, self._before = self._before, {}
         for number, handler in before.items():
             signal.signal(number, handler if handler is not None else signal.SIG_DFL)
 
     def adopt(self, other: SignalNotes) -> None:
-        """Take over what another has noted."""
+        """Adopt the signals that another object has recorded."""
         if other._signal and not self._signal:
             self._signal, self._count, self._since = other._signal, other._count, other._since
 
@@ -65,22 +65,22 @@ _EARLY = SignalNotes()
 
 
 def watch_early() -> None:
-    """Note signals from now on, until :func:`give_back_early`."""
+    """Record signals from now on, until :func:`give_back_early`."""
     _EARLY.watch()
 
 
 def early() -> SignalNotes:
-    """What was noted since :func:`watch_early`."""
+    """Return the signals recorded since :func:`watch_early`."""
     return _EARLY
 
 
 def give_back_early() -> None:
-    """For what has no step to stop after: signals do what they did before, also those that have come already.
+    """Restore the previous handlers for commands without steps, and deliver signals that were recorded.
 
     Raises
     ------
     KeyboardInterrupt
-        When there was a SIGINT.
+        If there was a SIGINT.
     """
     came = _EARLY._signal
     _EARLY.release()

@@ -35,10 +35,10 @@ __all__ = ["Simulation", "Step"]
 
 
 class Simulation:
-    """A case on a communicator; a context manager, which closes it.
+    """The simulation of a case on a communicator; a context manager that closes it.
 
-    One run at a time writes into an output folder: from :meth:`start` to the end of the iteration, or to
-    :meth:`close`, the folder is locked. What advances the state is its ``analysis``, what is written its ``outputs``.
+    Only one run at a time writes into an output folder: the folder is locked from :meth:`start` to the end of the
+    iteration or to :meth:`close`. The ``analysis`` advances the state, and the ``outputs`` write the results.
 
     Parameters
     ----------
@@ -46,17 +46,17 @@ class Simulation:
     comm : MPI.Comm, optional
         Default: the world.
     output : Path or None
-        Folder of the results; default ``results/<case name>``. Results found there are moved aside.
+        Folder of the results; default ``results/<case name>``. Existing results are moved aside.
     restart : None, True or Path
         Continue from the newest checkpoint of the output folder, of another one, or from a file; bit for bit on as many
         ranks.
     quiet : bool
         Print nothing on stdout.
     wall_time : float, optional
-        Stop with a checkpoint after so many seconds, but not before the first step; SIGTERM, SIGINT, SIGUSR1 and SIGHUP
+        Stop with a checkpoint after this time [s], but not before the first step; SIGTERM, SIGINT, SIGUSR1 and SIGHUP
         do so at any time during the run.
     check_only : bool
-        Set the model up and write nothing.
+        Set up the model and write nothing.
 
     Raises
     ------
@@ -88,7 +88,7 @@ class Simulation:
         self._compilation = ReportedCompilation(self.comm, quiet)
         self._closed = False
         self._lock = FolderLock(self.folder)
-        # of a simulation that nobody has closed, and nobody has any more
+        # PETSc objects of a simulation that was dropped without close()
         for held in (self._stop, self._lock):
             weakref.finalize(self, held.release)
         if not check_only:
@@ -121,7 +121,7 @@ class Simulation:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
-        # an unforeseen error may have come on this rank alone: closing together would wait for ever
+        # an unexpected error may have occurred on this rank only, and a collective close would wait forever
         if kind is None or self.comm.size == 1 or issubclass(kind, PfemError):
             self.close()
         else:
@@ -129,10 +129,10 @@ class Simulation:
             self._leave("failed")
 
     def close(self) -> None:
-        """Close the results, free PETSc's objects, give signals back and unlock the folder; again: nothing. Collective.
+        """Close the results, free PETSc objects, restore signal handlers and unlock the folder. Collective.
 
-        State, last row and mesh can still be looked at; everything else is refused. A run that was not at its end can
-        be continued from its last checkpoint.
+        A second call does nothing. State, last row and mesh remain accessible; everything else is refused. A run that
+        was not at its end can be continued from its last checkpoint.
         """
         if self._closed:
             return
@@ -150,7 +150,7 @@ class Simulation:
 
     @property
     def finished(self) -> bool:
-        """Whether a restart was asked for and the output folder holds results up to the end already."""
+        """Whether a restart was requested and the output folder already has results up to the end."""
         return self._reached is not None
 
     @property
@@ -164,12 +164,12 @@ class Simulation:
         return self.outputs.history.row if self.outputs.history is not None else None
 
     def summary(self) -> dict[str, str]:
-        """Label and text of what a user checks before a run. Collective."""
+        """Return label and text of a summary for the user before a run. Collective."""
         self._usable()
         return summarise(self.case, self.model, self.plan)
 
     def inspect(self) -> tuple[dict[str, str], list[str]]:
-        """Label and text of a closer look at the truss and a forecast of the run; and what looks wrong. Collective."""
+        """Return label and text of further checks and of a forecast of the run; and warnings. Collective."""
         self._usable()
         recorder = Recorder(self.stepper, None)
         entries, warnings = inspect(self.case, self.model)
@@ -177,16 +177,16 @@ class Simulation:
         return entries, self.model.warnings + warnings_before(self.case, self.model, self.plan) + warnings
 
     def on_step(self, function: Callable[[Step], object], every: int = 1) -> None:
-        """Have a function called on all ranks after each step whose number is a multiple of ``every``.
+        """Register a function to be called on all ranks after each step whose number is a multiple of ``every``.
 
-        It gets the finished :class:`Step` and may look at :attr:`state` and call what is collective; what it gives is
-        not looked at. With ``every`` large, :meth:`run` still makes the steps between by one compiled call. Functions
-        are called in the order in which they were given.
+        It receives the finished :class:`Step`, and may read :attr:`state` and call collective functions; its result is
+        ignored. With a large ``every``, :meth:`run` still fuses the steps in between into compiled calls. Functions are
+        called in the order of registration.
 
         Raises
         ------
         InputError
-            ``every`` is not a positive whole number.
+            If ``every`` is not a positive integer.
         """
         self._usable()
         if not isinstance(every, int | np.integer) or isinstance(every, bool) or every < 1:
@@ -195,7 +195,7 @@ class Simulation:
 
     @staged
     def start(self) -> None:
-        """Complete the state at the start and open the output. Collective; called by :meth:`run` and iteration."""
+        """Initialise the state and open the output. Collective; called by :meth:`run` and iteration."""
         self._usable()
         if self._started:
             return
@@ -219,9 +219,10 @@ class Simulation:
             yield from self._steps()
 
     def batches(self, min_steps: int = WORTH) -> Iterator[Step]:
-        """Run as iteration does, but give only some of the steps: those between may be made by one compiled call.
+        """Run as by iteration, but yield only some of the steps; those in between may be fused into one compiled call.
 
-        ``min_steps``: steps of a run for which that call is compiled, which takes some seconds when it is first met.
+        ``min_steps``: minimum number of steps of a run for which the fused loop is compiled, which takes some seconds
+        the first time.
         """
         self._usable()
         if self.finished:
@@ -244,7 +245,7 @@ class Simulation:
                     self.outputs.advance_together(batches)
                 yield self._advance()
                 self.outputs.stop_early()
-            # where a run that was killed after its last checkpoint had not got to it
+            # a run that was killed after its last checkpoint may not have done this
             self.outputs.complete()
             self.outputs.record_modes()
             self.outputs.tell_remarks()
@@ -256,7 +257,7 @@ class Simulation:
             self._finish("failed")
             raise
         except BaseException:
-            # one rank alone may be here: nothing collective is safe
+            # only one rank may be here, so collective operations are not safe
             if self.comm.size == 1:
                 self._finish("failed")
             else:
@@ -264,14 +265,14 @@ class Simulation:
             raise
 
     def run(self) -> int:
-        """Run to the end and give the exit status. Collective.
+        """Run to the end and return the exit status. Collective.
 
         Raises
         ------
         EarlyStop
-            On all ranks, on a signal or when the wall time is over: a checkpoint is written.
+            On all ranks, after a signal or at the end of the wall time; a checkpoint is written.
         SimulationFailure
-            On all ranks; what was recorded before is in the result file.
+            On all ranks; data recorded before are in the result file.
         """
         if self.finished and self.comm.rank == 0 and not self.quiet:
             print(finished_message(self.folder, self._reached, self.plan))
@@ -286,7 +287,7 @@ class Simulation:
         return self.outputs.after(made)
 
     def _finish(self, outcome: str) -> None:
-        """Close the results and let go of the folder. Collective."""
+        """Close the results and unlock the folder. Collective."""
         try:
             self.outputs.close(outcome)
         finally:
@@ -294,14 +295,14 @@ class Simulation:
             self._lock.release()
 
     def _leave(self, outcome: str) -> None:
-        """What this rank can do alone; the folder stays locked until its process ends: others may be writing."""
+        """Clean up without communication; the folder stays locked until the process ends, as others may be writing."""
         self.outputs.leave(outcome)
         if self.restart is not None:
             self.restart.file.close()
         self._stop.release()
 
     def gather(self, values: np.ndarray) -> np.ndarray | None:
-        """An owned array (owned, ...) as a whole in mesh numbering on rank 0, None elsewhere. Collective."""
+        """Return an owned array (owned, ...) gathered in mesh numbering on rank 0, None elsewhere. Collective."""
         self._usable()
         parts = self.comm.gather(self.mesh.node_order.to_slab(values))
         return np.concatenate(parts) if parts is not None else None

@@ -1,10 +1,10 @@
-"""Time this program and its peers on the same lattice, in one go, and print processor seconds a step and ratios.
+"""Times this program and its peers on the same lattice, and prints processor time per step and ratios.
 
 usage: python scripts/compare_peers.py [--sizes 10230 101706] [--only kratos openseespy] [--repeats 3]
 
-OpenSeesPy and Kratos are installed into an environment of their own (results/peers-venv, or --venv); what does not
-install is left out. One thread each. Every round runs all codes in turn, ratios are made within a round, and the median
-of the rounds is shown, so that a machine that is shared slows all of them. docs/performance.md says what is compared.
+OpenSeesPy and Kratos are installed into a separate environment (results/peers-venv, or --venv); codes that cannot be
+installed are omitted. All use one thread. Every round runs all codes in turn, ratios are formed within a round, and the
+median of the rounds is shown, so that load on a shared machine affects all codes. See docs/performance.md.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ PACKAGES = {
         ["KratosMultiphysics", "KratosStructuralMechanicsApplication", "KratosLinearSolversApplication"],
     ),
 }
-"""Peer: what its driver imports, and the packages that bring it."""
+"""Peer to the modules that its driver imports, and the packages that provide them."""
 
 
 @dataclass(frozen=True)
 class Code:
-    """A code as it is run: ``largest`` number of bars for which it is worth waiting."""
+    """A code with its driver; ``largest`` is the maximum number of bars for which it is run."""
 
     label: str
     package: str
@@ -92,12 +92,12 @@ def main() -> int:
 
 
 def cells_for(bars: int) -> int:
-    """Cells along an edge of the cubic lattice nearest to a number of bars."""
+    """Return the cells along an edge of the cubic lattice nearest to a number of bars."""
     return min(range(1, 500), key=lambda n: abs(3 * n * (n + 1) * (3 * n + 1) - bars))
 
 
 def install(name: str, folder: Path) -> str | None:
-    """Python of the environment with a peer in it; None where it does not install."""
+    """Return the Python of the environment with a peer; None if it cannot be installed."""
     modules, packages = PACKAGES[name]
     python = folder / "bin" / "python"
     if not python.exists():
@@ -118,14 +118,14 @@ def install(name: str, folder: Path) -> str | None:
 
 
 def steps_of(mode: str, bars: int) -> int:
-    """Steps that are timed: enough for the clock, few enough for the slowest."""
+    """Return the number of timed steps: enough for the clock, few enough for the slowest code."""
     if mode.startswith("implicit"):
         return 5 if bars < 50_000 else 3
     return 200 if bars < 50_000 else 40 if bars < 500_000 else 8
 
 
 def compare(mode: str, cells: int, codes: list[Code], pythons: dict[str, str], repeats: int) -> list[dict]:
-    """Run all codes ``repeats`` times in turn, print a table, and give the runs."""
+    """Run all codes ``repeats`` times in turn, print a table, and return the runs."""
     bars = 3 * cells * (cells + 1) * (3 * cells + 1)
     rounds: dict[str, list[dict]] = {code.label: [] for code in codes}
     left_out: dict[str, str] = {}
@@ -161,7 +161,7 @@ def compare(mode: str, cells: int, codes: list[Code], pythons: dict[str, str], r
 
 
 def run(code: Code, python: str, cells: int, mode: str, steps: int) -> dict | str:
-    """The result of one run, or why there is none."""
+    """Return the result of one run, or why there is none."""
     command = [python, str(DRIVERS / code.driver), str(cells), mode, str(steps), code.solver]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
     if code.package == "ours":

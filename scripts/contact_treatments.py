@@ -40,7 +40,7 @@ SCHEMES = (
 
 
 def run(treatment: str, integrator: str, parameters: dict[str, float]) -> list[dict] | None:
-    """History rows of the rod, None where the treatment does not go with the scheme."""
+    """Return the history rows of the rod, None if the treatment is not compatible with the scheme."""
     overrides = [
         f"time.integrator={integrator}",
         f"time.step={STEP}",
@@ -59,12 +59,12 @@ def run(treatment: str, integrator: str, parameters: dict[str, float]) -> list[d
 
 
 def label(integrator: str, parameters: dict[str, float]) -> str:
-    """Scheme and parameters as in a case file."""
+    """Return scheme and parameters as in a case file."""
     return ", ".join([integrator, *(f"{name} {value:g}" for name, value in parameters.items())])
 
 
 def table(results: dict) -> str:
-    """One line a scheme, one column a treatment."""
+    """Return the table, with one line per scheme and one column per treatment."""
     lines = ["| integrator | " + " | ".join(TREATMENTS) + " |", "|---" * (1 + len(TREATMENTS)) + "|"]
     for integrator, parameters in SCHEMES:
         cells = []
@@ -82,7 +82,7 @@ def table(results: dict) -> str:
 
 
 def figure(results: dict) -> None:
-    """Force over time of three schemes with all treatments."""
+    """Plot the force over time of three schemes with all treatments."""
     shown = [SCHEMES[0], SCHEMES[3], SCHEMES[4]]
     colours = dict(zip(TREATMENTS, ("#888888", "#d55e00", "#009e73", "#0072b2"), strict=True))
     _, axes = plt.subplots(len(shown), 1, figsize=(8, 8), sharex=True, layout="constrained")
@@ -100,7 +100,7 @@ def figure(results: dict) -> None:
 
 
 def main() -> None:
-    """Run everything, and put the table between its marks in the document."""
+    """Run everything, and insert the table between its marks in the document."""
     argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     results = {
         (label(integrator, parameters), treatment): run(treatment, integrator, parameters)

@@ -1,15 +1,15 @@
-"""Kill runs at random moments, restart them, and compare with runs that nobody disturbed.
+"""Kills runs at random times, restarts them, and compares with uninterrupted runs.
 
     .venv/bin/python scripts/crash_test.py --kills 200 --ranks 1,2
     .venv/bin/python scripts/crash_test.py --kills 200 --python .venv-petsc/bin/python
     .venv/bin/python scripts/crash_test.py --kills 1000 --cases 0:400
 
-Explicit, implicit, plastic and multistep cases, with contact and without, take their turns on all numbers of ranks, so
-that each gets as many kills; with --cases A:B they are the cases that scripts/random_cases.py draws by these numbers,
-without those that are refused or fail undisturbed. A run is killed by SIGKILL, all ranks or one of them, also before
-its first checkpoint, and restarted, and often killed again, until it is done. After each kill the result file must open
-in VTK and in open_result; at the end all its values must equal those of the undisturbed run bit for bit.
-Status 0 when all did.
+Explicit, implicit, plastic and multistep cases, with and without contact, are run in turn on all numbers of ranks, so
+that each gets the same number of kills. With --cases A:B they are the cases that scripts/random_cases.py draws by these
+numbers, except those that are refused or fail without a kill. A run is killed by SIGKILL, all ranks or one of them,
+possibly before its first checkpoint, and restarted, and often killed again, until it is done. After each kill the
+result file must open in VTK and in open_result; at the end all its values must be bitwise identical to those of the
+uninterrupted run. Status 0 if all tests pass.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 from helpers.kills import KINDS, LEFT_OVER, Kind, VtkReader, assert_readable, differences, killed, run  # noqa: E402
 
 EVERY = (7, 40, 1000)  # steps between checkpoints: many, some, none before the end
-MOST = 4  # kills of a run before it is let go on to its end
+MOST = 4  # kills of a run before it may run to its end
 COUNTED = ("kills", "before 1st checkpoint", "runs", "launcher left", "unreadable", "different", "failed")
 
 
 def main() -> int:
-    """Kill as often as asked."""
+    """Kill the requested number of runs."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=200, metavar="N", help="how many (default: %(default)s)")
     parser.add_argument("--ranks", type=_numbers, default=[1, 2], metavar="N,N", help="in turn (default: 1,2)")
@@ -49,14 +49,14 @@ def main() -> int:
     chance = random.Random(seed)
     begin = time.monotonic()
     kinds = KINDS if arguments.cases is None else _random_kinds(arguments.cases, folder)
-    # a random case runs on one number of ranks, on which in turn
+    # a random case runs on one number of ranks, chosen in turn
     several = [(name, ranks) for ranks in arguments.ranks for name in kinds]
     single = list(zip(kinds, arguments.ranks * len(kinds)))
     counts = {turn: Counter() for turn in (several if arguments.cases is None else single)}
     references: dict[tuple[str, int], tuple[Path, float]] = {}
     with VtkReader() as vtk:
         while (left := arguments.kills - sum(count["kills"] for count in counts.values())) > 0:
-            # whose turn it is: the one with the fewest kills, of random cases the one with the fewest runs
+            # next is the case with the fewest kills, of random cases the one with the fewest runs
             name, ranks = min(counts, key=lambda turn: counts[turn]["kills" if arguments.cases is None else "runs"])
             if (name, ranks) not in references:
                 reference = _reference(name, kinds[name], ranks, folder, arguments.python, arguments.cases is None)
@@ -67,7 +67,7 @@ def main() -> int:
             kind, reference = kinds[name], references[name, ranks]
             one = _one_run(name, kind, ranks, reference, folder, min(left, MOST), chance, vtk, arguments.python)
             counts[name, ranks].update(one)
-            if not one["kills"]:  # done before: the undisturbed run took longer, as when it compiled loops
+            if not one["kills"]:  # finished before a kill: the reference run took longer, as when it compiled loops
                 references[name, ranks] = reference[0], 0.5 * reference[1]
             if one["failed"]:
                 kept = folder / f"failed-{sum(count['failed'] for count in counts.values())}"
@@ -85,7 +85,7 @@ def _numbers(text: str) -> list[int]:
 
 
 def _random_kinds(numbers: str, folder: Path) -> dict[str, Kind]:
-    """Cases that the generator draws by these numbers, as files."""
+    """Write the cases that the generator draws by these numbers to files."""
     from random_trusses.draw import draw_case
     from random_trusses.running import case_text
 
@@ -109,7 +109,7 @@ def _one_run(
     vtk: VtkReader,
     python: str,
 ) -> Counter:
-    """Kill a run up to so many times, let it come to its end, and compare: what is counted of it."""
+    """Kill a run up to ``MOST`` times, let it run to its end, and compare; return the counts."""
     count = Counter(runs=1)
     every, work = chance.choice(EVERY), folder / "killed"
     for old in folder.glob("killed*"):
@@ -143,11 +143,11 @@ def _one_run(
 def _reference(
     name: str, kind: Kind, ranks: int, folder: Path, python: str, must_run: bool
 ) -> tuple[Path, float] | None:
-    """The undisturbed run: its result file, and how long its steps take [s]; None for a case that does not run."""
+    """Run without kills; return the result file and the time of its steps [s], None for a case that does not run."""
     place = folder / f"{name.replace(' ', '-').replace(',', '')}-{ranks}"
     shutil.rmtree(place, ignore_errors=True)
     if must_run:
-        run(kind, ranks, place, 0, python=python)  # compiles what is to be compiled
+        run(kind, ranks, place, 0, python=python)  # compiles the loops
         shutil.rmtree(place, ignore_errors=True)
     begin = time.time()
     done = run(kind, ranks, place, 0, python=python)
@@ -164,7 +164,7 @@ def _reference(
 
 
 def _table(counts: dict[tuple[str, int], Counter], seconds: float) -> int:
-    """Print what was counted; gives how often something was not as it should be."""
+    """Print the counts; return the number of failures."""
     width = max(len(name) for name, _ in counts)
     print(f"\n{'case':{width}}  ranks  {'  '.join(COUNTED)}")
     total = Counter()

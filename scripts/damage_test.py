@@ -1,10 +1,10 @@
 #!/usr/bin/env python
-"""Damage a result file many times, a bit, a byte or a page at a time, and see what readers and restarts make of it.
+"""Damages a result file many times, by a bit, a byte or a page, and tests readers and restarts with it.
 
     python scripts/damage_test.py [NUMBER] [SEED]
 
-A damage may be refused (status 2), or not matter: the continued results are then those of the undamaged file. Ends with
-status 1 where one went into continued results in silence, or a reader crashed or had an internal error.
+Damage may be refused (status 2) or have no effect: the continued results are then those of the undamaged file. The
+status is 1 if damage affected continued results silently, or if a reader crashed or had an internal error.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ CASE = ["rod_impact", "--quiet", "--set", "time.end=0.6", "output.fields_every=2
 
 
 def damaged(source: Path, target: Path, chance: random.Random) -> str:
-    """Write a damaged copy of a file, and say what was done to it."""
+    """Write a damaged copy of a file, and return a description of the damage."""
     content = bytearray(source.read_bytes())
     kind, at = chance.choice(["bit", "byte", "page"]), chance.randrange(len(content))
     if kind == "bit":
@@ -41,7 +41,7 @@ def damaged(source: Path, target: Path, chance: random.Random) -> str:
 
 
 def different(one: Path, other: Path) -> bool:
-    """Whether two results differ in any dataset."""
+    """Return whether two results differ in any dataset."""
     with h5py.File(one, "r", locking=False) as a, h5py.File(other, "r", locking=False) as b:
         names: list[list[str]] = [[], []]
         for file, found in zip((a, b), names, strict=True):
@@ -57,7 +57,7 @@ def program(*words: str | Path) -> subprocess.CompletedProcess:
 
 
 def main() -> int:
-    """Damage, read, restart, count."""
+    """Damage files, read and restart them, and count the outcomes."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("number", nargs="?", type=int, default=200, help="of damages; default: %(default)s")
     parser.add_argument("seed", nargs="?", type=int, default=1)

@@ -1,10 +1,10 @@
-"""Check case and mesh files with mistakes put in by chance: each must be accepted, or refused with a message.
+"""Checks case and mesh files with random mistakes: each must be accepted, or refused with a message.
 
     .venv/bin/python scripts/fuzz.py --mutants 10000
 
-A traceback, a status other than 0 and 2, a message without the file, of a case without key or line, no answer within a
-minute and a process that dies all count. Cases are the built-in ones, meshes of every format. Every mutant has a seed:
-``--seed 1234 --mutants 1 --keep DIR`` makes it again. Status 0 when nothing counts.
+Failures are a traceback, a status other than 0 and 2, a message without the file (or, for a case, without key or line),
+no answer within a minute, and a process that dies. Cases are the built-in ones, meshes are of every format. Every
+mutant has a seed: ``--seed 1234 --mutants 1 --keep DIR`` reproduces it. Status 0 if there are no failures.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "tests"))
 
 BATCH = 250
-MEMORY = 6 << 30  # bytes that a check may take: what asks for more must be refused, not end the machine
+MEMORY = 6 << 30  # bytes that a check may use; files that request more must be refused
 
 
 def main() -> int:
-    """Try as many as asked, in processes of their own."""
+    """Try the requested number of mutants in separate processes."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--mutants", type=int, default=10_000, metavar="N", help="default: %(default)s")
     parser.add_argument("--seed", type=int, default=0, help="of the first; the others follow")

@@ -1,13 +1,12 @@
-"""The tables of impact phases in docs/contact.md: does contact gain energy, wherever in a step the impact falls?
+"""The tables of impact phases in docs/contact.md: energy gain by contact for each phase of the impact within a step.
 
     python scripts/impact_phases.py            # rewrites them, in four minutes
     python scripts/impact_phases.py --program  # prints them from runs of the program itself, in an hour
 
-Every integrator, treatment and mass matrix runs the rod against the wall of `rod_impact` in 14 phases: equal rods, each
-a fourteenth of v h further from the wall than the one before; a second table has walls with restitution. Both are those
-of the small linear rods that the
-program itself judges by; in its own runs all rods are one mesh, so that one run does all phases, and the tests hold
-both against each other. The exact energy ratios and releases are 1.
+Every integrator, treatment and mass matrix runs the rod of `rod_impact` against the wall in 14 phases: equal rods, each
+a fourteenth of v h further from the wall than the previous one; a second table has walls with restitution. Both tables
+are computed with the small linear rods that the program itself uses for its check. With --program all rods are one
+mesh, so that one run covers all phases, and the tests compare both. The exact energy ratios and releases are 1.
 """
 
 from __future__ import annotations
@@ -36,13 +35,13 @@ START, END = "<!-- table: scripts/impact_phases.py -->\n", "<!-- end of phases -
 START_REBOUNDS, END_REBOUNDS = "<!-- table: scripts/impact_phases.py, restitution -->\n", "<!-- end of rebounds -->"
 RESTITUTIONS = 0.2, 0.5, 0.8, 0.9, 1.0
 PHASES, ELEMENTS = 14, 20
-SPEED = 1e-4  # over the wave speed: small enough for linear rods also where large steps throw nodes about
+SPEED = 1e-4  # relative to the wave speed, small enough for linear rods even with large steps
 LIMIT = 1.0 / ELEMENTS  # explicit limit of the step with lumped mass, l/c [s]
 COLUMNS = (("scheme", "lumped"), ("scheme", "consistent"), ("stick", "lumped"), ("conserving", "lumped"))
 COLUMNS += (("mass_redistribution", "lumped"),)
 EXPLICIT = "central_differences", "chung_lee", "hulbert_chung", "souza_moura"
 STEPS = 0.2, 1.0, 5.0, 20.0
-"""Over the explicit limit of the lumped rod; explicit schemes take 0.2 and 0.9 of their own limit."""
+"""Steps relative to the explicit limit of the lumped rod; explicit schemes use 0.2 and 0.9 of their own limit."""
 SCHEMES = (
     ("central_differences", {}),
     ("chung_lee", {"beta": 1.0}),
@@ -63,9 +62,9 @@ SCHEMES = (
 
 @dataclass(frozen=True)
 class Impacts:
-    """What impact made of the rods; arrays (phases,) as of :class:`pfem_petsc.contact.impact_phases.ImpactScan`.
+    """Results of the impacts; arrays (phases,) as in :class:`pfem_petsc.contact.impact_phases.ImpactScan`.
 
-    ``warned``: the program warned of gains before it started.
+    ``warned``: whether the program warned about gains before it started.
     """
 
     largest: np.ndarray
@@ -76,7 +75,7 @@ class Impacts:
 
 
 def write_rods(file: Path, step: float, speed: float = SPEED) -> None:
-    """A mesh of all rods side by side, tips at x = 0 less three steps of flight and (k + 1/2)/14 of one."""
+    """Write a mesh of all rods side by side, with tips three steps of flight and (k + 1/2)/14 of one before x = 0."""
     x = np.linspace(-1.0, 0.0, ELEMENTS + 1)
     points = np.zeros((PHASES, ELEMENTS + 1, 3))
     points[:, :, 0] = x - speed * step * (3.0 + (np.arange(PHASES)[:, None] + 0.5) / PHASES)
@@ -91,8 +90,8 @@ def write_rods(file: Path, step: float, speed: float = SPEED) -> None:
 def case_of(
     file: Path, integrator: str, parameters: dict, treatment: str, mass: str, step: float, restitution: float = 0.0
 ) -> Case:
-    """The rods as a case."""
-    # along its axis alone: a rod that is pressed would buckle within a few large steps, from rounding
+    """Return the case of the rods."""
+    # motion along the axis only: a compressed rod would buckle within a few large steps due to rounding
     supports = [] if integrator in EXPLICIT else [{"node_set": "all", "fix": "yz"}]
     wall = {"name": "wall", "type": "plane", "point": [0.0] * 3, "normal": [-1.0, 0.0, 0.0], "node_set": "tips"}
     return Case.from_dict(
@@ -114,7 +113,7 @@ def case_of(
 def impacts(
     integrator: str, parameters: dict, treatment: str, mass: str, step: float, restitution: float = 0.0
 ) -> Impacts | None:
-    """Run all phases; ``step`` over the explicit limit. None where the program refuses the pair."""
+    """Run all phases; ``step`` is relative to the explicit limit. None if the program refuses the combination."""
     h = step * LIMIT
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "rods.h5"
@@ -164,20 +163,20 @@ def _run(model: Model, stepper: Stepper, steps: int) -> Impacts:
 
 
 def own_limit(integrator: str, parameters: dict, mass: str) -> float:
-    """Largest step of a scheme over l/c, infinite for most implicit ones."""
+    """Return the largest step of a scheme over l/c, infinite for most implicit ones."""
     module = lookup("pfem_petsc.integrators", integrator, "")
     limit = module.Scheme(module.Parameters(**parameters)).limit()
     return 0.5 * limit / (np.sqrt(3.0) if mass == "consistent" else 1.0)
 
 
 def steps_of(integrator: str, parameters: dict, mass: str) -> list[float]:
-    """Steps over l/c that the table has."""
+    """Return the steps over l/c in the table."""
     limit = own_limit(integrator, parameters, mass)
     return list(STEPS) if np.isinf(limit) else [0.2 * limit, 0.9 * limit]
 
 
 def label(integrator: str, parameters: dict) -> str:
-    """Scheme and parameters as in a case file."""
+    """Return scheme and parameters as in a case file."""
     numbers = {28.0 / 27.0: "28/27", 0.25: "1/4", 0.5: "1/2", 1.5: "3/2"}
     parts = [
         f"{name} {numbers.get(value, f'{value:g}') if integrator != 'wilson' else value}"
@@ -187,7 +186,7 @@ def label(integrator: str, parameters: dict) -> str:
 
 
 def cell(found: Impacts | None) -> str:
-    """Largest energy on the way, largest at the end, false releases, largest force; an asterisk where it warns."""
+    """Return largest energy, largest final energy, false releases, largest force; an asterisk marks a warning."""
     if found is None:
         return "-"
     star = "*" if found.warned else ""
@@ -200,7 +199,7 @@ def cell(found: Impacts | None) -> str:
 def judged(
     integrator: str, parameters: dict, treatment: str, mass: str, step: float, restitution: float = 0.0
 ) -> Impacts | None:
-    """As :func:`impacts`, of the small rods; ``step`` over the explicit limit."""
+    """As :func:`impacts`, for the small rods; ``step`` is relative to the explicit limit."""
     module = lookup("pfem_petsc.integrators", integrator, "")
     known = module.Parameters(**parameters)
     scheme = module.Scheme(known)
@@ -215,7 +214,7 @@ def judged(
 
 
 def lines(of: Callable[..., Impacts | None]) -> Iterator[str]:
-    """The rows of the table."""
+    """Yield the rows of the table."""
     yield "| integrator | step | " + " | ".join(f"{treatment}, {mass}" for treatment, mass in COLUMNS) + " |"
     yield "|---" * (2 + len(COLUMNS)) + "|"
     for integrator, parameters in SCHEMES:
@@ -228,7 +227,7 @@ def lines(of: Callable[..., Impacts | None]) -> Iterator[str]:
 
 
 def rebounds(of: Callable[..., Impacts | None]) -> Iterator[str]:
-    """The rows of the table of walls with restitution."""
+    """Yield the rows of the table of walls with restitution."""
     yield "| integrator | step | " + " | ".join(f"e = {e:g}" for e in RESTITUTIONS) + " |"
     yield "|---" * (2 + len(RESTITUTIONS)) + "|"
     for integrator, parameters in SCHEMES:
@@ -238,7 +237,7 @@ def rebounds(of: Callable[..., Impacts | None]) -> Iterator[str]:
 
 
 def main() -> None:
-    """Run everything, and put the tables between their marks in the document."""
+    """Run everything, and insert the tables between their marks in the document."""
     tables = ((lines, START, END), (rebounds, START_REBOUNDS, END_REBOUNDS))
     if "--program" in sys.argv[1:]:
         for table, _, _ in tables:

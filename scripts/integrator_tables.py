@@ -1,8 +1,8 @@
-"""Tables of docs/integrators.md, from the schemes themselves on the linear oscillator.
+"""Tables of docs/integrators.md, computed with the schemes themselves on the linear oscillator.
 
 usage: python scripts/integrator_tables.py [--check]
-Rewrites what stands between <!-- table NAME --> and <!-- end --> in docs/integrators.md; with --check it changes
-nothing and fails where the file is not up to date.
+Rewrites the text between <!-- table NAME --> and <!-- end --> in docs/integrators.md; with --check it changes
+nothing and fails if the file is not up to date.
 """
 
 from __future__ import annotations
@@ -50,15 +50,15 @@ ROWS = (
 
 
 def make(row: Row) -> Scheme:
-    """The scheme of a line."""
+    """Return the scheme of a line."""
     module = lookup("pfem_petsc.integrators", row.integrator, "table")
     return module.Scheme(module.Parameters(**row.parameters))
 
 
 def advance(scheme: Scheme, state: State, h: float, held: bool) -> None:
-    """One step of a unit mass on a unit spring (omega = 1), or of a node whose position is held at x = 0, in place.
+    """Make one step of a unit mass on a unit spring (omega = 1), or of a node fixed at x = 0, in place.
 
-    The balance is solved as the program does: M a + (1 - w) f(x0) + w f(x) = 0, or x = 0.
+    The balance is solved as in the program: M a + (1 - w) f(x0) + w f(x) = 0, or x = 0.
     """
     if scheme.solves_next_position:
         scheme.advance(state, h)
@@ -76,7 +76,7 @@ def advance(scheme: Scheme, state: State, h: float, held: bool) -> None:
 
 
 def amplification(row: Row, h: float, held: bool = False) -> np.ndarray:
-    """The matrix of one step, on (x, v h, a h^2) and the scheme's memory; column by column from unit states."""
+    """Return the matrix of one step on (x, v h, a h^2) and the scheme's memory, column by column from unit states."""
     names = MEMORY.get(row.integrator, ())
     size = 3 + len(names)
     scales = np.array([1.0, 1.0 / h, 1.0 / h**2] + [1.0 / h if name == "half_velocity" else 1.0 for name in names])
@@ -93,18 +93,18 @@ def amplification(row: Row, h: float, held: bool = False) -> np.ndarray:
 
 
 def radius(row: Row, h: float, held: bool = False) -> float:
-    """Spectral radius of a step; an oscillator's without the root 1 that holds for no initial state."""
+    """Return the spectral radius of a step; for an oscillator without the root 1 that no initial state excites."""
     return float(np.abs(np.linalg.eigvals(amplification(row, h, held))).max())
 
 
 def principal(row: Row, h: float) -> complex:
-    """The eigenvalue that approximates exp(i omega h)."""
+    """Return the eigenvalue that approximates exp(i omega h)."""
     values = np.linalg.eigvals(amplification(row, h))
     return complex(values[np.argmin(np.abs(values - np.exp(1j * h)))])
 
 
 def damping_and_period(row: Row, share: float) -> tuple[float, float]:
-    """Algorithmic damping ratio, and relative error of the period, at h/T."""
+    """Return the algorithmic damping ratio, and the relative error of the period, at h/T."""
     omega = 2.0 * np.pi * share
     value = principal(row, omega)
     angle = abs(np.angle(value))
@@ -112,13 +112,13 @@ def damping_and_period(row: Row, share: float) -> tuple[float, float]:
 
 
 def order(row: Row) -> int:
-    """Of the principal eigenvalue: the local error falls with h^(order + 1)."""
+    """Return the order of the principal eigenvalue, whose local error decreases with h^(order + 1)."""
     errors = [abs(principal(row, h) - np.exp(1j * h)) for h in (0.02, 0.01)]
     return round(np.log2(errors[0] / errors[1])) - 1
 
 
 def limit(row: Row) -> float:
-    """Largest stable omega h by bisection; infinite where 10^4 is stable."""
+    """Return the largest stable omega h by bisection; infinite if 10^4 is stable."""
     stable = lambda h: radius(row, h) <= 1.0 + 1e-6  # noqa: E731 - double roots on the circle are off by 1e-8
     if stable(1e4):
         return np.inf
@@ -134,7 +134,7 @@ def _lines(head: list[str], rows: list[list[str]]) -> str:
 
 
 def accuracy_table() -> str:
-    """Order, limit, high frequencies, damping ratio and period error."""
+    """Return the table of order, limit, high frequencies, damping ratio and period error."""
     rows = []
     for row in ROWS:
         bound = limit(row)
@@ -149,7 +149,7 @@ def accuracy_table() -> str:
 
 
 def held_table() -> str:
-    """Velocities of a node that flies at v and is then held at a wall that it has just reached."""
+    """Return the table of velocities of a node that flies at v and is then fixed at a wall that it has just reached."""
     rows = []
     for row in ROWS:
         scheme, h = make(row), 1.0
@@ -158,7 +158,7 @@ def held_table() -> str:
         state = State(zero.copy(), one.copy(), zero.copy(), zero, zero, zero, zero)
         state.memory = {name: one.copy() for name in names}
         shown = []
-        if scheme.solves_next_position:  # the position has come from the velocity before: at the wall by then
+        if scheme.solves_next_position:  # the position follows from the previous velocity and is at the wall already
             state.x = -one
         for _ in range(6):
             advance(scheme, state, h, held=True)
@@ -172,7 +172,7 @@ def held_table() -> str:
 
 
 def spin_table() -> str:
-    """Angular momentum and energy left of a free bar after five turns of 100 steps, by the program."""
+    """Return the table of remaining angular momentum and energy of a free bar after five turns of 100 steps each."""
     from pfem_petsc import Case, Simulation
 
     stretch, h = 4e-3, 2.0 * np.pi / 100  # rho omega^2 l^2/(4 E), which also sets the bar's own frequency; omega = 1
@@ -206,7 +206,7 @@ TABLES = {"accuracy": accuracy_table, "held": held_table, "spin": spin_table}
 
 
 def filled(text: str) -> str:
-    """The document with its tables computed anew."""
+    """Return the document with its tables recomputed."""
     for name, table in TABLES.items():
         start = f"<!-- table {name} -->\n"
         before, found, after = text.partition(start)

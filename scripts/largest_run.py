@@ -1,9 +1,9 @@
-"""An explicit run of 10^8 bars on one rank: a cubic lattice dropped on a floor; time a step, memory, and a picture.
+"""An explicit run of 10^8 bars on one rank: a cubic lattice dropped on a floor; time per step, memory, and a picture.
 
     .venv/bin/python scripts/largest_run.py -o results/largest                  # 100,403,520 bars: 10 GB, some minutes
     .venv/bin/python scripts/largest_run.py --cells 48 --steps 40 -o results/smaller
 
-The picture shows the velocity along the fall in the middle plane at the end: the wave that the floor has sent up.
+The picture shows the vertical velocity in the middle plane at the end, with the wave reflected by the floor.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def main() -> int:
 
 
 def draw(simulation: Simulation, path: Path) -> None:
-    """The velocity along z of the nodes of the middle plane, each at its place in the lattice."""
+    """Draw the velocity along z of the nodes of the middle plane at their positions in the lattice."""
     from matplotlib import pyplot
 
     points = simulation.mesh.points

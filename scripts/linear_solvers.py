@@ -1,4 +1,4 @@
-"""Which linear solver is fastest at which step and size: the table behind ``solver.linear = "auto"``.
+"""Measures the fastest linear solver by step and size: the table behind ``solver.linear = "auto"``.
 
     python scripts/linear_solvers.py                          # 10^4 and 10^5 bars; some minutes
     python scripts/linear_solvers.py --cells 48 --steps 1     # 10^6 bars, in 10 GB of memory
@@ -6,8 +6,8 @@
 
 Newmark steps (beta = 1/4, gamma = 1/2) of an elastic cubic lattice that flies, vibrating, at 1, 10, 100 and 1000 times
 the critical step of central differences. Writes Markdown and JSON; times are CPU seconds of the slowest rank, per step,
-after a first step. What a lagged preconditioner takes once, in that first step, is in a column of its own; other
-preconditioners are made at every Newton iteration. An entry that takes 10 times the best so far is ended, with ">".
+after a first step. The set-up of a lagged preconditioner, in that first step, has a separate column; other
+preconditioners are set up at every Newton iteration. An entry that takes 10 times the best so far is stopped, with ">".
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ ENDED = 10.0  # times the best
 
 
 def case(cells: int, step: float, steps: int, overrides: tuple[str, ...]) -> Case:
-    """The lattice with a velocity field that bends and stretches it: a rotation and a shear."""
+    """Return the lattice with a velocity field that bends and stretches it: a rotation and a shear."""
     from pfem_petsc import Case
 
     pitch, extent = 0.01, 0.01 * cells
@@ -67,10 +67,10 @@ def case(cells: int, step: float, steps: int, overrides: tuple[str, ...]) -> Cas
 def measure(
     cells: int, ratio: float, overrides: tuple[str, ...], steps: int, most: float = np.inf, horizon: int = 10
 ) -> dict[str, float | str | bool]:
-    """Seconds, Newton and linear iterations a step, after a first step that is not counted.
+    """Return seconds, Newton and linear iterations per step, after a first step that is not counted.
 
-    Ended after the step at which more than ``most`` seconds a step are certain. The run is one of ``horizon`` steps at
-    least, of which the first are made: short runs choose otherwise.
+    The run is stopped as soon as more than ``most`` seconds per step are certain. Its end corresponds to at least
+    ``horizon`` steps, of which only the first are made, because the automatic choice depends on the number of steps.
     """
     from pfem_petsc import Simulation
 
@@ -111,7 +111,7 @@ def measure(
 
 
 def timed(function: Callable[..., Any], seconds: list[float]) -> Callable[..., Any]:
-    """The function, which adds the CPU seconds it takes."""
+    """Wrap a function such that its CPU time is accumulated."""
 
     def call(*arguments: Any) -> None:
         began = time.process_time()

@@ -1,4 +1,4 @@
-"""Make the example meshes of ``meshes/``; the same files, byte for byte, at every call.
+"""Creates the example meshes of ``meshes/``, byte for byte identical at every call.
 
     .venv/bin/python scripts/make_meshes.py
 
@@ -54,13 +54,13 @@ def make_ring(path: Path) -> None:
 
 
 def make_space_truss(path: Path) -> None:
-    """Write a ball of radius 1 m: bars on the edges of tetrahedra between jittered points, its skin a group."""
+    """Write a ball of radius 1 m: bars on the edges of tetrahedra between jittered points, with its skin as a group."""
     import pyvista
 
     random = np.random.default_rng(20180842)
     spacing, radius = 0.3, 1.0
     grid = np.stack(np.meshgrid(*[np.arange(-4, 5)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-    # Face-centred positions: as far from each other as positions of this density can be, before they are moved.
+    # Face-centred positions, the densest packing, before they are moved.
     inside = grid[grid.sum(axis=1) % 2 == 0] * (spacing / np.sqrt(2.0))
     inside = inside[np.linalg.norm(inside, axis=1) < radius - 0.5 * spacing]
     inside = inside + random.uniform(-0.15, 0.15, inside.shape) * spacing
@@ -90,7 +90,7 @@ def make_space_truss(path: Path) -> None:
 
 
 def make_mast(path: Path) -> None:
-    """Write a mast of square section, 1 m wide, 12 bays of 1 m, as the XML text that ParaView reads."""
+    """Write a mast of square section, 1 m wide, 12 bays of 1 m, as XML text for ParaView."""
     bays, width, height = 12, 1.0, 1.0
     corner = 0.5 * width * np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
     points = np.array([[x, y, height * level] for level in range(bays + 1) for x, y in corner])

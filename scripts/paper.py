@@ -1,7 +1,7 @@
-"""Reproduce the paper's examples: run, measure, draw docs/images/paper, write docs/paper.md.
+"""Reproduces the paper's examples: runs, measurements, figures in docs/images/paper, and docs/paper.md.
 
 usage: python scripts/paper.py [--workers 2] [--results results/paper] [--redraw]
-Runs take about six minutes on two cores; they are kept, and run again only when the case or the program changes.
+Runs take about six minutes on two cores; they are kept, and repeated only if the case or the program changes.
 """
 
 from __future__ import annotations

@@ -1,14 +1,14 @@
-"""Run random valid cases and check what must hold of the results of any case.
+"""Runs random valid cases and checks properties that the results of any case must have.
 
     .venv/bin/python scripts/random_cases.py --seeds 0:1000 --jobs 2 --keep failing
     .venv/bin/python scripts/random_cases.py --cases failing/*.toml
 
-Cases are drawn over all documented keys and their combinations, one a seed. Each is run on one rank and on three, in
-one process for many cases; every third one is also stopped in the middle and continued. Checked are: status 0, 2 or 3,
-with a message where it is not 0; no node beyond a wall, finite results, the balance of energy, its growth,
-dissipations, momentum, ranks against each other to 1e-9 and, bit for bit, the continued run; with `--schemes-every`
-also that an explicit and an implicit scheme tend to the same motion as steps shrink. A case that crashes or
-hangs is found and left behind. Status 0 when nothing is wrong.
+Cases are drawn over all documented keys and their combinations, one per seed. Each is run on one rank and on three, in
+one process for many cases; every third one is also stopped in the middle and continued. Checks: status 0, 2 or 3, with
+a message unless it is 0; no node beyond a wall; finite results; energy balance and growth; dissipations; momentum;
+agreement between numbers of ranks to 1e-9; bitwise identical continued runs; with `--schemes-every` also convergence of
+an explicit and an implicit scheme to the same motion. Cases that crash or hang are reported and skipped. Status 0 if
+there are no faults.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ from typing import TextIO
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 CHUNK = 40
-"""Cases of a process: what one leaves behind cannot harm more."""
+"""Number of cases per process, which limits side effects between cases."""
 LOOSE = ("energy balance above 1e-9", "chaotic: ")
-"""Causes that are counted and are no failure."""
+"""Causes that are counted but are not failures."""
 
 
 def main() -> int:
-    """Run as many as asked, and say what is wrong by cause."""
+    """Run the requested cases, and report faults by cause."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", default="0:200", metavar="A:B", help="from A to before B (default: %(default)s)")
     parser.add_argument("--cases", type=Path, nargs="+", default=[], metavar="FILE", help="case files instead")
@@ -80,7 +80,7 @@ def _sources(arguments: argparse.Namespace) -> dict[int, str]:
 
 
 class Study:
-    """What was found so far.
+    """Results so far.
 
     Attributes
     ----------
@@ -97,7 +97,7 @@ class Study:
         self._lock = threading.Lock()
 
     def chunk(self, seeds: list[int]) -> None:
-        """Run some cases on one rank and on several, compare, and take their results away."""
+        """Run some cases on one rank and on several, compare, and remove their results."""
         alone = self._work("check", seeds, 1)
         ended = [seed for seed in seeds if alone.get(seed, {}).get("status") == 0]
         for seed, told in alone.items():
@@ -157,7 +157,7 @@ class Study:
         return self.arguments.cases[seed].name if self.arguments.cases else str(seed)
 
     def _work(self, mode: str, seeds: Sequence[int], ranks: int) -> dict[int, dict]:
-        """What the worker says of each case, in as many processes as it takes to get past those that end one."""
+        """Return the worker's report of each case, starting new processes after cases that end one."""
         told: dict[int, dict] = {}
         left = list(seeds)
         while left:
@@ -180,7 +180,7 @@ class Study:
         return told
 
     def _process(self, mode: str, seeds: list[int], ranks: int, told: dict[int, dict]) -> tuple[int | None, str]:
-        """Let one process work; gives the case in work when it ended before its time, and how it ended."""
+        """Run one worker process; if it ends early, return the case in progress and how it ended."""
         line = [sys.executable, __file__, "--worker", mode, "--seeds", json.dumps(seeds)]
         line += ["--folder", str(self.folder), "--restart-every", str(self.arguments.restart_every)]
         if self.arguments.cases:
@@ -223,7 +223,7 @@ class Study:
             return current, f"{alone}status {status}: {' | '.join(errors.read()[-400:].split(chr(10)))}"
 
     def report(self, seconds: float) -> int:
-        """Print the table by cause; gives the exit status."""
+        """Print the table by cause; return the exit status."""
         print("\n".join(f"{count:6}  {what}" for what, count in sorted(self.statuses.items())))
         print("\nrefused or failed with a message:")
         for text, seeds in sorted(self.refusals.items(), key=lambda entry: -len(entry[1])):

@@ -2,9 +2,9 @@
 
 usage: python scripts/scaling.py [--ranks 1 2 4] [--strong 1000000] [--weak 500000] [--jobs explicit matrix_free]
 
-Every point is a run of "bench" under mpirun, kept in results/scaling; a study that was interrupted goes on where it
-stopped, and --again runs all anew. Written there: scaling.csv, scaling.md, strong.png, weak.png, model.md, model.png.
-On a cluster give --launcher "srun -n {ranks}"; docs/scaling.md has a job script and says how the model is made.
+Every point is a run of "bench" under mpirun, stored in results/scaling; an interrupted study continues where it
+stopped, and --again repeats all runs. Files written: scaling.csv, scaling.md, strong.png, weak.png, model.md,
+model.png. On a cluster use --launcher "srun -n {ranks}"; docs/scaling.md has a job script and describes the model.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ MODEL_SIZES = [1e6, 1e7, 1e8, 1e9, 1e10]
 
 
 def main() -> int:
-    """Run what is missing, then tables, plots and model from all that is there."""
+    """Run missing points, then make tables, plots and model from all points."""
     cores = os.cpu_count() or 1
     powers = [2**k for k in range(12) if 2**k <= cores]
     parser = argparse.ArgumentParser(

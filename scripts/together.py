@@ -1,9 +1,9 @@
-"""Start several runs into one folder at once, round after round: three starts, then two restarts.
+"""Starts several runs into one folder at once, in repeated rounds of three starts and two restarts.
 
     .venv/bin/python scripts/together.py --rounds 20
 
-Of each round one run must work, the others must be refused with status 2 and say why, and what is in the folders must
-be whole and equal to the results of a run that nobody disturbed, bit for bit. Status 0 when all rounds were so.
+In each round one run must succeed, the others must be refused with status 2 and a message, and the results must be
+complete and bitwise identical to those of a single run. Status 0 if all rounds pass.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from pfem_petsc.cli.main import main as program  # noqa: E402
 
 
 def main() -> int:
-    """Play as often as asked."""
+    """Run the requested number of rounds."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=20, metavar="N", help="how many (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=None, help="of the moments of the starts")

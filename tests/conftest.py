@@ -1,8 +1,9 @@
 """Tests on one rank and on several: ``mpirun -n 3 python -m pytest`` runs those marked ``parallel``.
 
-All ranks run the same tests in step. The outcome of each phase of a test (set-up, call, tear-down) is agreed on, so a
-failure on one rank is a failure everywhere, with that rank's report. A rank that waits for the others too long, as
-when one of them left a collective call early by an exception, says so and ends the run. Only rank 0 prints.
+All ranks run the same tests in the same order and agree on the outcome of each phase of a test (set-up, call,
+tear-down), so a failure on one rank is a failure on all, with that rank's report. A rank that waits too long for the
+others, for example because an exception ended a collective call on one of them, reports this and ends the run. Only
+rank 0 prints.
 
 Of tests that take long or have many sets of parameters a part is run, and those marked ``thorough`` are left out;
 ``--all-sets`` runs everything.
@@ -30,7 +31,7 @@ if "PYTEST_XDIST_WORKER" in os.environ:
     for _name in [name for name in os.environ if name.startswith(OF_A_LAUNCH)]:
         del os.environ[_name]
 
-# In the background and under nohup this process ignores signals, and so would the runs that tests stop by them.
+# In the background and under nohup this process ignores signals, and so would the runs that tests stop with signals.
 for _number, _handler in ((signal.SIGINT, signal.default_int_handler), (signal.SIGHUP, signal.SIG_DFL)):
     if signal.getsignal(_number) is signal.SIG_IGN:
         signal.signal(_number, _handler)
@@ -62,7 +63,7 @@ def pytest_configure(config: pytest.Config) -> None:
     if AGREEMENT is not None:
         # A folder of its own for each rank: pytest's numbered ones are claimed by several at once.
         config.option.basetemp = tempfile.mkdtemp(prefix=f"pytest-rank{WORLD.rank}-")
-        # Ended from outside, as at a time limit: the report of what was found so far still comes.
+        # On SIGTERM, for example at a time limit, the results so far are still reported.
         signal.signal(signal.SIGTERM, signal.default_int_handler)
 
 
@@ -96,10 +97,10 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def thinned(items: list[pytest.Item], ranks: int) -> list[pytest.Item]:
-    """Every test function but the thorough ones, with some of its sets of parameters.
+    """Return all tests except the thorough ones, with some of their sets of parameters.
 
-    Of slow ones every fourth set; of the others, on several ranks, every third or fifth where there are more than
-    three. Which sets these are differs from one number of ranks to the next.
+    Slow tests run with every fourth set; on several ranks the others run with every third or fifth set if they have
+    more than three. The selection depends on the number of ranks.
     """
     sets: dict[tuple[Path, str], list[pytest.Item]] = {}
     for item in items:
@@ -142,7 +143,7 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
             report.outcome = "failed"
             report.longrepr = "\n".join(f"--- rank {rank} of {WORLD.size}\n{texts[rank]}" for rank in failed)
     elif worst == SKIPPED and mine == PASSED and report.when == "setup":
-        # Not run here either: the others would be missing from its collective calls.
+        # Skipped here too: the other ranks would be missing from its collective calls.
         report.outcome = "skipped"
         report.longrepr = (str(item.path), 0, "Skipped: on another rank")
     return report
@@ -162,7 +163,7 @@ def pytest_runtest_logfinish(nodeid: str, location: tuple) -> None:
 
 
 def wait_for_all(what: str, outcome: int, text: str) -> int:
-    """Agree on the worst outcome of a phase over all ranks, or end the run when some rank never gets there."""
+    """Agree on the worst outcome of a phase over all ranks, or end the run if a rank does not arrive."""
     worst = bytearray([outcome])
     request = AGREEMENT.Iallreduce(MPI.IN_PLACE, [worst, MPI.UNSIGNED_CHAR], op=MPI.MAX)
     start = time.monotonic()
@@ -198,14 +199,14 @@ def shared_tmp_path() -> Iterator[Path]:
 
 @pytest.fixture
 def on_ranks() -> Callable[..., subprocess.CompletedProcess]:
-    """Run Python on several ranks, apart from this process: ``on_ranks(2, "-m", "pfem_petsc", "case.toml", cwd=...)``.
+    """Run Python on several ranks in separate processes: ``on_ranks(2, "-m", "pfem_petsc", "case.toml", cwd=...)``.
 
     The result has ``returncode``, ``stdout`` and ``stderr``; ``timeout`` [s] ends all ranks with an exception.
     """
 
     def run(ranks: int, *arguments: str | Path, timeout: float = 400.0, **options) -> subprocess.CompletedProcess:
         command = ["mpirun", "-n", str(ranks), sys.executable, *map(str, arguments)]
-        # timeout(1) ends mpirun politely, and mpirun its ranks; a killed mpirun would leave them behind.
+        # timeout(1) sends SIGTERM to mpirun, which ends its ranks; a killed mpirun would leave them running.
         command = ["timeout", "--kill-after=10", str(timeout), *command]
         done = subprocess.run(command, env=environment(), capture_output=True, text=True, **options)
         if done.returncode in (124, 137):

@@ -1,4 +1,4 @@
-"""docs/case_file.md names every key of a case file, and its example can be read."""
+"""docs/case_file.md documents every key of a case file, and its example is valid."""
 
 from __future__ import annotations
 

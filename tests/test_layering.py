@@ -1,4 +1,4 @@
-"""Imports never climb: a folder of the package imports only from floors below its own, within functions as well.
+"""Imports never climb: a folder of the package imports only from lower floors, even within functions.
 
 What only a checker of types reads (``if TYPE_CHECKING:``) may name a type of a higher floor.
 """

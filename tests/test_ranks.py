@@ -1,4 +1,4 @@
-"""The test runner itself: a failure on one rank is seen, told and hangs nothing."""
+"""The test runner itself: a failure on one rank is detected and reported, and nothing hangs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every function of the package and of the scripts has types, but for those that are compiled.
+"""Every function of the package and the scripts has types, except compiled loops.
 
 ruff requires them too, but does not recognise compiled loops, so files with such loops are exempt there as a whole.
 """

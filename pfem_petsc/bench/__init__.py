@@ -1,1 +1,1 @@
-"""Measurements of this program on this machine: bandwidth, steps per second, memory."""
+"""Performance measurements on this machine: bandwidth, steps per second, memory."""

@@ -1,4 +1,4 @@
-"""The machine's memory bandwidth by the STREAM triad, for one process and for all at once."""
+"""Memory bandwidth of the machine by the STREAM triad, for one process and for all at once."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ if TYPE_CHECKING:
 __all__ = ["BYTES_PER_ELEMENT", "Bandwidth", "measure_bandwidth"]
 
 BYTES_PER_ELEMENT = 24
-"""As STREAM counts: two reads and a write of 8 B. What a cache reads before it is overwritten is not counted."""
+"""As STREAM counts: two reads and a write of 8 B. Cache lines read before they are overwritten are not counted."""
 
-_ELEMENTS = 8_000_000  # 64 MB an array and process: beyond the share of a core in any cache of today
+_ELEMENTS = 8_000_000  # 64 MB per array and process, larger than the share of a core in any current cache
 
 
 class Bandwidth(NamedTuple):
@@ -29,7 +29,7 @@ class Bandwidth(NamedTuple):
 
     @property
     def ratio(self) -> float:
-        """How much faster all are than one: the ceiling of the speed-up of what memory limits."""
+        """Bandwidth of all ranks relative to one: the maximum speed-up of memory-bound work."""
         return self.together / self.alone
 
 
@@ -42,7 +42,7 @@ def _triad(a, b, c, scalar):
 def measure_bandwidth(comm: MPI.Comm, repeats: int = 10) -> Bandwidth:
     """Measure both. Collective; the other ranks sleep while one is measured."""
     a, b, c = np.zeros(_ELEMENTS), np.full(_ELEMENTS, 1.0), np.full(_ELEMENTS, 2.0)
-    _triad(a, b, c, 3.0)  # compiled, and every page touched
+    _triad(a, b, c, 3.0)  # compile, and touch every page
     size = BYTES_PER_ELEMENT * _ELEMENTS
     alone = 0.0
     if comm.rank == 0:
@@ -54,7 +54,7 @@ def measure_bandwidth(comm: MPI.Comm, repeats: int = 10) -> Bandwidth:
         slowest = []
         for _ in range(repeats):
             comm.Barrier()
-            # the slowest of a round: the others are not alone with the memory until it is done
+            # the slowest of a round, because all share the memory until it has finished
             slowest.append(max(comm.allgather(_timed(a, b, c))))
         together = comm.size * size / min(slowest)
     return Bandwidth(alone, together, comm.size)
@@ -67,7 +67,7 @@ def _timed(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> float:
 
 
 def _sleep_until_all(comm: MPI.Comm) -> None:
-    """A barrier that leaves the cores to those who have not arrived."""
+    """Wait at a barrier without using the cores."""
     from time import sleep
 
     request = comm.Ibarrier()

@@ -1,4 +1,4 @@
-"""The lattices that are timed: a block of cubic, octet or body-centred cells that is thrown at a floor."""
+"""The lattices that are timed: a block of cubic, octet or body-centred cells that hits a floor."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ KINDS = {
 
 @dataclass(frozen=True)
 class Job:
-    """One thing to time.
+    """A measurement.
 
     Attributes
     ----------
-    name : what the tables call it
+    name : in the tables
     integrator : name of a time integration scheme
     operator : of an implicit scheme: ``matrix_free`` or ``assembled``
     linear : linear solver of an implicit scheme
@@ -59,12 +59,12 @@ class Job:
 
 
 def bars_of(kind: str, cells: int) -> int:
-    """Bars of ``cells`` x ``cells`` x ``cells`` cells."""
+    """Return the number of bars of ``cells`` x ``cells`` x ``cells`` cells."""
     return KINDS[kind](cells)
 
 
 def cells_for(kind: str, bars: int) -> int:
-    """Cells along an edge of the lattice whose number of bars is nearest to ``bars``, at least one."""
+    """Return the cells along an edge, at least one, of the lattice whose number of bars is nearest to ``bars``."""
     n = 1
     while bars_of(kind, n + 1) <= bars:
         n += 1
@@ -72,9 +72,9 @@ def cells_for(kind: str, bars: int) -> int:
 
 
 def make_case(job: Job, kind: str, cells: int, steps: int, **time: Any) -> Case:
-    """The case of a job on a lattice: ``steps`` steps, history but no fields.
+    """Return the case of a job on a lattice, with ``steps`` steps and a history but no fields.
 
-    ``time`` holds further keys of ``[time]``.
+    ``time`` contains further keys of ``[time]``.
     """
     from ..case.schema import Case
 
@@ -95,6 +95,6 @@ def make_case(job: Job, kind: str, cells: int, steps: int, **time: Any) -> Case:
     if job.contact:
         table["wall"] = [{"name": "floor", "type": "plane", "point": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0]}]
     else:
-        # the same speed at the corners, by a spin: bars are strained and turn
+        # a spin with the same speed at the corners, which strains and rotates bars
         table["initial"] = {"angular_velocity": [2.0 * job.speed / edge, 0.0, 0.0]}
     return Case.from_dict(table, source="bench", folder=Path.cwd())

@@ -1,4 +1,4 @@
-"""What the bench times."""
+"""The measurements of the bench."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _CROSSING = PITCH / WAVE_SPEED  # [s] of a wave along the edge of a cell
 def jobs(
     names: list[str], explicit: str, implicit: str, mass: str, plastic: bool | None, history_every: int
 ) -> list[Job]:
-    """The jobs of these names.
+    """Return the jobs of these names.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ def jobs(
 
 
 def tiny_jobs(explicit: str) -> list[Job]:
-    """Jobs whose loops over bars take no time on a few bars: what remains is the cost of a step outside them."""
+    """Return jobs with so few bars that the measured time is the cost of a step outside the loops over bars."""
     step = 0.02 * _CROSSING
     return [
         Job("tiny", explicit, step=step),

@@ -1,4 +1,4 @@
-"""Time the steps of a job on a lattice through the public interface."""
+"""Times the steps of a job on a lattice through the public interface."""
 
 from __future__ import annotations
 
@@ -19,23 +19,23 @@ if TYPE_CHECKING:
 
 __all__ = ["Record", "time_job"]
 
-_FEWEST = 4  # steps timed, even if each takes longer than the time given
+_FEWEST = 4  # minimum number of timed steps, even if each takes longer than the given time
 
 
 @dataclass(frozen=True)
 class Record:
-    """A job on a lattice, timed. Times in seconds, over steps after the first; memory in bytes.
+    """Measurements of a job on a lattice. Times in seconds, over steps after the first; memory in bytes.
 
     Attributes
     ----------
     median, best : of a step, wall clock on rank 0
     cpu : processor time of a step, all ranks together
     setup, first : wall clock of the set-up, and from there to the end of the first step (with output opened)
-    newton, linear : iterations of a step, mean
-    traffic : bytes that a step moves at least
+    newton, linear : mean number of iterations of a step
+    traffic : minimum number of bytes that a step moves
     share : percent of the bandwidth of all ranks that this traffic needs at the median
-    memory : highest growth of resident memory, all ranks together
-    ghosts, neighbours : nodes of others and ranks to exchange with, most of any rank
+    memory : maximum growth of resident memory, all ranks together
+    ghosts, neighbours : maximum number of ghosts, and of neighbouring ranks, over all ranks
     evaluated : bars evaluated on all ranks together; those between two ranks are evaluated on both
     """
 
@@ -62,7 +62,7 @@ class Record:
 
     @property
     def rate(self) -> float:
-        """Bar updates a second: bars over the median step."""
+        """Bar updates per second: bars over the median step."""
         return self.bars / self.median
 
 
@@ -72,7 +72,7 @@ def time_job(
     """Run a job for about ``seconds``, at most ``most`` steps. Collective."""
     from ..simulation import Simulation
 
-    # while the front of an elastic impact runs to the far side and back, the foot stays on the floor
+    # the foot stays on the floor until the elastic wave has run to the far side and back
     lasting = int(2.0 * cells * PITCH / WAVE_SPEED / job.step) if job.contact else most
     steps = max(min(most, lasting), _FEWEST + 2)
     case = make_case(job, kind, cells, steps)
@@ -84,10 +84,10 @@ def time_job(
         ready = perf_counter()
         times, cpu, newton, linear = [], 0.0, 0, 0
         count = None
-        running = simulation.batches(min_steps=1)  # as a long run
+        running = simulation.batches(min_steps=1)  # as in a long run
         next(running)
         first = perf_counter() - ready
-        last = next(running).step  # loads what makes several steps at once
+        last = next(running).step  # loads the fused loop
         before, cpu_before = perf_counter(), process_time()
         for step in running:
             now = perf_counter()

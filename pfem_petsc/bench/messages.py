@@ -1,4 +1,4 @@
-"""What messages between ranks cost: the parts of a model of larger machines."""
+"""Cost of messages between ranks, as parameters of a performance model for larger machines."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ if TYPE_CHECKING:
 
 __all__ = ["Messages", "measure_messages"]
 
-_SUMMED = 40  # numbers in the sum over ranks that a row of history takes, about
+_SUMMED = 40  # approximate number of values in the reduction of a history row
 _LARGE = 1 << 20  # B
 
 
 class Messages(NamedTuple):
-    """Between ranks of this run, on whatever they share.
+    """Cost of messages between ranks of this run, over their network or shared memory.
 
     Attributes
     ----------
-    latency : of a message of 8 B between the first rank and the last, half a round trip [s]
-    bandwidth : of messages of 1 MiB between these [B/s]
+    latency : of a message of 8 B between the first and the last rank, half a round trip [s]
+    bandwidth : of messages of 1 MiB between these ranks [B/s]
     reduction : of a sum of 40 numbers over all ranks [s]
     """
 
@@ -32,7 +32,7 @@ class Messages(NamedTuple):
 
 
 def measure_messages(comm: MPI.Comm, repeats: int = 300) -> Messages | None:
-    """Measure; medians, None on one rank. Collective."""
+    """Measure and return medians; None on one rank. Collective."""
     if comm.size == 1:
         return None
     small = _one_way(comm, np.zeros(1), repeats)
@@ -49,7 +49,7 @@ def measure_messages(comm: MPI.Comm, repeats: int = 300) -> Messages | None:
 
 
 def _one_way(comm: MPI.Comm, data: np.ndarray, repeats: int) -> float:
-    """Median of half a round trip [s]; on rank 0, zero elsewhere."""
+    """Return the median of half a round trip [s] on rank 0, zero elsewhere."""
     last = comm.size - 1
     times = np.zeros(repeats)
     comm.Barrier()

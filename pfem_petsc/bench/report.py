@@ -1,4 +1,4 @@
-"""The bench's table and its JSON."""
+"""The table of the bench and its JSON."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ HEADER = f"{_FORMAT.format(*_NAMES)}\n{_FORMAT.format(*_UNITS)}"
 
 
 def line(record: Record) -> str:
-    """A row of the table."""
+    """Return a row of the table."""
     iterations = f"{record.newton:.1f}/{record.linear:.0f}" if record.newton or record.linear else "-"
     return _FORMAT.format(
         record.job,
@@ -59,7 +59,7 @@ def line(record: Record) -> str:
 
 
 def bandwidth_line(bandwidth: Bandwidth) -> str:
-    """The bandwidth in words."""
+    """Describe the bandwidth."""
     text = f"STREAM triad ({BYTES_PER_ELEMENT} B an element): one process {bandwidth.alone / 1e9:.1f} GB/s"
     if bandwidth.ranks > 1:
         text += f", {bandwidth.ranks} at once {bandwidth.together / 1e9:.1f} GB/s ({bandwidth.ratio:.2f} x)"
@@ -67,7 +67,7 @@ def bandwidth_line(bandwidth: Bandwidth) -> str:
 
 
 def messages_line(messages: Messages) -> str:
-    """What messages cost, in words."""
+    """Describe the cost of messages."""
     return (
         f"messages: latency {1e6 * messages.latency:.1f} us, {messages.bandwidth / 1e9:.1f} GB/s, "
         f"a sum over all ranks {1e6 * messages.reduction:.1f} us"
@@ -75,7 +75,7 @@ def messages_line(messages: Messages) -> str:
 
 
 def memory_slopes(records: list[Record]) -> dict[str, float]:
-    """Bytes a bar between the two largest sizes of each job, where it was run at two."""
+    """Return bytes per bar from the two largest sizes of each job with at least two sizes."""
     slopes = {}
     for name in dict.fromkeys(record.job for record in records):
         sized = sorted((r for r in records if r.job == name), key=lambda r: r.bars)
@@ -85,7 +85,7 @@ def memory_slopes(records: list[Record]) -> dict[str, float]:
 
 
 def processor() -> str:
-    """Name of the processor."""
+    """Return the name of the processor."""
     try:
         for text in Path("/proc/cpuinfo").read_text().splitlines():
             if text.startswith("model name"):
@@ -98,7 +98,7 @@ def processor() -> str:
 def document(
     comm: MPI.Comm, bandwidth: Bandwidth, messages: Messages | None, records: list[Record], tiny: list[Record]
 ) -> str:
-    """All that was measured, as JSON."""
+    """Return all measurements as JSON."""
     from ..output.provenance import describe_run
 
     content: dict[str, Any] = {

@@ -1,14 +1,14 @@
-"""What one step must move through memory: the bound that measured times are compared with.
+"""Minimum memory traffic of a step, the bound with which measured times are compared.
 
-Counted is what an ideal program would move once each, with nodes always found in the cache while their bars are worked
-on; as STREAM counts, an array that is overwritten is written only. Arrays are float64 (8 B), ends of bars 32-bit.
+The count is that of an ideal program that moves everything once and finds nodes in the cache while it processes their
+bars. As in STREAM, an array that is overwritten counts as written only. Arrays are float64 (8 B), ends of bars 32-bit.
 """
 
 from __future__ import annotations
 
 __all__ = ["ASSUMED", "bytes_per_step"]
 
-_VECTOR = 24  # B a node: three components
+_VECTOR = 24  # B per node: three components
 
 ASSUMED = {
     "bar": 16,  # both ends 2 x 4, rest length 8
@@ -19,13 +19,13 @@ ASSUMED = {
     "matrix entry": 12,  # value 8, column 4
     "conjugate gradients node": 12 * _VECTOR,  # x, r, p read and written; A p, z written and read; r . z; diagonal
 }
-"""Bytes, by what moves them."""
+"""Bytes per item."""
 
 
 def bytes_per_step(
     bars: int, nodes: int, *, implicit: bool, assembled: bool, plastic: bool, newton: float, linear: float
 ) -> float:
-    """Bytes that a step moves at least, over all ranks.
+    """Return the minimum number of bytes that a step moves, over all ranks.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ def bytes_per_step(
     entries = 9 * (nodes + 2 * bars)
     if assembled:
         matrix = entries * size["matrix entry"]
-        update = bars * (bar + 16) + 8 * entries  # where a bar's four blocks go, and their values
+        update = bars * (bar + 16) + 8 * entries  # indices of a bar's four blocks, and their values
     else:
         matrix = bars * (8 + size["linearised bar"])
         update = bars * (bar + size["linearised bar"])

@@ -1,1 +1,1 @@
-"""Case files as checked models."""
+"""Case files as validated models."""

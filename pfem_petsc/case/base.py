@@ -1,7 +1,7 @@
-"""What every table of a case file is made of: a strict model and its number types.
+"""Base of all tables of a case file: a strict model and its number types.
 
-Generators, integrators and walls declare their keys with these, so that a case file is refused with the key's name
-before any work is done. Imports pydantic alone.
+Generators, integrators and walls declare their keys with these types, so that an invalid case file is refused, with the
+name of the key, before any work is done. Imports pydantic only.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ __all__ = [
 
 
 class StrictModel(BaseModel):
-    """A table of a case file: unknown keys refused, values of the stated type only, finite numbers only, frozen.
+    """A table of a case file: no unknown keys, values of the stated type only, finite numbers only, frozen.
 
-    An integer is taken where a float is expected; a string or a boolean never stands for a number.
+    An integer is accepted as a float; a string or a boolean is never accepted as a number.
     """
 
     model_config = ConfigDict(
@@ -39,17 +39,17 @@ class StrictModel(BaseModel):
 
 
 def _tuple_from_list(value: Any) -> Any:
-    """TOML has lists where the models hold tuples; anything else is left to the strict check."""
+    """Convert TOML lists to the tuples of the models; anything else is left to the strict check."""
     return tuple(value) if isinstance(value, list) else value
 
 
 listed = BeforeValidator(_tuple_from_list)
-"""Put on a tuple type (``Annotated[tuple[float, float], listed]``): takes TOML's lists."""
+"""Annotation of a tuple type that accepts TOML lists: ``Annotated[tuple[float, float], listed]``."""
 
 
 def _no_path_of_its_own(name: str) -> str:
     if name in (".", ".."):
-        raise ValueError("a dot is no name; results are kept under it")
+        raise ValueError('"." is not a valid name; results are stored under it')
     return name
 
 
@@ -61,28 +61,28 @@ NonNegativeInt = Annotated[int, Field(ge=0, lt=2**63)]
 Vector3 = Annotated[tuple[Finite, Finite, Finite], listed]
 PositiveInts3 = Annotated[tuple[PositiveInt, PositiveInt, PositiveInt], listed]
 Name = Annotated[str, Field(min_length=1, pattern=r"^[^/\x00-\x1f\x7f-\x9f]+$"), AfterValidator(_no_path_of_its_own)]
-"""A name that ends up as part of a path inside the result file: not empty, no slash, no dot alone, which HDF5 skips."""
+"""A name that is part of a path in the result file: not empty, no slash, and not a single dot, which HDF5 skips."""
 
 
 NodeSetName = Annotated[str, Field(json_schema_extra={"refers_to": "node_set"})]
-"""A key of a constraint that names a node set of the case; that there is one is checked with the case."""
+"""A key of a constraint that names a node set; the names are checked with the case."""
 
 
 class ConstraintKeys(StrictModel):
-    """The keys that every constraint has; a kind of constraint adds its own."""
+    """Keys of all constraints; each kind adds its own."""
 
     name: Name
-    """Names the constraint in results and messages; unique. One without is called ``constraint1``, ..."""
+    """Name of the constraint in results and messages; unique. Default: ``constraint1``, ``constraint2``, ..."""
     kind: str
     """The kind of constraint: a module of ``pfem_petsc.contact.constraints``."""
 
 
 class WallParameters(StrictModel):
-    """The keys that every wall has; a kind of wall adds its own."""
+    """Keys of all walls; each type adds its own."""
 
     name: Name
-    """Names the wall in results and messages; unique. A wall without one is called ``wall1``, ``wall2``, ..."""
+    """Name of the wall in results and messages; unique. Default: ``wall1``, ``wall2``, ..."""
     type: str
-    """The kind of wall: a module of ``pfem_petsc.contact.walls``."""
+    """The type of wall: a module of ``pfem_petsc.contact.walls``."""
     node_set: str | None = None
-    """The nodes that the wall stops; default: every node."""
+    """The nodes that the wall stops; default: all nodes."""

@@ -1,4 +1,4 @@
-"""The cases that come with the package."""
+"""The built-in cases of the package."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ FOLDER = Path(__file__).parent.parent / "cases"
 
 
 def built_in_cases() -> list[str]:
-    """Names of the built-in cases."""
+    """Return the names of the built-in cases."""
     return sorted(path.stem for path in FOLDER.glob("*.toml"))
 
 
 def built_in_path(name: str) -> Path | None:
-    """File of a built-in case, or None where no such case is built in."""
+    """Return the file of a built-in case, or None if there is no such case."""
     return FOLDER / f"{name}.toml" if name in built_in_cases() else None

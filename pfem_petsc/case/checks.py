@@ -1,4 +1,4 @@
-"""Checks of a case across its tables: every name that is used exists, and names are unique."""
+"""Checks of a case across its tables: all names that are used exist, and names are unique."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ __all__ = ["check_names"]
 
 
 def check_names(case: Mapping[str, Any], data: Mapping[str, Any], problems: Problems) -> None:
-    """Note every name that leads nowhere or is there twice.
+    """Report all unknown and duplicate names.
 
     Parameters
     ----------
-    case : the validated tables by name (refused ones left out)
-    data : the case as read: names that are there but whose table was refused are not reported again
-    problems : takes what is wrong
+    case : the validated tables by name, without those that were refused
+    data : the case as read; names whose table was refused are not reported again
+    problems : receives the problems
     """
     materials, sections, node_sets = (_names(data, key) for key in ("material", "section", "node_set"))
     for key, names in (("material", materials), ("section", sections)):
         if not names and isinstance(data.get(key, {}), Mapping):
-            problems.add((), f"no [{key}.NAME] is given: a case has at least one {key}")
+            problems.add((), f"no [{key}.NAME] is given: a case needs at least one {key}")
     for name, section in case["section"].items():
         problems.refer(("section", name, "material"), section.material, materials, "material")
     default = [name for name, section in case["section"].items() if section.bars is None]
@@ -57,7 +57,7 @@ def check_names(case: Mapping[str, Any], data: Mapping[str, Any], problems: Prob
             if name not in known:
                 problems.add(("output", "fields", i), f"there is no field of this name{nearest(name, known)}", name)
             elif name in output.fields[:i]:
-                problems.add(("output", "fields", i), "this field is there twice", name)
+                problems.add(("output", "fields", i), "this field is listed twice", name)
 
 
 def _names(data: Mapping[str, Any], key: str) -> list[str]:
@@ -71,7 +71,7 @@ def _node_set(path: tuple[str | int, ...], entry: Any, known: list[str], problem
 
 
 def _node_sets(path: tuple[str | int, ...], entry: Any, known: list[str], problems: Problems) -> None:
-    """Names of node sets in the keys of type ``NodeSetName``."""
+    """Check names of node sets in the keys of type ``NodeSetName``."""
     for key, field in type(entry).model_fields.items():
         if (field.json_schema_extra or {}).get("refers_to") == "node_set" and getattr(entry, key) is not None:
             problems.refer((*path, key), getattr(entry, key), known, "node set")
@@ -85,7 +85,7 @@ def _distinct(path: tuple[str | int, ...], entries: Any, what: str, problems: Pr
 
 
 def _unique(key: str, named_bars: list[tuple[str, str | None]], problems: Problems) -> None:
-    """One bar group belongs to one section."""
+    """Check that each bar group belongs to one section only."""
     seen: dict[str, str] = {}
     for name, bars in named_bars:
         if bars is not None and bars in seen:

@@ -1,4 +1,4 @@
-"""The materials of a case: each with the keys of its law, which is a module of ``pfem_petsc.mechanics.materials``."""
+"""The materials of a case, each with the keys of its law, a module of ``pfem_petsc.mechanics.materials``."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ _HARDENING = ("isotropic_hardening", "kinematic_hardening")
 
 
 def law_name(keys: Mapping[str, Any]) -> Any:
-    """The law that a table asks for: without the key, a ``yield_stress`` decides."""
+    """Return the law of a table; without the key ``law`` it depends on whether there is a ``yield_stress``."""
     if keys.get("law") is not None:
         return keys["law"]
     return "elastic" if keys.get("yield_stress") is None else "elastoplastic"
 
 
 def law_of(material: StrictModel) -> Any:
-    """The :class:`~pfem_petsc.mechanics.materials.base.Law` of a material of a case."""
+    """Return the :class:`~pfem_petsc.mechanics.materials.base.Law` of a material of a case."""
     return lookup(LAWS, law_name(dict(material)), "material.law").LAW
 
 
 def internal_variables(materials: Mapping[str, StrictModel]) -> dict[str, str]:
-    """Name and unit of all internal variables of a case's laws, in the order of the case."""
+    """Return name and unit of all internal variables of a case's laws, in the order of the case."""
     return {name: unit for material in materials.values() for name, unit in law_of(material).internal}
 
 
 def read_materials(data: Mapping[str, Any], problems: Problems) -> dict[str, StrictModel]:
-    """The tables [material.NAME] in the file's order; what is refused is noted in ``problems`` and left out."""
+    """Read the tables [material.NAME] in file order; refused ones are reported in ``problems`` and left out."""
     tables = data.get("material", {})
     if not isinstance(tables, Mapping):
         problems.add(("material",), "expected tables, each under a heading [material.NAME]", tables)
@@ -51,11 +51,11 @@ def _read(table: Any, name: str, problems: Problems) -> StrictModel | None:
         return None
     law, hardening = law_name(table), []
     if table.get("law") is None and law == "elastic":
-        # zero is what a resolved case of an earlier version has for a bar that cannot yield
+        # resolved cases of earlier versions have zeros for materials that cannot yield
         table = {key: value for key, value in table.items() if not (key in _HARDENING and value == 0.0)}
         hardening = [key for key in _HARDENING if key in table]
         if hardening:
-            # the other keys are read all the same
+            # the other keys are validated nevertheless
             law, table = "elastoplastic", {**table, "yield_stress": 1.0}
     try:
         model = lookup(LAWS, law, "").Parameters
@@ -72,5 +72,5 @@ def _read(table: Any, name: str, problems: Problems) -> StrictModel | None:
 
 
 def _siblings() -> dict[str, list[str]]:
-    """All laws with the keys that they take."""
+    """Return all laws with their keys."""
     return {name: list(lookup(LAWS, name, "").Parameters.model_fields) for name in choices(LAWS)}

@@ -1,4 +1,4 @@
-"""Values set over those of the case file: ``time.step=1e-5``, ``wall.0.point=[1.0, 0.0, 0.0]``, ``time.beta=``."""
+"""Overrides of values of a case file: ``time.step=1e-5``, ``wall.0.point=[1.0, 0.0, 0.0]``, ``time.beta=``."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LISTS = {
     ("initial", "on"),
     ("output", "probe"),
 }
-"""Keys under which a missing value is made as a list of tables."""
+"""Keys under which a missing value is created as a list of tables."""
 
 DEEPEST = 100
 """Parts of a key."""
@@ -30,13 +30,13 @@ _PART = re.compile(r"""(?:"((?:[^"\\]|\\.)*)"|([^.\[\]"]+))|\[(\d+)\]""")
 
 
 def apply_overrides(data: dict[str, Any], overrides: Iterable[str]) -> list[tuple[str | int, ...]]:
-    """Set ``key=value`` texts in a case's tables, in place; missing tables are made.
+    """Apply ``key=value`` texts to the tables of a case, in place; missing tables are created.
 
     Parameters
     ----------
     data : the case as nested tables
-    overrides : texts ``path=value``; the value is TOML, or else taken as a text as it stands; without a value, the key
-        is taken out where it is there
+    overrides : texts ``path=value``; the value is TOML, or else used as a plain string; without a value, the key is
+        removed if it exists
 
     Returns
     -------
@@ -45,7 +45,7 @@ def apply_overrides(data: dict[str, Any], overrides: Iterable[str]) -> list[tupl
     Raises
     ------
     InputError
-        When a text has no ``=``, or its path leads through a value that is no table, or beyond a list's end.
+        If a text has no ``=``, or its path passes through a value that is not a table, or beyond the end of a list.
     """
     paths = []
     for text in overrides:
@@ -71,7 +71,7 @@ def _value(text: str) -> Any:
 
 
 def split_key(key: str) -> list[str] | None:
-    """Parts of a dotted path, indices in brackets included; None where it is malformed."""
+    """Return the parts of a dotted path, including indices in brackets; None if it is malformed."""
     parts, position = [], 0
     while position < len(key):
         match = _PART.match(key, position)

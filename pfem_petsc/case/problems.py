@@ -1,4 +1,4 @@
-"""Collect everything that is wrong with a case, and say it in one message: file, key, value, what is expected."""
+"""Collects all problems of a case and reports them in one message: file, key, value, what is expected."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from .toml import value_text
 __all__ = ["Path", "Problems", "key_text"]
 
 Path = tuple[str | int, ...]
-"""Where a value is in the case: keys of tables and indices of lists."""
+"""Path of a value in the case: keys of tables and indices of lists."""
 
 M = TypeVar("M", bound=StrictModel)
 
 MOST = 10
-"""Problems that one message lists; the rest is counted."""
+"""Maximum number of problems listed in a message; the others are counted."""
 
 SI_HINT = "expected a number in SI units, without quotes and unit"
 
 
 def key_text(path: Path) -> str:
-    """Key path as users write it: ``wall[0].normal``."""
+    """Return a key path as users write it: ``wall[0].normal``."""
     text = ""
     for part in path:
         if isinstance(part, int):
@@ -46,7 +46,7 @@ class Problems:
     Parameters
     ----------
     source : file or name of the case, for the message
-    overridden : key paths that were set on the command line: the message says so where one of them is wrong
+    overridden : key paths that were set on the command line, which the message states if one of them is wrong
     """
 
     def __init__(self, source: str, overridden: Iterable[Path] = ()) -> None:
@@ -55,7 +55,7 @@ class Problems:
         self.lines: list[str] = []
 
     def add(self, path: Path, message: str, value: Any = None) -> None:
-        """Note a problem; ``value`` is shown where given."""
+        """Add a problem; ``value`` is shown if given."""
         key = key_text(path)
         shown = f"{key} = {_short(value)}" if value is not None else key
         origin = " (given by --set)" if any(path[: len(p)] == p for p in self.overridden) else ""
@@ -64,7 +64,7 @@ class Problems:
             self.lines.append(line)
 
     def refer(self, path: Path, name: str, known: Sequence[str], what: str) -> None:
-        """Note a problem where ``name`` is not one of the ``known`` names of a ``what``."""
+        """Add a problem if ``name`` is not one of the ``known`` names of a ``what``."""
         if name not in known:
             hint = nearest(name, list(known)) if known else "; the case defines none"
             if what == "node set":
@@ -90,16 +90,16 @@ class Problems:
         taker: str = "",
         siblings: Callable[[], Mapping[str, Sequence[str]]] = dict,
     ) -> M | None:
-        """Validate a table; None, with the problems noted, where it is refused.
+        """Validate a table; if it is refused, add the problems and return None.
 
         Parameters
         ----------
-        model : what the table may hold
+        model : the model of the table
         data : the table as read
-        path : where it is
-        known : keys of the same table that are not the model's own (for hints)
-        taker : name of the scheme, generator or wall that takes these keys, named where one is unknown
-        siblings : gives the other choices by name with the keys that they take, to tell whose a key is
+        path : of the table
+        known : keys of the same table that do not belong to the model (for hints)
+        taker : name of the scheme, generator or wall with these keys, for messages about unknown keys
+        siblings : returns the alternatives by name with their keys, to identify the owner of a key
         """
         if not isinstance(data, Mapping):
             self.add(path, "expected a table", data)
@@ -162,7 +162,7 @@ def _unknown_key(key: str, own: list[str], shared: Sequence[str], taker: str, ow
 
 
 def _plain(annotation: Any) -> Any:
-    """A type without ``Annotated`` and ``None``."""
+    """Return a type without ``Annotated`` and ``None``."""
     while True:
         if typing.get_origin(annotation) is typing.Annotated:
             annotation = typing.get_args(annotation)[0]
@@ -173,7 +173,7 @@ def _plain(annotation: Any) -> Any:
 
 
 def _shape(field: FieldInfo | None) -> str:
-    """What a list field holds, from its type: ``a list of 3 numbers``."""
+    """Describe the content of a list field by its type: ``a list of 3 numbers``."""
     annotation = _plain(field.annotation) if field is not None else None
     arguments = typing.get_args(annotation)
     if typing.get_origin(annotation) is not tuple or not arguments:

@@ -1,4 +1,4 @@
-"""From the nested tables of a case file to checked models."""
+"""Converts the nested tables of a case file to validated models."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ STATIC_METHODS = "pfem_petsc.statics.methods"
 M = TypeVar("M", bound=StrictModel)
 
 DEEPEST = 100
-"""Parts of a dotted key; the time that many take grows with their square."""
+"""Maximum number of parts of a dotted key; the parsing time grows with their square."""
 _LONG_KEY = re.compile(r"""(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*)""" + f"{{{DEEPEST}}}")
 
 KEYS = [
@@ -37,11 +37,11 @@ KEYS = [
     *("load", "gravity", "temperature", "wall", "contact_pair", "constraint", "contact"),
     *("time", "static", "modes", "output", "solver"),
 ]
-"""Keys of a case file at its top."""
+"""Top-level keys of a case file."""
 
 
 def parse_toml(text: str, source: str) -> dict[str, Any]:
-    """TOML text to nested tables.
+    """Parse TOML text to nested tables.
 
     Raises
     ------
@@ -56,24 +56,24 @@ def parse_toml(text: str, source: str) -> dict[str, Any]:
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{source}: this is not valid TOML: {error}") from error
     except ValueError as error:
-        # Python converts no more digits than that to an integer
+        # Python limits the number of digits of integers
         raise InputError(f"{source}: this is not a case: it has an integer of more than 4,300 digits") from error
     except RecursionError as error:
         raise InputError(f"{source}: this is not a case: its lists or tables are nested too deep") from error
 
 
 def read_tables(data: Mapping[str, Any], folder: Path, problems: Problems) -> dict[str, Any]:
-    """Validate every table of a case; what is refused is noted in ``problems`` and left out or None.
+    """Validate all tables of a case; refused ones are reported in ``problems`` and left out or None.
 
     Parameters
     ----------
     data : the case as nested tables
-    folder : what the mesh file is relative to
-    problems : takes what is wrong
+    folder : to which the path of the mesh file is relative
+    problems : receives the problems
 
     Returns
     -------
-    The attributes of a :class:`~pfem_petsc.case.schema.Case` by name, ``title`` included where there is one.
+    The attributes of a :class:`~pfem_petsc.case.schema.Case` by name, including ``title`` if there is one.
     """
     for key in data:
         if key not in KEYS:
@@ -105,7 +105,7 @@ def read_tables(data: Mapping[str, Any], folder: Path, problems: Problems) -> di
 
 
 def _rows(data: Any, path: KeyPath, problems: Problems) -> Sequence[Any]:
-    """The items of an optional list of tables."""
+    """Return the items of an optional list of tables."""
     if data is None:
         return ()
     if not isinstance(data, list | tuple):
@@ -120,7 +120,7 @@ def _listed(model: type[M], data: Any, path: KeyPath, problems: Problems) -> lis
 
 
 def _named(model: type[M], data: Mapping[str, Any], key: str, problems: Problems) -> dict[str, M]:
-    """Tables that users name, like [material.steel], in the file's order."""
+    """Read tables with user-defined names, such as [material.steel], in file order."""
     table = data.get(key, {})
     if not isinstance(table, Mapping):
         problems.add((key,), f"expected tables, each under a heading [{key}.NAME]", table)
@@ -140,13 +140,13 @@ def _required(data: Mapping[str, Any], key: str, problems: Problems) -> Mapping[
 
 
 def _split(model: type[StrictModel], table: Mapping[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The keys of a model, and the others."""
+    """Split a table into the keys of a model and the others."""
     own = {k: v for k, v in table.items() if k in model.model_fields}
     return own, {k: v for k, v in table.items() if k not in model.model_fields}
 
 
 def _parameters_model(package: str, name: Any, path: KeyPath, problems: Problems) -> type[StrictModel] | None:
-    """The ``Parameters`` of a module found by name."""
+    """Return the ``Parameters`` of a module found by name."""
     try:
         return lookup(package, name, "").Parameters
     except InputError as error:
@@ -157,7 +157,7 @@ def _parameters_model(package: str, name: Any, path: KeyPath, problems: Problems
 
 
 def _siblings(package: str) -> dict[str, list[str]]:
-    """All choices in a package, with the keys that they take."""
+    """Return all modules of a package with their keys."""
     models = {name: getattr(lookup(package, name, ""), "Parameters", None) for name in choices(package)}
     return {name: list(model.model_fields) for name, model in models.items() if model is not None}
 
@@ -204,7 +204,7 @@ def _initial(data: Mapping[str, Any], problems: Problems) -> list[t.Initial]:
 
 
 def _kinds(data: Any, table: str, key: str, package: str, what: str, problems: Problems) -> list[StrictModel]:
-    """A list of tables of which a key names the module that knows the others."""
+    """Read a list of tables in which one key names the module that defines the other keys."""
     found = []
     for i, row in enumerate(_rows(data, (table,), problems)):
         path: KeyPath = (table, i)
@@ -223,7 +223,7 @@ def _kinds(data: Any, table: str, key: str, package: str, what: str, problems: P
 
 
 def _supports(data: Any, folder: Path, problems: Problems) -> list[t.Support]:
-    """Supports; the rows of an ``acceleration_file`` take its place, so that a resolved case holds all it needs."""
+    """Read supports; an ``acceleration_file`` is replaced by its rows, so that a resolved case is self-contained."""
     supports = []
     for i, row in enumerate(_rows(data, ("support",), problems)):
         path: KeyPath = ("support", i)

@@ -11,15 +11,15 @@ __all__ = ["read_record"]
 
 
 def read_record(path: Path) -> list[list[float]]:
-    """Rows [t, ax, ay, az] [s, m/s2] of a CSV file.
+    """Read rows [t, ax, ay, az] [s, m/s2] from a CSV file.
 
-    Commas, semicolons, tabs or blanks part the columns; empty lines, lines that start with ``#`` and one heading are
-    passed over.
+    Columns are separated by commas, semicolons, tabs or blanks; empty lines, lines that start with ``#`` and one
+    heading are skipped.
 
     Raises
     ------
     InputError
-        Where the file cannot be read, or a line has not four finite numbers; the message names the line.
+        If the file cannot be read, or a line does not have four finite numbers; the message names the line.
     """
     try:
         text = path.read_bytes().decode("utf-8-sig")

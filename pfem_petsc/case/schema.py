@@ -1,4 +1,4 @@
-"""A case: the complete input of a simulation, read from a TOML file and checked before any work is done."""
+"""A case: the complete input of a simulation, read from a TOML file and validated before any work is done."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ __all__ = ["Case"]
 
 
 class Case:
-    """A checked case. Made by :meth:`load`, :meth:`from_toml` or :meth:`from_dict`; not to be changed afterwards.
+    """A validated case, immutable. Created by :meth:`load`, :meth:`from_toml` or :meth:`from_dict`.
 
     Attributes
     ----------
     title : title of the case
     name : stem of the case file, or name of the built-in case
     source : file of the case as given, for messages
-    folder : what the case's relative file names start from
-    overrides : texts that were set over its values
+    folder : to which the case's relative file names refer
+    overrides : texts ``KEY=VALUE`` that override its values
     mesh : :class:`~pfem_petsc.case.tables.Mesh`: generator with parameters, or file
-    node_set, material, section : tables by name, in the file's order
+    node_set, material, section : tables by name, in file order
     initial, support, load, temperature, wall, contact_pair, constraint : lists of tables
     gravity : :class:`~pfem_petsc.case.tables.Gravity` or None
     contact, output, solver : tables of :mod:`~pfem_petsc.case.settings`
@@ -53,7 +53,7 @@ class Case:
         )
 
     def __eq__(self, other: object) -> bool:
-        """Same content; name, source and folder aside."""
+        """Compare the content, without name, source and folder."""
         return isinstance(other, Case) and self.to_dict() == other.to_dict()
 
     __hash__ = None  # type: ignore[assignment]
@@ -82,12 +82,12 @@ class Case:
         Parameters
         ----------
         path_or_name : TOML file, or name of a built-in case
-        overrides : texts like ``"time.step=1e-5"``, set over the file's values
+        overrides : texts such as ``"time.step=1e-5"`` that override values of the file
 
         Raises
         ------
         InputError
-            Names every key that is wrong.
+            Names all invalid keys.
         """
         path = built_in_path(str(path_or_name)) or Path(path_or_name)
         return cls.from_toml(_read_text(path), path.parent, name=path.stem, source=str(path), overrides=overrides)
@@ -102,7 +102,7 @@ class Case:
         source: str = "case",
         overrides: Iterable[str] = (),
     ) -> Case:
-        """Read the text of a case; see :meth:`load`. ``folder`` is what its mesh file is relative to."""
+        """Read the text of a case; see :meth:`load`. The path of its mesh file is relative to ``folder``."""
         return cls.from_dict(parse_toml(text, source), name=name, source=source, folder=folder, overrides=overrides)
 
     @classmethod
@@ -115,10 +115,10 @@ class Case:
         folder: str | Path = ".",
         overrides: Iterable[str] = (),
     ) -> Case:
-        """Check a case given as nested tables with the keys of the case file; see :meth:`load`.
+        """Validate a case given as nested tables with the keys of the case file; see :meth:`load`.
 
-        NumPy numbers and arrays, tuples and paths stand for what TOML has. ``folder`` is what ``mesh.file`` is relative
-        to, ``name`` the default folder of the results.
+        NumPy numbers and arrays, tuples and paths are accepted for the TOML types. ``mesh.file`` is relative to
+        ``folder``; ``name`` is the default folder of the results.
         """
         if not isinstance(data, Mapping):
             raise InputError(
@@ -140,7 +140,7 @@ class Case:
         return case
 
     def to_dict(self) -> dict[str, Any]:
-        """The case as nested tables with the keys of the case file, every default explicit, absent ones left out."""
+        """Return the case as nested tables with the keys of the case file and all defaults, without absent tables."""
         everywhere = [entry for entry in self.initial if entry.node_set is None]
         initial = _table(everywhere[0]) if everywhere else {}
         on = [_table(entry) for entry in self.initial if entry.node_set is not None]
@@ -171,7 +171,7 @@ class Case:
         return {key: value for key, value in data.items() if value not in ({}, [])}
 
     def to_toml(self) -> str:
-        """The resolved case, every default explicit, as text that :meth:`from_toml` reads back equal."""
+        """Return the resolved case, with all defaults, as text from which :meth:`from_toml` reads an equal case."""
         return table_text(self.to_dict())
 
 

@@ -1,4 +1,4 @@
-"""The tables of a case file that say how it is solved and what is written, each with its keys (SI units)."""
+"""The tables of a case file for solution and output, each with its keys (SI units)."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ TREATMENTS = "pfem_petsc.contact.treatments"
 
 
 class TimeKeys(StrictModel):
-    """The keys of [time] that are not an integrator's own."""
+    """The keys of [time] other than those of an integrator."""
 
     integrator: str
     """name of a time integration scheme"""
@@ -38,7 +38,7 @@ class TimeKeys(StrictModel):
     mass: Literal["lumped", "consistent"] = "lumped"
     """mass matrix"""
     safety: Annotated[float, Field(gt=0.0, le=1.0)] = 0.9
-    """factor on the critical step where step = "auto\""""
+    """factor on the critical step if step = "auto\""""
 
     @field_validator("step")
     @classmethod
@@ -58,7 +58,7 @@ class TimeKeys(StrictModel):
 
 
 def _computable(seconds: float) -> float:
-    """Refuse times whose powers in the formulas of the schemes are beyond double precision."""
+    """Refuse times whose powers in the formulas of the schemes overflow double precision."""
     if not 1e-50 <= seconds <= 1e50:
         raise ValueError("overflows double precision in the formulas of the schemes; give seconds from 1e-50 to 1e50")
     return seconds
@@ -100,16 +100,16 @@ class Probe(StrictModel):
     """A node set whose motion and reaction are recorded in the history."""
 
     name: Name
-    """names the probe in the results"""
+    """name of the probe in the results"""
     node_set: str
     """name of a node set"""
 
 
 class OutputKeys(StrictModel):
-    """The keys of [output], probes aside."""
+    """The keys of [output] without probes."""
 
     fields_every: NonNegativeInt = 10
-    """steps between field snapshots; 0: none but first and last"""
+    """steps between field snapshots; 0: only first and last"""
     history_every: PositiveInt = 1
     """steps between rows of the history"""
     checkpoint_every: NonNegativeInt = 0
@@ -123,16 +123,16 @@ class OutputKeys(StrictModel):
 
 
 class Output(OutputKeys):
-    """What is written, and how often."""
+    """Outputs and their intervals."""
 
     probe: tuple[Probe, ...] = ()
 
 
 class ContactSettings(StrictModel):
-    """How contact is treated."""
+    """Treatment of contact."""
 
     treatment: str = "scheme"
-    """what velocity and acceleration a node has on impact"""
+    """treatment of impact: velocity and acceleration of nodes in contact"""
 
     @field_validator("treatment")
     @classmethod
@@ -144,7 +144,7 @@ class ContactSettings(StrictModel):
 
 
 class Solver(StrictModel):
-    """How the nonlinear and linear systems are solved."""
+    """Solution of the nonlinear and linear systems."""
 
     linear: Literal["auto", "cg", "gamg", "mumps"] = "auto"
     """linear solver"""
@@ -155,6 +155,6 @@ class Solver(StrictModel):
     atol: PositiveFloat | None = None
     """absolute tolerance of the residual [N]; default: from the model's force scale"""
     max_newton: PositiveInt = 50
-    """Newton iterations allowed in a step"""
+    """maximum number of Newton iterations in a step"""
     guard: bool = True
-    """whether converged implicit steps that have nothing to do with the state before them are made in smaller parts"""
+    """whether converged implicit steps that are unrelated to the previous state are rejected and bisected"""

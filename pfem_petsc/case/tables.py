@@ -1,4 +1,4 @@
-"""The tables of a case file that make the model, each with its keys (SI units)."""
+"""The tables of a case file that define the model, each with its keys (SI units)."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ Indices = Annotated[tuple[NonNegativeInt, ...], listed]
 
 
 def _increasing(rows: Sequence[Sequence[float]] | None) -> None:
-    """Refuse a table over time that is empty or whose times do not increase."""
+    """Refuse a time table that is empty or whose times do not increase."""
     if rows is None:
         return
     if not rows:
@@ -51,7 +51,7 @@ def _increasing(rows: Sequence[Sequence[float]] | None) -> None:
 
 
 class MeshKeys(StrictModel):
-    """The keys of [mesh] that are not a generator's own."""
+    """The keys of [mesh] other than those of a generator."""
 
     generator: Name | None = None
     """name of a mesh generator"""
@@ -67,7 +67,7 @@ class MeshKeys(StrictModel):
 
 
 class Mesh(StrictModel):
-    """Where the mesh comes from: a generator with its parameters, or a file."""
+    """Source of the mesh: a generator with its parameters, or a file."""
 
     generator: str | None = None
     file: Path | None = None
@@ -75,18 +75,18 @@ class Mesh(StrictModel):
 
 
 class NodeSet(StrictModel):
-    """Nodes named once; exactly one key says which."""
+    """A named set of nodes, selected by exactly one key."""
 
     nearest: Vector3 | None = None
-    """a point [m]: the one node nearest to it"""
+    """a point [m]: selects the nearest node"""
     box: Annotated[tuple[Vector3, Vector3], listed] | None = None
-    """lower and upper corner [m]: the nodes inside, faces included"""
+    """lower and upper corner [m]: selects the nodes inside, faces included"""
     group: str | None = None
     """a node group of the mesh"""
     indices: Indices | None = None
     """node numbers of the mesh, from 0"""
     all: Literal[True] | None = None
-    """true: every node"""
+    """true: all nodes"""
 
     @field_validator("box")
     @classmethod
@@ -103,7 +103,7 @@ class NodeSet(StrictModel):
         if indices is not None and not indices:
             raise ValueError("expected at least one node number")
         if indices is not None and len(set(indices)) < len(indices):
-            raise ValueError("a node number is there twice")
+            raise ValueError("a node number is listed twice")
         return indices
 
     @model_validator(mode="after")
@@ -123,11 +123,11 @@ class Section(StrictModel):
     material: str
     """name of a material"""
     bars: str | None = None
-    """bar group of the mesh; default: every bar that no other section names"""
+    """bar group of the mesh; default: all bars that no other section names"""
 
 
 class Initial(StrictModel):
-    """Initial velocity v + w x (X - c) of a node set, or of every node where ``node_set`` is None."""
+    """Initial velocity v + w x (X - c) of a node set, or of all nodes if ``node_set`` is None."""
 
     node_set: str | None = None
     """name of a node set"""
@@ -153,7 +153,7 @@ class Support(StrictModel):
     fix: str
     """the fixed components: any of x, y, z"""
     motion: Table4 | None = None
-    """rows [t, dx, dy, dz]: displacement from the mesh's place [s, m], at rest before the first and after the last"""
+    """rows [t, dx, dy, dz]: displacement from the mesh [s, m], at rest before the first and after the last row"""
     velocity: Vector3 | None = None
     """constant velocity of the fixed components [m/s]"""
     acceleration: Table4 | None = None
@@ -161,7 +161,7 @@ class Support(StrictModel):
     acceleration_file: Annotated[str, Field(min_length=1)] | None = None
     """the same as a CSV file with columns t, ax, ay, az, relative to the case file"""
     interpolation: Literal["smooth", "linear"] = "smooth"
-    """of ``motion`` between its rows: a cubic spline, or straight lines, whose velocity jumps at rows"""
+    """interpolation of ``motion`` between its rows: a cubic spline, or straight lines with velocity jumps at rows"""
 
     @field_validator("fix")
     @classmethod
@@ -197,11 +197,11 @@ class ContactPair(StrictModel):
     """Nodes of two bodies that cannot pass each other along a direction, in pairs."""
 
     name: Name
-    """names the pairs in results and messages; unique"""
+    """name of the pairs in results and messages; unique"""
     first: NodeSetName
     """name of a node set"""
     second: NodeSetName
-    """name of a node set of as many nodes; each is paired with the first one nearest to it, seen along the direction"""
+    """name of a node set of equal size; each node is paired with the nearest of first, seen along the direction"""
     direction: Vector3
     """points from the first nodes to the second"""
     gap: Finite = 0.0
@@ -245,7 +245,7 @@ class Temperature(StrictModel):
     """Temperature above reference of bars."""
 
     bars: str | None = None
-    """bar group of the mesh; default: every bar"""
+    """bar group of the mesh; default: all bars"""
     value: Finite | None = None
     """temperature above reference [K]"""
     table: Table2 | None = None

@@ -1,4 +1,4 @@
-"""Write TOML: tables of numbers, texts, booleans, lists and tables, as case files hold them."""
+"""Writes TOML: tables of numbers, strings, booleans, lists and tables, as in case files."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def plain(value: Any) -> Any:
 
 
 def value_text(value: Any) -> str:
-    """A value on one line, so that a TOML reader gives it back equal."""
+    """Return a value on one line of TOML, exact to the last digit."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, str):
@@ -35,12 +35,12 @@ def value_text(value: Any) -> str:
     if isinstance(value, list | tuple):
         return "[" + ", ".join(value_text(v) for v in value) + "]"
     if isinstance(value, int) and abs(value) >= 1 << 4096:
-        return hex(value)  # Python writes no decimals of so large a number
+        return hex(value)  # Python limits the number of decimal digits of integers
     return repr(value) if isinstance(value, int | float) else str(value)
 
 
 def table_text(table: Mapping[str, Any], path: str = "") -> str:
-    """A table as TOML lines: its values first, then its tables and lists of tables under their own headings."""
+    """Return a table as TOML lines: values first, then tables and lists of tables under their own headings."""
     blocks = []
     lines = [f"{_key(k)} = {value_text(v)}\n" for k, v in table.items() if not _is_nested(v)]
     if lines:
@@ -58,7 +58,7 @@ def table_text(table: Mapping[str, Any], path: str = "") -> str:
 
 
 def _is_nested(value: Any) -> bool:
-    """Whether a value gets a heading of its own: a table, or a list of tables (never an empty list)."""
+    """Return whether a value gets its own heading: a table, or a list of tables (never an empty list)."""
     many = isinstance(value, list | tuple) and len(value) > 0 and all(isinstance(v, Mapping) for v in value)
     return isinstance(value, Mapping) or many
 

@@ -21,9 +21,9 @@ examples:
   {PROGRAM} bench
   mpirun -n 2 {PROGRAM} bench --sizes 100000 1000000 --jobs explicit matrix_free -o bench.json
 
-Steps are wall-clock times (median and best), cpu the processor time of all ranks. 'moved' is what a step must move
-through memory at least, as STREAM counts, and 'bound' how much of the median step that would take at the measured
-bandwidth; docs/performance.md says how it is counted. Nothing else should run meanwhile.
+Steps are wall-clock times (median and best), cpu the processor time of all ranks. 'moved' is the minimum memory traffic
+of a step, as STREAM counts, and 'bound' the share of the median step that it would take at the measured bandwidth; see
+docs/performance.md. Nothing else should run during the measurement.
 
 exit status: 0 done, 2 invalid input, 3 a run failed"""
 
@@ -97,7 +97,7 @@ def run(arguments: argparse.Namespace, comm: MPI.Comm) -> int:
     say(bandwidth_line(bandwidth))
     messages = measure_messages(comm)
     say(messages_line(messages) + "\n" if messages is not None else "")
-    for job in chosen:  # kernels compiled or loaded, libraries started: not part of what follows
+    for job in chosen:  # compile or load kernels and start libraries before the measurements
         time_job(job, arguments.kind, 2, comm, None, 0.0)
     say(HEADER)
     records = []
@@ -108,7 +108,7 @@ def run(arguments: argparse.Namespace, comm: MPI.Comm) -> int:
             say(line(record))
     say("")
     for name, slope in memory_slopes(records).items():
-        say(f"memory of {name}: {slope:.0f} B for each further bar")
+        say(f"memory of {name}: {slope:.0f} B per additional bar")
     tiny = [time_job(job, "cubic", 2, comm, None, arguments.seconds, 3000) for job in tiny_jobs(arguments.explicit)]
     for record in tiny:
         say(f"outside the loops over bars and nodes: {1e6 * record.median:.0f} us a step ({record.job})")
@@ -128,7 +128,7 @@ def _size(text: str) -> int:
 
 
 def _check_output(path: Path | None, comm: MPI.Comm) -> None:
-    """Refuse a file that cannot be written before minutes are spent on what goes into it. Collective."""
+    """Check that the output file can be written before the measurements, which take minutes. Collective."""
     from ..parallel.agreement import on_root
 
     def try_it() -> None:

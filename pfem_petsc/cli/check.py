@@ -1,4 +1,4 @@
-"""Check a case: read it, build its mesh and model, and say what would run."""
+"""Check a case: read it, build its mesh and model, and summarise the run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Say what a result holds: case, versions, snapshots, history and energy balance."""
+"""Show the content of a result: case, versions, snapshots, history and energy balance."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the verb."""
     add_result(parser)
     parser.add_argument(
-        "--verify", action="store_true", help="compare all values with their checksums; status 2 where one differs"
+        "--verify", action="store_true", help="compare all values with their checksums; status 2 if one differs"
     )
 
 
@@ -44,7 +44,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def describe(result: Result) -> list[str]:
-    """Lines about a result."""
+    """Return a description of a result, as lines."""
     lines = [result.case.title]
     rows = {"file": str(result.path), "mesh": f"{result.n_nodes:,} nodes, {result.n_bars:,} bars"}
     rows.update({key: str(value) for key, value in result.attributes.items() if value not in ("", {}, [])})
@@ -68,7 +68,7 @@ def describe(result: Result) -> list[str]:
 
 
 def _energies(history: Mapping[str, np.ndarray], names: list[str]) -> list[str]:
-    """Energies [J] at start and end, and what their balance leaves over, also of the largest that any had meanwhile."""
+    """Return energies [J] at start and end and their imbalance, also relative to the largest energy in between."""
     from ..output.units import engineering
 
     present = [name for name in (*STORED, *LOST, *SUPPLIED) if name in names]

@@ -1,7 +1,7 @@
-"""Ranks on the command line: who prints, and how a failure on any of them ends all of them.
+"""Ranks on the command line: which rank prints, and how a failure on one rank ends all of them.
 
-Nothing here imports MPI before it is needed: ``--help``, ``list`` and refused options know their rank from the
-environment that the launcher made.
+MPI is not imported before it is needed: ``--help``, ``list`` and invalid options determine their rank from the
+environment of the launcher.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ __all__ = ["collectively", "launched_rank", "on_first_rank", "refuse"]
 RANK_VARIABLES = ("OMPI_COMM_WORLD_RANK", "PMIX_RANK", "PMI_RANK", "SLURM_PROCID")
 
 _PETSC_REFUSED = (62, 63, 83, 86)
-"""Codes of PETSc's errors: wrong or out of range argument, file cannot be opened, unknown type."""
+"""Codes of PETSc errors: wrong or out of range argument, file cannot be opened, unknown type."""
 
 GRACE = 3.0
 """Seconds in which all ranks must report the same failure; after that the job is aborted."""
 
 
 def launched_rank() -> int | None:
-    """Rank of this process as its launcher says, None where it was started alone."""
+    """Return the rank of this process according to its launcher, None without a launcher."""
     for variable in RANK_VARIABLES:
         value = os.environ.get(variable, "")
         if value.isdigit():
@@ -40,12 +40,12 @@ def launched_rank() -> int | None:
 
 
 def refuse(error: PfemError, debug: bool) -> int:
-    """Print an error that every rank has found by itself, once, and give its exit status."""
+    """Print once an error that every rank has found, and return its exit status."""
     rank = launched_rank()
     if not rank:
         _print(error, debug)
     if rank is not None:
-        # A launcher kills the other ranks as soon as one ends with an error: wait until it is printed.
+        # A launcher kills the other ranks as soon as one exits with an error: wait until it is printed.
         from mpi4py import MPI
 
         MPI.COMM_WORLD.Barrier()
@@ -53,13 +53,13 @@ def refuse(error: PfemError, debug: bool) -> int:
 
 
 def on_first_rank(function: Callable[[], int], debug: bool, uses_mpi: bool) -> int:
-    """Run what needs one process; further ranks, where there are any, do nothing.
+    """Run a function on one process; further ranks, if there are any, do nothing.
 
     Parameters
     ----------
-    function : gives the exit status
+    function : returns the exit status
     debug : whether a failure prints its traceback
-    uses_mpi : whether the function's imports may start MPI, which must then be started on every rank
+    uses_mpi : whether imports of the function may start MPI, which must then be started on every rank
     """
     rank = launched_rank()
     if rank is not None and uses_mpi:
@@ -70,10 +70,10 @@ def on_first_rank(function: Callable[[], int], debug: bool, uses_mpi: bool) -> i
         return 0
     try:
         status = function()
-        sys.stdout.flush()  # what cannot be written is told, not lost at the end of the process
+        sys.stdout.flush()  # errors of writing are reported here, not lost at the end of the process
         return status
     except BrokenPipeError:
-        # Who reads the output has seen enough (``list | head``); the interpreter must not flush into the closed pipe.
+        # The reader of the output has exited (``list | head``); the interpreter must not flush into the closed pipe.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except (Exception, KeyboardInterrupt) as error:  # noqa: BLE001 - whatever it is becomes a message and a status
@@ -81,10 +81,10 @@ def on_first_rank(function: Callable[[], int], debug: bool, uses_mpi: bool) -> i
 
 
 def collectively(function: Callable[[MPI.Comm], int], debug: bool) -> int:
-    """Run what all ranks do together, and give the exit status, the same on all.
+    """Run a collective function and return the exit status, equal on all ranks.
 
-    Where all ranks fail, the lowest prints its message. Where only some do, the others may wait for them for ever:
-    each of the failed prints its message and ends the job.
+    If all ranks fail, the lowest prints its message. If only some fail, the others may wait for them forever: each of
+    the failed ranks prints its message and ends the job.
     """
     try:
         from mpi4py import MPI
@@ -92,7 +92,7 @@ def collectively(function: Callable[[MPI.Comm], int], debug: bool) -> int:
         return _print(error, debug)
 
     comm = MPI.COMM_WORLD
-    # Of its own, so that it matches whatever else the ranks are waiting in.
+    # A separate communicator, so that messages do not match those that other ranks wait for.
     failures = comm.Dup()
     try:
         status = function(comm)
@@ -108,7 +108,7 @@ def collectively(function: Callable[[MPI.Comm], int], debug: bool) -> int:
 
 
 def _all_arrive(comm: MPI.Comm) -> bool:
-    """Whether every rank gets here within the grace time."""
+    """Return whether every rank arrives within the grace time."""
     request = comm.Ibarrier()
     deadline = time.monotonic() + GRACE
     while not request.Test():
@@ -119,7 +119,7 @@ def _all_arrive(comm: MPI.Comm) -> bool:
 
 
 def _print(error: BaseException, debug: bool, who: str = "") -> int:
-    """Print one message for an error and give its exit status."""
+    """Print one message for an error and return its exit status."""
     status, text = _message(error)
     if debug:
         text = "".join(traceback.format_exception(error)) + text
@@ -135,7 +135,7 @@ def _print(error: BaseException, debug: bool, who: str = "") -> int:
 
 
 def _let_go_of_closed_streams() -> None:
-    """Python flushes both streams at its end, and exits with 120 where that fails."""
+    """Redirect closed streams: Python flushes both at exit, and exits with status 120 if that fails."""
     for stream in (sys.stdout, sys.stderr):
         try:
             number = stream.fileno()
@@ -143,13 +143,13 @@ def _let_go_of_closed_streams() -> None:
             continue
         try:
             stream.flush()
-            os.write(number, b"")  # a terminal that has gone refuses even nothing
+            os.write(number, b"")  # writing to a closed terminal fails even without data
         except OSError:
             _to_nowhere(stream)
 
 
 def _to_nowhere(stream: TextIO) -> None:
-    """The terminal has gone, or its disk is full: the interpreter must not flush into it at its end."""
+    """Redirect a stream whose terminal is closed or disk is full, into which the interpreter must not flush at exit."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 

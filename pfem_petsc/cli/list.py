@@ -29,7 +29,7 @@ KINDS = {
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Options of the verb: none of its own."""
+    """Add no options: the verb has none of its own."""
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -52,7 +52,7 @@ def _title(name: str) -> str:
 
 
 def _first_line(module: str) -> str:
-    """First line of a module's docstring, without running the module (some compile their kernels)."""
+    """Return the first line of a module's docstring without importing it (some modules compile kernels)."""
     spec = importlib.util.find_spec(module)
     text = ast.get_docstring(ast.parse(Path(spec.origin).read_text(encoding="utf-8"))) or ""
     return text.partition("\n")[0]

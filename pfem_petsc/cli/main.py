@@ -1,4 +1,4 @@
-"""The command line: finds the verb, gives it to the ranks that run it, and turns errors into messages and status."""
+"""The command line: finds the verb, runs it on its ranks, and converts errors to messages and exit status."""
 
 from __future__ import annotations
 
@@ -41,17 +41,17 @@ CASE alone means run. Everything after -- goes to PETSc. VERB --help shows more.
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line and give its exit status.
+    """Run the command line and return its exit status.
 
     Parameters
     ----------
-    argv : arguments without the program's name; default: those of this process
+    argv : arguments without the name of the program; default: those of this process
     """
     words = list(sys.argv[1:] if argv is None else argv)
     cut = words.index("--") if "--" in words else len(words)
     own, petsc_options = words[:cut], words[cut + 1 :]
     debug = "--debug" in own
-    # numbers that overflow are told as what they lead to
+    # overflows are reported by their consequences
     warnings.filterwarnings("default" if debug else "ignore", category=RuntimeWarning)
     try:
         _require_text(words)
@@ -92,11 +92,11 @@ def _parse(words: list[str]) -> tuple[argparse.Namespace, ModuleType]:
         if near and not Path(words[0]).exists() and words[0] not in built_in_cases():
             raise InputError(f"{words[0]}: there is no such verb or case; did you mean '{near[0]}'?")
         words = ["run", *words]
-    # Help comes from one rank.
+    # One rank prints help.
     with contextlib.redirect_stdout(io.StringIO()) if launched_rank() else contextlib.nullcontext():
         arguments, unknown = parser.parse_known_args(words)
     if unknown:
-        # the parser of all verbs would name its own help
+        # the common parser would refer to its own help
         raise InputError(f"unrecognized arguments: {' '.join(unknown)}; see {PROGRAM} {arguments.verb} --help")
     return arguments, verbs[arguments.verb]
 

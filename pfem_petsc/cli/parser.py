@@ -1,4 +1,4 @@
-"""The parser of the command line; options that several verbs share."""
+"""The parser of the command line, and options that several verbs share."""
 
 from __future__ import annotations
 
@@ -16,22 +16,22 @@ PROGRAM = "python -m pfem_petsc"
 
 
 class Parser(argparse.ArgumentParser):
-    """Parser whose refusals are raised instead of printed, so that one rank can print them."""
+    """Parser that raises errors instead of printing them, so that one rank can print them."""
 
     def __init__(self, **settings: object) -> None:
         settings.setdefault("formatter_class", argparse.RawDescriptionHelpFormatter)
         super().__init__(allow_abbrev=False, **settings)  # type: ignore[arg-type]
-        # argparse takes -1 for a number and -1e8 for an option.
+        # argparse treats -1 as a number and -1e8 as an option.
         self._negative_number_matcher = re.compile(r"^-(\d+\.?\d*|\.\d+)(e[-+]?\d+)?$", re.IGNORECASE)
 
     def error(self, message: str) -> NoReturn:
-        """Raise the refusal as invalid input."""
+        """Raise the error as invalid input."""
         hint = " (give it before --set and --restart)" if "required: CASE" in message else ""
         raise InputError(f"{message}{hint}; see {self.prog} --help")
 
 
 def add_case(parser: argparse.ArgumentParser) -> None:
-    """CASE and --set."""
+    """Add CASE and --set."""
     parser.add_argument("case", metavar="CASE", help="TOML file, or name of a built-in case (see list)")
     parser.add_argument(
         "--set",
@@ -45,19 +45,19 @@ def add_case(parser: argparse.ArgumentParser) -> None:
 
 
 def add_result(parser: argparse.ArgumentParser) -> None:
-    """RESULT."""
+    """Add RESULT."""
     parser.add_argument("result", metavar="RESULT", help="result file, or its folder")
 
 
 def surviving(result: str, deep: bool | None = None, refuse: bool = False) -> Path:
-    """The result file of RESULT, after a process of its own has read it: HDF5 may crash on a damaged one.
+    """Return the result file of RESULT after a separate process has read it, because HDF5 may crash on a damaged file.
 
     Values that do not match their checksums are a warning on stderr, or refused.
 
     Raises
     ------
     InputError
-        There is no such file, or it cannot be read; with ``refuse`` also where values do not match.
+        If there is no such file, or it cannot be read; with ``refuse`` also if values do not match.
     """
     from ..output.result import result_file
     from ..output.verify import SHOWN, examine
@@ -74,17 +74,17 @@ def surviving(result: str, deep: bool | None = None, refuse: bool = False) -> Pa
 
 
 def add_debug(parser: argparse.ArgumentParser) -> None:
-    """--debug, which every verb has."""
+    """Add --debug, which every verb has."""
     parser.add_argument("--debug", action="store_true", help="print the traceback of a failure")
 
 
 def seconds(text: str) -> float:
-    """A duration: ``90``, ``1:30`` or ``0:01:30``, in seconds.
+    """Convert a duration, ``90``, ``1:30`` or ``0:01:30``, to seconds.
 
     Raises
     ------
     argparse.ArgumentTypeError
-        Where it is none, or not positive.
+        If it is not a duration, or not positive.
     """
     try:
         parts = [float(part) for part in text.split(":")]

@@ -14,19 +14,19 @@ from .parser import PROGRAM
 __all__ = ["PREFIXES", "start_petsc", "without_effect"]
 
 PREFIXES = ("pfem_contact_full_", "pfem_contact_", "pfem_assembled_", "pfem_mass_", "pfem_")
-"""Of the program's solvers, described in docs/linear_solvers.md."""
+"""Prefixes of the program's solvers, described in docs/linear_solvers.md."""
 
 _SOLVER = ("snes_", "ksp_", "pc_", "mg_", "sub_", "mat_mumps_", "esteig_", "linesearch_")
 _FILES = ("-options_file", "-options_file_yaml")
 
 
 def start_petsc(options: Sequence[str], rank: int) -> None:
-    """Start PETSc with options; rank 0 warns of those without effect.
+    """Start PETSc with options; rank 0 warns about those without effect.
 
     Raises
     ------
     InputError
-        An options file that is missing, or options that PETSc does not take.
+        If an options file is missing, or PETSc refuses an option.
     """
     import petsc4py
 
@@ -45,7 +45,7 @@ def start_petsc(options: Sequence[str], rank: int) -> None:
 
 
 def without_effect(options: Sequence[str]) -> list[str]:
-    """A line for each option of a solver that none of the program's solvers reads."""
+    """Return one line for each solver option that none of the program's solvers reads."""
     lines = []
     for word in options:
         name = word.lstrip("-")

@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Plot, and say what was written."""
+    """Plot, and print the names of the files written."""
     from ..post.plot import plot
 
     for path in plot(surviving(arguments.result), arguments.output, curves=arguments.curves):

@@ -27,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--frames", metavar="N[,N...]", type=_frames, help="how many snapshots to draw, or their numbers; default: all"
     )
-    parser.add_argument("--fps", type=float, default=24.0, help="frames a second of the film; default: %(default)g")
+    parser.add_argument("--fps", type=float, default=24.0, help="frames per second of the film; default: %(default)g")
     parser.add_argument("--size", metavar="WxH", type=_size, default=(1280, 720), help="pixels; default: 1280x720")
     parser.add_argument("--view", default="auto", help="xy, xz, yz, iso or auto; default: %(default)s")
     parser.add_argument("--video", default="mp4", help="mp4, gif, both or none; default: %(default)s")
@@ -47,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Draw, and say what was written."""
+    """Draw, and print the names of the files written."""
     from ..post.render import render
 
     written = render(

@@ -53,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(arguments: argparse.Namespace, comm: MPI.Comm) -> int:
-    """Simulate, and give the exit status. Collective."""
+    """Simulate, and return the exit status. Collective."""
     restart = arguments.restart if arguments.restart in (None, True) else Path(arguments.restart)
     case = load_case(arguments, comm)
     output = arguments.output or Path("results", case.name)
@@ -75,9 +75,9 @@ def run(arguments: argparse.Namespace, comm: MPI.Comm) -> int:
 
 
 def load_case(arguments: argparse.Namespace, comm: MPI.Comm) -> Case:
-    """The case of the command line, read by rank 0; PETSc is started with its options. Collective.
+    """Return the case of the command line, read by rank 0; start PETSc with its options. Collective.
 
-    A restart goes on with the values that the run it continues was given by ``--set``, and those given now over them.
+    A restart applies the ``--set`` values of the continued run, overridden by those given now.
     """
     start_petsc(arguments.petsc_options, comm.rank)
     from ..parallel.agreement import on_root
@@ -101,7 +101,7 @@ def _load(arguments: argparse.Namespace) -> Case:
 
 
 def _command(arguments: argparse.Namespace, case: Case, ranks: int) -> str:
-    """The command line that continues this run, to be pasted into a shell."""
+    """Return the shell command that continues this run."""
     launcher = []
     if ranks > 1:
         launcher = ["srun" if "SLURM_STEP_NUM_TASKS" in os.environ else "mpirun", "-n", str(ranks)]

@@ -1,9 +1,9 @@
-"""The active set of contact in an implicit step: solves with bounds until all rows of walls and links are kept.
+"""The active set of contact in an implicit step: bounded solves until all rows of walls and links are satisfied.
 
-A step is solved with bounds for the nodes that may reach a wall, and for the links that may be met. Afterwards all rows
-are checked: walls that nodes were not expected at, walls that found no place among three coordinates, curved walls
-whose tangent plane was that of another point, links that were met, and rows whose gradients turn. Where something is
-left, the step is solved again, from where it is, with what was learnt. Values go from one to the next:
+A step is solved with bounds for the nodes that may reach a wall and for the links that may close. Afterwards all rows
+are checked: walls that nodes were not expected to reach, walls without a row among the three coordinates, curved walls
+whose tangent plane was taken at another point, links that have closed, and rows whose gradients have turned. If any
+check fails, the step is solved again from the current solution with updated candidates. Data flow:
 
     Candidates -> Trial (frames, transform) -> Bounds -> solution -> Outcome (forces, next Candidates) -> ...
 """
@@ -38,9 +38,9 @@ if TYPE_CHECKING:
 __all__ = ["ActiveSet", "Outcome", "Trial"]
 
 _ITERATIONS = 50  # solves of a step
-_PATIENCE = 5  # of these, before deferred walls take a row of smaller volume
-_SMALL_VOLUME = 1e-3  # of rows: two planes share a node from 0.06 degrees on
-_DESCENTS = 30  # of a guess from which Newton's method cycled
+_PATIENCE = 5  # solves before deferred walls may take a row of smaller volume
+_SMALL_VOLUME = 1e-3  # of rows: two planes can bound the same node from an angle of 0.06 degrees
+_DESCENTS = 30  # descent steps from a guess at which Newton's method cycled
 
 
 @dataclass(frozen=True)
@@ -49,8 +49,8 @@ class Trial:
 
     Attributes
     ----------
-    candidates : near walls; frames : of these; links : that may be met; transform : made of both
-    tied : places among the frames (k,), walls (k,) and places (k, 3) [m] of nodes that walls hold for good
+    candidates : nodes near walls; frames : their frames; links : that may close; transform : built from both
+    tied : of tied nodes, indices among the frames (k,), walls (k,) and positions (k, 3) [m]
     """
 
     candidates: Candidates
@@ -62,14 +62,14 @@ class Trial:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What the check of a solution found.
+    """Result of the check of a solution.
 
     Attributes
     ----------
-    settled : whether all rows are kept
-    candidates, links : of the next solve
-    trial : that was solved
-    normal_forces : (m, walls) on the candidates of the trial [N]; pull : (m, 3) what walls must bear there [N]
+    settled : whether all rows are satisfied
+    candidates, links : for the next solve
+    trial : the trial that was solved
+    normal_forces : (m, walls) on the candidates of the trial [N]; pull : (m, 3) force that walls must balance there [N]
     """
 
     settled: bool
@@ -113,12 +113,12 @@ class ActiveSet:
         self.links = tuple(link for link in links if link.reached(state, move, slack))
 
     def place(self, candidates: Candidates, links: Sequence[LinkCoordinates], x: np.ndarray) -> Trial:
-        """Coordinates of candidates and links at positions (owned, 3). Collective.
+        """Build the coordinates of candidates and links at positions (owned, 3). Collective.
 
         Raises
         ------
         SimulationFailure
-            On all ranks, where walls and supports leave a node no room.
+            On all ranks, if the walls and supports of a node are infeasible together.
         """
         contact, time = self.contact, self.balance.time
         frames, tied = NodalFrames(candidates.nodes, len(contact.walls)), contact.ties.nobody
@@ -134,9 +134,9 @@ class ActiveSet:
         return Trial(candidates, frames, tied, tuple(links), Transform(self.model, met, links))
 
     def feasible(self, trial: Trial, u: np.ndarray, stiffness: np.ndarray | None = None) -> np.ndarray:
-        """The increment (owned, 3) nearest to a guess that keeps the frames' planes and the links. Collective.
+        """Return the increment (owned, 3) nearest to a guess that satisfies the frames' planes and links. Collective.
 
-        ``stiffness`` (owned,): how hard nodes of links are to move [N/m]; default: as their masses.
+        ``stiffness`` (owned,): weights of the nodes of links in the distance [N/m]; default: their masses.
         """
         u, frames, fixed = u.copy(), trial.frames, self.contact.fixed
         for link in trial.links:
@@ -152,9 +152,9 @@ class ActiveSet:
         return u
 
     def approach(self, trial: Trial, problem: StepProblem, u: np.ndarray) -> np.ndarray:
-        """A guess (owned, 3) with a better active set, by projected steepest descent. Collective.
+        """Return a guess (owned, 3) with a better active set, by projected steepest descent. Collective.
 
-        In oblique coordinates Newton's active sets can cycle; projections onto the true planes cannot.
+        In oblique coordinates the active sets of Newton's method can cycle; projections onto the planes cannot.
         """
         model = self.model
         stiffness = problem.nodal + 2.0 * self.balance.weight * model.nodal_stiffness
@@ -167,13 +167,13 @@ class ActiveSet:
         return u
 
     def relax(self, trial: Trial) -> bool:
-        """Keep the directions of slip in the next solve; whether the last one solved for them. Collective."""
+        """Fix the directions of slip in the next solve; return whether the last solve solved for them. Collective."""
         return trial.candidates.anywhere and self.friction.relax()
 
     def bounds(self, trial: Trial, guess: np.ndarray, w: np.ndarray) -> Bounds:
-        """Bounds on w (owned, 3): those of the frames less B predictor, and of links. Collective.
+        """Return bounds on w (owned, 3): those of the frames minus B predictor, and those of links. Collective.
 
-        ``guess``, ``w`` (owned, 3): of u, with prescribed components as they will be, and the same as w.
+        ``guess``, ``w`` (owned, 3): a guess of u with the prescribed components at their new values, and its w.
         """
         if not trial.transform.bounded:
             return Bounds()
@@ -190,19 +190,19 @@ class ActiveSet:
     def check(
         self, trial: Trial, bounds: Bounds, w: np.ndarray, u: np.ndarray, g: np.ndarray, noise: float, tolerance: float
     ) -> Outcome:
-        """Whether the solution keeps all walls and links; if not, the next solve knows better. Collective.
+        """Check whether the solution satisfies all walls and links, and prepare the next solve if not. Collective.
 
         Parameters
         ----------
         w, u : (owned, 3) solution in the trial's coordinates and in x [m]
-        g : (owned, 3) imbalance there [N]
-        noise : what a free node has left of it [N]
-        tolerance : what it may have left [N]
+        g : (owned, 3) residual force at the solution [N]
+        noise : residual force left at a free node [N]
+        tolerance : residual force allowed at a free node [N]
 
         Raises
         ------
         NotConverged
-            On all ranks, after too many solves.
+            On all ranks, if the number of solves exceeds its limit.
         """
         contact, frames, candidates = self.contact, trial.frames, trial.candidates
         x, at = self.balance.predictor + u, trial.candidates.nodes
@@ -233,7 +233,7 @@ class ActiveSet:
         return f"step {self.state.step + 1}, t = {self.balance.time:.6g} s"
 
     def _why(self, left: np.ndarray, x: np.ndarray) -> str:
-        """Why solves of nodes (k,) at (owned, 3) do not converge, and what to do. Collective."""
+        """Return why the solves of nodes (k,) at (owned, 3) do not converge, and the remedy. Collective."""
         comm, jams = self.model.comm, self.friction.jams(left, x, self._displacements)
         jams = [text for part in comm.allgather(jams[:1]) for text in part]
         if jams:
@@ -248,8 +248,8 @@ class ActiveSet:
     def _check_links(
         self, trial: Trial, bounds: Bounds, w: np.ndarray, x: np.ndarray, g: np.ndarray, noise: float, slack: float
     ) -> tuple[bool, tuple[LinkCoordinates, ...], np.ndarray]:
-        """Whether links are kept at positions (owned, 3), those of the next solve, and what of the imbalance walls must
-        bear. Collective."""
+        """Return whether links are satisfied at positions (owned, 3), the links of the next solve, and the part of the
+        residual force that walls must balance. Collective."""
         kept, met, at = True, list(trial.links), trial.frames.nodes
         turned, g = g, g.copy() if trial.links else g
         if trial.links:
@@ -257,7 +257,7 @@ class ActiveSet:
             turned[at] = np.einsum("nji,nj->ni", trial.frames.inverse, g[at])
         for link in self._all_links:
             if link not in trial.links:
-                if link.broken(x, slack):  # it was not expected to be met
+                if link.broken(x, slack):  # it was not expected to close
                     met.append(link)
                 continue
             link.solve_forces(w, turned, bounds.arrays[0], noise)
@@ -275,7 +275,7 @@ class ActiveSet:
         return kept and len(links) == len(trial.links), links, g
 
     def forces(self, outcome: Outcome, u: np.ndarray) -> tuple[np.ndarray, WallForces, np.ndarray]:
-        """Contact forces (owned, 3) [N], sums per wall, and which owned nodes walls hold, at the solution."""
+        """Return contact forces (owned, 3) [N], sums per wall, and the owned nodes in contact, at the solution."""
         total = np.zeros_like(u)
         for link in self._all_links:
             if link not in outcome.links:

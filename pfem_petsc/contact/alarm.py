@@ -1,10 +1,10 @@
-"""The alarm of contact: a node beyond a wall where results are written is an error, whatever treatment let it pass.
+"""Check of contact when results are written: a node beyond a wall is an error, whatever the treatment.
 
-Positions that a step was solved for keep every wall to rounding, with all schemes and treatments; so they are what is
-looked at. With Wilson's method these are x_tau at t + theta h, not x1, which may lie beyond a wall by no more than the
-way from one to the other, (theta - 1) h v. No wall at all is a wall whose ``node_set`` does not contain the node, and a
-rectangle, which nodes pass beside. Supports that prescribe a node along the normal decide over the wall; where
-they take it beyond, both cannot be meant, and that is told as well: of rectangles by the step that crosses them.
+The positions that a step solves for satisfy every wall to rounding, with all schemes and treatments, so these are
+checked. With Wilson's method they are x_tau at t + theta h, not x1, which may lie beyond a wall by at most the
+displacement between the two, (theta - 1) h v. Walls whose ``node_set`` does not contain the node are skipped, and so
+are rectangles, which nodes can pass beside. Supports that prescribe a node along the normal override the wall. If they
+move a node beyond it, the input contradicts itself and is reported too, for rectangles by the step that crosses them.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ __all__ = ["CarriedNodes", "check_positions"]
 
 
 def check_positions(stepper: Stepper) -> None:
-    """Refuse a state with a node beyond a wall. One pass over the nodes and one reduction. Collective.
+    """Check that no node lies beyond a wall, with one pass over the nodes and one reduction. Collective.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ def check_positions(stepper: Stepper) -> None:
     Raises
     ------
     SimulationFailure
-        On all ranks: the wall, its deepest node and depth, how many there are, the step, and what to do.
+        On all ranks, with the wall, its deepest node and depth, the number of nodes, the step, and the remedy.
     """
     model, state, balance = stepper.model, stepper.state, stepper.balance
     contact, comm = model.contact, model.comm
@@ -44,13 +44,13 @@ def check_positions(stepper: Stepper) -> None:
         return
     x, time = state.position, state.time
     if not stepper.scheme.solves_end:
-        if balance is None:  # at the start, or right after a restart: looked at before
+        if balance is None:  # at the start, or right after a restart: checked before
             return
         x, time = balance.predictor + stepper.solution.u, balance.time
     gaps = contact.gaps(x, time)
     gaps[:, [wall.partial for wall in contact.walls]] = np.inf
     tolerance = BEYOND * max(model.length, model.reach)
-    # NaN is no number that a wall could be kept with, but has its own message
+    # a NaN has its own message elsewhere
     suspects = np.flatnonzero((gaps < -tolerance).any(axis=1))
     if comm.allreduce(len(suspects), op=MPI.MAX) == 0:
         return
@@ -70,28 +70,28 @@ def check_positions(stepper: Stepper) -> None:
         others = f'contact.treatment = "scheme" instead of "{case.contact.treatment}"'
     raise SimulationFailure(
         f"{where}: node {node} is {-depth:.3g} m beyond wall {contact.names[wall]!r} "
-        f"({count} node{'s' if count > 1 else ''} in all), which contact did not prevent: what was computed since it "
-        f"passed it is wrong; reduce time.step, or use {others}"
+        f"({count} node{'s' if count > 1 else ''} in all), which contact did not prevent: results since it "
+        f"passed the wall are wrong; reduce time.step, or use {others}"
     )
 
 
 def _told(where: str, node: int, depth: float, wall: str, count: int) -> str:
-    """What to tell about nodes that supports carry beyond a wall."""
+    """Return the message about nodes that supports move beyond a wall."""
     return (
         f"{where}: node {node} is {depth:.3g} m beyond wall {wall!r} "
-        f"({count} node{'s' if count > 1 else ''} in all), where its supports take it; let the wall move with "
-        "the supports, name the nodes that it concerns with 'node_set', or do not tie them"
+        f"({count} node{'s' if count > 1 else ''} in all), moved there by its supports; let the wall move with "
+        "the supports, name the nodes that it stops with 'node_set', or do not tie them"
     )
 
 
 class CarriedNodes:
-    """This rank's nodes whose way along the normal of a rectangle supports prescribe: no contact can stop them.
+    """Nodes of this rank whose motion along the normal of a rectangle is prescribed, so that contact cannot stop them.
 
-    Only the step in which they cross it tells that they have not come from beside or behind, so that each is looked at.
+    Only the step in which a node crosses shows that it did not come from beside or behind, so every step is checked.
 
     Attributes
     ----------
-    of : index of each rectangle that concerns such nodes, to these nodes (k,)
+    of : index of each rectangle that applies to such nodes, to these nodes (k,)
     """
 
     def __init__(self, contact: Contact) -> None:
@@ -103,12 +103,12 @@ class CarriedNodes:
                 self.of |= {k: nodes} if len(nodes) else {}
 
     def places(self, x: np.ndarray, time: float) -> dict[int, np.ndarray]:
-        """Where they are (k, 3) [m] relative to the rectangles, from all positions (owned, 3)."""
+        """Return their positions (k, 3) [m] relative to the rectangles, from all positions (owned, 3)."""
         displacements = self._contact.motion.displacements(time)
         return {k: x[nodes] - displacements[k] for k, nodes in self.of.items()}
 
     def crossing(self, before: dict[int, np.ndarray], after: dict[int, np.ndarray], where: str) -> str | None:
-        """What to tell of those that cross a rectangle on the way between two :meth:`places`, None for nothing."""
+        """Return the message about nodes that cross a rectangle between two :meth:`places`, None if there are none."""
         contact, tolerance = self._contact, BEYOND * self._contact.length
         for k, nodes in self.of.items():
             wall = contact.walls[k]
@@ -122,7 +122,10 @@ class CarriedNodes:
 
 
 def _prescribed(contact: Contact, node: int, wall: int, x: np.ndarray, time: float) -> bool:
-    """Whether supports prescribe an owned node of those at (owned, 3) along a wall's normal, or in part a tied node."""
+    """Return whether supports prescribe an owned node along a wall's normal, or some components of a tied node.
+
+    ``x`` (owned, 3) : positions [m]
+    """
     if contact.ties.any and contact.ties.held[node] and contact.fixed[node].any():
         return True
     normals, _ = contact.planes(

@@ -11,29 +11,29 @@ __all__ = ["Bounds"]
 
 @dataclass(frozen=True)
 class Bounds:
-    """What the rows of walls and links make of the unknowns.
+    """Lower and upper bounds that the rows of walls and links place on the unknowns.
 
     Attributes
     ----------
-    arrays : lower and upper bounds (owned, 3) [m], infinite where there is none; None in free flight
+    arrays : lower and upper bounds (owned, 3) [m], infinite where there is no bound; None in free flight
     """
 
     arrays: tuple[np.ndarray, np.ndarray] | None = None
 
     def clip(self, w: np.ndarray) -> np.ndarray:
-        """A guess (owned, 3) within the bounds, to the last digit."""
+        """Return a guess (owned, 3) clipped exactly to the bounds."""
         return w if self.arrays is None else np.clip(w, *self.arrays)
 
     def project(self, w: np.ndarray, within: float) -> None:
-        """Put unknowns (owned, 3) that are no farther than ``within`` [m] from a bound exactly there."""
+        """Set unknowns (owned, 3) within ``within`` [m] of a bound to the bound, in place."""
         for bound in self.arrays or ():
             near = np.abs(w - bound) <= within
             w[near] = bound[near]
 
     def active(self, nodes: np.ndarray, w: np.ndarray, g: np.ndarray, noise: float) -> np.ndarray:
-        """(m, 3) int8: -1 where unknowns of nodes (m,) are pressed on their lower bound, 1 on the upper, else 0.
+        """Return (m, 3) int8: -1 where an unknown of nodes (m,) is active at its lower bound, 1 at the upper, else 0.
 
-        ``w`` (owned, 3), residual ``g`` (m, 3) of these nodes; one of at most ``noise`` presses nothing [N].
+        ``w`` (owned, 3); ``g`` (m, 3) residual of these nodes, zero up to ``noise`` [N].
         """
         lower, upper = self.arrays
         active = np.zeros((len(nodes), 3), dtype=np.int8)

@@ -20,12 +20,12 @@ __all__ = ["Candidates", "expected_candidates"]
 
 @dataclass(frozen=True)
 class Candidates:
-    """Nodes that are solved with bounds.
+    """Nodes whose unknowns have bounds.
 
     Attributes
     ----------
     nodes : (m,) owned local indices, ascending; applicable : (m, walls) bool, walls that may stop them
-    priority : (m, walls) in which order walls are taken, lowest first; None: by distance
+    priority : (m, walls) order of the walls, lowest first; None: by distance
     anywhere : whether any rank has candidates
     """
 
@@ -44,16 +44,16 @@ class Candidates:
         strengths: np.ndarray,
         largest_rank: float,
     ) -> Candidates:
-        """The candidates of the next solve: broken walls first, then pressing ones, then by distance.
+        """Return the candidates of the next solve: violated walls first, then those that press, then by distance.
 
         Parameters
         ----------
         contact : Contact
         displacements : (walls, 3) of walls [m]
-        joined, broken : (k,) nodes beyond walls, and which walls these are (k, walls)
+        joined, broken : (k,) nodes beyond walls, and (k, walls) bool, which walls
         x : (owned, 3) positions [m]
         strengths : (m, walls) normal forces on the present candidates [N]
-        largest_rank : what puts a pressing wall before all that are apart [m]
+        largest_rank : offset that orders walls that press before all open ones [m]
         """
         nodes = np.union1d(self.nodes, joined)
         applicable = np.zeros((len(nodes), len(contact.walls)), dtype=bool)
@@ -70,16 +70,17 @@ class Candidates:
         return Candidates(nodes, applicable, priority)
 
     def without(self, held: np.ndarray) -> Candidates:
-        """The same where no wall is applicable to nodes that are ``held`` (owned,) bool for good."""
+        """Return the candidates with no applicable walls at tied nodes, ``held`` (owned,) bool."""
         return replace(self, applicable=self.applicable & ~held[self.nodes][:, None])
 
 
 def expected_candidates(
     model: Model, state: State, balance: Balance, held: np.ndarray, displacements: np.ndarray
 ) -> Candidates:
-    """Owned nodes that may touch a wall in a step, ``held`` (owned,) by walls before among them. Collective.
+    """Return the owned nodes that may touch a wall in a step, among them those in contact before it. Collective.
 
-    ``displacements`` (walls, 3) : of the walls where the balance holds [m]
+    ``held`` (owned,) bool : nodes in contact before the step; ``displacements`` (walls, 3) : of the walls at the time
+    of the balance [m]
     """
     contact, walls = model.contact, len(model.contact.walls)
     nobody = Candidates(np.empty(0, dtype=np.int64), np.zeros((0, walls), dtype=bool), anywhere=False)
@@ -99,7 +100,7 @@ def expected_candidates(
 def _within_reach(
     model: Model, state: State, nodes: np.ndarray, x: np.ndarray, displacements: np.ndarray, reach: np.ndarray
 ) -> np.ndarray:
-    """(m, walls) bool: walls that nodes (m,) on their way to (m, 3) come within reach (m,) [m] of, or are at."""
+    """Return (m, walls) bool: walls that nodes (m,) moving to (m, 3) touch or come within reach (m,) [m] of."""
     contact = model.contact
     applicable = contact.applicable(nodes, x, displacements)
     within = np.zeros_like(applicable)

@@ -1,6 +1,6 @@
-"""Small complementarity problems of nodes that pairs, walls and supports hold together.
+"""Small complementarity problems of nodes that pairs, walls and supports couple.
 
-Groups of pairs have their problems solved one after the other in one compiled loop: see
+One compiled loop solves the problems of all groups of pairs, one after the other; see
 :mod:`~pfem_petsc.contact.coupled`.
 """
 
@@ -18,7 +18,7 @@ __all__ = ["complementary", "solve_groups"]
 
 @kernel
 def _solve(matrix, rhs, n):
-    """Solve the leading n x n system in place, by elimination with the largest pivots; False where it is singular."""
+    """Solve the leading n x n system in place, by elimination with pivoting; return False if it is singular."""
     for k in range(n):
         pivot = k
         for i in range(k + 1, n):
@@ -53,7 +53,7 @@ def _active_system(matrix, active, count, system):
 
 @kernel
 def _complementary(matrix, values, tolerance, z):
-    """See :func:`complementary`; False where there is no solution."""
+    """See :func:`complementary`; return False if there is no solution."""
     n = len(values)
     active = np.empty(n, dtype=np.int64)
     held = np.zeros(n, dtype=np.bool_)
@@ -75,7 +75,7 @@ def _complementary(matrix, values, tolerance, z):
         if n == 0 or least >= -tolerance:
             return True
         while True:
-            # with the active rows kept, a unit of the new multiplier takes `lost` off theirs, and lifts its row
+            # with the active rows satisfied, a unit of the new multiplier reduces theirs by `lost` and lifts its row
             _active_system(matrix, active, count, system)
             for a in range(count):
                 lost[a] = matrix[active[a], row]
@@ -121,10 +121,10 @@ def _complementary(matrix, values, tolerance, z):
 
 
 def complementary(matrix: np.ndarray, values: np.ndarray, tolerance: float) -> np.ndarray | None:
-    """0 <= z complementary to (matrix z + values) >= 0 for a symmetric matrix (n, n) without negative eigenvalues.
+    """Solve 0 <= z complementary to (matrix z + values) >= 0 for a positive semidefinite matrix (n, n).
 
-    By dual active sets, the most broken row first (D. Goldfarb, A. Idnani, Mathematical Programming 27, 1983). Rows
-    broken by no more than the tolerance count as kept; None where there is no solution.
+    Uses dual active sets, the most violated row first (D. Goldfarb, A. Idnani, Mathematical Programming 27, 1983). Rows
+    violated by at most the tolerance count as satisfied. Returns None if there is no solution.
     """
     z = np.zeros(len(values))
     return z if _complementary(np.ascontiguousarray(matrix), values, tolerance, z) else None
@@ -134,29 +134,30 @@ def complementary(matrix: np.ndarray, values: np.ndarray, tolerance: float) -> n
 def solve_groups(
     groups, starts, members, ends, pair_normals, least, x, stiffness, free, first_plane, planes, tolerance, force
 ):
-    """Forces of the pairs of some groups, from the problems with their walls.
+    """Solve for the forces of the pairs of some groups, together with the walls at their nodes.
 
     Parameters
     ----------
-    groups : (g,) which groups
+    groups : (g,) indices of the groups
     starts, members : (groups + 1,), (p,) pairs of each group: members[starts[k] : starts[k + 1]]
-    ends, pair_normals, least : (2, p), (p, 3), (p,) nodes, directions and bounds of pairs, -inf where of no concern
-    x, stiffness, free : (n, 3), (n,), (n, 3) of nodes; ``free`` is 0.0 where supports hold
+    ends, pair_normals, least : (2, p), (p, 3), (p,) nodes, directions and bounds of pairs, -inf for pairs that do not
+        apply
+    x, stiffness, free : (n, 3), (n,), (n, 3) of nodes; ``free`` is 0.0 where supports prescribe
     first_plane : (n,) first row of a node among the planes, -1 for nodes of other groups
-    planes : (normals (k, w, 3), offsets (k, w)), -inf where a wall is no concern
-    tolerance : a constraint broken by no more counts as kept
-    force : (p,) out; written for these groups
+    planes : (normals (k, w, 3), offsets (k, w)), -inf where a wall does not apply
+    tolerance : a constraint violated by at most this counts as satisfied
+    force : (p,) output; written for these groups only
 
     Returns
     -------
     int
-        First of the groups whose constraints contradict each other, else -1.
+        First of the groups with infeasible constraints, else -1.
     """
     normals, offsets = planes
     walls = offsets.shape[1]
     for group in groups:
         begin, end = starts[group], starts[group + 1]
-        if end - begin == 1:  # mostly a pair is alone, and its own solution breaks no wall
+        if end - begin == 1:  # the common case: a single pair whose own solution violates no wall
             p = members[begin]
             i, j = ends[0, p], ends[1, p]
             square, distance, soft_first, soft_second = 0.0, 0.0, 0.0, 0.0
@@ -217,7 +218,7 @@ def solve_groups(
             for e in range(2):
                 i = ends[e, members[q]]
                 known = False
-                for b in range(begin, q + 1):  # a node of several pairs has its walls once
+                for b in range(begin, q + 1):  # the walls of a node in several pairs enter once
                     for d in range(2):
                         if (b < q or d < e) and ends[d, members[b]] == i:
                             known = True

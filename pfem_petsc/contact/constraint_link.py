@@ -1,6 +1,6 @@
-"""The constraints of a case as a link: what steps ask of rows, whatever kind they are of.
+"""The constraints of a case as a link: the interface of rows of any kind to the steps.
 
-All ranks know all rows and solve the same small problems; each applies what concerns its own nodes.
+All ranks know all rows and solve the same small problems; each rank applies the result to its own nodes.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class ConstraintLink:
     Attributes
     ----------
     rows : Rows
-    force : (r,) of the last step [N]; jacobian : (e, 3) gradients along which these act; the same on all ranks
+    force : (r,) of the last step [N]; jacobian : (e, 3) gradients along which they act; the same on all ranks
     """
 
     key = "constraints"
@@ -57,7 +57,7 @@ class ConstraintLink:
             key = f"{case.source}: constraint {parameters.name!r}"
             try:
                 source = lookup(PACKAGE, parameters.kind, f"{key}: kind").Constraint(parameters, nodes_of)
-            except InputError as error:  # a kind knows its keys, but not the file that they are in
+            except InputError as error:  # a kind knows its keys, but not the file that contains them
                 raise InputError(f"{key}: {error}") from error
             same = np.sort(source.nodes, axis=1)
             if (same[:, 1:] == same[:, :-1]).any():
@@ -72,7 +72,7 @@ class ConstraintLink:
         return self.rows.numbers
 
     def release(self) -> None:
-        """No row presses."""
+        """Set all forces to zero."""
         self.force = np.zeros(len(self.rows.source))
         self.jacobian = np.zeros((len(self.rows.entry_row), 3))
 
@@ -95,12 +95,12 @@ class ConstraintLink:
         contact[here] += forces
 
     def _planes(self, x: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray]:
-        """Planes (n, w, 3), (n, w) of walls at all nodes, from positions (m, 3) of those here. Collective."""
+        """Return planes (n, w, 3), (n, w) of walls at all nodes, from positions (m, 3) of owned nodes. Collective."""
         contact, here = self.contact, self.rows.here
         walls = len(contact.walls)
         displacements = contact.motion.displacements(time)
         normals, offsets = contact.planes(contact.applicable(here, x, displacements), x, displacements)
-        # a sum over ranks cannot take infinities
+        # a sum over ranks must not contain infinities
         data = np.zeros((len(contact.members), 4 * walls))
         data[here] = np.hstack([normals.reshape(len(here), 3 * walls), np.maximum(offsets, -1e300)])
         data = self.rows.gather(data) if walls else np.zeros((len(self.rows.numbers), 0))
@@ -117,7 +117,7 @@ class ConstraintLink:
 
     def totals(self) -> np.ndarray:
         totals = np.zeros((len(self.names), 3))
-        if self.rows.mesh.comm.rank == 0:  # all ranks know them
+        if self.rows.mesh.comm.rank == 0:  # all ranks know the forces
             np.add.at(totals, self.rows.source, self.force[:, None] * self.jacobian[self.rows.last])
         return totals
 
@@ -155,7 +155,7 @@ class ConstraintLink:
             )
 
     def resting(self, x: np.ndarray, v: np.ndarray, slack: float, still: float) -> np.ndarray:
-        """Second derivatives (r,) by time of closed rows without acceleration, infinite for the others [m/s2]."""
+        """Return second time derivatives (r,) [m/s2] of closed rows at zero acceleration, infinite for open rows."""
         x, v = self.rows.gather(x), self.rows.gather(v)
         self.jacobian = self.rows.gradients(x)
         closed = np.abs(self.rows.values(x)) <= slack
@@ -185,7 +185,7 @@ class ConstraintLink:
         return {}
 
     def load_state(self, name: str, values: np.ndarray) -> None:
-        """There are no arrays."""
+        """Do nothing: constraints keep no arrays."""
 
     def restore(self, saved: dict[str, list]) -> None:
         self.force = np.array(saved["force"], dtype=float)
@@ -193,5 +193,5 @@ class ConstraintLink:
 
 
 def acts_at_start(balance: Balance, state: State) -> bool:
-    """Whether the forces of a balance are those at the state's positions, not those at the position solved for."""
+    """Return whether the forces of a balance act at the state's positions, not at the positions solved for."""
     return all(time == state.time for _, time in balance.loads)

@@ -36,16 +36,16 @@ class Contact:
 
     Attributes
     ----------
-    names : of the walls, in the case's order
+    names : of the walls, in the order of the case
     any : whether the case has walls
     moving : (walls,) bool
     normals : (walls, 3) of flat walls, zero for the others
     log : ContactLog
     restitution, friction, static_friction : (walls,); has_friction : whether any wall has friction
     ties : Ties
-    plain : whether walls are flat and do nothing but stop nodes
-    rebounds : whether restitution is a bound on the next position, as for schemes that solve for it in advance
-    state : of the nodes, for walls that must know where nodes come from; set by the stepper
+    plain : whether all walls are flat and without further features
+    rebounds : whether restitution is a bound on the next position, for schemes that solve for the next position
+    state : of the nodes, for walls that need their previous positions; set by the stepper
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class Contact:
 
     @property
     def special(self) -> np.ndarray:
-        """(walls,) bool: walls that are not just planes whose motion is given: curved, with mass, friction,
+        """(walls,) bool: walls other than plain planes with prescribed motion: curved, with mass, friction or
         restitution, or tied."""
         special = ~self.flat | (self.restitution > 0.0) | (self.static_friction > 0.0) | self.ties.tying
         special[self.motion.bodies.at] = True
@@ -104,22 +104,22 @@ class Contact:
 
     @property
     def symmetric(self) -> bool:
-        """Whether the Hessian of a step with these walls is symmetric: friction makes it unsymmetric."""
+        """Whether the Hessian of a step with these walls is symmetric; friction makes it unsymmetric."""
         return not self.has_friction
 
     @cached_property
     def nothing(self) -> WallForces:
-        """No contact; not to be written to."""
+        """Zero contact forces; read-only."""
         return WallForces.none(len(self.walls))
 
     def positions(self, time: float) -> np.ndarray:
-        """Where the walls' centres are (walls, 3) [m]."""
+        """Return the positions of the walls' centres (walls, 3) [m]."""
         return np.array([wall.centre for wall in self.walls]).reshape(-1, 3) + self.motion.displacements(time)
 
     def gaps(self, x: np.ndarray, time: float, nodes: np.ndarray | None = None) -> np.ndarray:
-        """Distances (m, walls) [m] of owned nodes at (m, 3) from the walls, infinite for walls that do not apply.
+        """Return distances (m, walls) [m] of owned nodes at (m, 3) from walls, infinite where a wall does not apply.
 
-        ``nodes`` (m,) says which they are; default: all of them.
+        ``nodes`` (m,) : indices of these nodes; default: all owned nodes.
         """
         members = self.members if nodes is None else self.members[nodes]
         displacements = self.motion.displacements(time)
@@ -131,23 +131,26 @@ class Contact:
         return gaps
 
     def gap(self, k: int, x: np.ndarray, displacements: np.ndarray) -> np.ndarray:
-        """Distances (m,) [m] of positions (m, 3) from wall k."""
+        """Return distances (m,) [m] of positions (m, 3) from wall k."""
         normals, offsets = self.walls[k].planes(x - displacements[k])
         return np.einsum("ij,ij->i", normals, x - displacements[k]) - offsets
 
     @property
     def steady(self) -> bool:
-        """Whether there are no walls, or only flat ones at rest without further features."""
+        """Return whether there are no walls, or only flat walls at rest without further features."""
         return not self.any or (self.plain and not self.moving.any())
 
     def plane_offsets(self, time: float) -> np.ndarray:
-        """Offsets (w,) [m] of the planes n . x = d of flat walls at a time [s]."""
+        """Return offsets (w,) [m] of the planes n . x = d of flat walls at a time [s]."""
         if not self.moving.any():
             return self._offsets
         return self._offsets + np.einsum("ij,ij->i", self.normals, self.motion.displacements(time))
 
     def near(self, x: np.ndarray, displacements: np.ndarray, reach: np.ndarray = _ZERO) -> np.ndarray:
-        """(owned,) bool: nodes at positions (owned, 3) within reach of a wall; (owned,) or (1,) [m], 0: beyond it."""
+        """Return (owned,) bool: nodes at positions (owned, 3) within ``reach``, (owned,) or (1,) [m], of a wall.
+
+        With a reach of zero these are the nodes beyond a wall.
+        """
         near = np.zeros(len(x), dtype=bool)
         if self.flat.any():
             at = self.flat
@@ -159,7 +162,7 @@ class Contact:
         return near
 
     def applicable(self, nodes: np.ndarray, x: np.ndarray, displacements: np.ndarray) -> np.ndarray:
-        """(m, walls) bool: walls that can stop nodes on their way to positions (m, 3)."""
+        """Return (m, walls) bool: walls that can stop nodes that move to positions (m, 3)."""
         applicable = self.members[nodes]
         if self.partial and self.state is not None:
             state = self.state
@@ -167,14 +170,14 @@ class Contact:
             earlier = self.motion.displacements(state.time)
             for k, wall in enumerate(self.walls):
                 if wall.partial:
-                    # a node that the wall held may be beyond it by what the scheme makes of the balance
+                    # a node in contact may lie beyond the wall, because the balance need not hold at its position
                     held = state.contact[nodes] @ wall.normal > 0.0
                     slack = np.where(held, 0.1 * wall.half.min(), BEYOND * self.length)
                     applicable[:, k] &= wall.stops(before - earlier[k], x - displacements[k], slack)
         return applicable
 
     def planes(self, applicable: np.ndarray, x: np.ndarray, displacements: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Planes (m, w, 3), (m, w) at positions (m, 3); offset -inf for walls that do not apply."""
+        """Return planes (m, w, 3), (m, w) at positions (m, 3), with offset -inf for walls that do not apply."""
         normals = np.empty((len(x), len(self.walls), 3))
         offsets = np.empty((len(x), len(self.walls)))
         for k, wall in enumerate(self.walls):
@@ -186,11 +189,11 @@ class Contact:
     def explicit(
         self, predictor: np.ndarray, u: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float
     ) -> tuple[np.ndarray, np.ndarray, WallForces]:
-        """Correct increments ``u`` (owned, 3), in place, so that the walls allow the positions predictor + u.
+        """Correct increments ``u`` (owned, 3), in place, so that the positions predictor + u satisfy the walls.
 
         Parameters
         ----------
-        predictor, u : (owned, 3) positions at ``time`` if there were no walls are their sum [m]
+        predictor, u : (owned, 3); their sum is the position at ``time`` without walls [m]
         stiffness : (owned,) alpha m + eta c: force for a displacement of the node [N/m]
         tolerance : [m]
 
@@ -203,25 +206,25 @@ class Contact:
     def sums(
         self, nodes: np.ndarray, force: np.ndarray, x: np.ndarray, touching: np.ndarray, friction: float = 0.0
     ) -> WallForces:
-        """Sums of forces (m, w, 3) on nodes at (m, 3); ``friction``: energy that it takes in the step [J]."""
+        """Return sums of forces (m, w, 3) on nodes at (m, 3); ``friction``: energy dissipated in the step [J]."""
         moment = np.cross(x[:, None, :], force).sum(axis=0)
         return WallForces(force.sum(axis=0), touching.sum(axis=0), moment, nodes, touching, x, friction)
 
     def record(self, walls: WallForces, time: float, h: float) -> FreshTies:
-        """Record a step of ``h`` [s] whose positions at ``time`` have these forces; return what walls tied in it.
+        """Record a step of ``h`` [s] whose positions at ``time`` have these forces; return the nodes that were tied.
 
-        Collective where many steps have come together.
+        Collective whenever the log is full.
         """
         if self.any:
             self.log.book(walls, h, self.mesh.comm)
         return self.ties.take(walls.nodes, walls.touching, walls.places, time)
 
     def calm(self, fresh: FreshTies, v: np.ndarray, time: float, h: float) -> None:
-        """See :meth:`~pfem_petsc.contact.tied.Ties.calm`; velocities (owned, 3), and what :meth:`record` gave."""
+        """See :meth:`~pfem_petsc.contact.tied.Ties.calm`; velocities (owned, 3), and the result of :meth:`record`."""
         self.ties.calm(*fresh, v, self.motion.rates(time), h)
 
     def infeasible_message(self, node: int, offsets: np.ndarray) -> str:
-        """The message about a node (owned index) whose planes contradict each other."""
+        """Return the message about a node (owned index) whose planes are infeasible together."""
         touched = [name for name, offset in zip(self.names, offsets, strict=True) if offset > -np.inf]
         return (
             f"no position of node {self.mesh.node_ids[node]} satisfies all walls "
@@ -230,11 +233,11 @@ class Contact:
         )
 
     def unsettled_message(self) -> str:
-        """What to tell about walls with mass whose place does not follow from the forces on them."""
+        """Return the message about walls with mass for which no position balances the forces on them."""
         names = ", ".join(repr(self.names[k]) for k in self.motion.bodies.at)
         return (
-            f"walls with mass ({names}) found no place where the forces of the nodes balance them: nodes change "
-            "between walls that push them the same way; reduce time.step, take one of these walls away, or limit it by "
+            f"walls with mass ({names}) have no position at which the forces of the nodes balance: nodes alternate "
+            "between walls that push them the same way; reduce time.step, remove one of these walls, or limit it by "
             "'node_set'"
         )
 
@@ -247,11 +250,10 @@ class Contact:
         rank: np.ndarray | None = None,
         least: float = MIN_VOLUME,
     ) -> NodalFrames:
-        """Coordinates and bounds of candidate nodes from their planes at positions (owned, 3). Collective.
+        """Build coordinates and bounds of candidate nodes from their planes at positions (owned, 3). Collective.
 
-        ``applicable`` (m, walls) says which walls can stop a candidate; ``rank`` (m, walls) in which order they are
-        taken where there are more than three; default: nearest first; ``least`` is for
-        :func:`~pfem_petsc.contact.frames.build_frames`.
+        ``applicable`` (m, walls) marks the walls that can stop a candidate; ``rank`` (m, walls) is the order in which
+        planes are taken, by default nearest first; ``least``: see :func:`~pfem_petsc.contact.frames.build_frames`.
         """
         at = x[candidates]
         normals, offsets = self.planes(applicable, at, self.motion.displacements(time))
@@ -266,7 +268,7 @@ class Contact:
         return frames
 
     def strengths(self, frames: NodalFrames, residual: np.ndarray, active: np.ndarray) -> np.ndarray:
-        """Normal forces (m, walls) [N] of an implicit step from its residual on the active bounds.
+        """Return normal forces (m, walls) [N] of an implicit step from its residual on the active bounds.
 
         Parameters
         ----------
@@ -282,9 +284,9 @@ class Contact:
             sign = frames.signs[:, k]
             safe = np.maximum(row, 0)
             touching = (row >= 0) & (active[every, safe] == -sign)
-            # of walls that share a row and are not quite parallel one is nearer
+            # of almost parallel walls that share a row, take the nearest
             bound = np.where(sign > 0.0, frames.lower[every, safe], frames.upper[every, safe])
             touching &= sign * (bound - frames.bounds[:, k]) <= ON_BOUND * self.length
             strengths[touching, k] = np.abs(left[every[touching], safe[touching]])
-            left[every[touching], safe[touching]] = 0.0  # walls that share a bound: the first takes the force
+            left[every[touching], safe[touching]] = 0.0  # where walls share a bound, the first takes the force
         return strengths

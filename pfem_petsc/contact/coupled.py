@@ -1,14 +1,14 @@
-"""Pairs of nodes that walls stop as well, or that share nodes, in explicit steps with lumped mass.
+"""Pairs that share nodes, or whose nodes walls stop too, in explicit steps with lumped mass.
 
-What is left of contact at such nodes is one small problem for each group of pairs that hang together: the positions
-nearest to the free ones, with k |x - x_free|^2 as distance, that keep the group's pairs and its nodes' walls. With the
-rows of N the gradients of these constraints, its multipliers solve
+Each group of connected pairs is one small problem: find the positions nearest to the free ones, in the distance
+k |x - x_free|^2, that satisfy the group's pairs and the walls of its nodes. With the gradients of these constraints as
+rows of N, the multipliers solve
 
     0 <= lambda   complementary to   N K^-1 N^T lambda + (values at the free positions) >= 0,
 
-found by the dual active-set method of Goldfarb and Idnani (:mod:`~pfem_petsc.contact.complementarity`). All ranks that
-own a node of a group have the whole group and solve the same problem. Only the pairs' forces are taken from it: the
-projection onto walls, which follows, finds the walls' own.
+by the dual active-set method of Goldfarb and Idnani (:mod:`~pfem_petsc.contact.complementarity`). All ranks that own a
+node of a group have the whole group and solve the same problem. Only the forces of the pairs are used; the subsequent
+projection onto walls determines the forces of the walls.
 """
 
 from __future__ import annotations
@@ -35,15 +35,16 @@ _ZERO = np.zeros(1)
 
 
 class CoupledPairs:
-    """The pairs of a rank, and who shares nodes with whom.
+    """The pairs of a rank, grouped by shared nodes.
 
     Attributes
     ----------
-    any : whether any pairs of the model share nodes, or walls stop some: else each pair is on its own
+    any : whether any pairs of the model share nodes or have nodes that walls stop; else pairs are independent
     any_walled : whether walls stop any node of the model's pairs
-    shared_node, coupled_node : lowest mesh number of a node in several pairs, and of one of these or a walled one; None
+    shared_node : lowest mesh number of a node in several pairs, or None
+    coupled_node : lowest mesh number of a node in several pairs or with a wall, or None
     numbers : (n,) mesh numbers of the nodes of this rank's pairs, ascending
-    shared : (n,) bool, which are in several pairs
+    shared : (n,) bool, nodes in several pairs
     """
 
     def __init__(self, pairs: ContactPairs, contact: Contact) -> None:
@@ -72,9 +73,9 @@ class CoupledPairs:
         return lowest if lowest < 2**62 else None
 
     def _gather_groups(self) -> None:
-        """Sort the pairs by the groups that hang together."""
+        """Sort the pairs into groups connected by shared nodes."""
         group = np.arange(len(self.numbers))
-        while True:  # each node takes the lowest label of its pairs, until nothing changes
+        while True:  # propagate the lowest label through nodes and pairs until nothing changes
             lowest = np.minimum(group[self._of[0]], group[self._of[1]])
             before = group.copy()
             for end in self._of:
@@ -86,12 +87,12 @@ class CoupledPairs:
         self._starts = np.searchsorted(self._group[self._pairs], np.arange(len(labels) + 1))
 
     def _every(self, values: np.ndarray) -> np.ndarray:
-        """Values (n, k) of the nodes of pairs, from those of owned nodes (owned, k). Collective."""
+        """Return values (n, k) at the nodes of pairs from those at owned nodes (owned, k). Collective."""
         partners = self.pairs.partners
         return self._spread(values[self._here], partners.bring(values[partners.rows]))
 
     def _spread(self, here: np.ndarray, far: np.ndarray) -> np.ndarray:
-        """Values (n, k) from those of owned nodes of pairs (m, k) and those that partners sent."""
+        """Return values (n, k) from those at owned nodes of pairs (m, k) and those received from partners."""
         every = np.empty((len(self.numbers), here.shape[1]))
         every[self._owned] = here
         every[self._away] = far[self._far]
@@ -100,7 +101,7 @@ class CoupledPairs:
     def part(
         self, predictor: np.ndarray, u: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float
     ) -> np.ndarray:
-        """Forces of the pairs (p,) [N] in a step: see :meth:`ContactPairs.explicit`. Collective."""
+        """Return forces of the pairs (p,) [N] in a step; see :meth:`ContactPairs.explicit`. Collective."""
         contact, partners = self.contact, self.pairs.partners
         displacements = contact.motion.displacements(time)
         rows, walls = partners.rows, len(contact.walls)
@@ -133,15 +134,15 @@ class CoupledPairs:
     def rest(
         self, a: np.ndarray, mass: np.ndarray, least: np.ndarray, resting: np.ndarray, tolerance: float
     ) -> np.ndarray:
-        """Forces of the pairs (p,) [N] that accelerations (owned, 3) need at the start. Collective.
+        """Return initial forces of the pairs (p,) [N] for accelerations (owned, 3). Collective.
 
-        ``least`` (p,): bounds on n . (a_2 - a_1), -inf for pairs that are no concern; ``resting`` (owned, walls): nodes
-        that walls do not let go.
+        ``least`` (p,): bounds on n . (a_2 - a_1), -inf for pairs that do not apply; ``resting`` (owned, walls) bool:
+        nodes that rest on walls.
 
         Raises
         ------
         SimulationFailure
-            On ranks that have pairs for which there are none.
+            On ranks whose pairs have no solution.
         """
         state, contact = self.contact.state, self.contact
         data = self._every(np.concatenate([a, mass[:, None], state.position, resting], axis=1))
@@ -166,9 +167,9 @@ class CoupledPairs:
         near: np.ndarray,
         tolerance: float,
     ) -> np.ndarray:
-        """Forces of the pairs (p,), of nodes at x (n, 3), of which ``near`` (m,) may be beyond walls.
+        """Return forces of the pairs (p,) for nodes at x (n, 3), of which ``near`` (m,) may lie beyond walls.
 
-        ``planes(nodes)`` gives the normals (m, w, 3) and offsets (m, w) of nodes (m,), -inf where a wall is no concern.
+        ``planes(nodes)`` returns normals (m, w, 3) and offsets (m, w) of nodes (m,), -inf where a wall does not apply.
         """
         pairs, free = self.pairs, self._free
         force, broken = np.zeros(len(least)), np.empty(len(least), dtype=bool)

@@ -1,4 +1,4 @@
-"""Contact of explicit steps: each node's own small problem, curved walls, walls with mass, friction and restitution."""
+"""Contact in explicit steps: a small problem per node, with curved walls, walls with mass, friction and restitution."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ _CURVED_ROUNDS = 100  # projections of a step until tangent planes and positions
 
 
 class ExplicitContact:
-    """Projects free positions onto what the walls of a :class:`~pfem_petsc.contact.contact.Contact` allow.
+    """Projects free positions onto the region that the walls of a :class:`~pfem_petsc.contact.contact.Contact` allow.
 
     Attributes
     ----------
-    plain : flat walls without friction, restitution, ends or ties: one compiled pass does all
+    plain : infinite flat walls without friction, restitution or ties: one compiled pass handles them
     """
 
     def __init__(self, contact: Contact) -> None:
@@ -74,7 +74,7 @@ class ExplicitContact:
         return nodes, force, WallForces(*sums, nodes, touching, places)
 
     def push_walls(self, x: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float) -> None:
-        """Find where walls with mass end in an explicit step. Collective."""
+        """Find the final positions of walls with mass in an explicit step. Collective."""
         free = self.contact.motion.free
         failure: SimulationFailure | None = None
 
@@ -82,7 +82,7 @@ class ExplicitContact:
             nonlocal failure
             try:
                 nodes, _, _, walls = self.project(x.copy(), stiffness, time, tolerance, booked=False)
-            except SimulationFailure as met:  # told once all ranks have left the iteration
+            except SimulationFailure as met:  # raised once all ranks have left the iteration
                 failure = failure or met
                 return np.zeros((len(free.at), 3)), np.zeros((len(free.at), 3, 3))
             normals, _ = self.contact.planes(walls.touching, walls.places, self.contact.motion.displacements(time))
@@ -91,7 +91,7 @@ class ExplicitContact:
                 touching = touching & ~self.contact.ties.held[nodes][:, None]
             active = np.where(touching[:, :, None] & ~self.contact.fixed[nodes][:, None, :], normals, 0.0)
             inverse = np.linalg.pinv(active, rcond=RANK) if len(nodes) else np.zeros((0, 3, len(self.contact.walls)))
-            weight = stiffness[nodes][:, None] * (inverse * inverse).sum(axis=1)  # k (N N^T)^-1 on its diagonal
+            weight = stiffness[nodes][:, None] * (inverse * inverse).sum(axis=1)  # the diagonal of k (N N^T)^-1
             slope = np.einsum("mw,mwi,mwj->wij", np.where(touching, weight, 0.0), normals, normals)
             if self.contact.ties.any:
                 tied, at = self.contact.ties.nodes()
@@ -108,9 +108,10 @@ class ExplicitContact:
     def project(
         self, x: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float, booked: bool = True
     ) -> tuple:
-        """Move free positions (owned, 3), in place, onto what the walls allow; ``booked``: not a trial of the step.
+        """Project free positions (owned, 3), in place, onto the region that the walls allow.
 
-        Gives the nodes (m,), their corrections (m, 3) [m], the forces (m, 3) [N] on them, and the walls' sums.
+        ``booked`` : whether the step is final and not a trial. Returns the nodes (m,), their corrections (m, 3) [m],
+        the forces on them (m, 3) [N], and the sums per wall.
         """
         contact, ties = self.contact, self.contact.ties
         nodes, moved, force, touching, friction = self._press(x, stiffness, time, tolerance, booked)
@@ -129,8 +130,8 @@ class ExplicitContact:
         return nodes, correction, force.sum(axis=1), contact.sums(nodes, force, moved, touching, friction)
 
     def _press(self, x: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float, booked: bool) -> tuple:
-        """Nodes (m,) near walls that do not hold them for good, places (m, 3), forces (m, w, 3), touching (m, w), and
-        the energy that friction takes [J]."""
+        """Return nodes (m,) near walls that are not tied to them, positions (m, 3), forces (m, w, 3), touching (m, w),
+        and the energy that friction dissipates [J]."""
         displacements = self.contact.motion.displacements(time)
         near = self.contact.near(x, displacements)
         if self.contact.rebounds:
@@ -175,18 +176,18 @@ class ExplicitContact:
         return nodes, moved, force, np.einsum("mwi,mwi->mw", force, normals) > 0.0, friction
 
     def _returning(self) -> np.ndarray:
-        """(owned,) bool: nodes that hit a wall with restitution in the last step."""
+        """Return (owned,) bool: nodes that hit a wall with restitution in the last step."""
         squares = self.contact.state.memory.get("rebound")
         return (squares > 0.0).any(axis=1) if squares is not None else np.zeros(len(self.contact.members), dtype=bool)
 
     def _pull(self, nodes: np.ndarray, free: np.ndarray, time: float) -> np.ndarray:
-        """What forces make (m, 3) of the ways of nodes to where they get without walls [m]."""
+        """Return the part (m, 3) of the nodes' displacements without walls that is due to forces [m]."""
         state = self.contact.state
         as_before = state.memory["half_velocity"][nodes] * (time - state.time)
         return free - state.position[nodes] - as_before
 
     def _rebound(self, nodes: np.ndarray, normals: np.ndarray, pull: np.ndarray) -> np.ndarray:
-        """Distances (m, walls) [m] from walls that nodes get to in this step, having hit them in the last."""
+        """Return the distances (m, walls) [m] that nodes reach in this step from walls they hit in the last one."""
         memory = self.contact.state.memory
         squares, arrivals = memory["rebound"][nodes], memory["arrival"][nodes]
         towards = -np.einsum("mwi,mi->mw", normals, pull)
@@ -203,13 +204,13 @@ class ExplicitContact:
         normals: np.ndarray,
         strength: np.ndarray,
     ) -> None:
-        """Who hits a wall with restitution in this step, and how: see :mod:`~pfem_petsc.contact.rebound`."""
+        """Record which nodes hit a wall with restitution in this step; see :mod:`~pfem_petsc.contact.rebound`."""
         state = self.contact.state
         shape = len(self.contact.members), len(self.contact.walls)
         squares, arrivals = (state.memory.setdefault(name, np.zeros(shape)) for name in ("rebound", "arrival"))
         way = displacements - self.contact.motion.displacements(state.time)
         unpushed = way.copy()
-        if self.contact.motion.free is not None:  # how they would meet, not how the wall gives way
+        if self.contact.motion.free is not None:  # use the motion without the recoil of the wall
             at = self.contact.motion.free.at
             unpushed[at] = self.contact.motion.free.unpushed() - self.contact.motion.free.state.x
         start = state.position[nodes]
@@ -232,9 +233,9 @@ class ExplicitContact:
         strength: np.ndarray,
         time: float,
     ) -> tuple[np.ndarray, np.ndarray, float]:
-        """Positions and forces (m, w, 3) with friction, from those without, and the energy that it takes [J].
+        """Return positions (m, 3) and forces (m, w, 3) with friction, and the energy that it dissipates [J].
 
-        Curved walls are taken by their planes at the result.
+        Curved walls are represented by their tangent planes at the result.
         """
         contact, state = self.contact, self.contact.state
         way = displacements - self.contact.motion.displacements(state.time)

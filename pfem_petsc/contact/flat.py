@@ -1,4 +1,4 @@
-"""Explicit contact with flat walls and nothing else: search, projection, forces and their sums in one compiled pass."""
+"""Explicit contact with flat walls only: search, projection, forces and their sums in one compiled pass."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ __all__ = ["press_planes"]
 
 @kernel
 def press_planes(predictor, u, fixed, normals, offsets, all_nodes, members, tolerance, stiffness, room):
-    """Stop the nodes that are beyond planes, and sum up what the planes do.
+    """Project nodes that lie beyond planes onto them, and sum the forces of the planes.
 
     Parameters
     ----------
-    predictor, u : (n, 3): the free positions are predictor + u [m]; ``u`` is corrected in place
+    predictor, u : (n, 3); the free positions are predictor + u [m]; ``u`` is corrected in place
     fixed : (n, 3) bool, components that supports prescribe
     normals, offsets : (w, 3), (w,) planes n . x >= d [m]
-    everyone : (w,) bool, whether a plane concerns every node; members : (n, w) bool, whom where not
+    all_nodes : (w,) bool, whether a plane applies to all nodes; members : (n, w) bool, to which nodes otherwise
     tolerance : [m]
     stiffness : (n,) force for a displacement of the node [N/m]
-    room : (n,) int64, working space
+    room : (n,) int64, workspace
 
     Returns
     -------
     tuple
-        Nodes (m,); which of them found no room, or -1; their offsets (m, w), -inf where a plane is no concern; total
-        force (m, 3) [N]; what they touch (m, w); where they are (m, 3) [m]; and per plane force (w, 3) [N], contacts
-        (w,) and moment about the origin (w, 3) [N m].
+        Nodes (m,); index of the first infeasible node among them, or -1; their offsets (m, w), -inf where a plane does
+        not apply; total force (m, 3) [N]; planes that they touch (m, w); positions (m, 3) [m]; and per plane the force
+        (w, 3) [N], number of contacts (w,) and moment about the origin (w, 3) [N m].
     """
     w = len(offsets)
     m = 0

@@ -12,7 +12,7 @@ __all__ = ["WallForces"]
 
 @dataclass
 class WallForces:
-    """Per wall, sums over this rank's nodes, and these nodes.
+    """Sums over this rank's nodes for each wall, and these nodes.
 
     Attributes
     ----------
@@ -20,10 +20,10 @@ class WallForces:
     contacts : (walls,) nodes in contact
     moment : (walls, 3) of the force about the origin [N m]
     nodes : (m,) owned nodes near walls
-    touching : (m, walls) bool, what they touch
-    places : (m, 3) where they are [m]
-    friction : energy that friction on these nodes takes in the step solved for [J]
-    sums : names of those that are sums
+    touching : (m, walls) bool, walls that they touch
+    places : (m, 3) their positions [m]
+    friction : energy that friction on these nodes dissipates in the step solved for [J]
+    sums : names of the attributes that are sums
     """
 
     sums: ClassVar[tuple[str, ...]] = ("force", "contacts", "moment")
@@ -38,7 +38,7 @@ class WallForces:
 
     @classmethod
     def none(cls, walls: int) -> Self:
-        """No contact, for all steps without: its sums cannot be written to."""
+        """Return zero forces, shared by all steps without contact; the sums are read-only."""
         none = cls(
             np.zeros((walls, 3)),
             np.zeros(walls, dtype=np.int64),

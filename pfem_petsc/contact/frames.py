@@ -1,11 +1,11 @@
 """Bounds on nodal coordinates for implicit steps, and the oblique coordinates that turn planes into bounds.
 
 At a node, y = B x with the normals of up to three independent planes as rows of B makes each plane a bound on one
-coordinate; opposite planes bound the same coordinate from both sides. Rows along the axes stay in their axis's slot,
-so that walls along the axes need no change of coordinates at all. Planes are taken in the order of a rank, nearest
-first; a plane that finds no row, or would take the volume of the rows (the product of the sines of their angles) below
-:data:`MIN_VOLUME`, waits: whether it is kept is verified after the solve. A plane that is almost parallel to a row
-shares it, with the bound that is right at the place where the node is thought to be; that is verified as well.
+coordinate; opposite planes bound the same coordinate from both sides. Rows along the axes stay in the slot of their
+axis, so walls along the axes need no change of coordinates. Planes are taken in a given order, nearest first by
+default. A plane is deferred if no row is left, or if it would reduce the volume of the rows (the product of the sines
+of their angles) below :data:`MIN_VOLUME`; it is verified after the solve. A plane almost parallel to a row shares it,
+with the bound that is exact at the expected position of the node; this too is verified after the solve.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from .sliding import Sliding
 
 __all__ = ["MIN_VOLUME", "NodalFrames", "build_frames"]
 
-MIN_VOLUME = 0.04  # of the rows of B: cond(B) <= 2.6/0.04 = 65; two planes share a node from 2.3 degrees on
-_PARALLEL = 1e-14  # 1 - |cos| of normals that share a row, to which the bound is exact at the given place alone
-_ALONG = 1e-15  # parts of a unit normal off an axis that are none
+MIN_VOLUME = 0.04  # of the rows of B: cond(B) <= 2.6/0.04 = 65; two planes can share a node from 2.3 degrees
+_PARALLEL = 1e-14  # 1 - |cos| of normals that share a row; the bound is exact only at the given position
+_ALONG = 1e-15  # components of a unit normal off an axis that count as zero
 
 
 class NodalFrames:
@@ -31,15 +31,15 @@ class NodalFrames:
     ----------
     nodes : (m,) owned local indices
     basis, inverse : (m, 3, 3): y = B x
-    lower, upper : (m, 3) bounds on y [m], infinite where there is none
-    rows : (m, w) int8: the coordinate (0, 1, 2) that wall k bounds at the node, -1 where it does not
+    lower, upper : (m, 3) bounds on y [m], infinite where there is no bound
+    rows : (m, w) int8: the coordinate (0, 1, 2) that wall k bounds at the node, -1 for none
     signs : (m, w) +1 for a lower bound, -1 for an upper one
-    shared : (m, w) bool: the coordinate is that of an almost parallel wall, and the bound right at one place alone
+    shared : (m, w) bool: the coordinate belongs to an almost parallel wall, and the bound is exact at one position only
     bounds : (m, w) bounds of the walls on their coordinates [m]
     normals, offsets : (m, w, 3), (m, w) planes that have a row; offset -inf for the others
     oblique : whether any basis is not the identity
-    contradiction : index in ``nodes`` of a node whose bounds leave it no room, -1 for none
-    sliding : drag of nodes that slip, None without friction
+    contradiction : index in ``nodes`` of a node with infeasible bounds, -1 for none
+    sliding : friction forces on nodes that slip, None without friction
     """
 
     def __init__(self, nodes: np.ndarray, walls: int) -> None:
@@ -60,7 +60,7 @@ class NodalFrames:
         self.sliding: Sliding | None = None
 
     def pin(self, at: np.ndarray, values: np.ndarray, which: np.ndarray) -> None:
-        """Hold the coordinates ``which`` (k, 3) of the frames ``at`` (k,) at values (k, 3) [m]."""
+        """Fix the coordinates ``which`` (k, 3) bool of the frames ``at`` (k,) at values (k, 3) [m]."""
         self.lower[at] = np.where(which, values, self.lower[at])
         self.upper[at] = np.where(which, values, self.upper[at])
 
@@ -75,17 +75,17 @@ def build_frames(
     places: np.ndarray | None = None,
     least: float = MIN_VOLUME,
 ) -> NodalFrames:
-    """Frames of nodes from their planes, lowest rank first.
+    """Build frames of nodes from their planes, lowest rank first.
 
     Parameters
     ----------
     nodes : (m,) owned local indices
     fixed : (m, 3) bool, prescribed components: their axes are rows of B
-    normals, offsets : (m, w, 3), (m, w) planes n . x >= d; offset -inf where a wall does not concern a node
-    rank : (m, w) order in which planes are taken, commonly the distance [m]
-    tolerance : opposite bounds that overlap by no more are met in their middle [m]
-    places : (m, 3) where the nodes are thought to be [m]; default: the origin
-    least : volume of the rows below which a plane waits
+    normals, offsets : (m, w, 3), (m, w) planes n . x >= d; offset -inf where a wall does not apply
+    rank : (m, w) order in which planes are taken, usually the distance [m]
+    tolerance : opposite bounds that overlap by at most this are replaced by their mean [m]
+    places : (m, 3) expected positions of the nodes [m]; default: the origin
+    least : volume of the rows below which a plane is deferred
     """
     frames = NodalFrames(nodes, offsets.shape[1])
     frames.oblique, frames.contradiction = _build(
@@ -112,7 +112,7 @@ def build_frames(
 
 @kernel
 def _rest(vector, spanned, n, out):
-    """Length of the part of a unit vector off the span of n orthonormal vectors, which goes to ``out``."""
+    """Write the part of a unit vector orthogonal to n orthonormal vectors to ``out``; return its length."""
     for c in range(3):
         out[c] = vector[c]
     for _ in range(2):  # twice is enough for orthogonality to rounding
@@ -195,7 +195,7 @@ def _build(
                 for c in range(3):
                     if abs(normal[c]) > abs(normal[axis]):
                         axis = c
-                # not by the length along the axis alone, which is 1 to rounding up to 1e-8 off it
+                # the length along the axis is not enough: it is 1 to rounding for normals up to 1e-8 off the axis
                 along = max(abs(normal[(axis + 1) % 3]), abs(normal[(axis + 2) % 3])) <= _ALONG
                 if along and not taken[axis]:
                     slot = axis
@@ -232,7 +232,7 @@ def _build(
         for slot in range(3):
             if taken[slot]:
                 continue
-            # the axis of the slot where it can be had, so that nothing is turned without need
+            # prefer the axis of the slot, to avoid needless rotations
             best = -1.0
             for shift in range(3):
                 axis = (slot + shift) % 3

@@ -1,10 +1,10 @@
-"""Walls with mass, which the forces of contact push about.
+"""Rigid walls with mass, which move under the contact forces.
 
-A wall of mass M is one more node of the scheme, without bars: M (alpha u + a_hat) = W - F(u), where W is its weight,
-if it has one, and F the sum of its forces on the truss with the wall displaced by predictor + u. F is a monotone
-function of u, piecewise linear for plane walls in explicit steps: Newton's method ends after a few active sets. The
-acceleration is then taken from F itself, so that truss and walls together keep their momentum to rounding. Walls do
-not turn.
+A wall of mass M is an additional node of the scheme without bars: M (alpha u + a_hat) = W - F(u), where W is its
+weight, if gravity acts on it, and F the sum of its forces on the truss with the wall displaced by predictor + u. F is a
+monotone function of u, piecewise linear for plane walls in explicit steps, so Newton's method converges after a few
+active sets. The acceleration is then computed from F itself, so that truss and walls together conserve momentum to
+rounding. Walls do not rotate.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 __all__ = ["FreeWalls", "NoFreeWalls"]
 
 _ITERATIONS = 200
-_FULL_MOVES = 20  # Newton's method ends after a few active sets, or goes back and forth between some for good
+_FULL_MOVES = 20  # Newton's method converges after a few active sets, or else alternates between some of them
 
 Answer = tuple[np.ndarray, np.ndarray | None]
 
@@ -33,9 +33,9 @@ class FreeWalls:
 
     Attributes
     ----------
-    at : (f,) which walls of the case
-    state : of the walls: x is the displacement from where the case puts them (f, 3)
-    weight : (f, 3) of those on which gravity acts [N]
+    at : (f,) indices of these walls among all walls of the case
+    state : of the walls; x is the displacement from the initial position (f, 3)
+    weight : (f, 3) [N], zero where gravity does not act
     """
 
     def __init__(
@@ -53,19 +53,19 @@ class FreeWalls:
         self._u = np.zeros((n, 3))
 
     def start(self, h: float) -> None:
-        """Set acceleration and the scheme's memory up."""
+        """Initialise the acceleration and the scheme's memory."""
         self.state.a = self.weight / self.mass[:, None]
         self.scheme.start(self.state, h)
 
     def begin(self, time: float, h: float) -> None:
-        """The balance of a step from ``time``; for schemes that lead, the walls move first."""
+        """Set the balance of a step from ``time``; schemes that solve for the next position move the walls first."""
         if self.scheme.solves_next_position and time > self.state.time:
             self.scheme.advance(self.state, h)
         self.state.time = time
         self._balance = self.scheme.balance(self.state, h)
 
     def finish(self, h: float) -> None:
-        """Complete the walls' state with the solution."""
+        """Advance the walls' state with the solution."""
         self.scheme.finish(self.state, self._balance, self._u, h)
         if not self.scheme.solves_next_position:
             self.state.time = self._balance.time if self.scheme.solves_end else self.state.time + h
@@ -77,30 +77,30 @@ class FreeWalls:
 
     @property
     def balanced(self) -> np.ndarray:
-        """Accelerations (f, 3) of the last balance [m/s2]."""
+        """Return the accelerations (f, 3) of the last balance [m/s2]."""
         known = 0.0 if self._balance.a_hat is None else self._balance.a_hat
         return self._balance.alpha * self._u + known
 
     def displacements(self, time: float) -> np.ndarray:
-        """Displacements (f, 3) [m] at the state's time, or at the end of the step that is being solved."""
+        """Return displacements (f, 3) [m] at the state's time, or at the end of the step being solved."""
         if self._balance is None or time == self.state.time:
             return self.state.x
         return self._balance.predictor + self._u
 
     def unpushed(self) -> np.ndarray:
-        """Displacements (f, 3) [m] at the end of the step that is being solved if nothing touched the walls."""
+        """Return displacements (f, 3) [m] at the end of the step being solved, without contact."""
         balance = self._balance
         known = 0.0 if balance.a_hat is None else balance.a_hat
         return balance.predictor + (self.weight / self.mass[:, None] - known) / balance.alpha
 
     def solve(self, forces: Callable[[], Answer], tolerance: float) -> bool:
-        """Find the walls' increments; whether they were found, the same on all ranks. Collective.
+        """Solve for the walls' increments; return whether the iteration converged, equal on all ranks. Collective.
 
         Parameters
         ----------
-        forces : gives, for the :meth:`displacements` of the moment, this rank's sums of the walls' forces on the truss
+        forces : returns, for the current :meth:`displacements`, this rank's sums of the walls' forces on the truss
             (f, 3) [N] and of their derivatives dF/du (f, 3, 3) [N/m], or None where these are not known
-        tolerance : of the walls' places [m]
+        tolerance : of the walls' positions [m]
         """
         balance = self._balance
         n = 3 * len(self.at)
@@ -125,7 +125,7 @@ class FreeWalls:
                 for k in range(len(self.at)):
                     matrix[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += slope[k]
             elif earlier is not None:
-                # Broyden: the matrix that explains the last move and is nearest to the one before
+                # Broyden: the matrix nearest to the previous one that is consistent with the last move
                 du, dr = u - earlier[0], residual - earlier[1]
                 size = float(du @ du)
                 if size > 0.0:
@@ -139,7 +139,7 @@ class FreeWalls:
             start = -float(move @ earlier[1])
             if iteration < _FULL_MOVES or start <= 0.0:
                 continue
-            # beyond a change of the set, which the slope before it does not know: half way back to it, and again
+            # the active set changed within the move, where the slope no longer holds: bisect along the move
             least, most, part = 0.0, 1.0, 1.0
             size = np.abs(move).max()
             while abs(along := float(move @ residual)) > 0.5 * start and not (along < 0.0 and part == 1.0):
@@ -151,16 +151,16 @@ class FreeWalls:
                 force, slope, residual = evaluate(u)
         else:
             return False
-        # momentum is kept to rounding: the acceleration is that of the force, whatever the last digit of the place
+        # the acceleration follows from the force and not from the position, so that momentum is conserved to rounding
         self._u = (-force - rest) / (balance.alpha * self.mass[:, None])
         return True
 
     def step_changed(self, scheme: Scheme) -> None:
-        """Tell the scheme to forget what holds for steps of another size."""
+        """Notify the scheme that the step size has changed."""
         scheme.step_changed(self.state)
 
     def kept(self) -> dict[str, Any]:
-        """What a checkpoint must hold."""
+        """Return the state for a checkpoint."""
         state = self.state
         memory = {name: array.tolist() for name, array in state.memory.items()}
         return {
@@ -173,7 +173,7 @@ class FreeWalls:
         }
 
     def load_state(self, kept: dict[str, Any]) -> None:
-        """Take the state from a checkpoint."""
+        """Restore the state from a checkpoint."""
         shape = self.state.x.shape
         for name in ("x", "v", "a"):
             setattr(self.state, name, np.array(kept[name], dtype=float).reshape(shape))
@@ -184,7 +184,7 @@ class FreeWalls:
 
 
 class NoFreeWalls:
-    """Stands for :class:`FreeWalls` in a case whose walls have no mass; see there."""
+    """Null object for :class:`FreeWalls` if no wall has mass."""
 
     def __init__(self) -> None:
         self.at = np.empty(0, dtype=np.int64)
@@ -194,28 +194,28 @@ class NoFreeWalls:
         self.kinetic = 0.0
 
     def start(self, h: float) -> None:
-        """See :class:`FreeWalls`, here and below."""
+        """Do nothing."""
 
     def begin(self, time: float, h: float) -> None:
-        """Nothing moves."""
+        """Do nothing."""
 
     def finish(self, h: float) -> None:
-        """Nothing moves."""
+        """Do nothing."""
 
     def step_changed(self, scheme: Scheme) -> None:
-        """Nothing is remembered."""
+        """Do nothing."""
 
     def displacements(self, time: float) -> np.ndarray:
-        """None."""
+        """Return no displacements, (0, 3)."""
         return self.state.x
 
     def solve(self, forces: Callable[[], Answer], tolerance: float) -> bool:
-        """The forces are found once."""
+        """Evaluate the forces once; return True."""
         forces()
         return True
 
     def kept(self) -> None:
-        """Nothing."""
+        """Return None: a checkpoint needs nothing."""
 
     def load_state(self, kept: None) -> None:
-        """Nothing."""
+        """Do nothing."""

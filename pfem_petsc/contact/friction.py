@@ -1,9 +1,9 @@
 """Coulomb friction of nodes on walls in explicit steps.
 
-Each wall k presses a node with lambda_k >= 0 along its normal and drags it by tau_k in its plane. With the slip s_k of
-the step, which is the node's motion relative to the wall in the wall's plane: the node sticks (s_k = 0) where
-|tau_k| <= mu_static lambda_k does it, else it slips and tau_k = -mu lambda_k s_k/|s_k|. On one wall this is solved
-exactly; several walls at a node are swept until nothing changes.
+Each wall k exerts a normal force lambda_k >= 0 and a friction force tau_k in its plane on a node. The slip s_k of the
+step is the node's displacement relative to the wall in the wall's plane. The node sticks (s_k = 0) if this is possible
+with |tau_k| <= mu_static lambda_k; else it slips and tau_k = -mu lambda_k s_k/|s_k|. One wall at a node is solved
+exactly; several walls are swept until nothing changes.
 """
 
 from __future__ import annotations
@@ -17,29 +17,29 @@ from ..mechanics.compiled import kernel
 __all__ = ["add_friction"]
 
 _SWEEPS = 2000
-_OVERSHOOT = 0.9  # of the drag over the normal force, from which on sweeps go a part of the way
+_OVERSHOOT = 0.9  # ratio of displacements by friction and by the normal force above which sweeps are underrelaxed
 
 
 @kernel
 def add_friction(x, before, way, fixed, normals, offsets, dynamic, static, stiffness, normal_forces, drag):
-    """Drag the nodes that walls with friction press.
+    """Apply friction forces to the nodes in contact with walls that have friction.
 
     Parameters
     ----------
-    x : (m, 3) positions as the walls' normal forces leave them, changed in place [m]
+    x : (m, 3) positions under the normal forces alone, changed in place [m]
     before : (m, 3) positions at the start of the step [m]
-    way : (w, 3) motion of the walls in the step [m]
+    way : (w, 3) displacements of the walls in the step [m]
     fixed : (m, 3) bool, components that supports prescribe
-    normals, offsets : (m, w, 3), (m, w) planes n . x >= d; -inf where a wall is no concern
+    normals, offsets : (m, w, 3), (m, w) planes n . x >= d; -inf where a wall does not apply
     dynamic, static : (w,) coefficients of friction
     stiffness : (m,) force for a displacement of the node [N/m]
     normal_forces : (m, w) normal forces [N], changed in place
-    drag : (m, w, 3) tangential forces, out [N]
+    drag : (m, w, 3) friction forces, output [N]
 
     Returns
     -------
     int
-        First node whose walls were not settled, or -1.
+        First node whose sweeps did not converge, or -1.
     """
     m, w = offsets.shape
     trial = np.zeros(3)
@@ -56,9 +56,9 @@ def add_friction(x, before, way, fixed, normals, offsets, dynamic, static, stiff
         soft = 1.0 / stiffness[i]
         reach = stiffness[i] * (
             abs(x[i, 0]) + abs(x[i, 1]) + abs(x[i, 2])
-        )  # what rounding of positions makes of forces
-        # where supports leave little of a normal, what a wall drags moves the node more than what it presses: r times,
-        # so that sweeps overshoot from r = 1 on unless they go a part of the way
+        )  # forces that correspond to the rounding of positions
+        # where supports leave little of a normal free, the friction force moves the node r times as far as the normal
+        # force; sweeps overshoot for r >= 1 unless they are underrelaxed
         part = 1.0
         for k in range(w):
             if offsets[i, k] > -math.inf and static[k] > 0.0:
@@ -74,7 +74,7 @@ def add_friction(x, before, way, fixed, normals, offsets, dynamic, static, stiff
         for _ in range(_SWEEPS):
             change = 0.0
             largest = 0.0
-            least = 1.0  # where supports leave little of a normal, rounding makes more of forces
+            least = 1.0  # where supports leave little of a normal free, rounding is amplified in forces
             for k in range(w):
                 if offsets[i, k] == -math.inf:
                     continue
@@ -100,7 +100,7 @@ def add_friction(x, before, way, fixed, normals, offsets, dynamic, static, stiff
                         x[i, c] += (new - old) * normals[i, k, c] * soft
                 normal_forces[i, k] = new
                 largest = max(largest, new)
-                # tangential: the force that would end the slip, and what the wall can give of it
+                # tangential: the force that would stop the slip, limited by Coulomb's law
                 if static[k] == 0.0:
                     continue
                 slip = 0.0

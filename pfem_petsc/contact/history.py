@@ -1,4 +1,4 @@
-"""Contact in the history: columns, what a rank adds to their sums, and the values of a row."""
+"""Contact in the history: columns, the contributions of a rank to their sums, and the values of a row."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _WALL = [(name, (3,) if size == 3 else (), np.int64 if name in _COUNTS else floa
 
 
 def contact_columns(contact: Contact) -> list[tuple[str, tuple[int, ...], type]]:
-    """Name, shape and type of the columns of a case's walls."""
+    """Return name, shape and type of the columns of a case's walls."""
     columns: list[tuple[str, tuple[int, ...], type]] = [("active_set_changes", (), np.int64)] if contact.any else []
     for k, name in enumerate(contact.names):
         columns += [(f"wall/{name}/{what}", shape, kind) for what, shape, kind in _WALL]
@@ -30,13 +30,13 @@ def contact_columns(contact: Contact) -> list[tuple[str, tuple[int, ...], type]]
 
 
 class ContactColumns:
-    """Sums of a row, and what is made of them; the columns are those of :func:`contact_columns`, in that order.
+    """Converts sums over ranks to the columns of :func:`contact_columns`, in their order.
 
     Attributes
     ----------
-    size : numbers of this rank's share: the changes of the active set, and the ``WALL`` of
+    size : length of a rank's contribution: the number of changes of the active set, and the ``WALL`` of
         :mod:`~pfem_petsc.output.sums` for each wall
-    width : numbers of the columns
+    width : number of values in the columns
     """
 
     def __init__(self, contact: Contact) -> None:
@@ -50,7 +50,7 @@ class ContactColumns:
         self._motion_at = starts[self._moving, None] + np.arange(WALL.width, WALL.width + 6)
 
     def fill(self, sums: np.ndarray, walls: WallForces, impulses: Impulses) -> None:
-        """Put this rank's share into ``sums`` (size,)."""
+        """Write this rank's contribution into ``sums`` (size,)."""
         log = self.contact.log
         sums[0] = log.changes
         share = sums[1:].reshape(-1, WALL.width)
@@ -61,12 +61,12 @@ class ContactColumns:
         impulses.fill_walls(share)
 
     def contacts(self, sums: np.ndarray) -> np.ndarray | None:
-        """Nodes (walls,) that touch each wall, from the sums over the ranks; None without walls."""
+        """Return the number of nodes that touch each wall (walls,) from the sums over ranks; None without walls."""
         return sums[1 : self.size].reshape(-1, WALL.width)[:, WALL.first("contacts")] if self.size else None
 
     def put(self, sums: np.ndarray, time: float, values: np.ndarray) -> None:
-        """Fill the columns ``values`` (width,) of a time [s] from the sums over the ranks; the count of changes starts
-        anew."""
+        """Write the columns ``values`` (width,) at a time [s] from the sums over ranks, and reset the count of
+        changes."""
         contact = self.contact
         total = sums[1:].reshape(-1, WALL.width)
         total[:, WALL.first("contact_time")] = contact.log.time

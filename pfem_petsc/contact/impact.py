@@ -1,13 +1,12 @@
-"""The kinetic energy that impact takes, by its own formula: that of the velocities that closing contacts stop.
+"""Kinetic energy lost in impact, computed independently of the scheme from the approach velocities of closing contacts.
 
 A node of mass m that closes on a wall with the approach velocity s, relative to the wall and along its normal, and
-leaves it with e s, loses m/2 s^2 (1 - e^2). Several walls at a node stop the projection of its velocity on their span;
-a wall of mass M, and the other node of a pair, give way: m is the reduced mass. The approach velocity is that of the
-impact, which happens within a step: with the velocity v and acceleration a towards the wall at its start and the
-distance d, s^2 = v^2 + 2 a d. The formula is the same for all schemes; it converges with the step and does not depend
-on where in the step the impact falls.
+leaves it with e s, loses m/2 s^2 (1 - e^2). Several walls at a node stop the projection of its velocity on their span.
+For a wall of mass M, and for the other node of a pair, m is the reduced mass. The impact happens within a step: with
+the velocity v and acceleration a towards the wall at the start of the step and the distance d, s^2 = v^2 + 2 a d. The
+formula is the same for all schemes, converges with the step, and does not depend on the phase of the impact within it.
 
-A node that a scheme lets go of for a moment, and that has not left its wall, is not struck again.
+A node that a scheme releases for a moment, and that has not left its wall, does not count as a new impact.
 """
 
 from __future__ import annotations
@@ -31,7 +30,8 @@ class Impacts:
 
     Attributes
     ----------
-    met : (m,) owned nodes that have met walls and not left them yet; ``stepper.closed`` (owned, walls) says which
+    met : (m,) owned nodes that have touched walls and not left them yet; ``stepper.closed`` (owned, walls) marks these
+        walls
     """
 
     def __init__(self, stepper: Stepper) -> None:
@@ -47,7 +47,7 @@ class Impacts:
         self._free_rates = free.state.v if free is not None else None  # at the start of the step
         self.slack = ON_BOUND * self.model.length
         treatment = stepper.treatment
-        # nothing is lost where nodes have no mass along the normal, or where a treatment takes the work back
+        # nothing is lost if nodes have no mass along the normal, or if a treatment restores the work of contact
         self.elastic = treatment is not None and treatment.elastic
 
     def step(
@@ -58,13 +58,16 @@ class Impacts:
         time: float,
         displacements: np.ndarray,
     ) -> float:
-        """Energy [J] of this rank's closing contacts in the step just solved. Collective with pairs or free walls.
+        """Return the energy [J] lost in this rank's closing contacts in the step just solved.
+
+        Collective with pairs or walls with mass.
 
         Parameters
         ----------
-        x, motion : (owned, 3) at the start of the step of closure, velocity and acceleration there; for schemes that
-            solve in advance, those of the balance
-        load : (owned, 3) all forces there but those of contact and damping [N]; None where the scheme solves in advance
+        x, motion : (owned, 3) positions at the start of the step of closure, and velocity and acceleration there; for
+            schemes that solve for the next position, those of the balance
+        load : (owned, 3) all forces there except contact and damping [N]; None if the scheme solves for the next
+            position
         time, displacements : of the walls there
         """
         if not self.active:
@@ -75,7 +78,7 @@ class Impacts:
         return 0.0 if self.elastic else loss
 
     def _free(self, nodes: np.ndarray, motion: tuple[np.ndarray, np.ndarray], load: np.ndarray | None) -> tuple:
-        """Velocities and accelerations (m, 3) without contact at the start of the step."""
+        """Return velocities and accelerations (m, 3) without contact at the start of the step."""
         inertia, state = self.model.inertia, self.stepper.state
         v, a = motion
         if load is None and inertia.products:
@@ -94,7 +97,7 @@ class Impacts:
         return self._guided(nodes, motion, free_v, load / inertia.mass[nodes, None])
 
     def _guided(self, nodes: np.ndarray, motion: tuple[np.ndarray, np.ndarray], v: np.ndarray, a: np.ndarray) -> tuple:
-        """Velocities and accelerations (m, 3) with what supports prescribe in its place."""
+        """Return velocities and accelerations (m, 3) with the prescribed components inserted."""
         fixed = self.model.supports.fixed[nodes]
         if not fixed.any():
             return v, a
@@ -126,7 +129,7 @@ class Impacts:
         if free is not None:
             free_fall = free.weight / free.mass[:, None]
             rates[free.at], pulls[free.at] = self._free_rates, free_fall
-            if load is None:  # as they would be if nothing pushed them
+            if load is None:  # the motion without contact
                 balance = self.stepper.balance
                 rates[free.at] = free.state.v + balance.eta / balance.alpha * (free_fall - free.balanced)
             self._free_rates = free.state.v
@@ -156,7 +159,7 @@ class Impacts:
     def _tied(
         self, nodes: np.ndarray, normals: np.ndarray, speeds: np.ndarray, v: np.ndarray, rates: np.ndarray
     ) -> float:
-        """What walls that hold nodes for good take of their motion along them."""
+        """Return the energy [J] of the tangential motion of nodes that become tied to walls."""
         contact = self.model.contact
         across = v[:, None, :] - rates
         across = across - np.einsum("mwi,mwi->mw", across, normals)[:, :, None] * normals
@@ -166,7 +169,10 @@ class Impacts:
         return float(energy[caught].sum())
 
     def _on_free_walls(self, nodes: np.ndarray, normals: np.ndarray, speeds: np.ndarray) -> float:
-        """Nodes that close on a wall of mass M together: sum m s^2/2 - (sum m s n)^2/(2 (M + sum m)). Collective."""
+        """Return the loss of nodes that close on a wall of mass M together. Collective.
+
+        It is sum m s^2/2 - (sum m s n)^2/(2 (M + sum m)).
+        """
         contact, free = self.model.contact, self.model.contact.motion.free
         mass = self.model.inertia.mass[nodes, None]
         keeps = 1.0 - contact.restitution[free.at] ** 2
@@ -183,7 +189,7 @@ class Impacts:
         return float((keeps * (sums[:, 0] - given)).sum())
 
     def _of_pairs(self, x: np.ndarray, motion: tuple[np.ndarray, np.ndarray], load: np.ndarray | None) -> float:
-        """The same of pairs that meet, whose reduced mass counts: those whose second nodes are here. Collective."""
+        """Return the loss of closing pairs whose second nodes this rank owns, with the reduced mass. Collective."""
         pairs, mass = self.model.pairs, self.model.inertia.mass
         normal_forces = pairs.force > 0.0
         fresh, parted = normal_forces & ~pairs.closed, pairs.closed & ~normal_forces

@@ -1,4 +1,4 @@
-"""Compiled loops over closing contacts at walls; :mod:`pfem_petsc.contact.impact` has the formula."""
+"""Compiled loops over closing contacts at walls; see :mod:`pfem_petsc.contact.impact` for the formula."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["join_nodes", "plane_gaps", "stop_nodes", "unpressed"]
 
 @kernel
 def join_nodes(met, touched, present):
-    """Nodes of two lists, the first first; ``present`` (owned,) bool is working space, all false."""
+    """Return the union of two lists of nodes, the first one first; ``present`` (owned,) is workspace, all False."""
     nodes = np.empty(len(met) + len(touched), dtype=np.int64)
     count = 0
     for i in met:
@@ -29,7 +29,7 @@ def join_nodes(met, touched, present):
 
 @kernel
 def plane_gaps(nodes, x, normals, offsets):
-    """Normals (m, w, 3) and distances (m, w) [m] of nodes (m,) at x (owned, 3) from planes (w, 3), (w,)."""
+    """Return normals (m, w, 3) and distances (m, w) [m] of nodes (m,) at x (owned, 3) from planes (w, 3), (w,)."""
     w = len(offsets)
     every = np.empty((len(nodes), w, 3))
     gaps = np.empty((len(nodes), w))
@@ -46,7 +46,7 @@ def plane_gaps(nodes, x, normals, offsets):
 
 @kernel
 def unpressed(nodes, v, a, contact, mass, damping, alpha, eta):
-    """Velocities and accelerations (m, 3) of nodes (m,) as they would be without forces of contact (owned, 3)."""
+    """Return velocities and accelerations (m, 3) of nodes (m,) without the contact forces (owned, 3)."""
     free_v, free_a = np.empty((len(nodes), 3)), np.empty((len(nodes), 3))
     damped = len(damping) > 0
     for j in range(len(nodes)):
@@ -63,18 +63,18 @@ def unpressed(nodes, v, a, contact, mass, damping, alpha, eta):
 def stop_nodes(
     nodes, touching, closed, normals, gaps, v, a, rates, pulls, mass, fixed, restitution, counted, slack, speeds
 ):
-    """Energy [J] that walls take from nodes (m,) that close on them, and the nodes that are on walls then.
+    """Return the energy [J] that nodes (m,) lose when they close on walls, and the nodes that are on walls afterwards.
 
     Parameters
     ----------
-    touching : (owned, w) bool, who touches what in this step
-    closed : (owned, w) bool, who has met a wall and not left it yet; brought up to date
+    touching : (owned, w) bool, contacts in this step
+    closed : (owned, w) bool, contacts that have closed and whose node has not left the wall; updated
     normals, gaps : (m, w, 3), (m, w) at the start of the step [m]
-    v, a : (m, 3) there, without contact; rates, pulls (w, 3) velocities and accelerations of the walls
+    v, a : (m, 3) there, without contact; rates, pulls : (w, 3) velocities and accelerations of the walls
     mass, fixed : (owned,), (owned, 3)
-    restitution, counted : (w,); only walls that count take energy here
+    restitution, counted : (w,); only counted walls contribute to the energy
     slack : distance at which a node has left [m]
-    speeds : (m, w) out: approach velocities of closing contacts, else zero [m/s]
+    speeds : (m, w) output: approach velocities of closing contacts, else zero [m/s]
     """
     w = closed.shape[1]
     met = np.empty(len(nodes), dtype=np.int64)
@@ -108,7 +108,7 @@ def stop_nodes(
             count += 1
         if not fresh:
             continue
-        # the shortest velocity with these components along the walls, by orthogonal directions of their span
+        # the minimum-norm velocity with these components along the normals, from an orthogonal basis of their span
         size = 0
         for first in (True, False):
             for k in range(w):

@@ -1,11 +1,11 @@
-"""Stability of contact, judged over the phases of an impact: an elastic rod flies against a rigid wall.
+"""Stability of contact over the phases of an impact: an elastic rod hits a rigid wall.
 
-Whether contact gains energy depends on where in a step the impact falls: a node that is stopped gets a velocity that
-may lead it off its wall again (a false release), and what it does then depends on the phase. The motion of one node
-that is held does not show that. So equal rods, each a fraction of a step further from the wall than the one before,
-run against it with the integrator itself, in its affine form (:mod:`pfem_petsc.integrators.base`), here with a linear
-rod of springs c and masses m, dense matrices and one bound for each rod. In the exact problem energy stays as it is
-and there is one release.
+Whether contact gains energy depends on the phase, the instant of impact within a step: a node that is stopped gets a
+velocity that may lift it off the wall again (a false release), and its subsequent motion depends on the phase. The
+motion of a single node in contact does not show this. Therefore several equal rods, each a fraction of a step further
+from the wall than the previous one, are integrated with the scheme itself in its affine form
+(:mod:`pfem_petsc.integrators.base`). Each is a linear chain of springs c and masses m with dense matrices and one
+bound. In the exact solution energy is constant and there is one release.
 """
 
 from __future__ import annotations
@@ -20,27 +20,27 @@ from .rebound import impact_square, rebound_way
 __all__ = ["KNOWN", "PHASES", "SWING", "Asked", "ImpactScan", "scan_impacts"]
 
 KNOWN = ("scheme", "stick", "conserving", "mass_redistribution")
-"""Treatments that the rods have; of others nothing is predicted."""
+"""Treatments that the rods implement; there is no prediction for others."""
 
 PHASES = 14
 SWING = 0.05
-"""Part of the energy by which a scheme's own states may swing: near the limits of explicit schemes they do."""
-_START = 3  # steps of free flight before the earliest impact: schemes with a memory have filled it
-_CONTACT = 1e-12  # of the force of a node stopped in a step: a force that is rounding
+"""Allowed relative oscillation of the energy of a scheme without impact; it is large near explicit stability limits."""
+_START = 3  # steps of free flight before the earliest impact, so that multistep schemes have their history
+_CONTACT = 1e-12  # of the force that stops a node within a step; forces below are rounding
 
 
 @dataclass(frozen=True)
 class ImpactScan:
-    """What impact made of the rods; arrays are (phases,).
+    """Results of the impacts of all rods; arrays are (phases,).
 
     Attributes
     ----------
-    largest, last : largest energy met and energy at the end, over that of the flight
-    releases : how often the wall let go
-    force : largest force over the exact one, rho c A v
-    swing : largest energy over that of the start of a rod that flies on from a wall that holds it for good: the energy
-        of an explicit scheme's own states is not constant, where nothing closes or opens either; not followed beyond
-        what :data:`SWING` lets pass, and 1 for implicit schemes, which get no allowance
+    largest, last : largest energy and energy at the end, relative to that before impact
+    releases : number of releases
+    force : largest force relative to the exact one, rho c A v
+    swing : largest energy, relative to the initial one, of a rod permanently attached to the wall: with explicit
+        schemes this energy is not constant even without closing and opening. Not followed beyond the limit
+        :data:`SWING`, and 1 for implicit schemes, which get no allowance
     """
 
     largest: np.ndarray
@@ -51,21 +51,21 @@ class ImpactScan:
 
     @property
     def gain(self) -> float:
-        """Largest part of the energy that contact gains in any phase, beyond the scheme's own swing (of which
-        :data:`SWING` is let pass); infinite where the motion blew up."""
+        """Largest relative energy gain by contact over all phases, beyond the scheme's own oscillation (up to
+        :data:`SWING`); infinite if the motion diverged."""
         worst = float(self.largest.max()) / min(self.swing, 1.0 + SWING)
         return max(worst - 1.0, 0.0) if np.isfinite(worst) else np.inf
 
 
 @dataclass(frozen=True)
 class Asked:
-    """What a case asks for of contact.
+    """Parameters of the scan, as a case specifies them.
 
     Attributes
     ----------
     treatment : ``contact.treatment``
-    consistent : mass matrix; else lumped
-    step : over the explicit limit of the lumped rod, l/c
+    consistent : whether the mass matrix is consistent; else lumped
+    step : relative to the explicit limit of the lumped rod, l/c
     restitution : of the wall
     elements : bars along a rod
     """
@@ -78,9 +78,9 @@ class Asked:
 
 
 class _Rods:
-    """The rods: unit spring constant and inner mass, so that the explicit limit of the step (lumped mass) is one.
+    """Rods of unit spring constant and inner mass, so that the explicit limit of the step (lumped mass) is one.
 
-    The arrays of a state have a row for every node, rod after rod, and one column.
+    The arrays of a state have one row per node, rod after rod, and one column.
     """
 
     def __init__(self, scheme: Scheme, asked: Asked, phases: int, held: bool = False) -> None:
@@ -100,7 +100,7 @@ class _Rods:
             mass[-2, -2] += mass[-1, -1]
             mass[-1, -1] = 0.0
         self.k, self.m = k, mass
-        self.tip = 0.5  # the lumped mass of the node that hits, where it has some
+        self.tip = 0.5  # lumped mass of the contact node, if it has mass
         self.tips = np.arange(1, phases + 1) * nodes - 1
         self.wall = step * (_START + (np.arange(phases) + 0.5) / phases)  # gaps at unit speed
         zeros = np.zeros((phases * nodes, 1))
@@ -113,7 +113,7 @@ class _Rods:
         self.strength = np.zeros(phases)
         self.change = np.zeros(phases)
         self.debt = np.zeros(phases)
-        # of rods that hit the wall in the last step, where the next position is bound: see rebound_way
+        # for rods that hit the wall in the last step, if restitution bounds the next position; see rebound_way
         self.square, self.arrival = np.zeros(phases), np.zeros(phases)
         self._inverse: tuple[float, np.ndarray] | None = None
         scheme.start(self.state, step)
@@ -121,11 +121,11 @@ class _Rods:
             self._solve()
 
     def rods(self, values: np.ndarray) -> np.ndarray:
-        """(phases, nodes) view of an array of the state."""
+        """Return a (phases, nodes) view of an array of the state."""
         return values.reshape(self.shape)
 
     def energy(self) -> np.ndarray:
-        """(phases,) kinetic and elastic energy over that of the start."""
+        """Return (phases,) kinetic plus elastic energy, relative to its initial value."""
         return self._energy() / self.start
 
     def _energy(self) -> np.ndarray:
@@ -167,7 +167,10 @@ class _Rods:
             self._take_back(start, before)
 
     def _approach(self, start: np.ndarray, free: np.ndarray) -> np.ndarray | None:
-        """(phases,) way of the last nodes in the next step without a wall, by an explicit scheme that does not lead."""
+        """Return (phases,) displacements of the last nodes in the next step without a wall.
+
+        For explicit schemes that do not solve for the next position.
+        """
         if not self.restitution or not self.scheme.explicit or self.scheme.solves_next_position:
             return None
         balance = self.scheme.balance(self.state, self.h)
@@ -190,7 +193,7 @@ class _Rods:
         self.scheme.finish(self.state, balance, u.reshape(-1, 1), self.h)
 
     def _bounded(self, hessian: np.ndarray, load: np.ndarray, predictor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Increments of a step in which the wall bounds the last node, and forces (phases,) of the wall, positive."""
+        """Return the increments of a step in which the wall bounds the last node, and wall forces (phases,) >= 0."""
         wall = self.wall
         if self._inverse is None or self._inverse[0] != hessian[0, 0]:
             self._inverse = hessian[0, 0], np.linalg.inv(hessian)
@@ -213,9 +216,9 @@ class _Rods:
     def _in_equilibrium(
         self, balance: Balance, load: np.ndarray, predictor: np.ndarray, x: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """As :meth:`_bounded`, of explicit steps with a last node without mass: it follows its neighbour to the wall.
+        """As :meth:`_bounded`, for explicit steps and a massless last node, which follows its neighbour to the wall.
 
-        The force is that of the step's start.
+        The force is that at the start of the step.
         """
         strength = np.where(x[:, -1] >= self.wall - 1e-12, np.maximum(load[:, -1], 0.0), 0.0)
         u = np.zeros(self.shape)
@@ -224,7 +227,7 @@ class _Rods:
         return u, strength
 
     def _set(self, chosen: np.ndarray, v: np.ndarray | float, a: np.ndarray | float) -> None:
-        """Give the last nodes of some rods other velocities and accelerations."""
+        """Set velocities and accelerations of the last nodes of some rods."""
         state, at = self.state, self.tips[chosen]
         if not len(at):
             return
@@ -237,14 +240,14 @@ class _Rods:
         self.scheme.restart(state, at, self.h)
 
     def _let_go(self, chosen: np.ndarray, start: np.ndarray, before: np.ndarray) -> None:
-        """Take the work that the force at the start of the step does on nodes let go in it back from their velocity."""
+        """Remove from the velocity of released nodes the work done by the contact force at the start of the step."""
         v = self.state.v[self.tips, 0]
         work = -0.5 * before * (self.state.x[self.tips, 0] - start)
         chosen = chosen & (work > 0.0) & (v < 0.0)
         self._set(chosen, -np.sqrt(np.maximum(v * v - 2.0 * work / self.tip, 0.0)), self.state.a[self.tips, 0])
 
     def _take_back(self, start: np.ndarray, before: np.ndarray) -> None:
-        """The velocity of Laursen and Love: it takes the work of contact back."""
+        """Apply the velocity update of Laursen and Love, which cancels the work of contact."""
         state = self.state
         force = 0.5 * (self.strength + before) if self.scheme.balance_at_endpoints else self.strength
         work = self.debt - force * (state.x[self.tips, 0] - start)
@@ -253,13 +256,13 @@ class _Rods:
         self._set(self.touching, -np.sqrt(np.maximum(square, 0.0)), self._free())
 
     def _free(self) -> np.ndarray:
-        """(phases,) acceleration of the last nodes without contact."""
+        """Return (phases,) accelerations of the last nodes without contact."""
         return -(self.rods(self.state.x) @ self.k)[:, -1] / self.tip
 
 
 @np.errstate(all="ignore")
 def scan_impacts(scheme: Scheme, asked: Asked, phases: int = PHASES) -> ImpactScan:
-    """Let rods fly against a wall, impacts a fraction of a step apart, until the exact ones have left it.
+    """Integrate rods that hit a wall at different phases of a step until they have left it in the exact solution.
 
     ``phases`` : number of rods.
     """

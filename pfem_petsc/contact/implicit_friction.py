@@ -1,13 +1,13 @@
-"""Coulomb friction in implicit steps: who sticks and who slips, found by solves of the step.
+"""Coulomb friction in implicit steps: repeated solves determine which nodes stick and which slip.
 
-The law is that of :mod:`~pfem_petsc.contact.friction`. In a solve, a node that sticks to a wall has its tangential
-coordinates held where it would be without slip, and what is needed for that is the force of friction; one that slips is
-dragged (:mod:`~pfem_petsc.contact.sliding`). Afterwards each node's own small problem is asked what it makes of the
-outcome: with the reaction R at x and any stiffness K, the law is kept where x is the explicit solution for the free
-position x - R/K. Where it is not, that solution says what the node does in the next solve.
+The law is that of :mod:`~pfem_petsc.contact.friction`. In a solve, the tangential coordinates of a sticking node are
+fixed at their values without slip, and the reaction is the friction force; a slipping node gets a friction force that
+depends on its normal force (:mod:`~pfem_petsc.contact.sliding`). Afterwards the law is verified with a small problem
+per node: with the reaction R at x and any stiffness K, the law holds if x is the explicit solution for the free
+position x - R/K. If it is not, that solution determines the status of the node in the next solve.
 
-A slipping node first keeps the direction of its drag, for which there always is a solution: where it comes out the
-wrong way round, the node sticks. Once it is known to slip, its direction is solved for as well.
+The direction of friction of a slipping node is fixed at first; such a problem always has a solution. If the slip turns
+out to be opposite, the node sticks. Once the node is known to slip, its direction is solved for as well.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 
 __all__ = ["StepFriction"]
 
-# Weight of the known direction in one that is solved for, ten times as much each time that this fails: 0.01 saves a
-# fifth of the solves at first, but fails where nodes slip by micrometres.
+# Weight of the known direction relative to the one solved for, multiplied by ten after each failure. 0.01 saves a fifth
+# of the solves at first, but fails if nodes slip by micrometres.
 _FIRM = 0.1
 
 
@@ -45,8 +45,8 @@ class StepFriction:
 
     Attributes
     ----------
-    drag : (m, walls, 3) forces of friction on the nodes of the frames, after :meth:`check` [N]
-    unsettled : owned nodes whose solution did not keep the law in :meth:`check`
+    drag : (m, walls, 3) friction forces on the nodes of the frames, after :meth:`check` [N]
+    unsettled : owned nodes whose solution violated the law in :meth:`check`
     """
 
     def __init__(self, model: Model, state: State, balance: Balance) -> None:
@@ -62,26 +62,26 @@ class StepFriction:
         self._guessed = np.zeros(owned, dtype=bool)
         self._sticks = np.full(owned, -1)  # the wall that a node sticks to, -1 for none
         self._directions = np.zeros((owned, walls, 3))  # d a of slipping nodes
-        self._slips = np.zeros(owned, dtype=bool)  # known to slip along its direction
-        self._forces = np.zeros((owned, 3))  # drag of each node as its own problem had it last
+        self._slips = np.zeros(owned, dtype=bool)  # known to slip along their direction
+        self._forces = np.zeros((owned, 3))  # friction force on each node in its last local solution
         self._firmness = _FIRM
-        self._lagged = False  # the drag is a known force
+        self._lagged = False  # friction is treated as a known force
         self._failed = np.zeros(owned, dtype=bool)  # found not to stick
         self.drag = np.zeros((0, walls, 3))
         self.unsettled = np.empty(0, dtype=np.int64)
 
     def dissipated(self, nodes: np.ndarray, x: np.ndarray) -> float:
-        """Energy [J] that the drag takes from nodes (m,) on their way to positions (m, 3)."""
+        """Return the energy [J] that friction dissipates as nodes (m,) move to positions (m, 3)."""
         slip = (x - self.state.position[nodes])[:, None, :] - self._way
         return -float((self.drag * slip).sum())
 
     def add(self, force: np.ndarray, nodes: np.ndarray, x: np.ndarray) -> float:
-        """Add friction to the forces (m, walls, 3) on nodes (m,) at (m, 3) [N]; the energy that it takes [J]."""
+        """Add friction to the forces (m, walls, 3) on nodes (m,) at (m, 3) [N]; return the energy dissipated [J]."""
         force += self.drag
         return self.dissipated(nodes, x)
 
     def apply(self, frames: NodalFrames, x: np.ndarray) -> None:
-        """Hold the sticking nodes of the frames and drag the slipping ones, for a guess of positions (owned, 3)."""
+        """Fix the sticking nodes of the frames and apply friction to the slipping ones, at a guess (owned, 3)."""
         nodes = frames.nodes
         has_friction = self._has_friction(frames)
         fresh = has_friction & ~self._guessed[nodes]
@@ -106,13 +106,13 @@ class StepFriction:
         noise: float,
         tolerance: float,
     ) -> np.ndarray:
-        """Find the nodes whose solution does not keep the law; normal forces (m, walls) of all nodes of the frames [N].
+        """Find the nodes that violate the law; return normal forces (m, walls) of all nodes of the frames [N].
 
         Parameters
         ----------
         x, reaction : (m, 3) positions and forces by walls of the frames' nodes [m], [N]
-        strengths : (m, walls) normal forces as they are without friction; taken for nodes at smooth walls alone
-        noise : force that counts as none [N]
+        strengths : (m, walls) normal forces without friction; used for nodes at frictionless walls only
+        noise : force below which a force counts as zero [N]
         tolerance : of the forces [N]
         """
         nodes, contact = frames.nodes, self.contact
@@ -140,9 +140,9 @@ class StepFriction:
         return strengths
 
     def relax(self) -> bool:
-        """Solve for less in the next solve, the last one having failed; whether there was less to ask. Collective.
+        """Simplify the next solve after a failure; return whether it could be simplified. Collective.
 
-        First for no directions, then not even for what normal forces make of the drag.
+        First the directions are fixed, then friction forces are fixed as well.
         """
         slips, moves = bool(self._slips.any()), bool((self._directions != 0.0).any())
         turning, moving = self.model.comm.allreduce(np.array([slips, moves], dtype=np.int64)) > 0
@@ -154,20 +154,21 @@ class StepFriction:
         return moving and not lagged
 
     def jams(self, nodes: np.ndarray, x: np.ndarray, displacements: np.ndarray) -> list[str]:
-        """What to tell of nodes (k,) at (owned, 3) that walls and their friction hold in a wedge that locks itself."""
+        """Return messages about nodes (k,) at (owned, 3) that are jammed in a self-locking wedge by friction."""
         normals, _ = self.contact.planes(self.contact.members[nodes], x[nodes], displacements)
         return [text for node, n in zip(nodes, normals, strict=True) if (text := jam(self.contact, node, n))]
 
     def _has_friction(self, frames: NodalFrames) -> np.ndarray:
-        """(m,) bool: frames with a wall that has friction."""
+        """Return (m,) bool: frames with a wall that has friction."""
         return ((frames.rows >= 0) & (self.contact.static_friction > 0.0)).any(axis=1)
 
     def _local(
         self, frames: NodalFrames, at: np.ndarray, x: np.ndarray, reaction: np.ndarray, slipping: np.ndarray
     ) -> tuple[np.ndarray, ...]:
-        """The nodes' own problems: places (k, 3), normal (k, w) and friction (k, w, 3) forces, and stiffness (k,).
+        """Solve the local problems.
 
-        Slipping nodes are asked with the dynamic coefficient alone: whether they stick is seen when it is tried.
+        Returns positions (k, 3), normal (k, w) and friction (k, w, 3) forces, and stiffnesses (k,).
+        Slipping nodes use the dynamic coefficient only; whether they stick is determined by a trial.
         """
         contact, nodes = self.contact, frames.nodes[at]
         stiffness = self._stiffness[nodes]
@@ -198,16 +199,16 @@ class StepFriction:
     def _may_stick(
         self, nodes: np.ndarray, slipping: np.ndarray, x: np.ndarray, normal_forces: np.ndarray, normals: np.ndarray
     ) -> np.ndarray:
-        """(k, w) bool: walls that might hold slipping nodes by their static coefficient, which is to be tried once."""
+        """Return (k, w) bool: walls whose static coefficient may stop slipping nodes, which is tried once."""
         contact = self.contact
         slip = self._slip(nodes, x, normals)
-        # with the rest of the truss going along, inertia alone resists
+        # if the rest of the truss moves along, inertia alone resists
         needed = contact.friction * normal_forces + self._inertial[nodes, None] * np.linalg.norm(slip, axis=2)
         may = (contact.static_friction > contact.friction) & (needed <= contact.static_friction * normal_forces)
         return may & (normal_forces > 0.0) & (slipping & ~self._failed[nodes])[:, None]
 
     def _slip(self, nodes: np.ndarray, x: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """How nodes at (k, 3) have slipped on their walls (k, w, 3) [m]."""
+        """Return the slip of nodes at (k, 3) on their walls (k, w, 3) [m]."""
         slip = x[:, None, :] - self.state.position[nodes][:, None, :] - self._way
         return slip - np.einsum("kwi,kwi->kw", slip, normals)[:, :, None] * normals
 
@@ -222,11 +223,11 @@ class StepFriction:
         drag: np.ndarray,
         stiffness: np.ndarray,
     ) -> None:
-        """What nodes do next, from where they are, x, and from their own problems' solutions."""
+        """Decide which nodes stick or slip in the next solve, from positions x and the solutions of local problems."""
         nodes, contact = frames.nodes[at], self.contact
         slip = self._slip(nodes, moved, frames.normals[at])
         size = np.linalg.norm(drag, axis=2)
-        # a wall that presses with rounding alone neither holds nor drags
+        # a normal force within rounding neither sticks nor causes friction
         least = 1e-9 * normal_forces.max(axis=1, initial=0.0)
         rubbing = (normal_forces > least[:, None]) & (contact.static_friction > 0.0)
         needed = np.linalg.norm(drag - stiffness[:, None, None] * slip, axis=2)
@@ -234,7 +235,7 @@ class StepFriction:
         slips = rubbing & (needed > (1.0 + 1e-13) * limit)
         was = self._sticks[nodes] >= 0
         forwards = np.einsum("kwi,kwi->kw", self._slip(nodes, x, frames.normals[at]), self._directions[nodes])
-        # the drag has turned the slip round: it is enough to end it
+        # friction has reversed the slip, so it is large enough to stop it
         slips &= (forwards >= 0.0) | was[:, None]
         holds = rubbing & ~slips
         infeasible = holds.any(axis=1)
@@ -245,7 +246,7 @@ class StepFriction:
         self._directions[nodes] = unit * np.maximum(contact.friction * normal_forces, 1e-300)[:, :, None]
 
     def _hold(self, frames: NodalFrames, at: np.ndarray) -> None:
-        """Hold sticking nodes where they do not slip."""
+        """Fix sticking nodes at zero slip."""
         nodes = frames.nodes[at]
         wall = self._sticks[nodes]
         row = frames.rows[at, wall]
@@ -256,7 +257,7 @@ class StepFriction:
         which = ~self.contact.fixed[nodes] & (np.arange(3) != row[:, None])
         slack = ON_BOUND * self.contact.length
         fits = (held >= frames.lower[at] - slack) & (held <= frames.upper[at] + slack)
-        # another wall pushes it along, or its wall has no row: it cannot stick
+        # another wall pushes the node along, or its wall has no row: it cannot stick
         possible = (fits | ~which).all(axis=1) & (row >= 0)
         self._sticks[nodes[~possible]] = -1
         frames.pin(at[possible], held[possible], which[possible])
@@ -266,7 +267,7 @@ class StepFriction:
         friction = np.where((self._directions[nodes] != 0.0).any(axis=2), self.contact.friction, 0.0)
         friction = np.where(frames.rows[at] >= 0, friction, 0.0)
         for k in range(1, friction.shape[1]):
-            # of walls that share a bound one takes the force
+            # where walls share a bound, one takes the force
             shared = (frames.rows[at, :k] == frames.rows[at, k][:, None]) & (friction[:, :k] > 0.0)
             friction[shared.any(axis=1), k] = 0.0
         slips = self._slips[nodes]

@@ -1,13 +1,13 @@
-"""Nodes that rest on walls or on each other at the start: their acceleration and the forces that hold them.
+"""Initial contact equilibrium: accelerations and contact forces of nodes that rest on walls or on each other.
 
 A node that touches a wall and does not move along its normal is not accelerated into it: with the walls' forces r and
 accelerations a_w,
 
-    M a = f + r,   0 <= n . (a - a_w)  complementary to  the strength of r,
+    M a = f + r,   0 <= n . (a - a_w)  complementary to  the normal force in r,
 
-and likewise with n . (a_2 - a_1) of closed pairs. r includes friction: against the velocity of a node that slides, else
-what keeps it from sliding, if the wall can give that much. An acceleration without r starts a truss at rest on a floor
-with a jolt of h g, which dies out slowly with some schemes.
+and likewise with n . (a_2 - a_1) of closed pairs. r includes friction: opposite to the velocity of a node that slides,
+else the force that prevents sliding, up to the limit of the wall. Without r a truss at rest on a floor would start with
+a velocity error of h g, which decays slowly with some schemes.
 """
 
 from __future__ import annotations
@@ -30,27 +30,28 @@ if TYPE_CHECKING:
 __all__ = ["start_at_rest"]
 
 _ROUNDS = 60  # each at least halves the error
-_FAST = 1e16  # by so much a velocity that decides over the direction of slip is above an acceleration
+_FAST = 1e16  # weight of velocities relative to accelerations in the direction of slip
 
 
 def start_at_rest(
     model: Model, state: State, accelerate: Callable[[np.ndarray], np.ndarray], load: np.ndarray
 ) -> WallForces | None:
-    """Put the acceleration and the contact forces of resting nodes into the state; the forces per wall. Collective.
+    """Set acceleration and contact forces of resting nodes in the state; return the forces per wall. Collective.
 
-    The forces are found by projections with the lumped mass: at once where the mass is lumped. A consistent mass is
-    between a third of the lumped one and all of it, so that with half the lumped mass every round halves the error.
+    The forces follow from projections with the lumped mass, in one iteration if the mass is lumped. The eigenvalues of
+    a consistent mass are between one third and one times the lumped one, so projections with half the lumped mass
+    halve the error in every iteration.
 
     Parameters
     ----------
-    model, state : with ``state.a`` as it is without walls
-    accelerate : acceleration (owned, 3) with M a = load. Collective
+    model, state : with ``state.a`` without walls
+    accelerate : returns the acceleration (owned, 3) with M a = load. Collective
     load : (owned, 3) without walls [N]
 
     Returns
     -------
     WallForces or None
-        None where no node of any rank rests on a wall or another node, or only on what lets it go.
+        None if no node of any rank rests on a wall or on another node, or if no contact force is needed.
     """
     contact, comm, mass = model.contact, model.comm, model.inertia.mass
     x, v = state.position, state.v
@@ -62,8 +63,8 @@ def start_at_rest(
     gaps = np.einsum("mwi,mi->mw", normals, x[nodes]) - offsets
     away = np.einsum("mwi,mwi->mw", normals, v[nodes][:, None, :] - rates)
     resting = applicable & (np.abs(gaps) <= slack) & (np.abs(away) <= ON_BOUND * model.wave_speed)
-    resting[:, [wall.partial for wall in contact.walls]] = False  # beside it, its plane goes on
-    resting[:, contact.motion.bodies.at] = False  # these give way
+    resting[:, [wall.partial for wall in contact.walls]] = False  # the plane of a partial wall extends beyond the wall
+    resting[:, contact.motion.bodies.at] = False  # walls with mass are not fixed
     kept = resting.any(axis=1)
     nodes, normals, resting = nodes[kept], normals[kept], resting[kept]
     accelerations = contact.motion.accelerations(state.time)
@@ -79,12 +80,12 @@ def start_at_rest(
     hold = np.zeros((len(nodes), 3))  # free components of the walls' forces
     strengths = np.zeros(resting.shape)
     drag = np.zeros(normals.shape)
-    between = np.zeros_like(load)  # the same of the links' forces
+    between = np.zeros_like(load)  # likewise for the links
     for _ in range(_ROUNDS if model.inertia.consistent else 1):
         apart = state.a - between / (share * mass[:, None])
         apart[nodes] -= hold / weight[:, None]
         earlier = between
-        # first, as in a step: they know what the walls do
+        # links first, as in a step: they account for the walls
         between = links.rest(apart, share * mass, closed, held)
         free = apart[nodes] + between[nodes] / weight[:, None]
         moved = free.copy()
@@ -128,10 +129,10 @@ def _apply_friction(
     normal_forces: np.ndarray,
     drag: np.ndarray,
 ) -> None:
-    """Friction at the start: accelerations (m, 3), normal (m, w) and friction (m, w, 3) forces, in place.
+    """Apply friction at the start: update accelerations (m, 3), normal (m, w) and friction (m, w, 3) forces in place.
 
-    Nodes that slide have a slip in which their velocity outweighs any acceleration; that of the others is their
-    acceleration, relative to that of the wall.
+    For nodes that slide, the velocity determines the direction of slip; for the others it is that of their acceleration
+    relative to the wall.
     """
     away = v[nodes][:, None, :] - rates
     away -= np.einsum("mwi,mwi->mw", away, normals)[:, :, None] * normals

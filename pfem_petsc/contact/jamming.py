@@ -1,9 +1,9 @@
-"""Friction that jams nodes which supports guide: where a wall is to push them along, Coulomb's law has no solution.
+"""Jamming by friction: Coulomb's law may have no solution if a wall must push a node that supports guide.
 
-A node with prescribed components moves in what is left, along the free part f of a wall's normal, |f|^2 = a. The wall
-pushes it along f by a lambda, and the slip of this motion is dragged back by mu lambda sqrt(a (1 - a)). From
-mu = sqrt(a/(1 - a)) on, the cotangent of the angle between guide and normal, the wall cannot move the node however hard
-it presses: a wedge that locks itself.
+A node with prescribed components moves in the remaining directions, along the free part f of a wall's normal,
+|f|^2 = a. The wall pushes it along f with a lambda, and friction resists this motion with mu lambda sqrt(a (1 - a)). If
+mu >= sqrt(a/(1 - a)), the cotangent of the angle between guide and normal, no normal force can move the node: the wedge
+is self-locking.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ __all__ = ["jam"]
 
 
 def jam(contact: Contact, node: int, normals: np.ndarray) -> str:
-    """Why the friction of an owned node cannot be found, and the way out; empty where nothing jams it.
+    """Return why the friction of an owned node has no solution, and the remedy; empty if the node is not jammed.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
-"""What couples nodes to nodes: contact pairs and constraints, as one list in which nothing absent has a place.
+"""Links couple nodes to nodes: contact pairs and constraints, in one list of those that the case has.
 
-A *link* is a source of rows over several nodes, r(x) >= 0. Steps, the ledger, the history and checkpoints take the list
-and never ask what is in it. Explicit steps call :meth:`Links.explicit`; implicit steps take the
-:class:`LinkCoordinates` of each, in which its rows are bounds on unknowns (:mod:`pfem_petsc.contact.transform`).
+A *link* is a source of rows over several nodes, r(x) >= 0. Steps, the ledger, the history and checkpoints loop over the
+list without distinguishing its entries. Explicit steps call :meth:`Links.explicit`; implicit steps use the
+:class:`LinkCoordinates` of each link, in which its rows are bounds on unknowns (:mod:`pfem_petsc.contact.transform`).
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ class Link(Protocol):
 
     Attributes
     ----------
-    key : under which checkpoints hold its forces
-    columns : of its tables in the history, like ``pair/NAME``
-    numbers : mesh numbers of the nodes of its rows, at least of those whose nodes this rank owns
+    key : under which checkpoints store its forces
+    columns : of its tables in the history, such as ``pair/NAME``
+    numbers : mesh numbers of the nodes of its rows, at least of rows with nodes that this rank owns
     """
 
     key: str
@@ -47,22 +47,22 @@ class Link(Protocol):
         contact: np.ndarray,
         tolerance: float,
     ) -> None:
-        """Correct the increments ``u`` (owned, 3) of a step in which each node is solved on its own. Collective.
+        """Correct the increments ``u`` (owned, 3) of a step in which nodes are solved independently. Collective.
 
-        ``stiffness`` (owned,) is the force for a displacement of a node [N/m], ``contact`` (owned, 3) takes the forces
-        [N], ``tolerance`` [m] is the depth up to which a row counts as kept.
+        ``stiffness`` (owned,) is the force for a displacement of a node [N/m]; the forces [N] are added to ``contact``
+        (owned, 3); a row violated by at most ``tolerance`` [m] counts as satisfied.
 
         Raises
         ------
         SimulationFailure
-            Where no positions keep all rows; on this rank at least, after all that is collective.
+            If no positions satisfy all rows. Raised at least on this rank, after all collective operations.
         """
 
     def coordinates(self) -> LinkCoordinates:
-        """The coordinates of implicit steps. Collective."""
+        """Return the coordinates for implicit steps. Collective."""
 
     def held(self) -> np.ndarray:
-        """Owned nodes (k,) on which rows press."""
+        """Owned nodes (k,) with active rows."""
 
     def totals(self) -> np.ndarray:
         """This rank's share of the forces (tables, 3) of the rows on their last nodes [N]."""
@@ -71,9 +71,9 @@ class Link(Protocol):
         """(owned,) the table whose rows press on an owned node as their last one, -1 for none."""
 
     def check(self, model: Model, on_its_own: bool) -> None:
-        """Refuse what it does not go with, and nodes that start beyond it. Collective.
+        """Check that the model is compatible with the link and that no row is violated at the start. Collective.
 
-        ``on_its_own``: each node is solved on its own, by an explicit scheme with lumped mass.
+        ``on_its_own``: whether nodes are solved independently, by an explicit scheme with lumped mass.
 
         Raises
         ------
@@ -82,12 +82,12 @@ class Link(Protocol):
         """
 
     def resting(self, x: np.ndarray, v: np.ndarray, slack: float, still: float) -> Any:
-        """Which rows are closed at the start within a slack [m], at rest within ``still`` [m/s]. Collective."""
+        """Return the rows closed at the start within ``slack`` [m] and at rest within ``still`` [m/s]. Collective."""
 
     def rest(self, a: np.ndarray, mass: np.ndarray, closed: Any, on_walls: np.ndarray) -> np.ndarray:
-        """Set the forces that closed rows need for accelerations (owned, 3); those on free components. Collective.
+        """Set the forces of closed rows at accelerations (owned, 3); return them on free components. Collective.
 
-        ``on_walls`` (owned, walls) bool: who rests on which wall.
+        ``on_walls`` (owned, walls) bool: nodes that rest on walls.
         """
 
     def push(self, contact: np.ndarray) -> None:
@@ -97,13 +97,13 @@ class Link(Protocol):
         """Its forces, for :meth:`restore`: numbers and lists, as a checkpoint takes them. Collective."""
 
     def restore(self, saved: Any) -> None:
-        """Take the forces back."""
+        """Restore the forces."""
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """What a checkpoint keeps of it at nodes: name to rows (owned, ...); the same names on all ranks."""
+        """Return nodal arrays for a checkpoint: name to values (owned, ...); the same names on all ranks."""
 
     def load_state(self, name: str, values: np.ndarray) -> None:
-        """Take such an array (owned, ...) back. Collective."""
+        """Restore such an array (owned, ...). Collective."""
 
 
 class LinkCoordinates(Protocol):
@@ -119,69 +119,72 @@ class LinkCoordinates(Protocol):
     varies: bool
 
     def reached(self, state: State, move: np.ndarray, slack: float) -> bool:
-        """Whether rows may be met in a step in which nodes move by (owned, 3) [m]. Collective."""
+        """Return whether rows may close in a step in which nodes move by (owned, 3) [m]. Collective."""
 
     def place(self, frames: NodalFrames | None, balance: Balance, state: State, x: np.ndarray) -> None:
-        """Take the frames of a solve, None for none, and the guess of positions (owned, 3). Collective."""
+        """Set the frames of a solve, None if there are none, and the guess of positions (owned, 3). Collective."""
 
     def feasible(self, predictor: np.ndarray, u: np.ndarray, stiffness: np.ndarray) -> None:
-        """Change increments (owned, 3), in place, so that the rows are kept. Collective."""
+        """Change increments (owned, 3), in place, so that the rows are satisfied. Collective."""
 
     def forward(self, w: np.ndarray) -> None:
-        """W to y (owned, 3), in place. Collective."""
+        """Transform w to y (owned, 3), in place. Collective."""
 
     def inverse(self, y: np.ndarray) -> None:
-        """Y to w (owned, 3), in place. Collective."""
+        """Transform y to w (owned, 3), in place. Collective."""
 
     def adjoint(self, g: np.ndarray) -> None:
-        """A gradient by y to that by w (owned, 3), in place. Collective."""
+        """Transform a gradient with respect to y to that with respect to w (owned, 3), in place. Collective."""
 
     def diagonal(self, blocks: BlocksOf, diagonal: np.ndarray) -> None:
-        """Put the diagonal (owned, 3) of T^T H T in place of that of H. Collective.
+        """Replace the diagonal (owned, 3) of H by that of T^T H T. Collective.
 
-        ``blocks`` gives the diagonal blocks (k, 3, 3) of H at owned nodes (k,).
+        ``blocks`` returns the diagonal blocks (k, 3, 3) of H at owned nodes (k,).
         """
 
     def matrix(self) -> PETSc.Mat:
-        """T, with places for all that it may become; the caller destroys it. Collective."""
+        """Return T, preallocated for all states of the link; the caller destroys it. Collective."""
 
     def refresh(self, matrix: PETSc.Mat) -> None:
-        """Bring T up to date. Collective."""
+        """Update T. Collective."""
 
     def bound(self, x: np.ndarray, w: np.ndarray, lower: np.ndarray) -> None:
         """Write bounds on w into (owned, 3), from positions (owned, 3) and their w. Collective."""
 
     def solve_forces(self, w: np.ndarray, g: np.ndarray, lower: np.ndarray, noise: float) -> None:
-        """Set the forces, from w, the residual by y, and the bounds (owned, 3); ``noise`` is none [N]. Collective."""
+        """Set the forces from w, the residual with respect to y, and the bounds (owned, 3). Collective.
+
+        Forces up to ``noise`` [N] count as zero.
+        """
 
     def push(self, contact: np.ndarray, factor: float = 1.0) -> None:
         """Add its forces, times a factor, to those on the nodes (owned, 3) [N]."""
 
     def kept(self, x: np.ndarray, slack: float) -> bool:
-        """Whether positions (owned, 3) keep the rows that were bounds, to a slack [m]. Collective.
+        """Return whether positions (owned, 3) satisfy the rows that were bounds, to ``slack`` [m]. Collective.
 
         Raises
         ------
         NotConverged
-            On all ranks, where a row that found no unknown is broken.
+            On all ranks, if a row without an unknown is violated.
         """
 
     def broken(self, x: np.ndarray, slack: float) -> bool:
-        """Whether positions (owned, 3) break any row by more than a slack [m]. Collective."""
+        """Return whether positions (owned, 3) violate any row by more than ``slack`` [m]. Collective."""
 
     def release(self) -> None:
-        """No row presses."""
+        """Set all forces to zero."""
 
 
 class BlocksOf(Protocol):
     """Diagonal blocks of a Hessian."""
 
     def __call__(self, nodes: np.ndarray) -> np.ndarray:
-        """Blocks (k, 3, 3) at owned nodes (k,)."""
+        """Return blocks (k, 3, 3) at owned nodes (k,)."""
 
 
 class Links:
-    """All links of a model, in the order in which a step takes them; false where there are none."""
+    """All links of a model, in the order in which a step treats them; False if there are none."""
 
     def __init__(self, members: Sequence[Link] = ()) -> None:
         self.members = tuple(members)
@@ -196,7 +199,7 @@ class Links:
     def explicit(
         self, balance: Balance, state: State, u: np.ndarray, stiffness: np.ndarray, none: np.ndarray, tolerance: float
     ) -> np.ndarray:
-        """See :meth:`Link.explicit`; the forces (owned, 3) [N], ``none`` where there are no links."""
+        """See :meth:`Link.explicit`; return the forces (owned, 3) [N], ``none`` if there are no links."""
         if not self.members:
             return none
         contact, failure = np.zeros(u.shape), None
@@ -210,11 +213,11 @@ class Links:
         return contact if any(len(link.held()) for link in self.members) else none
 
     def held(self, nodes: np.ndarray) -> np.ndarray:
-        """Nodes (k,) that walls hold, with those that links hold."""
+        """Return the nodes in contact with walls, ``nodes`` (k,), together with those in contact through links."""
         return reduce(np.union1d, (link.held() for link in self.members), nodes)
 
     def totals(self) -> np.ndarray:
-        """This rank's share of the forces (tables, 3) of all tables on the last nodes of their rows [N]."""
+        """This rank's share of the forces (tables, 3) of all links on the last nodes of their rows [N]."""
         return np.concatenate([np.zeros((0, 3)), *(link.totals() for link in self.members)])
 
     def tables(self, owned: int) -> np.ndarray:
@@ -236,7 +239,7 @@ class Links:
         return [link.resting(x, v, slack, still) for link in self.members]
 
     def rest(self, a: np.ndarray, mass: np.ndarray, closed: list[Any], on_walls: np.ndarray) -> np.ndarray:
-        """See :meth:`Link.rest`; the sum of all."""
+        """See :meth:`Link.rest`; return the sum over all links."""
         total = np.zeros_like(a)
         for link, own in zip(self.members, closed, strict=True):
             total += link.rest(a, mass, own, on_walls)
@@ -248,11 +251,11 @@ class Links:
             link.push(contact)
 
     def save(self) -> dict[str, Any]:
-        """Forces of all links by key. Collective."""
+        """Return the forces of all links by key. Collective."""
         return {link.key: link.save() for link in self.members}
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """See :meth:`Link.arrays`; those of all links."""
+        """See :meth:`Link.arrays`; return those of all links."""
         return {name: array for link in self.members for name, array in link.arrays().items()}
 
     def load_state(self, name: str, values: np.ndarray) -> None:
@@ -262,6 +265,6 @@ class Links:
                 link.load_state(name, values)
 
     def restore(self, saved: dict[str, Any]) -> None:
-        """Take the forces back from what :meth:`save` gave."""
+        """Restore the forces from the result of :meth:`save`."""
         for link in self.members:
             link.restore(saved[link.key])

@@ -1,4 +1,4 @@
-"""What contact did so far: contact times, releases and changes of the active set."""
+"""Log of contact: contact times, releases and changes of the active set."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ if TYPE_CHECKING:
 
 __all__ = ["ContactLog", "compare_contacts"]
 
-_PENDING = 4096  # steps whose contacts are kept before the ranks put them together
+_PENDING = 4096  # steps whose contacts are buffered before ranks combine them
 
 
 @kernel
 def compare_contacts(touching, before, nodes, now, present, releases):
-    """Bring ``touching`` (owned, w) up to date, from the nodes that touched ``before`` to what ``nodes`` (m,) touch
+    """Update ``touching`` (owned, w) from the nodes that touched ``before`` to the walls that ``nodes`` (m,) touch
     ``now`` (m, w), and count ``releases`` (w,).
 
-    ``present`` (owned,) bool is working space, all false. Gives the number of changes, and the nodes that touch.
+    ``present`` (owned,) bool is workspace, all False. Returns the number of changes and the nodes that touch walls.
     """
     walls = touching.shape[1]
     changes = 0
@@ -59,12 +59,12 @@ class ContactLog:
 
     Attributes
     ----------
-    touching : (owned, walls) bool, who touches what after the last step
-    releases : (walls,) how often nodes of this rank let go of each wall
-    changes : nodes and walls of this rank that met or parted since the last row of the history
+    touching : (owned, walls) bool, contacts after the last step
+    releases : (walls,) number of releases of this rank's nodes from each wall
+    changes : number of contacts of this rank that closed or opened since the last row of the history
     last : (m,) nodes that touch any wall after the last step
-    present : (owned,) bool, working space of :func:`compare_contacts`
-    time : (walls,) for how long any node of the model has touched each wall [s]; the same on all ranks
+    present : (owned,) bool, workspace of :func:`compare_contacts`
+    time : (walls,) time during which any node of the model touched each wall [s]; the same on all ranks
     """
 
     def __init__(self, n_owned: int, n_walls: int) -> None:
@@ -79,7 +79,7 @@ class ContactLog:
         self._flags = np.empty((_PENDING, n_walls), dtype=np.uint8)
 
     def book(self, walls: WallForces, step: float, comm: MPI.Comm) -> None:
-        """Book the forces of a step of so many seconds. Collective where many have come together."""
+        """Record the contacts of a step of size ``step`` [s]. Collective whenever the buffer is full."""
         self.note(walls.contacts > 0, step, comm)
         if len(walls.nodes) == 0 and len(self.last) == 0:
             return
@@ -89,7 +89,7 @@ class ContactLog:
         self.changes += changes
 
     def note(self, touched: np.ndarray, step: float, comm: MPI.Comm) -> None:
-        """Take note of which walls (walls,) bool were touched in a step. Collective where many have come together."""
+        """Record the walls (walls,) bool that were touched in a step. Collective whenever the buffer is full."""
         if self._pending >= _PENDING:
             self.meet(comm)
         self._steps[self._pending] = step
@@ -97,9 +97,9 @@ class ContactLog:
         self._pending += 1
 
     def meet(self, comm: MPI.Comm, contacts: np.ndarray | None = None) -> None:
-        """Bring the contact times up to date on all ranks. Collective.
+        """Update the contact times on all ranks. Collective.
 
-        ``contacts`` (walls,): nodes of all ranks that touch after the last step, where that is known.
+        ``contacts`` (walls,): number of nodes of all ranks in contact after the last step, if known.
         """
         n, self._pending = self._pending, 0
         if n == 1 and contacts is not None:
@@ -111,23 +111,23 @@ class ContactLog:
             self.time += self._steps[:n] @ flags
 
     def share(self) -> dict[str, Any]:
-        """This rank's sums, for a checkpoint."""
+        """Return this rank's sums for a checkpoint."""
         return {
             "wall_releases": self.releases.tolist(),
             "contact_changes": self.changes,
         }
 
     def times(self, comm: MPI.Comm) -> dict[str, Any]:
-        """Contact times, and the steps not yet added to them, for a checkpoint. Collective.
+        """Return contact times, and the steps not yet added to them, for a checkpoint. Collective.
 
-        They are added by :meth:`meet` only: other partial sums would end in other last digits.
+        Only :meth:`meet` adds them: other partial sums would round differently.
         """
         flags = self._flags[: self._pending].copy()
         comm.Allreduce(MPI.IN_PLACE, flags, op=MPI.MAX)
         return {"sum": self.time.tolist(), "steps": self._steps[: self._pending].tolist(), "flags": flags.tolist()}
 
     def load_state(self, share: dict[str, Any], times: dict[str, Any], touching: np.ndarray) -> None:
-        """Take this rank's sums, the contact times and who touches what from a checkpoint."""
+        """Restore this rank's sums, the contact times and the contacts from a checkpoint."""
         self.releases[:] = np.array(share["wall_releases"], dtype=np.int64)
         self.changes = int(share["contact_changes"])
         self.time[:] = times["sum"]

@@ -1,9 +1,9 @@
-"""Nearest neighbours across a direction: how the nodes of a pair table find each other.
+"""Nearest neighbours in the plane normal to a direction, which match the nodes of a pair table.
 
-Points are sorted into the cells of a square grid in the plane across the direction, about one point a cell, and each
-query looks at rings of cells around its own until no cell left can hold a nearer point. On several ranks the plane is
-cut into strips with about as many points each, one for each rank. A query goes to the nearest strip first, and then to
-all others that can hold a nearer point than was found there.
+Points are sorted into the cells of a square grid in that plane, about one point per cell. Each query searches rings of
+cells around its own until no remaining cell can contain a nearer point. On several ranks the plane is divided into
+strips with about equal numbers of points, one per rank. A query goes to the nearest strip first, and then to all others
+that can contain a nearer point.
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ from ..mesh.exchange import Router
 
 __all__ = ["across", "nearest_across", "nearest_among_ranks"]
 
-_CHUNK = 1 << 21  # candidates looked at in one go
-_BINS = 1 << 12  # of the histogram by which strips are cut
+_CHUNK = 1 << 21  # candidates compared at once
+_BINS = 1 << 12  # of the histogram that divides the strips
 
 
 def across(points: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Points (n, 3) without their part along a unit vector; the same to the last bit wherever they are in an array."""
+    """Return points (n, 3) minus their part along a unit vector, bitwise independent of their index in the array."""
     along = points[:, 0] * normal[0] + points[:, 1] * normal[1] + points[:, 2] * normal[2]
     return points - along[:, None] * normal
 
 
 def nearest_across(points: np.ndarray, queries: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Indices (m,) of the points (n, 3) that are nearest to queries (m, 3) across a unit vector; n >= 1.
+    """Return indices (m,) of the points (n, 3) nearest to queries (m, 3) in the plane normal to a unit vector; n >= 1.
 
-    Of points at the same distance, to the last bit, the first one is taken.
+    Of points at bitwise equal distance the first one is taken.
     """
     return _Grid(across(points, normal), normal).nearest(across(queries, normal))[0]
 
@@ -38,17 +38,17 @@ def nearest_across(points: np.ndarray, queries: np.ndarray, normal: np.ndarray) 
 def nearest_among_ranks(
     comm: MPI.Comm, keys: np.ndarray, points: np.ndarray, queries: np.ndarray, normal: np.ndarray
 ) -> np.ndarray:
-    """Keys (m, k) of the points nearest to this rank's queries (m, 3), across a unit vector. Collective.
+    """Return keys (m, k) of the points nearest to this rank's queries (m, 3) in a plane. Collective.
 
     Parameters
     ----------
     comm : MPI.Comm
     keys : (n, k) int64
-        What this rank's points are known by. Of points at the same distance, to the last bit, the one with the smallest
-        first key is taken.
+        Keys of this rank's points. Of points at bitwise equal distance, the one with the smallest first key is taken.
     points : (n, 3)
         At least one point on all ranks together.
     queries, normal : (m, 3), (3,)
+        Distances are measured in the plane normal to the unit vector ``normal``.
     """
     points, queries = across(points, normal), across(queries, normal)
     along = _along(comm, points, normal)
@@ -79,7 +79,7 @@ def nearest_among_ranks(
     again = strip != first[query]
     query = query[again]
     found, other = answer(held[strip[again]], queries[query])
-    # of each query's answers the nearest one comes first, then the one with the smallest key
+    # sort each query's answers by distance, then by key
     query, square = np.append(np.arange(len(queries)), query), np.append(square, other)
     best = np.concatenate([best, found])
     order = np.lexsort((best[:, 0], square, query))
@@ -87,7 +87,7 @@ def nearest_among_ranks(
 
 
 def _along(comm: MPI.Comm, points: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """The axis in the plane along which points (n, 3) of all ranks extend the farthest."""
+    """Return the axis in the plane along which the points (n, 3) of all ranks extend farthest."""
     axes = _axes(normal)
     flat = points @ axes
     ends = np.stack([-flat.min(axis=0, initial=np.inf), flat.max(axis=0, initial=-np.inf)])
@@ -96,7 +96,7 @@ def _along(comm: MPI.Comm, points: np.ndarray, normal: np.ndarray) -> np.ndarray
 
 
 def _strips(comm: MPI.Comm, place: np.ndarray) -> np.ndarray:
-    """Ranks (n,) among which points at (n,) are divided, in ascending order and about evenly."""
+    """Divide points at coordinates (n,) among ranks, in ascending order and about evenly; return ranks (n,)."""
     ends = np.array([-place.min(initial=np.inf), place.max(initial=-np.inf)])
     comm.Allreduce(MPI.IN_PLACE, ends, op=MPI.MAX)
     width = max(float(ends.sum()) / _BINS, 1e-300)
@@ -108,7 +108,7 @@ def _strips(comm: MPI.Comm, place: np.ndarray) -> np.ndarray:
 
 
 def _axes(normal: np.ndarray) -> np.ndarray:
-    """Two unit vectors across a unit vector, as columns (3, 2)."""
+    """Return two unit vectors orthogonal to a unit vector and to each other, as columns (3, 2)."""
     first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
     first /= np.linalg.norm(first)
     return np.stack([first, np.cross(normal, first)], axis=1)
@@ -123,7 +123,7 @@ class _Grid:
         flat = points @ self.axes
         self.low, self.high = flat.min(axis=0), flat.max(axis=0)
         extent, n = self.high - self.low, len(points)
-        # of points on a line the area is none
+        # points on a line span no area
         self.edge = max(float(np.sqrt(extent.prod() / n)), float(extent.max()) / n) or 1.0
         self.rounding = 1e-12 * float(np.abs(flat).max()) + 1e-300
         self.shape = np.floor(extent / self.edge).astype(np.int64) + 1
@@ -136,10 +136,11 @@ class _Grid:
         return np.clip(np.floor((flat - self.low) / self.edge).astype(np.int64), 0, self.shape - 1)
 
     def nearest(self, queries: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Indices (m,) of the points nearest to queries (m, 3) in the plane, and the squared distances (m,)."""
+        """Return indices (m,) of the points nearest to queries (m, 3) in the plane, and squared distances (m,)."""
         flat = queries @ self.axes
         inside = np.clip(flat, self.low, self.high)
-        # the points lie in a box: p is no nearer to a query than sqrt(|q - c|^2 + |c - p|^2), c the box's nearest place
+        # the points lie in a box: the distance of p from a query q is at least sqrt(|q - c|^2 + |c - p|^2), with c the
+        # point of the box nearest to q
         outside = ((flat - inside) ** 2).sum(axis=1)
         cells = self._cells(inside)
         best, distance = np.full(len(queries), len(self.points)), np.full(len(queries), np.inf)
@@ -154,7 +155,7 @@ class _Grid:
         return best, distance
 
     def _ranges(self, cells: np.ndarray, ring: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """For each run of cells of the ring around cells (m, 2): the places (m,), (m,) of its points in the order."""
+        """Yield, for each run of cells of the ring around cells (m, 2), the range (m,), (m,) of its sorted points."""
         for row in range(-ring, ring + 1):
             runs = [(-ring, ring)] if abs(row) == ring else [(-ring, -ring), (ring, ring)]
             at = cells[:, 0] + row
@@ -175,7 +176,7 @@ class _Grid:
         best: np.ndarray,
         distance: np.ndarray,
     ) -> None:
-        """Compare queries ``left`` with their points at begin..end of the order; best and distance are brought up."""
+        """Compare queries ``left`` with the sorted points begin..end; update ``best`` and ``distance``."""
         counts = end - begin
         met = np.flatnonzero(counts)
         parts = np.flatnonzero(np.diff(np.cumsum(counts[met]) // _CHUNK)) + 1

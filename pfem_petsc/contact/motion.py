@@ -1,4 +1,4 @@
-"""Where walls are: their displacement from the place that the case gives them."""
+"""Motion of walls: displacements from their initial positions."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ class WallMotion:
 
     Attributes
     ----------
-    moving : (w,) bool, walls that move at all
-    bodies : FreeWalls, the walls with mass; NoFreeWalls where there are none
+    moving : (w,) bool, walls that move
+    bodies : FreeWalls, the walls with mass; NoFreeWalls if there are none
     """
 
     def __init__(self, walls: Sequence[WallKeys]) -> None:
@@ -36,36 +36,36 @@ class WallMotion:
 
     @property
     def free(self) -> FreeWalls | None:
-        """The walls with mass, None where there are none."""
+        """The walls with mass, None if there are none."""
         return self.bodies if len(self.bodies.at) else None
 
     @property
     def speeds(self) -> np.ndarray:
-        """Velocities (f, 3) [m/s] of walls with mass; (0, 3) where there are none."""
+        """Velocities (f, 3) [m/s] of walls with mass; (0, 3) if there are none."""
         return self.bodies.state.v
 
     def set_speeds(self, v: np.ndarray) -> None:
-        """Give walls with mass the velocities (f, 3) [m/s]."""
+        """Set the velocities (f, 3) [m/s] of walls with mass."""
         self.bodies.state.v = v
 
     def start(self, h: float) -> None:
-        """Complete the state of walls with mass at the start of steps of ``h`` [s]."""
+        """Initialise the state of walls with mass for steps of ``h`` [s]."""
         self.bodies.start(h)
 
     def begin(self, time: float, h: float) -> None:
-        """Begin a step of ``h`` from ``time`` [s], with walls that have mass."""
+        """Begin a step of ``h`` from ``time`` [s] for walls with mass."""
         self.bodies.begin(time, h)
 
     def finish(self, h: float) -> None:
-        """Complete the state of walls with mass after a step of ``h`` [s]."""
+        """Advance the state of walls with mass after a step of ``h`` [s]."""
         self.bodies.finish(h)
 
     def step_changed(self, scheme: Scheme) -> None:
-        """Tell the scheme to forget of walls with mass what holds for steps of another size."""
+        """Notify the scheme of the walls with mass that the step size has changed."""
         self.bodies.step_changed(scheme)
 
     def kept(self) -> dict[str, Any] | None:
-        """What a checkpoint must hold, None where no wall has mass."""
+        """Return the state for a checkpoint, None if no wall has mass."""
         return self.bodies.kept()
 
     def load_state(self, kept: dict[str, Any] | None) -> None:
@@ -73,7 +73,7 @@ class WallMotion:
         self.bodies.load_state(kept)
 
     def displacements(self, time: float) -> np.ndarray:
-        """Displacements (w, 3) [m] at a time [s]."""
+        """Return displacements (w, 3) [m] at a time [s]."""
         displacements = np.zeros((len(self._motions), 3))
         for k, motion in enumerate(self._motions):
             if motion is not None:
@@ -82,7 +82,8 @@ class WallMotion:
         return displacements
 
     def rates(self, time: float, ahead: bool = False) -> np.ndarray:
-        """Velocities (w, 3) [m/s] at a time [s]; in the kinks of a linear table that before, or that ahead."""
+        """Return velocities (w, 3) [m/s] at a time [s]; at the kinks of a linear table the left limit, or the right one
+        if ``ahead``."""
         rates = np.zeros((len(self._motions), 3))
         for k, motion in enumerate(self._motions):
             if motion is not None:
@@ -91,7 +92,7 @@ class WallMotion:
         return rates
 
     def accelerations(self, time: float) -> np.ndarray:
-        """Accelerations (w, 3) [m/s2] at a time [s] of walls whose motion is given; zero for those with mass."""
+        """Return accelerations (w, 3) [m/s2] of walls with prescribed motion at a time [s]; zero for others."""
         nothing = np.zeros((3, 3))
         moved = [nothing if motion is None else motion.at(time) for motion in self._motions]
         return np.array([each[2] for each in moved]).reshape(-1, 3)

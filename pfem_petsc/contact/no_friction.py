@@ -36,13 +36,13 @@ class NoStepFriction:
         return strengths
 
     def jams(self, nodes: np.ndarray, x: np.ndarray, displacements: np.ndarray) -> list[str]:
-        """No walls jam."""
+        """Return no messages."""
         return []
 
     def relax(self) -> bool:
-        """No friction can be relaxed."""
+        """Return False: there is nothing to simplify."""
         return False
 
     def add(self, force: np.ndarray, nodes: np.ndarray, x: np.ndarray) -> float:
-        """Add no force; friction takes no energy."""
+        """Add no force; return zero energy."""
         return 0.0

@@ -1,4 +1,4 @@
-"""Contact pairs that do not work with the rest of a case are refused before the first step."""
+"""Checks before the first step that contact pairs are compatible with the rest of a case."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ __all__ = ["check_scheme", "check_start"]
 
 
 def check_scheme(pairs: ContactPairs, on_its_own: bool, treatment: str) -> None:
-    """Refuse schemes, treatments of impact and walls that do not work with the pairs of a case. Collective.
+    """Refuse schemes, treatments of impact and walls that are not compatible with the pairs of a case. Collective.
 
     Parameters
     ----------
     pairs : ContactPairs
     on_its_own : bool
-        Whether each node is solved on its own, by an explicit scheme with lumped mass.
+        Whether nodes are solved independently, by an explicit scheme with lumped mass.
     treatment : str
         Treatment of impact, ``contact.treatment`` of the case.
 
@@ -62,7 +62,7 @@ def check_start(pairs: ContactPairs, x: np.ndarray, length: float, source: str) 
     ----------
     pairs : ContactPairs
     x : (owned, 3) positions at the start [m]
-    length : of the model [m]
+    length : size of the model [m]
     source : name of the case file, for messages
 
     Raises

@@ -1,16 +1,16 @@
-"""Coordinates of implicit steps in which every contact pair is a bound on one unknown.
+"""Coordinates for implicit steps in which every contact pair is a bound on one unknown.
 
-A pair bounds the distance d . (x_c - x_o), of which the node c carries the bound and o is the other one. With y the
-coordinates of both, those of their frames where walls are near (u = B^-1 y), else u_o = y_o and u_c = H y_c with the
-reflection H that takes an axis into the direction of d, the distance is alpha . y_c - beta . y_o. It takes the place
-of a coordinate s of y_c that no wall bounds:
+A pair bounds the distance d . (x_c - x_o); node c carries the bound, and o is the other node. Let y be the coordinates
+of both nodes: those of their frames if walls are near (u = B^-1 y), else u_o = y_o and u_c = H y_c with the reflection
+H that maps an axis to the direction of d. Then the distance is alpha . y_c - beta . y_o, and it replaces a coordinate s
+of y_c that no wall bounds:
 
     w_s = (alpha . y_c - beta . y_o)/|alpha_s|,   all others w = y,   and back   y_s = r_c . w_c + r_o . w_o.
 
-The gradient follows, g_c <- g_c - g_s e_s + g_s r_c, g_o <- g_o + g_s r_o, and the pair's force is g_s/|alpha_s| then.
-What supports prescribe is no part of alpha and beta: it moves the bound. The two nodes may be on two ranks, which both
-have the pair and exchange single numbers of it. Where walls stop no node of a pair the coordinates are the same for all
-steps.
+The gradient transforms accordingly, g_c <- g_c - g_s e_s + g_s r_c, g_o <- g_o + g_s r_o, and the force of the pair is
+g_s/|alpha_s|. Prescribed components do not enter alpha and beta; they move the bound. If two ranks own the two nodes,
+both have the pair and exchange one number per pair. If walls stop no node of a pair, the coordinates are the same for
+all steps.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ from .pairs import ContactPairs
 
 __all__ = ["PairCoordinates"]
 
-_THIN = 1e-6  # length of a direction's free part below which supports alone decide
-_LEAST = 0.1  # |alpha_s| at a node with a frame below which the pair must wait
+_THIN = 1e-6  # length of a direction's free part below which supports alone determine the motion
+_LEAST = 0.1  # |alpha_s| at a node with a frame below which the pair is deferred
 
 
 class _Ends:
-    """One end of each of some pairs.
+    """One end of each pair in a list.
 
     Attributes
     ----------
-    mine : (k,) bool, which of them this rank owns; ``nodes`` (m,) their owned local indices
+    mine : (k,) bool, ends that this rank owns; ``nodes`` (m,) their owned local indices
     """
 
     def __init__(self, pairs: ContactPairs, ends: np.ndarray, at: np.ndarray) -> None:
@@ -42,14 +42,14 @@ class _Ends:
         self.nodes = where[self.mine]
         self._far = -1 - where[~self.mine]
         self._partners = partners = pairs.partners
-        # which of this rank's ends are those that partners want; a node is in one pair
+        # this rank's ends that partners need; a node is in one pair only
         order = np.argsort(self.nodes)
         place = np.minimum(np.searchsorted(self.nodes, partners.rows, sorter=order), max(len(order) - 1, 0))
         self._leaving = order[place] if len(order) else np.zeros(len(partners.rows), dtype=np.int64)
         self._wanted = self.nodes[self._leaving] == partners.rows if len(order) else np.zeros(len(place), dtype=bool)
 
     def known(self, values: np.ndarray) -> np.ndarray:
-        """Numbers (k,) of all ends, from those (m,) that their owners have. Collective."""
+        """Return values (k,) at all ends from those (m,) at owned ends. Collective."""
         data = np.empty(len(self.mine))
         data[self.mine] = values
         if not self._partners.alone:
@@ -76,7 +76,7 @@ class PairCoordinates:
         )
 
     def place(self, frames: NodalFrames | None) -> None:
-        """Take the frames of a solve; None where no wall is near. Collective."""
+        """Set the frames of a solve; None if no wall is near. Collective."""
         pairs = self.pairs
         if not pairs.coupled.any_walled:
             return
@@ -93,9 +93,10 @@ class PairCoordinates:
         self._place(ends[:, :, :9].reshape(*pairs.mine.shape, 3, 3), ends[:, :, 9] > 0.0, room)
 
     def _place(self, inverse: np.ndarray, framed: np.ndarray, room: np.ndarray) -> None:
-        """Choose who carries the bounds, and in which coordinate.
+        """Choose the nodes and coordinates that carry the bounds.
 
-        ``inverse`` (2, p, 3, 3), ``framed`` (2, p): of the ends' frames; ``room`` (2, p, 3): coordinates to be had.
+        ``inverse`` (2, p, 3, 3), ``framed`` (2, p) bool: of the ends' frames; ``room`` (2, p, 3) bool: available
+        coordinates.
         """
         pairs = self.pairs
         direction = np.array([-1.0, 1.0])[:, None, None] * pairs.normals
@@ -123,7 +124,7 @@ class PairCoordinates:
         square = np.einsum("pi,pi->p", mirror, mirror)
         scale = np.divide(2.0, square, out=np.zeros_like(square), where=square > 0.0)
         turn = np.eye(3) - scale[:, None, None] * mirror[:, :, None] * mirror[:, None, :]
-        # without a frame the reflection leaves the carrier's part of the distance in its coordinate alone
+        # without a frame, the reflection makes the distance depend on one coordinate of the carrier only
         unframed = ~framed[carrier, at]
         lengths = np.linalg.norm(alpha, axis=1)
         alpha[unframed] = 0.0
@@ -140,18 +141,18 @@ class PairCoordinates:
         self._share, self._shared = share[here], share[there]
 
     def _of_others(self, w: np.ndarray) -> np.ndarray:
-        """r_o . w_o of the pairs carried here. Collective."""
+        """Return r_o . w_o of the pairs that this rank carries. Collective."""
         shares = self._sharing.known(np.einsum("pi,pi->p", self._shared, w[self._other]))
         return shares[self._carrying.mine]
 
     def increment(self, w: np.ndarray) -> None:
-        """Turn w (owned, 3) into coordinates of the frames, or u where there are none, in place. Collective."""
+        """Transform w (owned, 3) to frame coordinates, or to u where there are no frames, in place. Collective."""
         y = w[self.slave_nodes]
         y[np.arange(len(y)), self._slots] = np.einsum("pi,pi->p", self._own, y) + self._of_others(w)
         w[self.slave_nodes] = np.einsum("pij,pj->pi", self._turns, y)
 
     def coordinates(self, y: np.ndarray) -> None:
-        """Turn what :meth:`increment` gives (owned, 3) into w, in place. Collective."""
+        """Transform the result of :meth:`increment` (owned, 3) back to w, in place. Collective."""
         w, every = np.einsum("pij,pj->pi", self._turns, y[self.slave_nodes]), np.arange(len(self.slave_nodes))
         sign = self._own[every, self._slots]
         rest = np.einsum("pi,pi->p", self._own, w) - sign * w[every, self._slots] + self._of_others(y)
@@ -159,7 +160,7 @@ class PairCoordinates:
         y[self.slave_nodes] = w
 
     def gradient(self, g: np.ndarray) -> None:
-        """Turn a gradient (owned, 3) by what :meth:`increment` gives into that by w, in place. Collective."""
+        """Transform a gradient (owned, 3) with respect to y to that with respect to w, in place. Collective."""
         y, every = np.einsum("pij,pj->pi", self._turns, g[self.slave_nodes]), np.arange(len(self.slave_nodes))
         pull = y[every, self._slots].copy()
         y[every, self._slots] = 0.0
@@ -167,7 +168,7 @@ class PairCoordinates:
         g[self._other] += self._carrying.known(pull)[self._sharing.mine, None] * self._shared
 
     def diagonal(self, blocks: np.ndarray, diagonal: np.ndarray) -> None:
-        """Put the diagonal (owned, 3) of T^T H T in place of that of H at pairs; bars between the ends are left out.
+        """Replace the diagonal (owned, 3) of H at pairs by that of T^T H T; bars between the ends are neglected.
 
         ``blocks`` (carriers, 3, 3): the diagonal blocks of H there. Collective.
         """
@@ -180,7 +181,7 @@ class PairCoordinates:
         diagonal[self._other] += self._carrying.known(stiff)[self._sharing.mine, None] * self._shared**2
 
     def matrix(self) -> PETSc.Mat:
-        """T of :meth:`increment`, with places for any choice of carriers; the caller destroys it. Collective."""
+        """Return T of :meth:`increment`, preallocated for any carriers; the caller destroys it. Collective."""
         mesh, pairs = self.pairs.mesh, self.pairs
         first, total = 3 * mesh.first_node, 3 * mesh.n_nodes
         numbers = pairs.gather(np.arange(mesh.first_node, mesh.first_node + mesh.n_owned)[:, None].astype(float))
@@ -207,12 +208,12 @@ class PairCoordinates:
         return matrix
 
     def refresh(self, matrix: PETSc.Mat) -> None:
-        """Bring T up to date with the frames. Collective."""
+        """Update T for the current frames. Collective."""
         pairs, mesh = self.pairs, self.pairs.mesh
         pointers, columns = self._pattern
         local = columns - 3 * mesh.first_node
         values = np.zeros(len(columns))
-        # rows of nodes that carry nothing are those of the unit matrix
+        # rows of nodes that carry no bound are those of the identity
         values[local == np.repeat(np.arange(3 * mesh.n_owned), np.diff(pointers))] = 1.0
         place = pointers[3 * self.slave_nodes[:, None] + np.arange(3)][:, :, None] + np.arange(6)
         every = np.arange(len(self.slave_nodes))
@@ -228,14 +229,17 @@ class PairCoordinates:
         matrix.assemble()
 
     def reached(self, x: np.ndarray, move: np.ndarray, contact: np.ndarray, slack: float) -> bool:
-        """Whether pairs can meet in a step: ends at (owned, 3) that move so far, or pressed before. Collective."""
+        """Return whether pairs can close in a step in which nodes at ``x`` (owned, 3) move by ``move``. Collective.
+
+        Pairs that were in contact before count as well.
+        """
         data = self.pairs.gather(np.concatenate([x + move, move, contact], axis=1))
         reach = 0.5 * np.linalg.norm(data[:, :, 3:6], axis=2).sum(axis=0) + slack
         near = self.pairs.distances(data[:, :, :3]) - self.pairs.gaps < reach
         return self._anywhere((near | data[0, :, 6:].any(axis=1))[self._usable])
 
     def broken(self, x: np.ndarray, tolerance: float) -> bool:
-        """Whether positions (owned, 3) break a pair by more than a tolerance [m]. Collective."""
+        """Return whether positions (owned, 3) violate a pair by more than a tolerance [m]. Collective."""
         short = self.pairs.gaps - self.pairs.distances(self.pairs.gather(x))
         return self._anywhere(short[self._usable] > tolerance)
 
@@ -243,8 +247,8 @@ class PairCoordinates:
         return bool(self.pairs.mesh.comm.allreduce(bool(which.any()), op=MPI.LOR))
 
     def blocked(self, x: np.ndarray, tolerance: float) -> tuple[int, int, str] | None:
-        """The first pair that found no coordinate, and that positions (owned, 3) break by more than a tolerance. Nodes
-        and table, or None; the same on all ranks. Collective."""
+        """Return the first pair without a coordinate that positions (owned, 3) violate by more than a tolerance, as its
+        nodes and table, or None; the same on all ranks. Collective."""
         if not self._waits:
             return None
         pairs = self.pairs
@@ -267,9 +271,9 @@ class PairCoordinates:
 
         Parameters
         ----------
-        w, g : (owned, 3) solution in these coordinates [m], and the residual of its increment's coordinates [N]
+        w, g : (owned, 3) solution in these coordinates [m], and the residual in the coordinates of the increment [N]
         lower : (owned, 3) bounds on w [m]
-        noise : of the residual [N]
+        noise : residual that counts as zero [N]
         """
         at, slot = self.slave_nodes, self._slots
         every = np.arange(len(at))

@@ -1,4 +1,4 @@
-"""Contact pairs as a link: what steps ask of :mod:`pairs <pfem_petsc.contact.pairs>` and of their coordinates."""
+"""Contact pairs as a link: adapts :mod:`pairs <pfem_petsc.contact.pairs>` and their coordinates to its interface."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ class PairLink:
         return None
 
     def restore(self, saved: None) -> None:
-        """They are in the arrays."""
+        """Do nothing: the forces are in the arrays."""
 
     def arrays(self) -> dict[str, np.ndarray]:
         return self.pairs.kept()
@@ -90,7 +90,7 @@ class PairLink:
 
 
 class PairLinkCoordinates:
-    """Their coordinates; see :class:`~pfem_petsc.contact.links.LinkCoordinates`."""
+    """Coordinates of contact pairs; see :class:`~pfem_petsc.contact.links.LinkCoordinates`."""
 
     def __init__(self, pairs: ContactPairs) -> None:
         self.pairs = pairs
@@ -138,7 +138,7 @@ class PairLinkCoordinates:
         self.pairs.push(contact, factor)
 
     def kept(self, x: np.ndarray, slack: float) -> bool:
-        """Pairs that found no coordinate beside the walls at both their nodes must not be broken."""
+        """See :class:`~pfem_petsc.contact.links.LinkCoordinates`; pairs without a free coordinate are checked too."""
         blocked = self.own.blocked(x, slack)
         if blocked is not None:
             first, second, name = blocked

@@ -1,7 +1,7 @@
 """Compiled loops over the pairs of a rank.
 
-An end i = where[e, p] is a node of this rank for i >= 0, else row -1 - i of arrays that partners have sent. Distances
-are summed up as (d_0 + d_2) + d_1; the numbers of a pair are the same on all ranks that have it.
+An end i = where[e, p] is a node of this rank for i >= 0, else row -1 - i of arrays received from partners. Distances
+are summed as (d_0 + d_2) + d_1, so that the values of a pair are bitwise equal on all ranks that have it.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ __all__ = [
 
 @kernel
 def part_nodes(where, x, u, stiffness, far, normals, along, least, free, held, force, load):
-    """Move nodes of pairs, of which each is in one pair, so that these keep their bounds.
+    """Move the nodes of pairs so that the bounds are satisfied; each node is in one pair only.
 
     Parameters
     ----------
     where : (2, p)
-    x, u : (owned, 3) positions are their sum [m]; u is changed
+    x, u : (owned, 3); positions are their sum [m]; u is changed
     stiffness : (owned,) force for a displacement of a node [N/m]
     far : (partners, 4) positions [m] and 1/stiffness
-    normals, along, least : (p, 3), (2, p) how far ends give way, (p,) bounds [m]
-    free, held : (2, p, 3) 0.0 where supports hold an end, (2, p) which ends have such components
-    force : (p,) out, zero or positive [N]
-    load : (owned, 3) takes the forces on nodes, unless it is (0, 3) [N]
+    normals, along, least : (p, 3); (2, p) compliance factor of ends along the direction; (p,) bounds [m]
+    free, held : (2, p, 3) 0.0 where supports prescribe a component; (2, p) bool, ends with such components
+    force : (p,) output, zero or positive [N]
+    load : (owned, 3) to which the forces on nodes are added, unless it is (0, 3) [N]
 
     Returns
     -------
@@ -48,7 +48,7 @@ def part_nodes(where, x, u, stiffness, far, normals, along, least, free, held, f
     loaded = len(load) > 0
     apart = np.empty(3)
     for p in range(len(force)):
-        # written out: a function that takes the arrays costs more than all the rest
+        # inlined by hand: a call that passes the arrays costs more than all the rest
         i, j = where[0, p], where[1, p]
         for c in range(3):
             there = x[j, c] + u[j, c] if j >= 0 else far[-1 - j, c]
@@ -82,7 +82,7 @@ def part_nodes(where, x, u, stiffness, far, normals, along, least, free, held, f
 
 @kernel
 def leaving_rows(rows, x, u, stiffness, leaving):
-    """Put x + u (owned, 3) and 1/stiffness of the nodes that partners want into ``leaving`` (rows, 4)."""
+    """Write x + u (owned, 3) and 1/stiffness of the nodes that partners need into ``leaving`` (rows, 4)."""
     for k in range(len(rows)):
         i = rows[k]
         for c in range(3):
@@ -92,9 +92,9 @@ def leaving_rows(rows, x, u, stiffness, leaving):
 
 @kernel
 def needed_forces(where, x, stiffness, far, normals, along, least, force):
-    """Forces of pairs that bring the distances of x (owned, 3) to bounds (p,), none where these are -inf.
+    """Compute forces of pairs that bring the distances at x (owned, 3) to bounds (p,), zero where these are -inf.
 
-    As :func:`part_nodes`, of which nothing is moved; ``force`` (p,) may be negative.
+    As :func:`part_nodes`, but no node is moved, and ``force`` (p,) may be negative.
     """
     apart = np.empty(3)
     for p in range(len(force)):
@@ -114,9 +114,9 @@ def needed_forces(where, x, stiffness, far, normals, along, least, force):
 
 @kernel
 def move_nodes(where, force, normals, free, held, stiffness, u, load):
-    """Add to u (owned, 3) the displacements by forces (p,), and these to ``load`` (owned, 3), unless that is (0, 3).
+    """Add displacements by forces (p,) to u (owned, 3), and the forces to ``load`` (owned, 3) unless it is (0, 3).
 
-    ``free`` (2, p, 3) is 0.0 where supports hold an end, ``held`` (2, p) says which ends have such components.
+    ``free`` (2, p, 3) is 0.0 where supports prescribe a component; ``held`` (2, p) marks ends with such components.
     """
     loaded = len(load) > 0
     for end in range(2):
@@ -151,7 +151,7 @@ def push_nodes(where, force, factor, normals, load):
 
 @kernel
 def pressed_nodes(where, force, normals, nodes, directions):
-    """Put owned nodes that pairs press into ``nodes``, and the directions of the pairs; gives their number."""
+    """Write owned nodes of pairs in contact and the pairs' directions into the arrays; return their number."""
     count = 0
     for end in range(2):
         for p in range(len(force)):
@@ -166,7 +166,7 @@ def pressed_nodes(where, force, normals, nodes, directions):
 
 @kernel
 def table_forces(where, table, force, normals, sums):
-    """Forces of the pairs of each table whose second node is owned, into (tables, 3)."""
+    """Sum the forces of the pairs of each table whose second node is owned, into (tables, 3)."""
     last = -1
     for p in range(len(force)):
         if where[1, p] < 0:
@@ -183,7 +183,7 @@ def table_forces(where, table, force, normals, sums):
 
 @kernel
 def broken_pairs(ends, x, least, normals, tolerance, broken):
-    """Mark pairs of nodes ``ends`` (2, p) at x (n, 3) that are nearer than their bounds (p,); gives their number."""
+    """Mark pairs of nodes ``ends`` (2, p) at x (n, 3) that violate their bounds (p,); return their number."""
     count = 0
     for p in range(len(least)):
         i, j = ends[0, p], ends[1, p]

@@ -1,8 +1,8 @@
-"""Which pairs of nodes a rank has: those of its own nodes, and what hangs together with them.
+"""Distribution of contact pairs over ranks: a rank has the pairs of its own nodes, and those connected with them.
 
-The tables of a case are matched among the ranks (:mod:`~pfem_petsc.contact.matching`), so that the owner of a second
-node learns of its first one. The owner of that is told. Where a node is in several pairs, all ranks that own a node of
-such a group have the whole group.
+The tables of a case are matched among the ranks (:mod:`~pfem_petsc.contact.matching`): the owner of each second node
+finds the first node and notifies its owner. If a node is in several pairs, all ranks that own a node of such a group
+have the whole group.
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ if TYPE_CHECKING:
 
 __all__ = ["PairNodes", "find_pairs"]
 
-_TAG = 7500  # of the messages between partners, apart from those of the mesh's ghosts
+_TAG = 7500  # of the messages between partners, distinct from those of the mesh's ghosts
 _TABLE, _SECOND, _SECOND_AT, _FIRST, _FIRST_AT = range(5)  # columns of pairs: mesh and PETSc numbers
 
 
 @dataclass(frozen=True)
 class PairNodes:
-    """The pairs of this rank, by table and then by the mesh number of the second node.
+    """The pairs of this rank, sorted by table and then by the mesh number of the second node.
 
     Attributes
     ----------
     table : (p,) index of a pair's table
     numbers : (2, p) mesh numbers of the first and second ends
-    where : (2, p) local index of an end that this rank owns, else -1 less its row among those that others own
-    owners : (p,) rank of the second end where the first one is here, else of the first
-    partners : brings values of ends that others own
+    where : (2, p) local index of an end that this rank owns, else -1 minus its row among those of other ranks
+    owners : (p,) owner of the second end if this rank owns the first, else owner of the first
+    partners : exchanges values at ends that other ranks own
     """
 
     table: np.ndarray
@@ -54,13 +54,13 @@ def find_pairs(case: Case, nodes: dict[str, np.ndarray], mesh: DistributedMesh) 
     Raises
     ------
     InputError
-        On all ranks: sets of unequal size, nodes that are paired with themselves, or two with one.
+        On all ranks, for sets of unequal size, a node paired with itself, or two nodes paired with the same node.
     """
     comm = mesh.comm
     starts = np.concatenate([[0], np.cumsum(comm.allgather(mesh.n_owned))]).astype(np.int64)
     found = np.concatenate([_match(case, k, nodes, mesh) for k in range(len(case.contact_pair))])
     _refuse_itself(found, case.source, comm)
-    # of each pair the owner of the first node is told; rows that both have are the same ones
+    # notify the owner of each pair's first node; rows that both owners have are equal
     owner = np.searchsorted(starts, found[:, _FIRST_AT], side="right") - 1
     away = owner != comm.rank
     pairs = _sorted(np.concatenate([found, Router(comm, owner[away]).send(found[away])]))
@@ -77,7 +77,7 @@ def find_pairs(case: Case, nodes: dict[str, np.ndarray], mesh: DistributedMesh) 
 
 
 def _match(case: Case, index: int, nodes: dict[str, np.ndarray], mesh: DistributedMesh) -> np.ndarray:
-    """Rows of a table's pairs (m, 5): each second node of this rank with the first one nearest to it."""
+    """Return the pairs of a table (m, 5): each second node of this rank with the first node nearest to it."""
     pair, comm = case.contact_pair[index], mesh.comm
     key = f"{case.source}: contact_pair {pair.name!r}"
     normal = np.array(pair.direction) / np.linalg.norm(pair.direction)
@@ -104,12 +104,12 @@ def _refuse_itself(pairs: np.ndarray, source: str, comm: MPI.Comm) -> None:
 
 
 def _sorted(pairs: np.ndarray) -> np.ndarray:
-    """Each pair once, in their order."""
+    """Return the pairs sorted and without duplicates."""
     return np.unique(pairs, axis=0)
 
 
 def _with_groups(pairs: np.ndarray, starts: np.ndarray, comm: MPI.Comm) -> np.ndarray:
-    """Add the pairs that share nodes with those of this rank, and so on, until no rank learns of more. Collective."""
+    """Add the pairs connected with those of this rank through shared nodes, repeated until complete. Collective."""
     own = pairs
     order = [np.argsort(own[:, at], kind="stable") for at in (_FIRST_AT, _SECOND_AT)]
     first, last = starts[comm.rank], starts[comm.rank + 1]

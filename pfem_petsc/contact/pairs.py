@@ -1,14 +1,14 @@
 """Contact between bodies: pairs of nodes that cannot pass each other along a direction.
 
 A pair bounds the relative coordinate: n . (x_second - x_first) >= gap. In an explicit step with lumped mass a pair
-whose free positions x break it is a problem of two nodes of stiffness k_1 and k_2 with the exact solution
+whose free positions x violate it is a problem of two nodes of stiffness k_1 and k_2 with the exact solution
 
     lambda = (gap - n . (x_2 - x_1)) / (1/k_1 + 1/k_2),   x_1 -= lambda n / k_1,   x_2 += lambda n / k_2,
 
-where components that supports prescribe do not give way. Where pairs share nodes, or walls stop these as well, see
-:mod:`pfem_petsc.contact.coupled`; else pairs are independent of each other. A rank has the pairs of its own nodes.
-Where another rank owns the other node, both ranks have the pair: they exchange the values of their nodes, and compute
-the same force. For implicit steps see :mod:`pfem_petsc.contact.pair_coordinates`.
+where prescribed components do not move. Pairs are independent of each other unless they share nodes or walls stop their
+nodes too; see :mod:`pfem_petsc.contact.coupled`. A rank has the pairs of its own nodes. If another rank owns the other
+node, both ranks have the pair, exchange the values of their nodes, and compute the same force. For implicit steps see
+:mod:`pfem_petsc.contact.pair_coordinates`.
 """
 
 from __future__ import annotations
@@ -34,21 +34,20 @@ __all__ = ["ContactPairs"]
 
 
 class ContactPairs:
-    """The pairs of a case that this rank has: those of its nodes, and those that share nodes with them. Construction is
-    collective.
+    """The pairs of a case on this rank: those of its nodes, and those connected with them. Construction is collective.
 
     Attributes
     ----------
-    names : of the tables; ``table`` (p,) says to which of them a pair belongs
+    names : of the tables; ``table`` (p,) is the index of each pair's table
     first, second : (p,) mesh numbers of the nodes
     normals, gaps : (p, 3), (p,) unit directions, and bounds on n . (x_second - x_first) [m]
-    where : (2, p) local index of an end that this rank owns, else -1 less its row among those that others own
-    mine, local : (2, p) which ends this rank owns, and their local indices, else 0
-    partners : GhostExchange that brings values of ends that others own
+    where : (2, p) local index of an end that this rank owns, else -1 minus its row among those of other ranks
+    mine, local : (2, p) bool, ends that this rank owns, and their local indices, else 0
+    partners : GhostExchange for values at ends that other ranks own
     coupled : CoupledPairs
     free : (2, p, 3) 1.0 where a component of an end may move, 0.0 where a support prescribes it
-    force : (p,) force of each pair in the last step, positive where it presses [N]; the same on all ranks that have it
-    closed : (p,) bool, pairs that have met and not parted since
+    force : (p,) force of each pair in the last step, positive in compression [N]; equal on all ranks that have the pair
+    closed : (p,) bool, pairs that have closed and not opened since
     """
 
     def __init__(
@@ -67,7 +66,7 @@ class ContactPairs:
         self.mine = self.where >= 0
         self.local = np.maximum(self.where, 0)
         self.free = self.gather(np.where(fixed, 0.0, 1.0))
-        self._along = np.einsum("epi,pi->ep", self.free, self.normals**2)  # how far ends give way to their pairs
+        self._along = np.einsum("epi,pi->ep", self.free, self.normals**2)  # compliance factors
         self._held = (self.free == 0.0).any(axis=2)
         self._none = np.empty((0, 3))
         self._nodes = np.empty(int(self.mine.sum()), dtype=np.int64)
@@ -79,7 +78,7 @@ class ContactPairs:
         self.coupled = CoupledPairs(self, contact)
 
     def numbers(self, pair: int) -> tuple[int, int]:
-        """Mesh numbers of a pair's second and first node."""
+        """Return the mesh numbers of a pair's second and first node."""
         return int(self.second[pair]), int(self.first[pair])
 
     def explicit(
@@ -91,20 +90,20 @@ class ContactPairs:
         time: float,
         tolerance: float,
     ) -> None:
-        """Separate the pairs that the free positions, predictor + u, violate; walls follow. Collective.
+        """Separate the pairs that the free positions, predictor + u, violate; called before the walls. Collective.
 
         Parameters
         ----------
         predictor, u : (owned, 3) [m]; u is changed
         stiffness : (owned,) force for a displacement of a node [N/m]
-        contact : (owned, 3) forces on the nodes, added to [N]
+        contact : (owned, 3) forces on the nodes, to which those of the pairs are added [N]
         time : of the positions [s]
-        tolerance : a pair broken by no more counts as kept, where walls stop its nodes as well [m]
+        tolerance : a coupled pair violated by at most this counts as satisfied [m]
 
         Raises
         ------
         SimulationFailure
-            On ranks that have such pairs: pairs, walls and supports leave nodes no room.
+            On ranks with pairs that are infeasible together with walls and supports.
         """
         if self.coupled.any:
             self.force = self.coupled.part(predictor, u, stiffness, time, tolerance)
@@ -113,14 +112,14 @@ class ContactPairs:
             self.force = self.part(predictor, u, stiffness, contact)
 
     def pressed(self) -> tuple[np.ndarray, np.ndarray]:
-        """Owned nodes (k,) that pairs hold, and the directions (k, 3) of their pairs."""
+        """Return owned nodes (k,) of pairs in contact, and the directions (k, 3) of their pairs."""
         if not self.force.any():
             return self._nodes[:0].copy(), self._none
         count = pressed_nodes(self.where, self.force, self.normals, self._nodes, self._directions)
         return self._nodes[:count].copy(), self._directions[:count].copy()
 
     def any_pressed(self) -> bool:
-        """Whether any pair of the model has a force. Collective."""
+        """Return whether any pair of the model has a force. Collective."""
         return bool(self.mesh.comm.allreduce(bool(self.force.any()), op=MPI.LOR))
 
     def release(self) -> None:
@@ -130,9 +129,9 @@ class ContactPairs:
     def part(
         self, predictor: np.ndarray, u: np.ndarray, stiffness: np.ndarray, contact: np.ndarray | None = None
     ) -> np.ndarray:
-        """Change u (owned, 3) [m] so that predictor + u keeps all pairs; the pairs' forces (p,) [N]. Collective.
+        """Change u (owned, 3) [m] so that predictor + u satisfies all pairs; return their forces (p,) [N]. Collective.
 
-        ``contact`` (owned, 3): forces on the nodes, to which these are added [N].
+        ``contact`` (owned, 3): forces on the nodes, to which those of the pairs are added [N].
         """
         force, load = np.empty(len(self.table)), self._none if contact is None else contact
         far = np.empty((0, 4))
@@ -147,25 +146,25 @@ class ContactPairs:
     def together(
         self, values: np.ndarray, mass: np.ndarray, rates: np.ndarray | float = 0.0, which: np.ndarray | None = None
     ) -> np.ndarray:
-        """Velocities or accelerations (owned, 3) at which pairs ``which`` (p,) part at ``rates`` (p,); default: those
-        that are pressed. Momentum is kept. Collective."""
+        """Return velocities or accelerations (owned, 3) at which pairs ``which`` (p,) separate at ``rates`` (p,), by
+        default those in contact. Momentum is conserved. Collective."""
         same, which = values.copy(), self.force > 0.0 if which is None else which
         force = self._needed(values, mass, np.where(which, rates, -np.inf))
         self._move(same, force, mass)
         return same
 
     def resting(self, x: np.ndarray, v: np.ndarray, slack: float, still: float) -> np.ndarray:
-        """(p,) bool: pairs of nodes at (owned, 3) that are closed within a slack [m] and do not part or meet faster
-        than ``still`` [m/s]. Collective."""
+        """Return (p,) bool: pairs at positions (owned, 3) that are closed within ``slack`` [m] and whose relative
+        velocity is at most ``still`` [m/s]. Collective."""
         ends = self.gather(np.concatenate([x, v], axis=1))
         closed = np.abs(self.distances(ends[:, :, :3]) - self.gaps) <= slack
         return closed & (np.abs(self.distances(ends[:, :, 3:])) <= still)
 
     def rest(self, a: np.ndarray, mass: np.ndarray, closed: np.ndarray, resting: np.ndarray) -> np.ndarray:
-        """Set the forces that closed pairs (p,) need for accelerations (owned, 3) that do not bring them nearer.
+        """Set the forces of closed pairs (p,) such that accelerations (owned, 3) do not make them overlap.
 
-        ``resting`` (owned, walls): nodes that walls do not let go either. Gives the pairs' forces (owned, 3) [N] on
-        components that are free. Collective.
+        ``resting`` (owned, walls) bool: nodes that rest on walls too. Returns the pairs' forces (owned, 3) [N] on free
+        components. Collective.
         """
         least = np.where(closed, 0.0, -np.inf)
         if self.coupled.any:
@@ -179,16 +178,16 @@ class ContactPairs:
         return change
 
     def reduced_mass(self, mass: np.ndarray) -> np.ndarray:
-        """1/(1/m_1 + 1/m_2) (p,) [kg] along the directions, from those of owned nodes (owned,). Collective."""
+        """Return 1/(1/m_1 + 1/m_2) (p,) [kg] along the directions, from masses of owned nodes (owned,). Collective."""
         return self.reduced(self.gather(mass), slice(None))
 
     def reduced(self, mass: np.ndarray, at: np.ndarray | slice) -> np.ndarray:
-        """The same (k,) of pairs ``at``, from the masses of their ends (2, k)."""
+        """Return the reduced masses (k,) [kg] of pairs ``at``, from the masses of their ends (2, k)."""
         gives = (self._along[:, at] / mass).sum(axis=0)
         return 1.0 / np.maximum(gives, 1e-300)
 
     def keep(self, values: np.ndarray, of_pairs: np.ndarray) -> None:
-        """Write values (p,) of pairs in contact into those of owned nodes (owned,), at the second ends."""
+        """Write values (p,) of pairs in contact to their second ends in an array of owned nodes (owned,)."""
         here = self.mine[1] & (self.force > 0.0)
         values[self.local[1, here]] = of_pairs[here]
 
@@ -197,7 +196,7 @@ class ContactPairs:
         push_nodes(self.where, self.force, factor, self.normals, contact)
 
     def _needed(self, x: np.ndarray, stiffness: np.ndarray, least: np.ndarray) -> np.ndarray:
-        """Forces (p,) at nodes x (owned, 3) that make the distances ``least`` (p,), none where that is -inf.
+        """Return forces (p,) that bring the distances at x (owned, 3) to ``least`` (p,), zero where that is -inf.
         Collective."""
         far, force, rows = np.empty((0, 4)), np.empty(len(self.table)), self.partners.rows
         if not self.partners.alone:
@@ -210,14 +209,14 @@ class ContactPairs:
         move_nodes(self.where, force, self.normals, self.free, self._held, stiffness, u, load)
 
     def totals(self) -> dict[str, np.ndarray]:
-        """Name of each table to its pairs' force on the second nodes of this rank (3,) [N], in the last step."""
+        """Return the force (3,) [N] of each table's pairs on this rank's second nodes in the last step, by name."""
         sums = self._no_totals.copy()
         if self.force.any():
             table_forces(self.where, self.table, self.force, self.normals, sums)
         return dict(zip(self.names, sums, strict=True))
 
     def kept(self) -> dict[str, np.ndarray]:
-        """The state of pairs for a checkpoint, at their second nodes: name to (owned, tables)."""
+        """Return the state of pairs for a checkpoint, at their second nodes: name to (owned, tables)."""
         at, found = self.mine[1], {}
         for name, values in (("pairs.force", self.force), ("pairs.closed", self.closed.astype(np.uint8))):
             found[name] = np.zeros((self.mesh.n_owned, len(self.names)), dtype=values.dtype)
@@ -233,7 +232,7 @@ class ContactPairs:
             self.closed = of_pairs > 0.0
 
     def gather(self, values: np.ndarray) -> np.ndarray:
-        """Values (2, p, ...) of both ends from those of owned nodes (owned, ...). Collective."""
+        """Return values (2, p, ...) at both ends from those at owned nodes (owned, ...). Collective."""
         values = np.asarray(values, dtype=float)
         data = values[self.local] if len(values) else np.zeros((*self.local.shape, *values.shape[1:]))
         if not self.partners.alone:
@@ -244,9 +243,9 @@ class ContactPairs:
         return data
 
     def gather_of(self, at: np.ndarray, of_nodes: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-        """Values (2, k, n) of both ends of pairs ``at`` (k,), where ``of_nodes`` gives those (m, n) of owned (m,).
+        """Return values (2, k, n) at both ends of pairs ``at`` (k,); ``of_nodes`` returns (m, n) at owned nodes (m,).
 
-        Of a pair that two ranks have, both ask, or neither; only these two meet.
+        If two ranks have a pair, both must request it, or neither; only these two communicate.
         """
         where = self.where[:, at]
         mine = where >= 0
@@ -260,5 +259,5 @@ class ContactPairs:
         return data
 
     def distances(self, ends: np.ndarray) -> np.ndarray:
-        """n . (x_2 - x_1) (p,) [m] of positions (2, p, 3)."""
+        """Return n . (x_2 - x_1) (p,) [m] at positions (2, p, 3)."""
         return np.einsum("pi,pi->p", self.normals, ends[1] - ends[0])

@@ -1,8 +1,8 @@
-"""Bars that lie across walls: contact is of nodes only, so a bar can pass through a wall between its nodes.
+"""Detection of bars across walls: only nodes are in contact, so a bar can pass through a wall between its nodes.
 
-Planes and the inside of spheres and cylinders are convex: a bar whose ends keep them keeps them. Across a sphere or a
-cylinder from outside a bar whose ends touch it is a chord, which is no defect of the run; what is told is a bar that
-gets deeper than a quarter of the radius. A rectangle is crossed by a bar whose ends are on its two sides.
+The regions that planes and the inside of spheres and cylinders allow are convex, so a bar whose ends lie in them does
+too. Outside a sphere or a cylinder, a bar whose ends touch it is a chord, which is normal; only a bar deeper than a
+quarter of the radius is reported. A bar crosses a rectangle if its ends lie on opposite sides of it.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ if TYPE_CHECKING:
 __all__ = ["DEEP", "Piercing", "distances", "small_walls"]
 
 DEEP = 0.25
-"""Part of the radius from which on a bar inside a curved wall counts as piercing it."""
+"""Depth, as a fraction of the radius, beyond which a bar inside a curved wall is reported."""
 
 
 def small_walls(walls: Sequence[BaseWall]) -> list[int]:
-    """Indices of the walls that a bar can pierce while its nodes keep them."""
+    """Return the indices of the walls that a bar can cross while its nodes satisfy them."""
     return [k for k, wall in enumerate(walls) if wall.partial or getattr(wall, "sign", -1.0) > 0.0]
 
 
 def distances(starts: np.ndarray, ends: np.ndarray, point: np.ndarray, axis: np.ndarray | None) -> np.ndarray:
-    """Distances (m,) [m] of segments (m, 3) from a point, or from the line through it along a unit ``axis``."""
+    """Return distances (m,) [m] of segments (m, 3) from a point, or from the line through it along a unit ``axis``."""
     first, way = starts - point, ends - starts
     if axis is not None:
         first, way = first - np.outer(first @ axis, axis), way - np.outer(way @ axis, axis)
@@ -39,7 +39,7 @@ def distances(starts: np.ndarray, ends: np.ndarray, point: np.ndarray, axis: np.
 
 
 def _crossing(wall: BaseWall, starts: np.ndarray, ends: np.ndarray, slack: float) -> np.ndarray:
-    """(m,) bool: segments that cross a rectangle, relative to where it is at rest."""
+    """Return (m,) bool: segments, relative to the rectangle at rest, that cross it."""
     first, second = starts @ wall.normal - wall.offset, ends @ wall.normal - wall.offset
     across = np.minimum(first, second) < -slack
     across &= np.maximum(first, second) > slack
@@ -49,14 +49,14 @@ def _crossing(wall: BaseWall, starts: np.ndarray, ends: np.ndarray, slack: float
 
 
 class Piercing:
-    """Looks for bars across walls, snapshot by snapshot. Construction is collective.
+    """Detects bars across walls in each snapshot. Construction is collective.
 
     Attributes
     ----------
-    walls : indices of the walls looked at
-    first : wall to the time [s] when a bar was first seen across it
+    walls : indices of the walls that are checked
+    first : wall to the time [s] of the first snapshot with a bar across it
     seen : wall to the number of snapshots with bars across it
-    looks : snapshots looked at
+    looks : number of snapshots checked
     """
 
     def __init__(self, model: Model) -> None:
@@ -75,7 +75,7 @@ class Piercing:
         self._applicable = (members[self._bars[:, 0]] > 0.0) & (members[self._bars[:, 1]] > 0.0)
 
     def look(self, x: np.ndarray, time: float) -> list[str]:
-        """What to tell of bars at positions (local, 3), ghosts included, that is new. Collective."""
+        """Return new messages about bars at positions (local, 3), ghosts included. Collective."""
         if not self.walls:
             return []
         self.looks += 1
@@ -98,7 +98,7 @@ class Piercing:
         return told
 
     def _across(self, i: int, k: int, x: np.ndarray, shift: np.ndarray) -> tuple[int, int]:
-        """Number of this rank's bars across wall ``k``, and the lowest of their numbers in the mesh."""
+        """Return the number of this rank's bars across wall ``k``, and the lowest of their mesh numbers."""
         mesh, wall = self._model.mesh, self._model.contact.walls[k]
         rows = np.flatnonzero(self._applicable[:, i])
         starts, ends = x[self._bars[rows, 0]] - shift, x[self._bars[rows, 1]] - shift
@@ -110,7 +110,7 @@ class Piercing:
         return len(ids), int(ids.min(initial=np.iinfo(np.int64).max))
 
     def summary(self) -> list[str]:
-        """What to tell at the end of the run."""
+        """Return messages for the end of the run."""
         names = self._model.contact.names
         return [
             f"bars lay across wall {names[k]!r} in {self.seen[k]} of {self.looks} snapshots, first at t = "

@@ -1,10 +1,10 @@
-"""The explicit contact problem, one small problem a node, solved exactly.
+"""The explicit contact problem: one small problem per node, solved exactly.
 
-With lumped mass, minimise |x - x_free|^2 subject to n_k . x >= d_k for the planes that the node's walls offer; the mass
-is the same in all directions, so it drops out. The solution is the one active set of at most three independent planes
-whose multipliers are not negative and whose point breaks no other plane: 0 <= lambda complementary to N x - d >= 0.
-Clamping one plane after the other is wrong where planes are oblique. Only planes that are broken on the way take part
-in the search: the optimum for them that breaks no other plane is the optimum for all.
+With lumped mass, minimise |x - x_free|^2 subject to n_k . x >= d_k for the planes of the node's walls; the mass is the
+same in all directions and drops out. The solution has an active set of at most three independent planes with
+nonnegative multipliers and satisfies all other planes: 0 <= lambda complementary to N x - d >= 0. Projecting onto one
+plane after the other would be wrong for oblique planes. Only planes that are violated during the search take part in
+it: an optimum for these that satisfies all other planes is the optimum for all.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ __all__ = ["project"]
 
 @kernel
 def _solve(gram, rhs, n, factor, out):
-    """Solve the n x n (n <= 3) symmetric positive system by Cholesky; False where it is not positive."""
+    """Solve the n x n (n <= 3) system by Cholesky factorisation; return False if it is not positive definite."""
     for i in range(n):
         for j in range(i + 1):
             s = gram[i, j]
@@ -48,9 +48,9 @@ def _solve(gram, rhs, n, factor, out):
 
 @kernel
 def _best_set(free, gap, among, count, tolerance, gram, rhs, factor, solution, chosen, multipliers, move):
-    """The optimum for ``among[:count]`` planes: number of active planes, 0 where no set fits.
+    """Find the optimum for the planes ``among[:count]``; return the number of active planes, 0 if there is none.
 
-    ``chosen`` and ``multipliers`` (3,) take the active planes, ``move`` (3,) the way to the optimum.
+    ``chosen`` and ``multipliers`` (3,) receive the active planes, ``move`` (3,) the displacement to the optimum.
     """
     best = math.inf
     found = 0
@@ -112,20 +112,20 @@ def _best_set(free, gap, among, count, tolerance, gram, rhs, factor, solution, c
 
 @kernel
 def project(x, fixed, normals, offsets, tolerance, multipliers):
-    """Move nodes to the nearest position that breaks no plane.
+    """Move nodes to the nearest position that satisfies all planes.
 
     Parameters
     ----------
     x : (m, 3) free positions [m], changed in place
-    fixed : (m, 3) bool, components that supports prescribe: they do not move
-    normals : (m, w, 3) unit normals; offsets : (m, w) [m], -inf for a plane that does not concern the node
-    tolerance : a plane broken by no more counts as kept [m]
-    multipliers : (m, w) out [m]: the node moved by the sum of multipliers times normals (free components)
+    fixed : (m, 3) bool, prescribed components, which do not move
+    normals : (m, w, 3) unit normals; offsets : (m, w) [m], -inf for a plane that does not apply
+    tolerance : a plane violated by at most this counts as satisfied [m]
+    multipliers : (m, w) output [m]: the node moves by the sum of multipliers times normals (free components)
 
     Returns
     -------
     int
-        First node for which no active set fits (contradicting planes), or -1.
+        First node with infeasible planes, or -1.
     """
     m, w = offsets.shape
     free = np.zeros((w, 3))
@@ -156,7 +156,7 @@ def project(x, fixed, normals, offsets, tolerance, multipliers):
                 among[count] = k
                 count += 1
         found = 0
-        if count == 1:  # mostly one plane alone is broken, and its own point breaks no other
+        if count == 1:  # the common case: a single violated plane whose projection satisfies all others
             k = among[0]
             square = free[k, 0] * free[k, 0] + free[k, 1] * free[k, 1] + free[k, 2] * free[k, 2]
             strengths[0] = -gap[k] / square

@@ -1,15 +1,15 @@
-"""Restitution by a jump of velocity, for schemes whose state at the end of a step holds its position and velocity.
+"""Restitution by a velocity jump, for schemes whose state at the end of a step contains its position and velocity.
 
-A node that touches a wall in this step and did not in the one before has closed: its normal velocity relative to the
+A node that touches a wall in this step and did not in the one before has closed. Its normal velocity relative to the
 wall becomes -e times that at the impact, and its acceleration the one without contact, so that it leaves. The impact
-happened within the step: with the velocity v towards the wall at its start, at a distance d, it had
-sqrt(v^2 + (a0 + a1) d), with the accelerations a0 and a1 that all but the wall give the node at both ends of the step.
-That is the work of these forces, so that it keeps the energy of a falling node whatever the step, and takes no energy
-from bars that they have not given. With explicit schemes, see :mod:`~pfem_petsc.contact.rebound`. One that
-is pressed for longer has the wall's velocity and no acceleration, as with ``stick``. The energy that is lost, (1 - e^2)
-of that of the approach, is work of contact.
+happens within the step: with the velocity v towards the wall at the start of the step and the distance d, the impact
+velocity is sqrt(v^2 + (a0 + a1) d), where a0 and a1 are the accelerations without the wall at both ends of the step.
+The added term is the work of the forces, so a falling node conserves energy for any step, and no energy appears that
+the bars have not released. For explicit schemes see :mod:`~pfem_petsc.contact.rebound`. A node in contact for more than
+one step has the velocity of the wall and no acceleration, as with ``stick``. The energy lost, (1 - e^2) of that of the
+approach, is work of contact.
 
-This is the treatment of walls with restitution where the others are left to the scheme.
+This treatment applies to walls with restitution when other walls are left to the scheme.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ from .treatments.base import Treatment as Base
 
 __all__ = ["Treatment"]
 
-_STILL = 1e-13  # of the model's length: a slip that is rounding
-_NONE = 1e-9  # of a force: what of it is rounding, and of the tolerance of the solve
+_STILL = 1e-13  # of the model's length: slip below this is rounding
+_NONE = 1e-9  # relative part of a force, and of the tolerance of the solve, that counts as rounding
 
 
 class Treatment(Base):
-    """Nodes that close against walls with restitution leave them.
+    """Makes nodes that close on walls with restitution leave them.
 
-    ``everywhere`` : whether the treatment is that of nodes at walls without restitution, too.
+    ``everywhere`` : whether the treatment applies to walls without restitution too.
     """
 
     everywhere = False
 
     def before(self) -> None:
-        """Keep who touches what, and how nodes move."""
+        """Record contacts and the motion of nodes."""
         self._touched = self.stepper.touching.copy()
         contact, state = self.stepper.model.contact, self.stepper.state
         scheme = self.stepper.scheme
-        # nodes whose first free step the wall's old force works on
+        # nodes in whose first free step the old wall force still does work
         self._frees = scheme.balance_at_endpoints and not scheme.solves_next_position
         if self._frees or contact.has_friction or contact.restitution.any():
             self._time, self._place = state.time, state.position.copy()
@@ -48,7 +48,7 @@ class Treatment(Base):
             change = state.memory.get("contact_change")
             pressed = state.contact[self._held]
             self._force = pressed + (0.0 if change is None else change[self._held])
-            # a node that leaves by restitution had its force taken back: what rounding leaves of it is none
+            # a node that leaves by restitution has had its force removed up to rounding
             none = np.linalg.norm(self._force, axis=1) <= _NONE * np.linalg.norm(pressed, axis=1)
             self._force[none] = 0.0
         if not contact.restitution.any():
@@ -58,7 +58,7 @@ class Treatment(Base):
             self._free = self._without_contact(np.arange(len(state.v)))
 
     def _without_contact(self, nodes: np.ndarray) -> np.ndarray:
-        """Accelerations (m, 3) of nodes by all forces but those of contact, none where supports hold them [m/s2]."""
+        """Return accelerations (m, 3) of nodes without contact forces [m/s2], zero in prescribed components."""
         state, inertia = self.stepper.state, self.stepper.model.inertia
         load = state.external[nodes] - state.f[nodes]
         if inertia.damped:
@@ -73,7 +73,7 @@ class Treatment(Base):
         self.put(nodes, v, a)
 
     def put(self, nodes: np.ndarray, v: np.ndarray, a: np.ndarray) -> None:
-        """Give held nodes (m,) and those that were just let go their velocities and accelerations (m, 3)."""
+        """Set velocities and accelerations (m, 3) of nodes (m,) in contact and of those just released."""
         gone, slower = self._let_go()
         if len(gone):
             nodes, v, a = np.append(nodes, gone), np.vstack([v, slower]), np.vstack([a, self.stepper.state.a[gone]])
@@ -81,10 +81,10 @@ class Treatment(Base):
             self.set(nodes, v, a)
 
     def _let_go(self) -> tuple[np.ndarray, np.ndarray]:
-        """Nodes (m,) that this treatment held and that walls let go in this step, and their velocities (m, 3).
+        """Return nodes (m,) of this treatment that walls released in this step, and their velocities (m, 3).
 
-        By schemes whose forces work by the trapezoidal rule the force that held a node at the start of the step pushes
-        it off, at rest as it was, which would be work of a wall: it is taken back from the velocity away from the wall.
+        With schemes whose forces do work by the trapezoidal rule, the contact force at the start of the step would do
+        work on the released node. This work is removed from the velocity away from the wall.
         """
         state, stepper = self.stepper.state, self.stepper
         if not self._frees or not len(self._held):
@@ -118,9 +118,9 @@ class Treatment(Base):
         return np.where(fresh & (speed < 0.0), contact.restitution * impact, 0.0)
 
     def _explicit_rebound(self, nodes: np.ndarray, distance: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """Velocities (m, w) at which nodes leave walls that they have met after a distance (m, w), see :meth:`leaving`.
+        """Return velocities (m, w) at which nodes leave walls hit after a distance (m, w); see :meth:`leaving`.
 
-        The ways without walls follow from the balance of the step.
+        The displacements without walls follow from the balance of the step.
         """
         stepper, state, h = self.stepper, self.stepper.state, self.stepper.part
         contact, balance, mass = stepper.model.contact, stepper.balance, stepper.model.inertia.mass[nodes, None]
@@ -146,13 +146,13 @@ class Treatment(Base):
         return touching & still & (model.contact.static_friction > 0.0)
 
     def _moved(self, nodes: np.ndarray) -> np.ndarray:
-        """How nodes (m,) moved in this step relative to the walls (m, w, 3) [m]."""
+        """Return displacements of nodes (m,) in this step relative to the walls (m, w, 3) [m]."""
         contact, state = self.stepper.model.contact, self.stepper.state
         way = contact.motion.displacements(state.time) - contact.motion.displacements(self._time)
         return (state.position[nodes] - self._place[nodes])[:, None, :] - way
 
     def on_walls(self, applicable: np.ndarray | bool = True) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Nodes that walls hold (m,), and velocities and accelerations (m, 3) that they get [m/s], [m/s2]."""
+        """Return nodes in contact with walls (m,), and their new velocities and accelerations (m, 3) [m/s], [m/s2]."""
         state, model = self.stepper.state, self.stepper.model
         nodes, normal, speed = self.held(applicable)
         v, a = state.v[nodes], state.a[nodes]

@@ -1,14 +1,14 @@
-"""Coordinates of implicit steps in which every row over several nodes is a bound on one unknown.
+"""Coordinates for implicit steps in which every row over several nodes is a bound on one unknown.
 
-With y the coordinates of the nodes, those of their frames where walls are near (u = B^-1 y), a row is J y >= d in each
-solve. Of each group of rows that share nodes, pivots P are chosen, one free component for each row, by elimination with
-complete pivoting; with s the size of a row's gradient and N all other components,
+With y the coordinates of the nodes, in their frames if walls are near (u = B^-1 y), a row is J y >= d in each solve.
+For each group of rows that share nodes, pivots P are chosen, one free component per row, by elimination with complete
+pivoting. With s the size of a row's gradient and N all other components,
 
     w_P = J y / s,   w_N = y_N,   and back   y_P = J_P^-1 (s w_P - J_N w_N),
 
-so that the row is a lower bound on w_P. The gradient follows: g_N <- g_N - J_N^T q, g_P <- s q with q = J_P^-T g_P, and
-q are the rows' forces then. What supports prescribe is no part of J: it moves the bound. Rows that are not linear are
-taken again at the solution, until it keeps them and their gradients are those of the solve.
+so that the row is a lower bound on w_P. The gradient transforms accordingly, g_N <- g_N - J_N^T q, g_P <- s q with
+q = J_P^-T g_P, and q are the forces of the rows. Prescribed components do not enter J; they move the bound. Nonlinear
+rows are linearised again at the solution until it satisfies them and their gradients no longer change.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 __all__ = ["RowCoordinates"]
 
 _LEAST = 0.05  # of a pivot below which a row is deferred
-_TURN = 1e-10  # of a gradient that counts as none
+_TURN = 1e-10  # change of a gradient that counts as zero
 
 
 class RowCoordinates:
@@ -73,8 +73,11 @@ class RowCoordinates:
         self._place(jacobian, data[:, :9].reshape(-1, 3, 3), data[:, 9:] == 0.0)
 
     def _place(self, jacobian: np.ndarray, inverse: np.ndarray, room: np.ndarray) -> None:
-        """Choose the pivots. ``jacobian`` (e, 3) by x; of the nodes: ``inverse`` (n, 3, 3) of their frames' bases, and
-        ``room`` (n, 3) bool: coordinates that no wall bounds."""
+        """Choose the pivots.
+
+        ``jacobian`` (e, 3) with respect to x; ``inverse`` (n, 3, 3) of the bases of the nodes' frames; ``room`` (n, 3)
+        bool, coordinates that no wall bounds.
+        """
         rows = self.rows
         self.jacobian = jacobian
         turned = np.einsum("eji,ej->ei", inverse[rows.entry_node], jacobian) * rows.free[rows.entry_node]
@@ -82,7 +85,7 @@ class RowCoordinates:
         self._pivot = np.full(count, -1)  # unknown of each row among those of all nodes
         self._scale = np.ones(count)
         room = (room & (rows.free > 0.0)).ravel()
-        self._blocks: list[tuple[np.ndarray, np.ndarray]] = []  # unknowns of a group and T of it
+        self._blocks: list[tuple[np.ndarray, np.ndarray]] = []  # unknowns of a group and its part of T
         self._inverse_rows, inverses = [], []
         for group in rows.groups:
             unknowns = (3 * group.nodes[:, None] + np.arange(3)).ravel()
@@ -104,7 +107,7 @@ class RowCoordinates:
         self._turned = turned
         self._placed = np.flatnonzero(self._pivot >= 0)
         self._deferred = np.flatnonzero((self._pivot < 0) & rows.usable(jacobian))
-        # T on the pivots' rows, as entries
+        # entries of T in the rows of pivots
         parts = []
         for unknowns, transform in self._blocks:
             pivot = np.isin(unknowns, self._pivot[self._placed])
@@ -116,7 +119,7 @@ class RowCoordinates:
         )
         self._owner = np.zeros(n, dtype=bool)
         self._owner[self._pivot[self._placed]] = True
-        # pivots of this rank's nodes: local node, component, row
+        # pivots at this rank's nodes: local node, component, row
         place = np.full(len(rows.numbers), -1)
         place[rows.mine] = rows.here
         local = place[self._pivot[self._placed] // 3]
@@ -124,7 +127,7 @@ class RowCoordinates:
         self._here = local[here], self._pivot[self._placed][here] % 3, self._placed[here]
 
     def _all(self, array: np.ndarray) -> np.ndarray:
-        """Unknowns (3 n,) of all nodes from arrays whose first rows are those of owned nodes. Collective."""
+        """Return the unknowns (3 n,) of all nodes from an array whose first rows are owned nodes. Collective."""
         return self.rows.gather(array[: self.rows.mesh.n_owned]).ravel()
 
     def feasible(self, predictor: np.ndarray, u: np.ndarray, stiffness: np.ndarray) -> None:
@@ -168,7 +171,7 @@ class RowCoordinates:
         rows, mesh = self.rows, self.rows.mesh
         numbers = rows.gather(np.arange(mesh.first_node, mesh.first_node + mesh.n_owned).astype(float))
         columns: list[np.ndarray] = [np.array([3 * mesh.first_node + k]) for k in range(3 * mesh.n_owned)]
-        self._places = []  # of each group: local rows, and the order of its unknowns by PETSc's numbers
+        self._places = []  # for each group: local rows, and the order of its unknowns in PETSc numbering
         local = np.full(len(rows.numbers), -1)
         local[rows.mine] = rows.here
         for group, (unknowns, _) in zip(rows.groups, self._blocks, strict=True):
@@ -246,7 +249,7 @@ class RowCoordinates:
 
 
 def _pivots(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows and columns (k,) of a matrix (p, q) that elimination with complete pivoting takes, largest first."""
+    """Return the rows and columns (k,) of the pivots of a matrix (p, q) under complete pivoting, largest first."""
     left, rows, columns = matrix.copy(), [], []
     for _ in range(len(left)):
         at, column = np.unravel_index(np.abs(left).argmax(), left.shape)

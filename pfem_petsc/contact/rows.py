@@ -1,13 +1,13 @@
-"""Rows over several nodes, r(x) >= 0, whatever made them, and the explicit solution of small problems of them.
+"""Rows over several nodes, r(x) >= 0, from any source, and the explicit solution of small problems with them.
 
 With J the rows' gradients and K the nodes' stiffnesses, the positions nearest to free ones x_f with rows linearised at
 x are x_f + K^-1 J^T f, where
 
     0 <= f   complementary to   r(x) + J (x_f + K^-1 J^T f - x) >= 0.
 
-Repeated until x is the solution, this keeps the rows themselves. Gradients are those of the solution, or those of the
-places where the forces of the balance act, which may be other ones. Rows that share nodes make one problem; planes of
-walls that stop the same nodes are rows of it.
+This is repeated until x is the solution, which then satisfies the nonlinear rows. The gradients of the forces are taken
+at the solution, or at the positions where the forces of the balance act if these differ. Rows that share nodes form one
+problem; planes of walls that stop the same nodes are further rows of it.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ if TYPE_CHECKING:
 
 __all__ = ["Group", "Rows"]
 
-_ITERATIONS = 100  # of rows and positions
+_ITERATIONS = 100  # linearisations of a problem
 
 
 class Group:
-    """Rows that hang together by their nodes.
+    """Rows connected by shared nodes.
 
     Attributes
     ----------
@@ -46,7 +46,7 @@ class Group:
         self._node = np.searchsorted(nodes, every.entry_node[entries])
 
     def dense(self, jacobian: np.ndarray) -> np.ndarray:
-        """Gradients (p, q, 3) from those of all entries (e, 3)."""
+        """Return the gradients (p, q, 3) of the group from the entries (e, 3) of the Jacobian."""
         dense = np.zeros((len(self.rows), len(self.nodes), 3))
         np.add.at(dense, (self._row, self._node), jacobian[self.entries])
         return dense
@@ -59,7 +59,7 @@ class Rows:
     ----------
     source : (r,) index of the source of each row
     numbers : (n,) mesh numbers of the nodes
-    mine, here : (n,) bool, nodes that this rank owns, and their owned local indices (m,)
+    mine, here : (n,) bool, nodes that this rank owns; (m,) their owned local indices
     free : (n, 3) 1.0 where a component may move, 0.0 where a support prescribes it
     entry_row, entry_node : (e,) row and node of each entry of the Jacobian; last : (r,) the last entry of each row
     groups : rows that share nodes
@@ -87,7 +87,7 @@ class Rows:
 
     def _grouped(self) -> list[Group]:
         label = np.arange(len(self.numbers))
-        while True:  # the smallest number of its rows' nodes goes to each node
+        while True:  # propagate the smallest node number through rows until nothing changes
             least = np.full(len(self.source), len(self.numbers))
             np.minimum.at(least, self.entry_row, label[self.entry_node])
             before = label.copy()
@@ -102,7 +102,7 @@ class Rows:
         return groups
 
     def gather(self, values: np.ndarray) -> np.ndarray:
-        """Values (n, ...) of the nodes from those of owned nodes (owned, ...), on all ranks. Collective."""
+        """Return values (n, ...) at the nodes from those at owned nodes (owned, ...), on all ranks. Collective."""
         data = np.zeros((len(self.numbers), *values.shape[1:]))
         data[self.mine] = values[self.here]
         if self.mesh.comm.size > 1:
@@ -110,7 +110,7 @@ class Rows:
         return data
 
     def _each(self, method: str, *arrays: np.ndarray) -> list[np.ndarray]:
-        """What a method of each source makes of arrays (n, 3)."""
+        """Return the results of a method of each source for arrays (n, 3)."""
         found, first = [], 0
         for source in self.sources:
             at = self.entry_node[first : first + source.nodes.size].reshape(source.nodes.shape)
@@ -119,30 +119,30 @@ class Rows:
         return found
 
     def values(self, x: np.ndarray) -> np.ndarray:
-        """Rows (r,) [m] at positions (n, 3)."""
+        """Return rows (r,) [m] at positions (n, 3)."""
         return np.concatenate(self._each("values", x))
 
     def gradients(self, x: np.ndarray) -> np.ndarray:
-        """Entries (e, 3) of the Jacobian at positions (n, 3)."""
+        """Return entries (e, 3) of the Jacobian at positions (n, 3)."""
         return np.concatenate([part.reshape(-1, 3) for part in self._each("gradients", x)])
 
     def drift(self, x: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Second derivatives (r,) by time of rows whose nodes at (n, 3) move straight on with v (n, 3) [m/s2]."""
+        """Return second time derivatives (r,) of rows [m/s2] for nodes at (n, 3) with constant velocities v (n, 3)."""
         return np.concatenate(self._each("drift", x, v))
 
     def along(self, jacobian: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """J y (r,) of vectors (n, 3)."""
+        """Return J y (r,) for vectors (n, 3)."""
         products = np.einsum("ei,ei->e", jacobian, y[self.entry_node])
         return np.bincount(self.entry_row, products, minlength=len(self.source))
 
     def forces(self, jacobian: np.ndarray, force: np.ndarray) -> np.ndarray:
-        """J^T f (n, 3) of the forces (r,) of the rows [N]."""
+        """Return J^T f (n, 3) [N] for the forces (r,) of the rows [N]."""
         total = np.zeros((len(self.numbers), 3))
         np.add.at(total, self.entry_node, force[self.entry_row, None] * jacobian)
         return total
 
     def usable(self, jacobian: np.ndarray) -> np.ndarray:
-        """(r,) bool: rows whose nodes supports leave free to keep them."""
+        """Return (r,) bool: rows with free components, which can be satisfied."""
         return self.along(jacobian**2, self.free) > FREE_PART
 
     def solve(
@@ -153,20 +153,20 @@ class Rows:
         planes: tuple[np.ndarray, np.ndarray],
         tolerance: float,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Forces (r,) [N] of the rows, and the moves (n, 3) [m] of the nodes by rows and planes.
+        """Return forces (r,) [N] of the rows, and displacements (n, 3) [m] of the nodes by rows and planes.
 
         Parameters
         ----------
-        jacobian, values : (e, 3) gradients and (r,) rows at the free positions; infinite for rows that are no concern
+        jacobian, values : (e, 3) gradients and (r,) rows at the free positions; infinite for rows that do not apply
         stiffness : (n,) force for a displacement of a node [N/m]
-        planes : (n, w, 3), (n, w) normals of walls and distances from them at the free positions, infinite for no
-            concern
-        tolerance : rows broken by no more count as kept [m]
+        planes : (n, w, 3), (n, w) normals of walls and distances from them at the free positions, infinite where a wall
+            does not apply
+        tolerance : rows violated by at most this count as satisfied [m]
 
         Raises
         ------
         SimulationFailure
-            On all ranks, where nothing keeps all rows.
+            On all ranks, if the rows are infeasible.
         """
         force, moves = np.zeros(len(values)), np.zeros((len(self.numbers), 3))
         normals, gaps = planes
@@ -203,14 +203,14 @@ class Rows:
         planes: tuple[np.ndarray, np.ndarray],
         tolerance: float,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Forces (r,) [N] that keep the rows, and the gradients (e, 3) along which they act.
+        """Return forces (r,) [N] that satisfy the rows, and the gradients (e, 3) along which they act.
 
         Parameters
         ----------
         free_x : (n, 3) positions without rows [m]
         stiffness : (n,) force for a displacement of a node [N/m]
-        start : (n, 3) where the forces act; None: at the solution
-        planes : (n, w, 3), (n, w) of walls at the nodes n . x >= d; offsets -inf for no concern
+        start : (n, 3) positions at which the forces act [m]; None: at the solution
+        planes : (n, w, 3), (n, w) planes n . x >= d of walls at the nodes; offset -inf where a wall does not apply
         tolerance : [m]
 
         Raises

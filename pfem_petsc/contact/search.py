@@ -1,4 +1,4 @@
-"""Which nodes a wall can concern in a step: one compiled pass over all nodes for all flat walls."""
+"""Search for nodes near walls: one compiled pass over all nodes for all flat walls."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ def near_planes(x, normals, offsets, all_nodes, members, reach, near):
     ----------
     x : (n, 3) positions [m]
     normals : (w, 3); offsets : (w,) [m]: planes n . x = d
-    everyone : (w,) bool, whether a plane concerns every node
-    members : (n, w) bool, whom it concerns where not
-    reach : (n,) or (1,) [m]: distance below which a node counts as near
-    near : (n,) bool, in and out
+    all_nodes : (w,) bool, whether a plane applies to all nodes
+    members : (n, w) bool, nodes to which a plane applies otherwise
+    reach : (n,) or (1,) distance below which a node counts as near [m]
+    near : (n,) bool, updated
 
     Returns
     -------

@@ -1,16 +1,16 @@
-"""The drag of slipping nodes in one solve of an implicit step, as a map of the imbalance of forces.
+"""Friction forces on slipping nodes in one solve of an implicit step, as a linear map of the residual force.
 
-A wall that presses a slipping node with lambda_k drags it by -mu_k lambda_k d_k. Its normal force is the imbalance on
-its bound, so that the drag is a linear function of the imbalance itself: with y = B x, the rows r(k) of the walls and
-their signs s_k,
+A wall with normal force lambda_k exerts the friction force -mu_k lambda_k d_k on a slipping node. The normal force is
+the residual on its bound, so friction is a linear function of the residual itself: with y = B x, the rows r(k) of the
+walls and their signs s_k,
 
     g' = B^-T g + sum_k mu_k s_k g'_r(k) B^-T d_k   =>   g' = (I - C)^-1 B^-T g,
 
-and g' is complementary to the bounds. Where a wall does not press, nothing is dragged. Normal and tangential forces are
-so coupled within Newton's method; the Hessian loses its symmetry.
+and g' is complementary to the bounds. An open wall causes no friction. Normal and tangential forces are thus coupled
+within Newton's method, and the Hessian loses its symmetry.
 
-The direction is d_k = z/|z| with z = a d + b s_k(u), the slip s_k, and a known direction d: b = 0 keeps it as it is,
-a << b |s_k| makes it that of the slip.
+The direction is d_k = z/|z| with z = a d + b s_k(u), the slip s_k, and a known direction d: with b = 0 the direction is
+fixed, with a << b |s_k| it is that of the slip.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import numpy as np
 
 __all__ = ["Sliding"]
 
-_SINGULAR = 1e-6  # determinant of I - C from which on a wedge is jammed
+_SINGULAR = 1e-6  # determinant of I - C below which a wedge is jammed
 
 
 @dataclass
@@ -30,16 +30,16 @@ class Sliding:
 
     Attributes
     ----------
-    nodes, at : (m,) owned local indices, and places among the frames
-    known : (m, 3) drag that is known [N]
+    nodes, at : (m,) owned local indices, and indices among the frames
+    known : (m, 3) known part of the friction forces [N]
     inverse : (m, 3, 3) of the frames' bases
     rows, signs : (m, w) of the frames
-    friction : (m, w) coefficients, zero where a wall does not drag
-    normals, origins : (m, w, 3) of the walls; places where the node would be without slip [m]
+    friction : (m, w) coefficients, zero where a wall exerts no friction
+    normals, origins : (m, w, 3) normals of the walls; positions of the node without slip [m]
     start : (m, w, 3) a d [N]
     weight : (m,) b [N/m]
     maps : (m, 3, 3) (I - C)^-1 at the last evaluation
-    stiffness : (m, 3, 3) derivative of the drag by the node's position, in x, at the last evaluation [N/m]
+    stiffness : (m, 3, 3) derivative of friction with respect to the node's position x, at the last evaluation [N/m]
     """
 
     nodes: np.ndarray
@@ -60,14 +60,14 @@ class Sliding:
 
     @classmethod
     def none(cls, walls: int) -> Sliding:
-        """No slipping nodes."""
+        """Return an instance without slipping nodes."""
         zeros, rows = np.zeros((0, walls, 3)), np.zeros((0, walls), dtype=np.int8)
         nodes, matrices = np.empty(0, dtype=np.int64), np.zeros((0, 3, 3))
         signs, known = np.zeros((0, walls)), np.zeros((0, 3))
         return cls(nodes, nodes, known, matrices, rows, signs, signs, zeros, zeros, zeros, np.zeros(0))
 
     def couple(self, x: np.ndarray, g: np.ndarray) -> np.ndarray:
-        """The imbalance (m, 3) with drag from the one without, in the frames' coordinates, at positions (m, 3)."""
+        """Return the residual (m, 3) with friction from the one without, in frame coordinates, at positions (m, 3)."""
         slip = x[:, None, :] - self.origins
         slip -= np.einsum("mwi,mwi->mw", slip, self.normals)[:, :, None] * self.normals
         way = self.start + self.weight[:, None, None] * slip
@@ -85,7 +85,7 @@ class Sliding:
         system[jammed] = np.eye(3)
         self.maps = np.linalg.inv(system)
         g = np.einsum("mij,mj->mi", self.maps, g - np.einsum("mji,mj->mi", self.inverse, self.known))
-        # what a turn of the slip makes of the drag
+        # the change of friction as the direction of slip turns
         self.stiffness[:] = 0.0
         for k in range(self.rows.shape[1]):
             normal_forces = np.maximum(self.signs[:, k] * g[every, np.maximum(self.rows[:, k], 0)], 0.0)

@@ -1,4 +1,4 @@
-"""The links of a case: what its tables name that couples nodes to nodes. The one place that knows which there are."""
+"""Creates the links of a case, which couple nodes to nodes. The only module that knows all kinds of links."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ __all__ = ["make_links"]
 def make_links(
     case: Case, nodes: dict[str, np.ndarray], mesh: DistributedMesh, fixed: np.ndarray, contact: Contact
 ) -> tuple[Links, ContactPairs | None]:
-    """All links in the order in which a step takes them, and the contact pairs among them. Collective.
+    """Create all links in the order in which a step treats them; also return the contact pairs. Collective.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ def make_links(
     Raises
     ------
     InputError
-        On all ranks: nodes that cannot be paired, or a constraint that refuses its keys.
+        On all ranks, for nodes that cannot be paired, or a constraint with invalid keys.
     """
     links: list[Link] = []
     pairs = None

@@ -19,7 +19,7 @@ __all__ = ["adjust_start", "check_start"]
 
 
 def adjust_start(case: Case, nodes: dict[str, np.ndarray], mesh: DistributedMesh) -> int:
-    """Move nodes of the mesh onto the walls that ask for it; the bars are unstressed there. Collective.
+    """Move nodes onto walls with ``adjust = true``; bars are unstressed in the new positions. Collective.
 
     Returns
     -------
@@ -29,9 +29,9 @@ def adjust_start(case: Case, nodes: dict[str, np.ndarray], mesh: DistributedMesh
     Raises
     ------
     InputError
-        On all ranks: walls that leave a node no room, or a bar that loses its length.
+        On all ranks, for infeasible walls at a node, or a bar that loses its length.
     """
-    # neither the path of the nodes nor what they do at the wall matters here
+    # friction, restitution and ties play no role here
     plain = {"friction": 0.0, "static_friction": None, "restitution": 0.0, "tied": False}
     walls = [wall.model_copy(update=plain) for wall in case.wall if wall.adjust]
     if not walls:
@@ -54,14 +54,14 @@ def adjust_start(case: Case, nodes: dict[str, np.ndarray], mesh: DistributedMesh
             bar = int(np.argmin(length))
             ends = mesh.node_ids[[a[bar], b[bar]]]
             raise InputError(
-                f"{case.source}: wall.adjust: bar {mesh.bar_ids[bar]} between nodes {ends[0]} and {ends[1]} has no "
-                "length left once its nodes are on the wall; move the wall or the mesh"
+                f"{case.source}: wall.adjust: bar {mesh.bar_ids[bar]} between nodes {ends[0]} and {ends[1]} has zero "
+                "length once its nodes are on the wall; move the wall or the mesh"
             )
     return mesh.comm.allreduce(len(moved))
 
 
 def check_start(contact: Contact, x: np.ndarray, length: float) -> None:
-    """Refuse nodes that start beyond a wall by more than rounding of the model's size ``length`` [m]. Collective.
+    """Check that no node starts beyond a wall by more than rounding of the model's size ``length`` [m]. Collective.
 
     Raises
     ------
@@ -73,7 +73,7 @@ def check_start(contact: Contact, x: np.ndarray, length: float) -> None:
     comm = contact.mesh.comm
     gaps = contact.gaps(x, 0.0)
     for k, wall in enumerate(contact.walls):
-        if wall.partial:  # nothing starts beyond a wall that nodes can pass by
+        if wall.partial:  # no node starts beyond a wall that nodes can pass beside
             continue
         deepest, node, count = 0.0, -1, 0
         if len(gaps):

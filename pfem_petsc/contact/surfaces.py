@@ -1,4 +1,4 @@
-"""Surfaces of walls as they are drawn: what a wall's ``surface`` gives, and shapes to make it of."""
+"""Surfaces of walls for pictures: the result of a wall's ``surface``, and functions that build it."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ __all__ = ["Surface", "revolved", "slab"]
 
 @dataclass(frozen=True)
 class Surface:
-    """A wall as drawn: its polygons and how deep beyond the face each point lies.
+    """Polygons of a wall for pictures, with the depth of each point beyond the face.
 
     Parameters
     ----------
     name : the wall's name
     points : (n, 3) float64 [m]
     faces : (f, 4) int64, corners of quadrilaterals
-    depth : (n,) float64, 0 on the face that nodes touch, 1 where the drawing fades out
+    depth : (n,) float64, 0 on the face that nodes touch, 1 where the picture fades out
     edge : (e, 2) int64, lines that outline the face
     """
 
@@ -30,7 +30,7 @@ class Surface:
 
 
 def slab(name: str, face: np.ndarray, normal: np.ndarray, thickness: float) -> Surface:
-    """Slab behind a quadrilateral face (4, 3) [m] whose unit normal points to the allowed side."""
+    """Return a slab behind a quadrilateral face (4, 3) [m] whose unit normal points to the allowed side."""
     return Surface(
         name,
         np.concatenate([face, face - thickness * normal]),
@@ -41,7 +41,7 @@ def slab(name: str, face: np.ndarray, normal: np.ndarray, thickness: float) -> S
 
 
 def revolved(name: str, profile: np.ndarray, centre: np.ndarray, axis: np.ndarray, segments: int = 48) -> Surface:
-    """Surface of revolution of a profile (p, 2) of radius and height [m] about an axis through ``centre``."""
+    """Return the surface of revolution of a profile (p, 2), radius and height [m], about an axis through ``centre``."""
     first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
     first /= np.linalg.norm(first)
     second = np.cross(axis, first)

@@ -1,10 +1,10 @@
-"""Nodes that walls with ``tied = true`` hold for good.
+"""Nodes tied permanently to walls with ``tied = true``.
 
-In the step in which a node meets such a wall it is stopped as by any wall, along the normal; from then on its position
-relative to the wall is the one of that moment, in all three directions and whatever the sign of the force. Components
-that supports prescribe stay the supports'; where these carry a node through its wall the run ends. What is tied is part
-of the state: ``tied_to`` (owned,) is the wall's index plus one, 0 where there is none, and ``tied_at`` (owned, 3) the
-place relative to the wall [m].
+In the step in which a node reaches such a wall it is stopped along the normal, as by any wall. From then on its
+position relative to the wall is constant in all three directions, whatever the sign of the force. Prescribed components
+still follow the supports; if these move a node through its wall, the run ends. Ties are part of the state: ``tied_to``
+(owned,) is the index of the wall plus one, 0 if there is none, and ``tied_at`` (owned, 3) the position relative to the
+wall [m].
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ class Ties:
 
     Attributes
     ----------
-    any : whether the case has walls that tie
+    any : whether the case has walls with ``tied = true``
     tying : (walls,) bool
-    nobody : no nodes, no walls, and vectors of none of them
+    nobody : empty arrays of nodes, walls and vectors
     """
 
     nobody: FreshTies = (np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), np.empty((0, 3)))
@@ -53,22 +53,22 @@ class Ties:
         return self._memory()[0] > 0
 
     def walls(self, nodes: np.ndarray) -> np.ndarray:
-        """Walls (m,) that tied nodes (m,) are tied to."""
+        """Return the walls (m,) to which nodes (m,) are tied."""
         return self._memory()[0][nodes] - 1
 
     def nodes(self) -> tuple[np.ndarray, np.ndarray]:
-        """Tied nodes (m,), ascending, and their walls (m,)."""
+        """Return tied nodes (m,), ascending, and their walls (m,)."""
         tied_to, _ = self._memory()
         nodes = np.flatnonzero(tied_to)
         return nodes, tied_to[nodes] - 1
 
     def targets(self, time: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Tied nodes (m,), their walls (m,), and where these hold them at a time [s] (m, 3) [m]."""
+        """Return tied nodes (m,), their walls (m,), and their positions at a time [s] (m, 3) [m]."""
         nodes, walls = self.nodes()
         return nodes, walls, self._memory()[1][nodes] + self.contact.motion.displacements(time)[walls]
 
     def hold(self, x: np.ndarray, stiffness: np.ndarray, time: float) -> tuple[np.ndarray, ...]:
-        """Tied nodes (m,) of an explicit step, with their walls (m,), places and forces (m, 3) [m], [N].
+        """Return tied nodes (m,) in an explicit step, their walls (m,), positions and forces (m, 3) [m], [N].
 
         Parameters
         ----------
@@ -78,7 +78,7 @@ class Ties:
         Raises
         ------
         SimulationFailure
-            On this rank: a node was carried through another wall.
+            On this rank, if a node was moved through another wall.
         """
         nodes, walls, places = self.targets(time)
         places = np.where(self.contact.fixed[nodes], x[nodes], places)
@@ -86,18 +86,18 @@ class Ties:
         return nodes, walls, places, stiffness[nodes, None] * (places - x[nodes])
 
     def pin(self, frames: NodalFrames, x: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Hold the tied nodes of an implicit step, of which there are frames. Collective.
+        """Fix the tied nodes of an implicit step in their frames. Collective.
 
-        ``x`` (owned, 3) has the prescribed components at ``time`` [m].
+        ``x`` (owned, 3) contains the prescribed components at ``time`` [m].
 
         Returns
         -------
-        (places among the frames (m,), walls (m,), places at ``time`` (m, 3) [m])
+        (indices among the frames (m,), walls (m,), positions at ``time`` (m, 3) [m])
 
         Raises
         ------
         SimulationFailure
-            On all ranks: a node was carried through another wall.
+            On all ranks, if a node was moved through another wall.
         """
         nodes, walls, places = self.targets(time)
         with agreed(self.contact.mesh.comm):
@@ -107,7 +107,7 @@ class Ties:
         return at, walls, places
 
     def check(self, nodes: np.ndarray, walls: np.ndarray, places: np.ndarray, time: float) -> None:
-        """Refuse to carry nodes at (m, 3) through walls, their own (m,) among them where supports prescribe components.
+        """Check that tied nodes at (m, 3) are not moved through walls, their own (m,) included if supports move them.
 
         Raises
         ------
@@ -118,7 +118,7 @@ class Ties:
         partly = contact.fixed[nodes].any(axis=1)
         if len(contact.walls) == 1 and not partly.any():
             return
-        partly &= ~np.isin(walls, contact.motion.bodies.at)  # whose place may be a trial
+        partly &= ~np.isin(walls, contact.motion.bodies.at)  # their positions may be trial values
         if len(nodes) == 0:
             return
         displacements = contact.motion.displacements(time)
@@ -131,20 +131,20 @@ class Ties:
         if gaps[node, other] < -BEYOND * contact.length and other == walls[node]:
             raise SimulationFailure(
                 f"node {contact.mesh.node_ids[nodes[node]]} is tied to wall {contact.names[other]!r} and its supports "
-                f"carry it {-gaps[node, other]:.3g} m beyond the wall; free these components, move the wall with the "
+                f"move it {-gaps[node, other]:.3g} m beyond the wall; free these components, move the wall with the "
                 "supports, or do not tie the node"
             )
         if gaps[node, other] < -BEYOND * contact.length:
             raise SimulationFailure(
-                f"node {contact.mesh.node_ids[nodes[node]]}, tied to wall {contact.names[walls[node]]!r}, is carried "
+                f"node {contact.mesh.node_ids[nodes[node]]}, tied to wall {contact.names[walls[node]]!r}, is moved "
                 f"{-gaps[node, other]:.3g} m beyond wall {contact.names[other]!r}; keep the walls "
-                "apart, or name the nodes that they concern with 'node_set'"
+                "apart, or name the nodes that they stop with 'node_set'"
             )
 
     def take(self, nodes: np.ndarray, touching: np.ndarray, places: np.ndarray, time: float) -> FreshTies:
-        """Tie nodes (m,) at (m, 3) that touch (m, walls) walls that tie; of several the first.
+        """Tie nodes (m,) at (m, 3) that touch (m, walls) walls with ``tied = true``, to the first of several.
 
-        Gives the nodes that are now tied (k,), their walls (k,), and the walls' normals there (k, 3).
+        Returns the newly tied nodes (k,), their walls (k,), and the walls' normals there (k, 3).
         """
         tied_to, tied_at = self._memory()
         fresh = touching & self.tying & (tied_to[nodes] == 0)[:, None]
@@ -163,13 +163,13 @@ class Ties:
     ) -> None:
         """Tie nodes where they come to rest on their walls, for schemes with x1 - x0 = h (v0 + v1)/2.
 
-        Held at the place of the touch, such a node would have its velocity relative to the wall turned round in every
-        step, for ever. Half a step further on along that velocity it has lost it. A node that still approaches the wall
-        is stopped once more before it is tied.
+        If such a node were fixed at the position of first contact, its velocity relative to the wall would be reversed
+        in every step. It vanishes if the node is fixed half a step further along that velocity. A node that still
+        approaches the wall is stopped once more before it is tied.
 
         Parameters
         ----------
-        nodes, walls, normals : as :meth:`take` gives them
+        nodes, walls, normals : results of :meth:`take`
         v : (owned, 3) velocities [m/s]; rates : (walls, 3) those of the walls
         h : step [s]
         """
@@ -189,7 +189,7 @@ class Ties:
 
 
 class NoTies(Ties):
-    """Stands for :class:`Ties` where no wall ties: keeps nothing in the state."""
+    """Null object for :class:`Ties` if no wall has ``tied = true``; keeps nothing in the state."""
 
     def __init__(self, contact: Contact, walls: Sequence[WallKeys]) -> None:
         super().__init__(contact, walls)

@@ -1,9 +1,9 @@
-"""The coordinates of one implicit solve, in which rows of contact are bounds on unknowns: u = T w.
+"""The coordinates of one implicit solve, in which contact rows are bounds on unknowns: u = T w.
 
-T is made of the frames of nodes near walls (:mod:`~pfem_petsc.contact.frames`), u = B^-1 y, and of the coordinates of
-links (:mod:`~pfem_petsc.contact.links`), y = T_1 ... T_n w. Drag by friction multiplies the residual from the left
-(:mod:`~pfem_petsc.contact.sliding`). Solvers see this object and nothing of what produced a row; without contact it is
-the identity.
+T is composed of the frames of nodes near walls (:mod:`~pfem_petsc.contact.frames`), u = B^-1 y, and the coordinates of
+links (:mod:`~pfem_petsc.contact.links`), y = T_1 ... T_n w. Friction multiplies the residual from the left
+(:mod:`~pfem_petsc.contact.sliding`). Solvers use this object only and do not know what produced a row; without contact
+it is the identity.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ __all__ = ["Transform"]
 
 @kernel
 def _turn_blocks(ptr, local_columns, frame_of, left, inverse, values):
-    """H <- L H B^-1 on the rows and columns of nodes with a frame (index -1: none)."""
+    """Apply H <- L H B^-1 to the rows and columns of nodes with a frame (index -1: none)."""
     block = np.zeros((3, 3))
     for row in range(len(ptr) - 1):
         width = 3 * (ptr[row + 1] - ptr[row])
@@ -61,14 +61,14 @@ class Transform:
     Parameters
     ----------
     model : Model
-    frames : of nodes near walls; None where no rank has any
-    links : coordinates of the links that a step may meet
+    frames : of nodes near walls; None if no rank has any
+    links : coordinates of the links that may close in the step
 
     Attributes
     ----------
     links : tuple of these
-    sliding : drag of slipping nodes, of no nodes without friction
-    identity : whether w is u, and the residual as it is
+    sliding : friction forces on slipping nodes; has no nodes without friction
+    identity : whether w equals u and the residual is unchanged
     bounded : whether the solve has bounds
     """
 
@@ -98,21 +98,21 @@ class Transform:
         self._inverse = np.ascontiguousarray(inverse[turned, 1:]).reshape(-1, 3, 3)
 
     def forward(self, w: np.ndarray) -> None:
-        """Turn w (owned, 3) into u, in place. Collective."""
+        """Transform w (owned, 3) to u, in place. Collective."""
         for link in reversed(self.links):
             link.forward(w)
         at = self._frames.nodes
         w[at] = np.einsum("nij,nj->ni", self._frames.inverse, w[at])
 
     def inverse(self, u: np.ndarray) -> None:
-        """Turn u (owned, 3) into w, in place. Collective."""
+        """Transform u (owned, 3) to w, in place. Collective."""
         at = self._frames.nodes
         u[at] = np.einsum("nij,nj->ni", self._frames.basis, u[at])
         for link in self.links:
             link.inverse(u)
 
     def residual(self, predictor: np.ndarray, u: np.ndarray, g: np.ndarray) -> None:
-        """Turn the imbalance of forces (owned, 3) at predictor + u into the residual, in place. Collective."""
+        """Transform the residual force (owned, 3) at predictor + u to the residual of w, in place. Collective."""
         at, slipping = self._frames.nodes, self.sliding.nodes
         g[at] = np.einsum("nji,nj->ni", self._frames.inverse, g[at])
         g[slipping] = self.sliding.couple(predictor[slipping] + u[slipping], g[slipping])
@@ -120,16 +120,16 @@ class Transform:
             link.adjoint(g)
 
     def left(self) -> np.ndarray:
-        """What turns the imbalance of nodes with a frame into their residual (m, 3, 3), at the last evaluation."""
+        """Matrices (m, 3, 3) that map the residual force at framed nodes to the residual, at the last evaluation."""
         left = self._frames.inverse.transpose(0, 2, 1).copy()
         at = self.sliding.at
         left[at] = self.sliding.maps @ left[at]
         return left
 
     def linear(self, left: np.ndarray, u: np.ndarray, out: np.ndarray) -> None:
-        """Turn H u (local, 3), in place, into the derivative of the residual along u (local, 3). Collective.
+        """Transform H u (local, 3), in place, to the derivative of the residual along u (local, 3). Collective.
 
-        ``left`` : of :meth:`left`, where H was taken.
+        ``left`` : value of :meth:`left` where H was evaluated.
         """
         at, slipping = self._frames.nodes, self.sliding.nodes
         out[slipping] += np.einsum("nij,nj->ni", self.sliding.stiffness, u[slipping])
@@ -138,7 +138,7 @@ class Transform:
             link.adjoint(out)
 
     def diagonal(self, left: np.ndarray, blocks: BlocksOf, diagonal: np.ndarray) -> None:
-        """Put the diagonal (owned, 3) of the residual's derivative in place of that of H. Collective."""
+        """Replace the diagonal (owned, 3) of H by that of the derivative of the residual. Collective."""
         nodes = self._frames.nodes
         full = blocks(nodes)
         full[self.sliding.at] += self.sliding.stiffness
@@ -153,7 +153,7 @@ class Transform:
         return blocks
 
     def turn(self, matrix: HessianMatrix, values: np.ndarray) -> None:
-        """Turn the values of an assembled Hessian into frames; links have no coordinates there. Collective."""
+        """Transform the values of an assembled Hessian to frame coordinates, without those of links. Collective."""
         if not self._oblique:
             return
         matrix.add_blocks(self.sliding.nodes, self.sliding.stiffness, values)

@@ -25,7 +25,7 @@ def broken_walls(
     x: np.ndarray,
     tolerance: float,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes (k,) beyond walls that no bound on them stands for, and which walls these are (k, walls).
+    """Return nodes (k,) beyond walls that no bound of theirs represents, and these walls (k, walls) bool.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ def broken_walls(
     displacements : (walls, 3) of walls [m]
     candidates, frames : of the solve
     x : (owned, 3) solution [m]
-    tolerance : depth that counts as none [m]
+    tolerance : depth that counts as zero [m]
     """
     beyond = np.flatnonzero(contact.near(x, displacements, np.array([-tolerance])))
     applicable = contact.applicable(beyond, x[beyond], displacements)
@@ -43,7 +43,7 @@ def broken_walls(
     place = np.searchsorted(candidates.nodes, beyond)
     known = place < len(candidates.nodes)
     known[known] = candidates.nodes[place[known]] == beyond[known]
-    # what a bound of its own keeps is kept to rounding of the coordinates; supports decide over walls
+    # walls with their own bound are satisfied to rounding of the coordinates; supports override walls
     place = place[known]
     broken[known] &= (frames.rows[place] < 0) | frames.shared[place]
     broken &= ~contact.ties.held[beyond][:, None]
@@ -53,7 +53,7 @@ def broken_walls(
 
 
 def is_misaligned(frames: NodalFrames, strengths: np.ndarray) -> bool:
-    """Whether a wall presses on the row of an almost parallel one that does not: the force is off its normal."""
+    """Return whether a wall presses through the row of an almost parallel wall, so that the force is off its normal."""
     normal_forces = strengths > 0.0
     astray = normal_forces & frames.shared
     for node, wall in np.argwhere(astray):
@@ -74,9 +74,9 @@ def is_off_surface(
     x: np.ndarray,
     tolerance: float,
 ) -> bool:
-    """Whether a node pressed on a curved wall is off its surface, or was held by the plane of another point.
+    """Return whether a node in contact with a curved wall is off its surface or used the plane of another point.
 
-    One that the wall does not press may keep the plane of another point and be beyond the wall for all that.
+    A node without contact force may satisfy the plane of another point and still lie beyond the wall.
     """
     at = frames.nodes
     for k in np.flatnonzero(~contact.flat):

@@ -1,1 +1,1 @@
-"""Time integrators, one a module; the module's name is the one that case files use."""
+"""Time integrators, one per module; the module's name is the one that case files use."""

@@ -1,4 +1,4 @@
-"""What all integrators share: the state they advance and the affine form of their balance.
+"""Base of all integrators: the state that they advance and the affine form of their balance.
 
 With positions as unknowns every scheme is an affine map from the position it solves for, x_u = predictor + u, to the
 acceleration and velocity of its balance: a_b = alpha u + a_hat, v_b = eta u + v_hat. The balance is
@@ -6,7 +6,7 @@ acceleration and velocity of its balance: a_b = alpha u + a_hat, v_b = eta u + v
     M a_b + C v_b + w f_int(x_u) + (1 - w) f_int(x_n) = f_ext + r,
 
 with w = 0 for an explicit scheme. The unknown is the increment u from the predictor, never the position itself:
-accelerations are second differences of positions over h^2, and would lose those digits.
+accelerations are second differences of positions over h^2 and would lose significant digits.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ __all__ = ["Balance", "ExplicitScheme", "NoParameters", "Scheme", "State", "lagg
 
 @dataclass
 class State:
-    """Everything that determines the future of the nodes of a rank.
+    """Everything that determines the future of a rank's nodes.
 
     Attributes
     ----------
@@ -34,7 +34,7 @@ class State:
     external, contact, support : (owned, 3) forces of the last balance [N]
     time : float [s]
     step : int
-    memory : arrays (owned, 3) that a scheme keeps between steps
+    memory : named arrays (owned, 3) that a scheme keeps between steps
     """
 
     x: np.ndarray
@@ -63,7 +63,7 @@ class Balance:
     alpha, eta : a_b = alpha u + a_hat [1/s2], v_b = eta u + v_hat [1/s]
     predictor : x_u = predictor + u [m]
     v_hat, a_hat : known parts; None for zero
-    time : when x_u holds: walls and supports are where they are then [s]
+    time : at which x_u holds; walls and supports are evaluated at this time [s]
     loads : (weight, time) pairs: the external force of the balance
     weight : w of the module's equation
     discrete_gradient : the internal force is that of the step from x_n to x_u (discrete gradient), not that at x_u
@@ -81,7 +81,7 @@ class Balance:
 
 
 class NoParameters(StrictModel):
-    """For schemes without parameters."""
+    """Parameters of schemes without parameters."""
 
 
 class Scheme(ABC):
@@ -90,20 +90,20 @@ class Scheme(ABC):
     Attributes
     ----------
     explicit : whether the balance needs no force at the unknown position
-    solves_next_position : the scheme solves for x_{n+2} at t_{n+1} (central differences), so x_{n+1} is known before
-    balance_at_endpoints : the balance holds at the ends of steps, so that works follow the trapezoidal rule; else the
-        forces of the balance work over the whole step
+    solves_next_position : the scheme solves for x_{n+2} at t_{n+1} (central differences), so x_{n+1} is already known
+    balance_at_endpoints : the balance holds at the ends of steps, so works follow the trapezoidal rule; else the forces
+        of the balance act over the whole step
     solves_end : the position solved for is x_{n+1}
     discrete_gradient : the internal force of its balances is that of the step (``Balance.discrete_gradient``)
-    force_acts_once : the contact force of a step acts in that step alone once its acceleration is taken away
-    loops : ``inlined`` functions that move nodes and finish a step, for the loop over many steps
-        (``stepping/fused_loop.py``); None: steps are made one by one
-    symmetric : whether the Hessian is
-    remembers : names of what it keeps of nodes in the state's memory, linear in motions
-    dissipates : whether the scheme takes energy from high frequencies
-    turns_held : x1 - x0 = h (v0 + v1)/2 and nothing else ties velocity to position: a node that is held in place from
-        one step to the next has its velocity turned round
-    notice : what users must be told when they choose it; empty for nothing
+    force_acts_once : a contact force affects only its own step if its acceleration is removed
+    loops : ``inlined`` functions that move nodes and finish a step, for the fused loop (``stepping/fused_loop.py``);
+        None: steps are made one by one
+    symmetric : whether the Hessian is symmetric
+    remembers : names of the scheme's nodal arrays in the state's memory, which are linear in the motion
+    dissipates : whether the scheme dissipates energy at high frequencies
+    turns_held : x1 - x0 = h (v0 + v1)/2 and nothing else relates velocity to position, so the velocity of a node that
+        is fixed from one step to the next is reversed
+    notice : message to users who choose the scheme; empty for none
     inertial : whether its balance has inertia; without it there are no velocities, impulses and impacts
     """
 
@@ -125,7 +125,7 @@ class Scheme(ABC):
         self.parameters = parameters
 
     def limit(self, damping_ratio: float = 0.0) -> float:
-        """Largest stable Omega = omega h at a damping ratio; infinite where unconditionally stable."""
+        """Return the largest stable Omega = omega h at a damping ratio; infinite if unconditionally stable."""
         return np.inf
 
     def expected_move(self, state: State, h: float) -> np.ndarray:
@@ -133,34 +133,34 @@ class Scheme(ABC):
         return h * state.v
 
     def start(self, state: State, h: float) -> None:
-        """Set memory up from the complete state at the start (x, v, a); nothing by default."""
+        """Initialise the memory from the complete initial state (x, v, a); nothing by default."""
 
     def restart(self, state: State, nodes: np.ndarray | tuple[np.ndarray, np.ndarray], h: float) -> None:
-        """Make what is remembered of some owned nodes agree with v and a, which contact or supports changed.
+        """Make the memory of some owned nodes consistent with v and a after contact or supports changed them.
 
         ``nodes`` : (m,), or (nodes, components), both (m,). Nothing by default.
         """
 
     def step_changed(self, state: State) -> None:
-        """Forget what holds for the old step only; the state (x, v, a) is complete. Nothing by default."""
+        """Discard memory that depends on the previous step size; (x, v, a) remain complete. Nothing by default."""
 
     @abstractmethod
     def balance(self, state: State, h: float) -> Balance:
-        """The affine form of the step that starts from ``state``."""
+        """Return the affine form of the step that starts from ``state``."""
 
     @abstractmethod
     def finish(self, state: State, balance: Balance, u: np.ndarray, h: float) -> None:
-        """Advance v, a, memory and (unless :attr:`leads`) the owned x of ``state`` after the solve."""
+        """Advance v, a, memory and (unless :attr:`solves_next_position`) the owned x of ``state`` after the solve."""
 
 
 class ExplicitScheme(Scheme):
-    """Base of schemes whose Hessian has no stiffness."""
+    """Base class of schemes whose Hessian contains no stiffness."""
 
     explicit = True
 
 
 def lagged_limit(alpha_m: float, beta: float, gamma: float, damping_ratio: float) -> float:
-    """Stability limit of the explicit Newmark family with the balance (1-a_m) a1 + a_m a0 + 2 xi w v0 + w^2 x0 = 0.
+    """Return the stability limit of explicit Newmark schemes, (1-a_m) a1 + a_m a0 + 2 xi w v0 + w^2 x0 = 0.
 
     The eigenvalue -1 appears at (2 beta - gamma)/2 Omega^2 + xi (2 gamma - 1) Omega - (1 - 2 a_m) = 0.
     """

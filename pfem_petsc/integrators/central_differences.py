@@ -2,8 +2,8 @@
 
     a0 = (x1 - 2 x0 + x-1)/h^2,   v0 = (x1 - x-1)/(2h),   balance at t0; start v-1/2 = v0 - h a0/2.
 
-The velocities at half steps are carried (v+1/2 = v-1/2 + h a0, x1 = x0 + h v+1/2), which keeps momentum to rounding
-where the three positions would lose it. The balance at t0 gives x1, so the program moves first and then solves: the
+The scheme stores velocities at half steps (v+1/2 = v-1/2 + h a0, x1 = x0 + h v+1/2), which conserves momentum to
+rounding; three positions would not. The balance at t0 determines x1, so the program moves first and then solves: the
 recorded velocity and acceleration belong to the recorded position.
 """
 
@@ -18,19 +18,19 @@ __all__ = ["Parameters", "Scheme", "drift", "kick"]
 
 Parameters = NoParameters
 
-# the loops run over arrays (3 n,): vector instructions take several numbers at once
+# the loops run over arrays (3 n,), so that they are vectorised
 
 
 @inlined
 def move(x, h, half, moved):
-    """``moved`` = x + h half."""
+    """Compute ``moved`` = x + h half."""
     for i in range(len(half)):
         moved[i] = x[i] + h * half[i]
 
 
 @inlined
 def finish(u, alpha, eta, h, half, a, v):
-    """Acceleration and velocity of the balance, and ``half`` half a step later."""
+    """Compute acceleration and velocity of the balance, and ``half`` half a step later."""
     for i in range(len(u)):
         a[i] = alpha * u[i]
         v[i] = half[i] + eta * u[i]
@@ -49,14 +49,14 @@ class Scheme(ExplicitScheme):
     dissipates = False
 
     def limit(self, damping_ratio: float = 0.0) -> float:
-        """2 for any damping ratio: damping is centred."""
+        """Return 2 for any damping ratio, because damping is centred."""
         return 2.0
 
     def start(self, state: State, h: float) -> None:
         state.memory["half_velocity"] = state.v - (0.5 * h) * state.a
 
     def advance(self, state: State, h: float) -> None:
-        """Move to x_{n+1}, which the last balance has fixed."""
+        """Move to x_{n+1}, which the last balance has determined."""
         position = state.position.reshape(-1)
         drift(position, h, state.memory["half_velocity"].reshape(-1), position)
 

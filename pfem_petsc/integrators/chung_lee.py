@@ -3,8 +3,9 @@
     M a1 + C v0 + f_int(x0) = f_ext(t0),
     x1 = x0 + h v0 + h^2 [(1/2 - beta) a0 + beta a1],   v1 = v0 + h [(1 - gamma) a0 + gamma a1],   gamma = 3/2.
 
-beta = 1 has the positions of central differences; beta = 28/27 halves the amplitude at the bifurcation a step. Second
-order, stable to Omega = 2/sqrt(4 beta - 3) (undamped). It is the explicit generalised-alpha family with a_m = 0.
+beta = 1 has the positions of central differences; beta = 28/27 halves the amplitude at the bifurcation in each step.
+Second order, stable up to Omega = 2/sqrt(4 beta - 3) (undamped). It is the explicit generalised-alpha family with
+a_m = 0.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ class Scheme(ExplicitGeneralisedAlpha):
     """Method of Chung and Lee (explicit)."""
 
     def set_coefficients(self) -> None:
-        """alpha_m, beta, gamma from the parameters."""
+        """Set alpha_m, beta, gamma from the parameters."""
         self.dissipates = self.parameters.beta > 1.0
         self.alpha_m = 0.0
         self.beta = self.parameters.beta

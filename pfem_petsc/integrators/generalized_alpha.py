@@ -4,7 +4,8 @@
         = (1 - a_f) f_ext(t1) + a_f f_ext(t0),   x1, v1 by Newmark's formulas,
     a_m = (2 rho - 1)/(rho + 1),  a_f = rho/(rho + 1),  gamma = 1/2 - a_m + a_f,  beta = (1 - a_m + a_f)^2/4.
 
-Second order, unconditionally stable (linear); rho_inf = 1 keeps energy, 0 removes the highest frequency in a step.
+Second order, unconditionally stable (linear); rho_inf = 1 conserves energy, 0 removes the highest frequency in one
+step.
 """
 
 from __future__ import annotations

@@ -2,8 +2,8 @@
 
     a1 = (2 x1 - 5 x0 + 4 x-1 - x-2)/h^2,   v1 = (11 x1 - 18 x0 + 9 x-1 - 2 x-2)/(6h),   balance at t1.
 
-History is kept as the differences d0 = x0 - x-1 and d1 = x-1 - x-2. Houbolt's own start (fictitious x-1, x-2 from v0
-and a0) makes the first step that of linear acceleration, with x-1 = h^2 a0 + 2 x0 - x1 for the second.
+The history is stored as the differences d0 = x0 - x-1 and d1 = x-1 - x-2. With Houbolt's starting procedure (fictitious
+x-1, x-2 from v0 and a0) the first step is that of linear acceleration, with x-1 = h^2 a0 + 2 x0 - x1 for the second.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ class Parameters(StrictModel):
     rho_b: Annotated[float, Field(ge=0.0, le=1.0)] = 0.8
 
 
-# the loops run over arrays (3 n,): vector instructions take several numbers at once
+# the loops run over arrays (3 n,), so that they are vectorised
 
 
 @kernel
@@ -53,7 +53,7 @@ class Scheme(ExplicitScheme):
         self.set_coefficients()
 
     def set_coefficients(self) -> None:
-        """alpha_m, beta, gamma from the parameters."""
+        """Set alpha_m, beta, gamma from the parameters."""
         rho = self.parameters.rho_b
         self.dissipates = rho < 1.0
         self.alpha_m = (2.0 * rho - 1.0) / (1.0 + rho)

@@ -3,8 +3,8 @@
     x1 = x0 + h v0 + h^2 [(1/2 - beta) a0 + beta a1],   v1 = v0 + h [(1 - gamma) a0 + gamma a1],
     balance at t1.
 
-beta = 1/4, gamma = 1/2 is the trapezoidal rule. For Hu's pair the velocity and acceleration of a node whose position
-is held are zero after two steps; its numerical damping ratio is omega h / 2, and it slows rotation down.
+beta = 1/4, gamma = 1/2 is the trapezoidal rule. With Hu's parameters the velocity and acceleration of a node whose
+position is fixed vanish after two steps; the numerical damping ratio is omega h / 2, and rotations are slowed down.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class Scheme(Base):
         self.dissipates = parameters.gamma > 0.5
 
     def limit(self, damping_ratio: float = 0.0) -> float:
-        """Unconditionally stable for 2 beta >= gamma >= 1/2; else Omega^2 (gamma/2 - beta) = 1 (undamped)."""
+        """Return infinity for 2 beta >= gamma >= 1/2; else Omega with Omega^2 (gamma/2 - beta) = 1 (undamped)."""
         beta, gamma = self.parameters.beta, self.parameters.gamma
         if gamma < 0.5:
             return 0.0

@@ -1,8 +1,8 @@
 """Stand-in for the explicit method of Souza and Moura, whose source has not been found.
 
-What is known is how the paper describes it: explicit, with lower velocity oscillations at impact than Newmark's and
-Chung and Lee's methods, which take longer to die out. Explicit generalised-alpha with rho_b = 0.3 behaves so. It is not
-the method of Souza and Moura.
+Only the description in the paper is known: explicit, with smaller velocity oscillations at impact than the methods of
+Newmark and of Chung and Lee, but slower decay. Explicit generalised-alpha with rho_b = 0.3 behaves in this way. It is
+not the method of Souza and Moura.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ Parameters = NoParameters
 
 
 class Scheme(ExplicitGeneralisedAlpha):
-    """Stand-in for Souza and Moura: hulbert_chung with rho_b = 0.3 (their own scheme is not known to us)."""
+    """Stand-in for Souza and Moura: hulbert_chung with rho_b = 0.3 (their scheme is not available)."""
 
     notice = (
         "souza_moura is a stand-in: the source of Souza and Moura's scheme has not been found, so hulbert_chung with "

@@ -6,11 +6,11 @@ With tau = theta h the unknown is x_tau at t0 + tau:
     balance at t0 + tau with f_ext(t0) + theta [f_ext(t1) - f_ext(t0)],
     a1 = a0 + (a_tau - a0)/theta,   v1 = v0 + h (a0 + a1)/2,   x1 = x0 + h v0 + h^2 (2 a0 + a1)/6.
 
-Walls bound x_tau, not x1. A node held so moves as at infinite frequency: at theta = 1.4 by a factor -0.778 a step, so
-its reaction alternates, the wall lets go, and contact chatters and gains energy. That a held node calms down (0.533 a
-step at theta = 1.5) does not make contact safe: false releases depend on where in a step the impact falls, and gain
-energy below theta = 1.8 at small steps (docs/contact.md has the table). Plastic strains are kept from x1, not from
-x_tau.
+Walls bound x_tau, not x1. A node in contact then moves as at infinite frequency, at theta = 1.4 by a factor of -0.778
+per step, so its reaction alternates, the wall releases it, and contact chatters and gains energy. The decay of a node
+in contact (0.533 per step at theta = 1.5) does not make contact safe: false releases depend on the phase of the impact
+and gain energy below theta = 1.8 at small steps (see the table in docs/contact.md). Plastic strains are stored from x1,
+not from x_tau.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Scheme(Base):
     solves_end = False
 
     def limit(self, damping_ratio: float = 0.0) -> float:
-        """Infinite from theta = (1 + sqrt 3)/2 on; below, the eigenvalue -1 appears at Omega^2 =
+        """Return infinity for theta >= (1 + sqrt 3)/2; below, the eigenvalue -1 appears at Omega^2 =
         12 (2 theta - 1)/(6 theta^2 - 4 theta^3 - 1) (undamped)."""
         theta = self.parameters.theta
         if theta >= 0.5 * (1.0 + np.sqrt(3.0)):

@@ -1,4 +1,4 @@
-"""All bars of a rank: blocks of one section each, evaluated by the compiled loops of their material."""
+"""All bars of a rank, in blocks of one section each, evaluated by the compiled loops of their material."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ __all__ = ["BarBlock", "Bars", "StrainEnergy", "first_inverted"]
 
 class StrainEnergy(NamedTuple):
     """Sums over the bars counted on this rank, in the order of :data:`~pfem_petsc.energies.BAR_ENERGIES` [J], the first
-    bar that collapsed (local index, -1: none), and whether any is so short that it may have turned over."""
+    collapsed bar (local index, -1: none), and whether any bar is so short that it may be inverted."""
 
     energies: tuple[float, ...] = (0.0,) * len(BAR_ENERGIES)
     failed: int = -1
     shortened: bool = False
 
     def of(self, name: str) -> float:
-        """The energy of a name [J]."""
+        """Return the energy of a name [J]."""
         return self.energies[BAR_ENERGIES.index(name)]
 
     @property
@@ -48,7 +48,7 @@ class StrainEnergy(NamedTuple):
 class BarBlock:
     """Local bars [start, stop) of one section, of which [start, counted) are counted on this rank.
 
-    ``modulus`` is the largest that the law can have [Pa]; ``history`` (rows, stop - start) holds ``law.rows``.
+    ``modulus`` is the largest tangent modulus of the law [Pa]; ``history`` (rows, stop - start) holds ``law.rows``.
     """
 
     section: str
@@ -68,7 +68,7 @@ class BarBlock:
     conserving: SimpleNamespace | None
 
     def variables(self) -> Iterator[tuple[str, str, np.ndarray]]:
-        """Name, unit and values (stop - start,) of all that is kept of a bar from step to step."""
+        """Yield name, unit and values (stop - start,) of all data kept from step to step."""
         for (name, unit), values in zip(self.law.rows, self.history, strict=True):
             yield name, unit, values
 
@@ -86,7 +86,7 @@ def _lengths(points, bars, rest):
 
 @kernel
 def first_inverted(x, before, bars, rest):
-    """First bar that is shortened and points back against where it pointed before, or -1."""
+    """Return the first shortened bar whose direction has reversed, or -1."""
     for k in range(len(bars)):
         a = bars[k, 0]
         b = bars[k, 1]
@@ -108,13 +108,13 @@ class Bars:
     Attributes
     ----------
     ends : (b, 2) int32, local node indices of each bar
-    far : (b,) uint32, that end of each bar whose index is larger
+    far : (b,) uint32, the end of each bar with the larger index
     rest : (b,) float64, rest lengths [m]
-    heat : (2, b) thermal strains and temperatures [K], or (2, 0) where no temperature acts
-    heat_at_start : the same at the start of the step, where they vary
-    step : from the start of the step to the positions that are evaluated [s]; 0 at the start of a run
+    heat : (2, b) thermal strains and temperatures [K], or (2, 0) without temperatures
+    heat_at_start : the same at the start of the step, if they vary
+    step : time from the start of the step to the evaluated positions [s]; 0 at the start of a run
     internal : name and unit of the internal variables of all laws of the case
-    kept_names : names of all that laws keep of a bar from step to step, the same on all ranks
+    kept_names : names of all data that laws keep from step to step, the same on all ranks
     blocks : bars by section
     """
 
@@ -163,8 +163,8 @@ class Bars:
         return (x, self.ends, self.rest, self.heat, *law)
 
     def forces(self, x: np.ndarray, f: np.ndarray, commit: bool) -> StrainEnergy:
-        """Internal forces ``f`` (local nodes, 3) [N] at positions ``x``; valid for owned nodes. Keeps the internal
-        variables reached only where ``commit``."""
+        """Compute internal forces ``f`` (local nodes, 3) [N] at positions ``x``; valid for owned nodes. Internal
+        variables are updated only if ``commit``."""
         f[:] = 0.0
         energies = np.zeros(len(BAR_ENERGIES))
         failed, shortened = -1, False
@@ -179,28 +179,28 @@ class Bars:
         return StrainEnergy(tuple(energies.tolist()), failed, shortened)
 
     def first_inverted(self, x: np.ndarray, before: np.ndarray) -> int:
-        """First local bar that went through zero length from positions ``before`` to ``x``, or -1.
+        """Return the first local bar that passed through zero length from positions ``before`` to ``x``, or -1.
 
-        Its length alone does not tell: in one step a bar jumps over zero. Stretched bars are not looked at.
+        Lengths alone do not show this, because a bar can jump over zero in one step. Stretched bars are not checked.
         """
         return first_inverted(x, before, self.ends, self.rest)
 
     def tangents(
         self, x: np.ndarray, weight: float, inertia: list[float], pattern: BlockPattern, values: np.ndarray
     ) -> None:
-        """Add ``weight`` K_t(x) and the consistent inertia (a coefficient per block) to a matrix's values."""
+        """Add ``weight`` K_t(x) and the consistent inertia (a coefficient per block) to the values of a matrix."""
         for block, m in zip(self.blocks, inertia, strict=True):
             block.kernels.tangents(
                 *self._arguments(x, block), block.start, block.stop, m, weight, pattern.ptr, pattern.slots, values
             )
 
     def linearise(self, x: np.ndarray, weight: float, stored: np.ndarray) -> None:
-        """Fill ``stored`` (b, 5) with n, dN/dl - N/l [N/m] and N/l [N/m], times ``weight``, of each bar at ``x``."""
+        """Fill ``stored`` (b, 5) with n, dN/dl - N/l [N/m] and N/l [N/m], times ``weight``, for each bar at ``x``."""
         for block in self.blocks:
             block.kernels.linearise(*self._arguments(x, block), block.start, block.stop, weight, stored)
 
     def step_forces(self, x0: np.ndarray, x: np.ndarray, f: np.ndarray) -> None:
-        """Discrete-gradient forces ``f`` (local nodes, 3) [N] of a step from ``x0`` to ``x``."""
+        """Compute discrete-gradient forces ``f`` (local nodes, 3) [N] of a step from ``x0`` to ``x``."""
         f[:] = 0.0
         for block in self.blocks:
             arguments = self._arguments(x, block)
@@ -221,20 +221,20 @@ class Bars:
             block.conserving.tangents(*arguments, m, weight, pattern.ptr, pattern.slots, values)
 
     def product(self, x: np.ndarray, u: np.ndarray, out: np.ndarray) -> None:
-        """``out`` = K_t(x) u for local arrays (nodes, 3); valid for owned nodes."""
+        """Compute ``out`` = K_t(x) u for local arrays (nodes, 3); valid for owned nodes."""
         out[:] = 0.0
         for block in self.blocks:
             block.kernels.product(*self._arguments(x, block), block.start, block.stop, u, out)
 
     def lengths(self, x: np.ndarray) -> np.ndarray:
-        """Length (b,) of each local bar [m]."""
+        """Return the length (b,) of each local bar [m]."""
         lengths = np.empty_like(self.rest)
         _lengths(x, self.ends, lengths)
         return lengths
 
     def fields(self, x: np.ndarray) -> dict[str, np.ndarray]:
-        """Per local bar: ``strain``, ``stress`` [Pa], ``axial_force`` [N], ``plastic_strain``, and the internal
-        variables of the case's laws; zero where a bar has no such variable. At the end of the last step."""
+        """Return, per local bar at the end of the last step, ``strain``, ``stress`` [Pa], ``axial_force`` [N],
+        ``plastic_strain``, and the internal variables of the case's laws; zero for bars without such a variable."""
         out = {name: np.empty(len(self.ends)) for name in ("strain", "stress", "axial_force")}
         out |= {name: np.zeros(len(self.ends)) for name in ("plastic_strain", *self.internal)}
         for block in self.blocks:
@@ -246,8 +246,8 @@ class Bars:
         return out
 
     def history(self) -> np.ndarray:
-        """What laws keep of all local bars (b, names), a column for each of :attr:`kept_names`; zero where a bar does
-        not have it."""
+        """Return the data that laws keep of all local bars (b, names), one column for each of :attr:`kept_names`; zero
+        for bars without such data."""
         history = np.zeros((len(self.ends), len(self.kept_names)))
         for block in self.blocks:
             for name, _, values in block.variables():
@@ -255,7 +255,7 @@ class Bars:
         return history
 
     def put_history(self, history: np.ndarray) -> None:
-        """Set what :meth:`history` gives."""
+        """Restore the result of :meth:`history`."""
         for block in self.blocks:
             for name, _, values in block.variables():
                 values[:] = history[block.start : block.stop, self.kept_names.index(name)]

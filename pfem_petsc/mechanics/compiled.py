@@ -1,4 +1,4 @@
-"""The one way in which loops over bars and nodes are compiled."""
+"""Compilation of loops over bars and nodes by Numba, with a cache keyed by byte code."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from numba.extending import _Intrinsic, register_jitable
 
 __all__ = ["Compilation", "code_digest", "inlined", "kernel"]
 
-# Neither contraction to fused multiply-add nor reassociation: what a loop gives must not depend on how it was compiled,
-# alone or into a loop over steps, for one bar or for eight at once, so that a bar evaluated on two ranks has the same
-# bits on both and a restarted run those of the run that was not stopped (contraction would save 5 %). Assuming "no NaN"
-# would hide a blow-up.
+# Neither contraction to fused multiply-add nor reassociation: the result of a loop must not depend on how it was
+# compiled, alone or into the fused loop, for one bar or for eight at once. Then a bar evaluated on two ranks has the
+# same bits on both, and a restarted run is bitwise identical to an uninterrupted one (contraction would save 5 %).
+# Assuming "no NaN" would hide divergence.
 _FAST = {"nsz"}
 
 
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a loop; the machine code is cached on disk where a folder for it can be written."""
+    """Compile a loop; the machine code is cached on disk if a folder for it is writable."""
     options: dict[str, Any] = {"fastmath": _FAST, "error_model": "numpy", "nogil": True}
     try:
         compiled = numba.njit(cache=True, **options)(function)
@@ -51,12 +51,12 @@ def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
 
 @functools.cache
 def _warn_once(text: str) -> None:
-    """There are some forty loops: what is wrong with the folder of one is wrong with that of all."""
+    """Warn once, because all loops share the folder of the cache."""
     warnings.warn(text, stacklevel=3)
 
 
 def _variant(function: Callable[..., Any]) -> str:
-    """Names of the functions in modules that a loop was made with: ``elastic.response-strain.green``."""
+    """Return the names of the functions in modules from which a loop was made: ``elastic.response-strain.green``."""
     found: list[str] = []
     seen: set[int] = set()
 
@@ -76,15 +76,15 @@ def _variant(function: Callable[..., Any]) -> str:
 
 
 def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a loop into the loops that call it, as :func:`kernel` would."""
+    """Compile a function into the loops that call it, with the options of :func:`kernel`."""
     return register_jitable(fastmath=_FAST, error_model="numpy")(function)
 
 
 class _CacheFile(IndexDataCacheFile):
-    """Index of the machine code of one loop on disk: valid for the code that it was compiled from, wherever that is.
+    """Index of the machine code of one loop on disk, valid for the byte code it was compiled from, in whatever file.
 
-    Numba's own stamp is time and size of the loop's file: it keeps machine code whose inlined functions have changed in
-    other files, and drops it when a comment has.
+    Numba's own stamp is the time and size of the loop's file. It would keep machine code whose inlined functions have
+    changed in other files, and discard it if only a comment has changed.
     """
 
     _function: Callable[..., Any]
@@ -93,12 +93,12 @@ class _CacheFile(IndexDataCacheFile):
 
     @property
     def _index_path(self) -> str:
-        # loops that one function makes, of every law and strain measure, would take each other's place
+        # loops made by one function, for each law and strain measure, would otherwise overwrite each other
         return os.path.join(self._cache_path, self._named(self._index_name))
 
     @_index_path.setter
     def _index_path(self, path: str) -> None:
-        """That of the loop as it is written."""
+        """Accept Numba's path, which has no variant."""
 
     def _data_path(self, name: str) -> str:
         return os.path.join(self._cache_path, self._named(name))
@@ -109,20 +109,20 @@ class _CacheFile(IndexDataCacheFile):
 
     @property
     def _source_stamp(self) -> str:
-        # not when the loop is defined: functions below it in its file do not exist yet
+        # computed late: when the loop is defined, functions below it in its file do not exist yet
         if self._digest is None:
             self._digest = code_digest(self._function)
         return self._digest
 
     @_source_stamp.setter
     def _source_stamp(self, stamp: Any) -> None:
-        """Numba's own stamp is not used."""
+        """Ignore Numba's own stamp."""
 
     def _load_index(self) -> dict[Any, str]:
         try:
             return super()._load_index()
         except (pickle.UnpicklingError, EOFError, ValueError, TypeError, AttributeError, IndexError, ImportError):
-            return {}  # truncated or damaged: compiled anew and overwritten
+            return {}  # truncated or damaged: compile again and overwrite
 
     def load(self, key: Any) -> Any:
         try:
@@ -138,9 +138,9 @@ class _CacheFile(IndexDataCacheFile):
 
 
 def code_digest(function: Callable[..., Any]) -> str:
-    """Digest of the byte code of a function and of all that it refers to: functions, constants, types of records.
+    """Return a digest of the byte code of a function and of all functions, constants and record types it refers to.
 
-    Machine code depends on nothing else of the program; compiled functions that are called are followed as well.
+    Machine code depends on nothing else in the program. Calls of compiled functions are followed too.
     """
     digest = _Digest()
     digest.add(function)
@@ -148,7 +148,7 @@ def code_digest(function: Callable[..., Any]) -> str:
 
 
 class _Digest:
-    """Of things that machine code may be made of, and of all that they refer to."""
+    """Digest of objects that machine code can depend on, and of all objects that they refer to."""
 
     def __init__(self) -> None:
         self._digest = hashlib.sha256()
@@ -156,7 +156,7 @@ class _Digest:
         self.hexdigest = self._digest.hexdigest
 
     def add(self, thing: Any) -> None:
-        """Add a function, or what functions refer to."""
+        """Add a function, or an object that functions refer to."""
         update = self._digest.update
         if isinstance(thing, CodeType):
             self._add_code(thing)
@@ -193,7 +193,7 @@ class _Digest:
         self._add_code(function.__code__)
         for cell in function.__closure__ or ():
             self.add(cell.cell_contents)
-        # sorted: the order of a set of names is another in every process
+        # sorted, because the order of a set of names differs between processes
         for name in sorted(_global_names(function.__code__)):
             if name in function.__globals__:
                 self._digest.update(name.encode())
@@ -201,7 +201,7 @@ class _Digest:
 
 
 def _global_names(code: CodeType) -> set[str]:
-    """Names that a function and those nested in it may look up globally."""
+    """Return the names that a function and its nested functions may look up globally."""
     names = set(code.co_names)
     for constant in code.co_consts:
         if isinstance(constant, CodeType):
@@ -210,18 +210,18 @@ def _global_names(code: CodeType) -> set[str]:
 
 
 class Compilation(event.Listener):
-    """Notices loops that are compiled by this process, not those whose machine code is on disk, while it is a context.
+    """Context manager that reports loops compiled by this process, but not those loaded from the cache.
 
     Parameters
     ----------
-    begun : called before the first, with its name
-    took : called with the time that each took [s]
+    begun : called before the first compilation, with the name of the loop
+    took : called after each compilation, with its time [s]
     """
 
     def __init__(self, begun: Callable[[str], None], took: Callable[[float], None]) -> None:
         self._begun, self._took = begun, took
         self._told = False
-        self._nested = 0  # loops that are compiled for one that calls them
+        self._nested = 0  # loops compiled for a loop that calls them
         self._begin = 0.0
 
     def __enter__(self) -> Compilation:
@@ -233,7 +233,7 @@ class Compilation(event.Listener):
         self._nested = 0
 
     def on_start(self, event: event.Event) -> None:
-        """A loop is about to be compiled."""
+        """Handle the start of a compilation."""
         if self._nested == 0:
             self._begin = time.perf_counter()
             if not self._told:
@@ -242,7 +242,7 @@ class Compilation(event.Listener):
         self._nested += 1
 
     def on_end(self, event: event.Event) -> None:
-        """It is compiled, or refused."""
+        """Handle the end of a compilation, successful or not."""
         self._nested -= 1
         if self._nested == 0:
             self._took(time.perf_counter() - self._begin)

@@ -1,14 +1,14 @@
-"""Bars between two positions: the discrete-gradient force of Simo-Tarnow type, which conserves energy and momenta.
+"""The discrete-gradient force of bars between two positions, of Simo-Tarnow type, which conserves energy and momenta.
 
 Between d0 and d1 (end differences of a bar at the start and end of a step) with d = (d0 + d1)/2, the force on the ends
 is -+ A l0 S R d, with R = (e1 - e0)/((l1^2 - l0^2)/2) and the stress S, the mean over a path on which the strain goes
-from e0 to e1 in one direction. Its work over the step is exactly A l0 S (e1 - e0); it is along d, so that both momenta
-are kept. For engineering strain R = 2/(L (l0 + l1)), for Green's 1/L^2, for the logarithmic
+from e0 to e1 in one direction. Its work over the step is exactly A l0 S (e1 - e0); it acts along d, so both momenta
+are conserved. For engineering strain R = 2/(L (l0 + l1)), for Green's 1/L^2, for the logarithmic
 ln(l1/l0)/((l1^2 - l0^2)/2).
 
-The law of a material gives S (``mean_stress`` of :class:`~pfem_petsc.mechanics.materials.base.Law`): (s0 + s1)/2 for an
-elastic bar, so that the work is the change of its energy. Where temperature changes, e is the strain less the thermal
-strain.
+The material law defines S (``mean_stress`` of :class:`~pfem_petsc.mechanics.materials.base.Law`): (s0 + s1)/2 for an
+elastic bar, so that the work equals the change of its energy. If the temperature changes, e is the strain minus the
+thermal strain.
 """
 
 from __future__ import annotations
@@ -60,9 +60,9 @@ _RATIOS = {engineering: _engineering_ratio, green: _green_ratio, logarithmic: _l
 
 @cache
 def make_conserving_kernels(law: Law, measure: Callable) -> SimpleNamespace:
-    """Kernels ``forces`` and ``tangents`` of a material law; arguments as in :mod:`~pfem_petsc.mechanics.kernels`, with
-    positions, and thermal strains and temperatures, at the start (``x0``, ``cold``) and end (``x``, ``heat``) of the
-    step."""
+    """Make the kernels ``forces`` and ``tangents`` of a material law; arguments as in
+    :mod:`~pfem_petsc.mechanics.kernels`, with positions, thermal strains and temperatures at the start (``x0``,
+    ``cold``) and end (``x``, ``heat``) of the step."""
     response, mean_stress, like, by_rate, last = (
         law.response,
         law.mean_stress,
@@ -74,7 +74,7 @@ def make_conserving_kernels(law: Law, measure: Callable) -> SimpleNamespace:
 
     @register_jitable
     def pair(ox, oy, oz, dx, dy, dz, rest, shift0, shift, warmth0, warmth, p, area, step, kept, q):
-        """Coefficient c = A l0 S R [N/m], dc/dl1 [N/m2] and 1/l1; c is NaN for a collapsed bar."""
+        """Return the coefficient c = A l0 S R [N/m], dc/dl1 [N/m2] and 1/l1; c is NaN for a collapsed bar."""
         length = math.sqrt(dx * dx + dy * dy + dz * dz)
         s0 = math.sqrt(ox * ox + oy * oy + oz * oz) / rest
         s1 = length / rest

@@ -1,4 +1,4 @@
-"""Loops over bars, made once for each material law.
+"""Compiled loops over bars, made once for each material law.
 
 Bar from node a to node b with d = x_b - x_a, l = |d|, n = d/l (Greco & Coda's positional bar; design equations):
 internal force on a is -N n, on b is +N n; the Hessian block is (dN/dl) n n^T + (N/l)(I - n n^T), added to the diagonal
@@ -23,28 +23,28 @@ from .sweep import CHUNK
 
 __all__ = ["COLLAPSED_STRETCH", "SHORTENED_STRETCH", "last_row", "make_kernels", "no_variables"]
 
-COLLAPSED_STRETCH = 1e-3  # a bar below this fraction of its rest length has been crushed: no truss model holds there
-SHORTENED_STRETCH = math.sqrt(0.8)  # only a bar shorter than this is looked at for having jumped through zero length
+COLLAPSED_STRETCH = 1e-3  # below this fraction of its rest length a bar is crushed, and no truss model applies
+SHORTENED_STRETCH = math.sqrt(0.8)  # only bars shorter than this are checked for passing through zero length
 
 
 def no_variables(law: Law) -> tuple[float, ...]:
-    """As many numbers as a law has internal variables."""
+    """Return a tuple of zeros, one for each internal variable of a law."""
     return (0.0,) * len(law.internal)
 
 
 def last_row(law: Law) -> int:
-    """Row of the history that has the strain at the end of the last step; the stress is in the next."""
+    """Return the row of the history with the strain at the end of the last step; the stress is in the next row."""
     return len(law.internal)
 
 
 @cache
 def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
-    """Kernels of a material law and strain measure: ``forces``, ``tangents``, ``product``, ``linearise``, ``fields``.
+    """Make the kernels of a law and strain measure: ``forces``, ``tangents``, ``product``, ``linearise``, ``fields``.
 
     Common arguments: ``x`` (local nodes, 3) [m]; ``bars`` (b, 2) local ends; ``rest`` (b,) rest lengths [m]; ``heat``
     (2, b) thermal strains and temperatures [K], or (2, 0) for none; ``p`` the law's parameters; ``area`` [m2]; ``step``
     from the start of the step to ``x`` [s]; ``history`` (rows, n) of the bars of this block: ``law.rows`` of bar ``k``
-    in column ``k - start``. No array goes into an inner function: counting its references costs more than the bar.
+    in column ``k - start``. No array is passed to an inner function: reference counting would cost more than the bar.
     """
     response, like, by_rate, last, n_rows = law.response, no_variables(law), law.rate, last_row(law), len(law.rows)
     places = tuple(BAR_ENERGIES.index(name) for name in law.energies)
@@ -54,11 +54,11 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
     @inlined
     def sweep_forces(x, heads, starts, chunks, counted, far, rest, heat, p, area, step, history, commit, f, energies):
         """Add internal forces to ``f``, and sums over counted bars to ``energies``, see
-        :data:`~pfem_petsc.energies.BAR_ENERGIES` [J]; gives the first failed bar or -1, and whether any is so short
-        that it may have turned over.
+        :data:`~pfem_petsc.energies.BAR_ENERGIES` [J]; return the first failed bar or -1, and whether any bar is so
+        short that it may be inverted.
 
         ``heads``, ``starts``, ``chunks``, ``counted``: a :class:`~pfem_petsc.mechanics.sweep.Sweep`; ``far`` (b,) the
-        other end of each bar. Sums are kept for each place of a chunk: vector instructions need not reorder any then.
+        other end of each bar. One sum is kept per position in a chunk, so vector instructions need no reordering.
         """
         failed = -1
         shortened = False
@@ -67,7 +67,7 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
         # end differences, force over length, energies, new history
         work = np.zeros((4 + n_energies + n_rows, CHUNK))
         for chunk in range(len(chunks) - 1):
-            if chunk == counted:  # what follows is counted elsewhere
+            if chunk == counted:  # the remaining bars are counted on other ranks
                 for j in range(n_energies):
                     energies[places[j]] += work[4 + j].sum()
             first = starts[chunks[chunk]]
@@ -128,8 +128,8 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
                         shortened = True
                     if not (stretch > COLLAPSED_STRETCH):  # NaN fails this test too
                         if failed < 0:
-                            failed = np.int64(first + i)  # a signed one, as -1 is
-                        # of a trial position the solver's norms must see that it is out of bounds
+                            failed = np.int64(first + i)  # signed, like -1
+                        # the norms of the solver must detect an inadmissible trial position
                         work[3, i] = 0.0 if commit else math.nan
             for run in range(chunks[chunk], chunks[chunk + 1]):
                 fx = 0.0
@@ -161,7 +161,7 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
 
     @register_jitable
     def stiffness(dx, dy, dz, rest, shift, warmth, p, area, step, before, q):
-        """dN/dl [N/m], N/l [N/m] and 1/l of one bar."""
+        """Return dN/dl [N/m], N/l [N/m] and 1/l of one bar."""
         length = math.sqrt(dx * dx + dy * dy + dz * dz)
         strain, slope, curvature = measure(length / rest)
         rate = 0.0
@@ -173,10 +173,10 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
 
     @kernel
     def tangents(x, bars, rest, heat, p, area, step, history, start, stop, inertia, weight, ptr, slots, values):
-        """Add ``weight`` K_t, and ``inertia`` l0 (2 on the diagonal, 1 beside it), to the block rows of owned nodes.
+        """Add ``weight`` K_t, and ``inertia`` l0 (2 on the diagonal, 1 off it), to the block rows of owned nodes.
 
-        ``slots`` (b, 4): index among all blocks of (a, a), (a, b), (b, b), (b, a), -1 where the row is not owned;
-        ``ptr`` (owned + 1,) first block of a row; ``values``: the matrix in scalar compressed rows.
+        ``slots`` (b, 4): index among all blocks of (a, a), (a, b), (b, b), (b, a), -1 if the row is not owned;
+        ``ptr`` (owned + 1,) first block of each row; ``values``: the matrix in scalar compressed rows.
         """
         has_thermal = heat.shape[1] > 0
         for k in range(start, stop):
@@ -253,7 +253,7 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
 
     @kernel
     def linearise(x, bars, rest, heat, p, area, step, history, start, stop, weight, stored):
-        """What a product with ``weight`` K_t needs of each bar: n, dN/dl - N/l and N/l, to ``stored`` (b, 5)."""
+        """Write the data of each bar for products with ``weight`` K_t, n, dN/dl - N/l and N/l, to ``stored`` (b, 5)."""
         has_thermal = heat.shape[1] > 0
         for k in range(start, stop):
             a = bars[k, 0]
@@ -274,7 +274,7 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
 
     @kernel
     def fields(x, bars, rest, heat, p, area, step, history, start, stop, strain_out, stress_out, force_out):
-        """Total strain, stress [Pa] and axial force [N] of each bar at the end of the last step."""
+        """Write total strain, stress [Pa] and axial force [N] of each bar at the end of the last step."""
         has_thermal = heat.shape[1] > 0
         for k in range(start, stop):
             a = bars[k, 0]

@@ -1,4 +1,4 @@
-"""External forces: nodal loads times a table over time, and gravity."""
+"""External forces: gravity, and nodal loads multiplied by time tables."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["ExternalForce", "Table"]
 
 
 class Table:
-    """Piecewise linear in time, constant before the first and after the last entry."""
+    """Piecewise linear function of time, constant before the first and after the last entry."""
 
     def __init__(self, rows: Sequence[Sequence[float]]) -> None:
         rows = np.asarray(rows, dtype=np.float64)
@@ -23,7 +23,7 @@ class Table:
         self.values = np.ascontiguousarray(rows[:, 1:])
 
     def __call__(self, time: float) -> np.ndarray:
-        """Values at a time, one per column."""
+        """Return the values at a time, one per column."""
         return np.array([np.interp(time, self.times, column) for column in self.values.T])
 
 
@@ -33,7 +33,7 @@ class ExternalForce:
     Attributes
     ----------
     ramped : whether gravity and loads without a table are multiplied by the time, which is a load factor then
-    active : whether anything acts at all (on any rank, at any time)
+    active : whether there are any forces (on any rank, at any time)
     steady : whether the forces are constant
     """
 

@@ -1,7 +1,7 @@
-"""Mass and damping: lumped to the nodes, or consistent with the linear shape functions of the bar.
+"""Mass and damping, lumped at the nodes or consistent with the linear shape functions of the bar.
 
-Consistent mass of a bar: rho A l0 / 6 [[2, 1], [1, 2]] for each direction; its row sums are the lumped mass
-rho A l0 / 2. Damping is c_m per reference volume, distributed the same way.
+The consistent mass of a bar is rho A l0 / 6 [[2, 1], [1, 2]] for each direction; its row sums are the lumped mass
+rho A l0 / 2. Damping is c_m per reference volume, distributed in the same way.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def _lump(bars, rest, start, stop, density, out):
 
 @kernel
 def consistent_product(bars, rest, start, stop, density, u, out):
-    """Add the consistent product of a line density [kg/m] with ``u`` to ``out``, both (local nodes, 3)."""
+    """Add the consistent mass matrix of a line density [kg/m] times ``u`` to ``out``, both (local nodes, 3)."""
     for k in range(start, stop):
         a = bars[k, 0]
         b = bars[k, 1]
@@ -41,7 +41,7 @@ def consistent_product(bars, rest, start, stop, density, u, out):
 
 
 class Inertia:
-    """Mass M [kg] and damping C [kg/s] of the nodes this rank owns.
+    """Mass M [kg] and damping C [kg/s] of the nodes that this rank owns.
 
     Attributes
     ----------
@@ -70,15 +70,15 @@ class Inertia:
 
     @property
     def products(self) -> bool:
-        """Whether M is more than one number for a node, so that it must be multiplied by :meth:`mass_times`."""
+        """Whether M is not diagonal with one value per node, so that products need :meth:`mass_times`."""
         return self.consistent or self.redistribution is not None
 
     def mass_times(self, a: np.ndarray, out: np.ndarray) -> np.ndarray:
-        """``out`` = M a for owned nodes, both (owned, 3). Collective where the mass is consistent."""
+        """Compute ``out`` = M a for owned nodes, both (owned, 3). Collective with consistent mass."""
         return self._times(a, out, self.mass, lambda block: block.density)
 
     def damping_times(self, v: np.ndarray, out: np.ndarray) -> np.ndarray:
-        """``out`` = C v for owned nodes, both (owned, 3). Collective where the mass is consistent."""
+        """Compute ``out`` = C v for owned nodes, both (owned, 3). Collective with consistent mass."""
         if not self.damped:
             out[:] = 0.0
             return out
@@ -104,7 +104,7 @@ class Inertia:
         return out
 
     def coefficients(self, alpha: float, eta: float) -> list[float]:
-        """Per block, (alpha rho + eta c_m) A / 6 [kg/(m s2)]: the consistent part of a Hessian; zeros where lumped."""
+        """Return (alpha rho + eta c_m) A / 6 [kg/(m s2)] per block, the consistent part of a Hessian; or zeros."""
         if not self.consistent:
             return [0.0] * len(self.bars.blocks)
         return [(alpha * b.density + eta * b.damping) * b.area / 6.0 for b in self.bars.blocks]

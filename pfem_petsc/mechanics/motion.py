@@ -1,13 +1,14 @@
 """Prescribed motion over time: position, velocity and acceleration of supports and walls, piecewise cubic.
 
-Rows of displacements are interpolated by a clamped cubic spline: twice continuously differentiable between the first
-row and the last one, so that velocities and accelerations of a sampled record are right to second order. Monotone
-interpolants jump in acceleration at every row, and flatten the crests of a record, where its acceleration is largest.
-The motion is constant outside the rows, so it starts from rest and comes to rest: the end slopes are zero.
+Rows of displacements are interpolated by a clamped cubic spline, twice continuously differentiable between the first
+and the last row, so that velocities and accelerations of a sampled record are accurate to second order. Monotone
+interpolants have jumps of acceleration at every row and flatten the crests of a record, where its acceleration is
+largest. The motion is constant outside the rows; it starts and ends at rest, so the end slopes are zero.
 
-A spline would swing beyond rows that stand still. Two equal values one after the other are therefore a rest: nothing
-moves between them, and the spline ends there with slope zero. The crest of a wave sampled at equal intervals, whose two
-highest samples may be equal, is no rest: there the values turn back and the slopes fall off towards the crest.
+A spline would overshoot at rows of constant displacement. Two equal consecutive values are therefore an interval of
+rest: the displacement is constant between them, and the spline ends there with slope zero. The crest of a wave sampled
+at equal intervals may have two equal highest samples; this is not an interval of rest, which is recognised by the
+values that turn back and the slopes that decrease towards the crest.
 
 Accelerations are linear between their rows and zero outside, and are integrated exactly from rest.
 """
@@ -24,21 +25,21 @@ if TYPE_CHECKING:
 
 __all__ = ["Motion", "motion_of"]
 
-_ROUNDING = 1e-14  # relative, of times: a row that a step reaches but for rounding is reached
+_ROUNDING = 1e-14  # relative tolerance of times: a step reaches a row up to rounding
 
 
 class Motion:
-    """Cubics in time, one after the other; displacement zero velocity before the first.
+    """Piecewise cubic function of time; displacement and velocity are zero before the first piece.
 
     Parameters
     ----------
-    times : (n,) when each cubic begins [s]
-    coefficients : (n, 4, 3) of 1, s, s^2, s^3, where s is the time since it began [m, m/s, m/s2, m/s3]
+    times : (n,) start of each cubic [s]
+    coefficients : (n, 4, 3) of 1, s, s^2, s^3, where s is the time since its start [m, m/s, m/s2, m/s3]
     jumps : whether the velocity jumps from one cubic to the next
 
     Attributes
     ----------
-    jumps : as given; accelerations are then means over the step that ends at the time asked for
+    jumps : as given; accelerations are then means over the step that ends at the requested time
     """
 
     def __init__(self, times: np.ndarray, coefficients: np.ndarray, jumps: bool = False) -> None:
@@ -47,13 +48,13 @@ class Motion:
         self.jumps = jumps
 
     def at(self, time: float, span: float = 0.0, ahead: bool = True) -> np.ndarray:
-        """Displacement [m], velocity [m/s] and acceleration [m/s2] at a time [s], (3, 3).
+        """Return displacement [m], velocity [m/s] and acceleration [m/s2] at a time [s], (3, 3).
 
         Parameters
         ----------
         time : [s]
-        span : length of the step [s]; a jump of velocity within it, after t = 0, counts as acceleration over the step
-        ahead : at the very time of a row, what comes after it, else what came before
+        span : size of the step [s]; a velocity jump within it, after t = 0, counts as acceleration over the step
+        ahead : at the time of a row, whether to return the right limit; else the left limit
         """
         slack = _ROUNDING * abs(time)
         row = int(np.searchsorted(self._times, time + slack if ahead else time - slack, "right" if ahead else "left"))
@@ -70,11 +71,11 @@ class Motion:
 
 
 def motion_of(entry: Support | WallKeys) -> Motion | None:
-    """The motion that a support or a wall of a case is given; None for none.
+    """Return the motion that a case prescribes for a support or a wall; None if there is none.
 
     Parameters
     ----------
-    entry : with ``motion`` and ``velocity``, and where it takes them ``interpolation`` and ``acceleration``
+    entry : with ``motion`` and ``velocity``, and optionally ``interpolation`` and ``acceleration``
     """
     if getattr(entry, "acceleration", None) is not None:
         return _accelerated(np.array(entry.acceleration, dtype=np.float64))
@@ -111,7 +112,7 @@ def _smooth(times: np.ndarray, values: np.ndarray) -> Motion:
 
 
 def _slopes(times: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Slopes (n,) of the cubic spline through values (n,): zero at both ends and at rests."""
+    """Return the slopes (n,) of the cubic spline through values (n,), zero at both ends and at intervals of rest."""
     width = np.diff(times)
     rate = np.diff(values) / width
     still = np.zeros(len(times), dtype=bool)
@@ -136,7 +137,7 @@ def _slopes(times: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def _rests(width: np.ndarray, rate: np.ndarray) -> np.ndarray:
-    """(n - 1,) bool: intervals of equal values in which nothing moves; crests of sampled waves are none."""
+    """Return (n - 1,) bool: intervals of rest, with equal values at both ends, except crests of sampled waves."""
     rests = rate == 0.0
     for k in np.flatnonzero(rests[2:-2]) + 2:
         before, after = rate[k - 1], rate[k + 1]

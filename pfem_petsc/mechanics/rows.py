@@ -1,7 +1,7 @@
-"""Columns of a two-dimensional array as tuples, in compiled loops: any number of rows, known when they are compiled.
+"""Columns of a two-dimensional array as tuples in compiled loops, for a number of rows known at compile time.
 
-Machine code for each row, with nothing to count references of: an array that is handed to an inner function costs more
-than a bar, and a loop over a handful of rows cannot be laid side by side for several bars.
+The code is unrolled over rows and needs no reference counting: an array passed to an inner function costs more than a
+bar, and a loop over a few rows cannot be vectorised over several bars.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ __all__ = ["accumulate", "differ", "put", "take"]
 
 
 def _places(context: Any, builder: Any, signature: Any, args: Any, first: int, column: int, count: int) -> list[Any]:
-    """Pointers to ``count`` rows of a column: ``first`` and ``column`` are places of arguments, ``first`` -1 for 0."""
+    """Return pointers to ``count`` rows of a column; ``first``, ``column``: argument indices, -1 for row 0."""
     array_type = signature.args[0]
     array = context.make_array(array_type)(context, builder, args[0])
     at = context.cast(builder, args[column], signature.args[column], types.intp)
@@ -28,7 +28,7 @@ def _places(context: Any, builder: Any, signature: Any, args: Any, first: int, c
 
 @intrinsic
 def take(typingctx, rows, column, like):  # noqa: ANN001, ANN201 - Numba's types
-    """Numbers ``rows[0, column]``, ``rows[1, column]``, ... as many as the tuple ``like`` has."""
+    """Return ``rows[0, column]``, ``rows[1, column]``, ... as a tuple of the length of ``like``."""
     count = len(like)
 
     def generate(context, builder, signature, args):  # noqa: ANN001, ANN202
@@ -40,7 +40,7 @@ def take(typingctx, rows, column, like):  # noqa: ANN001, ANN201 - Numba's types
 
 @intrinsic
 def put(typingctx, rows, first, column, values):  # noqa: ANN001, ANN201
-    """Write a tuple to ``rows[first, column]`` and the rows after it."""
+    """Write a tuple to ``rows[first, column]`` and the following rows."""
     count = len(values)
 
     def generate(context, builder, signature, args):  # noqa: ANN001, ANN202
@@ -53,7 +53,7 @@ def put(typingctx, rows, first, column, values):  # noqa: ANN001, ANN201
 
 @intrinsic
 def accumulate(typingctx, rows, first, column, factor, values):  # noqa: ANN001, ANN201
-    """Add ``factor`` times a tuple to ``rows[first, column]`` and the rows after it."""
+    """Add ``factor`` times a tuple to ``rows[first, column]`` and the following rows."""
     count = len(values)
 
     def generate(context, builder, signature, args):  # noqa: ANN001, ANN202
@@ -67,7 +67,7 @@ def accumulate(typingctx, rows, first, column, factor, values):  # noqa: ANN001,
 
 @intrinsic
 def differ(typingctx, one, other):  # noqa: ANN001, ANN201
-    """Whether two tuples of as many numbers differ, or hold NaN."""
+    """Return whether two tuples of equal length differ or contain NaN."""
     count = len(one)
 
     def generate(context, builder, signature, args):  # noqa: ANN001, ANN202

@@ -17,12 +17,12 @@ __all__ = ["section_of_bars"]
 
 
 def section_of_bars(case: Case, slab: MeshSlab) -> np.ndarray:
-    """Section index (m,) int32 of each bar of a slab: the section that names its group, else the default one.
+    """Return the section index (m,) int32 of each bar of a slab: the section that names its group, else the default.
 
     Raises
     ------
     InputError
-        Where a section names a group that the mesh lacks, or a bar has two sections or none.
+        If a section names a group that the mesh does not have, or a bar has two sections or none.
     """
     chosen = np.full(len(slab.bars), -1, dtype=np.int32)
     for index, (name, section) in enumerate(case.section.items()):

@@ -1,4 +1,4 @@
-"""Supports: components of node positions that are prescribed, at rest or moving."""
+"""Supports: prescribed components of node positions, fixed or moving."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ class Supports:
     ----------
     fixed : (owned, 3) bool
     any : whether any component of the whole model is prescribed; moving : whether any of them moves
-    at : (nodes, components), an index of arrays (owned, 3)
-    nodes, components : (k,) indices of the prescribed components, in order of the nodes
+    at : (nodes, components), an index into arrays (owned, 3)
+    nodes, components : (k,) indices of the prescribed components, sorted by node
     """
 
     def __init__(self, case: Case, nodes: dict[str, np.ndarray], mesh: DistributedMesh) -> None:
@@ -53,15 +53,15 @@ class Supports:
         self.any = bool(case.support)
 
     def positions(self, time: float) -> np.ndarray:
-        """Prescribed positions (k,) [m] at a time [s], in the order of :attr:`nodes` and :attr:`components`."""
+        """Return prescribed positions (k,) [m] at a time [s], in the order of :attr:`nodes` and :attr:`components`."""
         if not self._motions:
             return self._start
         return self._start + self._at(time, 0.0)[0]
 
     def rates(self, time: float, span: float) -> tuple[np.ndarray, np.ndarray]:
-        """Prescribed velocities (k,) [m/s] and accelerations (k,) [m/s2] at a time [s], the exact derivatives.
+        """Return prescribed velocities (k,) [m/s] and accelerations (k,) [m/s2] at a time [s], the exact derivatives.
 
-        Where velocities jump (linear interpolation) the acceleration is the mean over the ``span`` [s] before.
+        At velocity jumps (linear interpolation) the acceleration is the mean over the preceding ``span`` [s].
         """
         _, v, a = self._at(time, span)
         return v, a

@@ -1,7 +1,7 @@
-"""The order in which loops over bars go: runs of bars that leave the same node, runs gathered into chunks.
+"""The order of loops over bars: runs of bars with the same head node, gathered into chunks.
 
-The force on the node that a run leaves is summed in registers, and what a bar costs in square roots and divisions is
-done for a chunk at once, by vector instructions, between gathering the end differences and scattering the forces.
+The force on the head node of a run is summed in registers. Square roots and divisions are evaluated for a whole chunk
+by vector instructions, between gathering the end differences and scattering the forces.
 """
 
 from __future__ import annotations
@@ -15,19 +15,19 @@ from .compiled import kernel
 __all__ = ["CHUNK", "Sweep", "make_sweep"]
 
 CHUNK = 256
-"""Most bars of a chunk: its working arrays stay in the fastest cache."""
+"""Maximum number of bars of a chunk, whose working arrays then fit into the fastest cache."""
 
 
 class Sweep(NamedTuple):
-    """Runs and chunks of the bars [start, stop) of a block. Indices are unsigned: compiled loops need not ask whether
-    they count from the end.
+    """Runs and chunks of the bars [start, stop) of a block. Indices are unsigned, so compiled loops need not handle
+    negative ones.
 
     Attributes
     ----------
-    heads : (runs,) uint32, the node that the bars of a run leave
+    heads : (runs,) uint32, head node of each run
     starts : (runs + 1,) uint32, first bar of each run, and the end
     chunks : (chunks + 1,) uint32, first run of each chunk, and the end
-    counted : chunks whose bars are counted on this rank; the others follow
+    counted : number of leading chunks whose bars are counted on this rank
     """
 
     heads: np.ndarray
@@ -37,9 +37,9 @@ class Sweep(NamedTuple):
 
 
 def make_sweep(bars: np.ndarray, start: int, counted: int, stop: int, chunk: int = CHUNK) -> Sweep:
-    """The sweep over ``bars`` (b, 2) [start, stop), of which [start, counted) are counted, from their smaller ends.
+    """Make the sweep over ``bars`` (b, 2) [start, stop), of which [start, counted) are counted, by their smaller ends.
 
-    Runs end where that node changes, at ``counted``, and after ``chunk`` bars.
+    Runs end where this node changes, at ``counted``, and after ``chunk`` bars.
     """
     none = np.empty(0, dtype=np.uint32)
     runs, chunks, counted_chunks = _cut(bars, start, counted, stop, chunk, none, none, none)
@@ -51,7 +51,7 @@ def make_sweep(bars: np.ndarray, start: int, counted: int, stop: int, chunk: int
 
 @kernel
 def _cut(bars, start, counted, stop, chunk, heads, starts, chunks):
-    """Numbers of runs, chunks and counted chunks; fills the arrays where they are not empty."""
+    """Return the numbers of runs, chunks and counted chunks; fill the arrays unless they are empty."""
     fill = len(heads) > 0
     n_runs = 0
     n_chunks = 0

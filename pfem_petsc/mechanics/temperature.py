@@ -1,4 +1,4 @@
-"""Temperatures of bars above the reference, constant or over time, and the thermal strains alpha theta they cause."""
+"""Temperatures of bars above the reference, constant or varying, and the resulting thermal strains alpha theta."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Temperatures:
             bars.heat_at_start = bars.heat.copy()
 
     def apply(self, time: float) -> None:
-        """Give the bars their thermal strains at a time [s]; later entries of the case override earlier ones."""
+        """Set the thermal strains of the bars at a time [s]; later entries of the case override earlier ones."""
         for members, value, table in self._entries:
             self.values[members] = value if table is None else table(time)[0]
         for block in self._bars.blocks:

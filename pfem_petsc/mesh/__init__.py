@@ -1,4 +1,4 @@
-"""Meshes: generators, readers, checks, and their distribution over the ranks."""
+"""Meshes: generators, readers, checks, and distribution over the ranks."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["load_slab"]
 
 
 def load_slab(mesh: Any, comm: MPI.Comm) -> MeshSlab:
-    """Each rank's part of the mesh that a case asks for, checked; what looks odd is in its ``warnings``. Collective.
+    """Return this rank's part of the mesh of a case after checks, with warnings in ``warnings``. Collective.
 
     Parameters
     ----------
@@ -25,7 +25,7 @@ def load_slab(mesh: Any, comm: MPI.Comm) -> MeshSlab:
     Raises
     ------
     InputError
-        On all ranks, when the mesh cannot be made or read, or is not sound.
+        On all ranks, if the mesh cannot be generated or read, or is invalid.
     """
     from ..parallel.agreement import agreed
     from ..registry import lookup

@@ -1,4 +1,4 @@
-"""Is a mesh one that can be simulated? Checked on slabs, before it is distributed."""
+"""Checks of a mesh on slabs, before it is distributed."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SHORT = 1e-6
 """Bars shorter than this fraction of the mean length are reported as suspicious."""
 
 LARGE = 1e150
-"""Coordinates [m] from here on are refused with those that are no numbers: their squares are not."""
+"""Coordinates [m] of at least this size are refused, because their squares overflow."""
 
 _SHOWN = 5
 
@@ -28,20 +28,19 @@ _NO_LINES = (
 def check_mesh(slab: MeshSlab, comm: MPI.Comm) -> list[str]:
     """Refuse a mesh that cannot be simulated. Collective.
 
-    Nodes and bars are named by their numbers in the mesh, from 0. A structured mesh is sound by construction and
-    not looked at.
+    Nodes and bars are named by their numbers in the mesh, from 0. A structured mesh is valid by construction and is not
+    checked.
 
     Returns
     -------
     warnings : list of str
-        The slab's own and what looks wrong but can be simulated (bars far shorter than the others); equal on all
-        ranks.
+        Those of the slab, and about suspicious bars (far shorter than the others); equal on all ranks.
 
     Raises
     ------
     InputError
-        On all ranks: no nodes or bars, coordinates that are not finite, bar ends that do not exist, bars of zero
-        length, several bars between the same two nodes, nodes without bars.
+        On all ranks, for a mesh without nodes or bars, coordinates that are not finite, bar ends that do not exist,
+        bars of zero length, several bars between the same two nodes, or nodes without bars.
     """
     warnings = comm.bcast(slab.warnings if comm.rank == 0 else None)
     if slab.structured:
@@ -51,7 +50,7 @@ def check_mesh(slab: MeshSlab, comm: MPI.Comm) -> list[str]:
         raise InputError(f"{slab.source}: {slab.n_nodes} nodes and {slab.n_bars} bars: nothing to simulate{hint}")
     _check_points(slab, comm)
     _check_ends(slab, comm)
-    # The bars of a node meet at the rank whose slab holds it: there both ends of each bar are known to be used.
+    # Each end of a bar is sent to the rank whose slab contains it, which then knows all nodes in use.
     ends, place = np.unique(slab.bars, return_inverse=True)
     asking = Router(comm, slab_of(ends, slab.n_nodes, comm.size))
     asked = asking.send(ends) - slab.first_node
@@ -101,7 +100,7 @@ def _check_lengths(slab: MeshSlab, comm: MPI.Comm, points: np.ndarray, ends: np.
     bad = np.flatnonzero(~((length > 0.0) & (length < np.inf)))
     lines = [f"{_bar(slab, i)}, length {length[i]:g}" for i in bad[:_SHOWN]]
     remedy = "merge the nodes at its ends, or correct their positions"
-    _refuse(slab, comm, lines, len(bad), "bars have no length that can be computed with", remedy)
+    _refuse(slab, comm, lines, len(bad), "bars have a length that is zero or overflows double precision", remedy)
     mean = comm.allreduce(float(length.sum())) / slab.n_bars
     short = np.flatnonzero(length < SHORT * mean)
     lines = [f"{_bar(slab, i)}, length {length[i]:g} m" for i in short[:_SHOWN]]
@@ -110,7 +109,7 @@ def _check_lengths(slab: MeshSlab, comm: MPI.Comm, points: np.ndarray, ends: np.
 
 
 def _check_duplicates(slab: MeshSlab, comm: MPI.Comm) -> None:
-    """Bars between the same two nodes meet at the rank whose slab holds the lower end, and are neighbours there."""
+    """Refuse bars between the same two nodes: the rank whose slab has the lower end sorts them next to each other."""
     key = slab.bars.min(axis=1).astype(np.int64)
     router = Router(comm, slab_of(key, slab.n_nodes, comm.size))
     key *= slab.n_nodes
@@ -133,7 +132,7 @@ def _bar(slab: MeshSlab, i: int) -> str:
 
 
 def _sentence(comm: MPI.Comm, lines: list[str], count: int, what: str) -> str:
-    """What all ranks found together: the count, ``what``, and the first few; empty when nothing. Collective."""
+    """Return what all ranks found: the count, ``what``, and the first few; empty if nothing. Collective."""
     total = comm.allreduce(count)
     if total == 0:
         return ""
@@ -143,7 +142,7 @@ def _sentence(comm: MPI.Comm, lines: list[str], count: int, what: str) -> str:
 
 
 def _refuse(slab: MeshSlab, comm: MPI.Comm, lines: list[str], count: int, what: str, remedy: str) -> None:
-    """Raise the same InputError on all ranks when any found something. Collective."""
+    """Raise the same InputError on all ranks if any rank found something. Collective."""
     text = _sentence(comm, lines, count, what)
     if text:
         raise InputError(f"{slab.source}: {text}; {remedy}")

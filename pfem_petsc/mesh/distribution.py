@@ -1,4 +1,4 @@
-"""A mesh spread over the ranks: owned nodes and ghosts, the bars that touch owned nodes, and how ghosts are filled."""
+"""A mesh distributed over ranks: owned nodes, ghosts, bars connected to owned nodes, and updates of ghosts."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ __all__ = ["Block", "DistributedMesh", "distribute"]
 
 @dataclass(frozen=True)
 class Block:
-    """The local bars of one section: ``[start, counted)`` count here, ``[counted, stop)`` are evaluated here too.
+    """The local bars of one section: ``[start, counted)`` are counted here, ``[counted, stop)`` only evaluated.
 
-    A bar counts on the rank that owns its first end, so that sums over all ranks meet each bar once.
+    A bar is counted on the rank that owns its first end, so that sums over all ranks include each bar once.
     """
 
     section: int
@@ -31,7 +31,7 @@ class Block:
 
 
 class DistributedMesh:
-    """One rank's part of a distributed mesh; made by :func:`distribute`.
+    """One rank's part of a distributed mesh; created by :func:`distribute`.
 
     Local nodes are the owned ones, in PETSc order, then the ghosts: the other ends of bars that touch an owned node,
     sorted by owner and PETSc number.
@@ -53,23 +53,23 @@ class DistributedMesh:
     points: np.ndarray
     """(n_local, 3) float64 [m]: reference positions."""
     bars: np.ndarray
-    """(b, 2) int32: local ends, in the mesh's own order of ends."""
+    """(b, 2) int32: local ends, in the order of the mesh."""
     bar_ids: np.ndarray
-    """(b,) mesh numbers: int64, or the smallest integers that the distribution worked with."""
+    """(b,) mesh numbers: int64, or the smallest sufficient integer type."""
     blocks: list[Block]
-    """By section, ascending; only sections that have bars here."""
+    """By section, ascending; only sections with local bars."""
     node_groups: dict[str, np.ndarray]
     """int32 local indices of owned members, ascending."""
     bar_groups: dict[str, np.ndarray]
     """int32 local bar indices, ascending."""
     partitioner: str
-    """What decided ownership, for the log."""
+    """The partitioner, for the log."""
 
     _exchange: GhostExchange
 
     @cached_property
     def counted(self) -> slice | np.ndarray:
-        """Local bars that count on this rank: an index for arrays of local bars."""
+        """Local bars that are counted on this rank, as an index into arrays of local bars."""
         if len(self.blocks) == 1:
             return slice(self.blocks[0].start, self.blocks[0].counted)
         parts = [np.arange(block.start, block.counted) for block in self.blocks]
@@ -77,17 +77,17 @@ class DistributedMesh:
 
     @cached_property
     def node_order(self) -> NaturalOrder:
-        """Between owned nodes and slabs in mesh numbering. Collective at first use."""
+        """Maps between owned nodes and slabs in mesh numbering. Collective at first use."""
         return NaturalOrder(self.comm, self.node_ids[: self.n_owned], self.n_nodes)
 
     @cached_property
     def bar_order(self) -> NaturalOrder:
-        """Between counted bars and slabs in mesh numbering. Collective at first use."""
+        """Maps between counted bars and slabs in mesh numbering. Collective at first use."""
         return NaturalOrder(self.comm, self.bar_ids[self.counted], self.n_bars)
 
     @property
     def n_neighbours(self) -> int:
-        """Ranks that this one exchanges ghosts with."""
+        """Number of ranks with which this rank exchanges ghosts."""
         return self._exchange.n_neighbours
 
     def update_ghosts(self, array: np.ndarray) -> None:
@@ -95,11 +95,11 @@ class DistributedMesh:
         self._exchange.update(array)
 
     def begin_update(self, array: np.ndarray) -> None:
-        """Start :meth:`update_ghosts`; owned rows must not change, nor ghosts be read, before :meth:`end_update`."""
+        """Start :meth:`update_ghosts`; do not change owned rows or read ghosts before :meth:`end_update`."""
         self._exchange.begin(array)
 
     def end_update(self, array: np.ndarray) -> None:
-        """Finish what :meth:`begin_update` started on the same array."""
+        """Finish the update that :meth:`begin_update` started on the same array."""
         self._exchange.end(array)
 
     def close(self) -> None:
@@ -108,12 +108,12 @@ class DistributedMesh:
 
 
 def distribute(slab: MeshSlab, bar_section: np.ndarray, comm: MPI.Comm, partitioner: str = "auto") -> DistributedMesh:
-    """Spread a mesh over the ranks. Collective; no rank ever holds the whole mesh.
+    """Distribute a mesh over the ranks. Collective; no rank ever has the whole mesh.
 
     Parameters
     ----------
     slab : MeshSlab
-        This rank's contiguous part; may be given up after.
+        This rank's contiguous part, not needed afterwards.
     bar_section : (bars of the slab,) int32
         Section of each bar.
     comm : MPI.Comm
@@ -123,7 +123,7 @@ def distribute(slab: MeshSlab, bar_section: np.ndarray, comm: MPI.Comm, partitio
     Returns
     -------
     DistributedMesh
-        The same in every run of the same mesh, number of ranks and partitioner.
+        Reproducible for the same mesh, number of ranks and partitioner.
     """
     mesh = DistributedMesh()
     mesh.comm = comm
@@ -139,7 +139,7 @@ def distribute(slab: MeshSlab, bar_section: np.ndarray, comm: MPI.Comm, partitio
 
 
 def _alone(mesh: DistributedMesh, slab: MeshSlab, section: np.ndarray) -> None:
-    """One rank: reorder nodes and bars, with as few temporary arrays of the size of the mesh as can be."""
+    """Reorder nodes and bars on one rank, with few temporary arrays of the size of the mesh."""
     order = node_order(sweep_keys(slab.points))
     place = np.empty(len(order), np.int32)
     place[order] = np.arange(len(order), dtype=np.int32)
@@ -155,7 +155,7 @@ def _alone(mesh: DistributedMesh, slab: MeshSlab, section: np.ndarray) -> None:
 
 
 def _among_ranks(mesh: DistributedMesh, slab: MeshSlab, section: np.ndarray, owners: np.ndarray) -> None:
-    """Several ranks: nodes go to their owners and are numbered there, then bars go to the owners of their ends."""
+    """Distribute over several ranks: number nodes on their owners, then send bars to the owners of their ends."""
     comm = mesh.comm
     to_owner = Router(comm, owners)
     ids = to_owner.send(np.arange(slab.first_node, slab.first_node + len(slab.points)))
@@ -165,7 +165,7 @@ def _among_ranks(mesh: DistributedMesh, slab: MeshSlab, section: np.ndarray, own
     starts = np.concatenate([[0], np.cumsum(comm.allgather(n_owned))]).astype(np.int64)
     numbers = np.empty(n_owned, np.int64)
     numbers[order] = np.arange(starts[comm.rank], starts[comm.rank + 1])
-    # The directory: PETSc numbers (and with `starts` the owners) of the slab's nodes, kept where the slab is.
+    # The directory has the PETSc numbers (and with `starts` the owners) of the slab's nodes on the rank of the slab.
     directory = to_owner.reply(numbers)
 
     bars, bar_ids, section, groups = _fetch_bars(slab, section, directory, starts, comm)
@@ -183,7 +183,7 @@ def _among_ranks(mesh: DistributedMesh, slab: MeshSlab, section: np.ndarray, own
     mesh.points = np.empty((mesh.n_local, 3))
     mesh.points[:n_owned] = points[order]
     mesh.update_ghosts(mesh.points)
-    # Mesh numbers are far below 2^53, so they travel unharmed as floating-point numbers.
+    # Mesh numbers are far below 2^53, so they are exact as floating-point numbers.
     travelling = np.empty((mesh.n_local, 1))
     travelling[:n_owned, 0] = ids[order]
     mesh.update_ghosts(travelling)
@@ -200,7 +200,7 @@ def _among_ranks(mesh: DistributedMesh, slab: MeshSlab, section: np.ndarray, own
 def _fetch_bars(
     slab: MeshSlab, section: np.ndarray, directory: np.ndarray, starts: np.ndarray, comm: MPI.Comm
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-    """Ends (PETSc numbers), mesh numbers, sections and membership of groups of the bars that touch an owned node."""
+    """Return ends (PETSc numbers), mesh numbers, sections and group memberships of bars connected to owned nodes."""
     wanted, place = np.unique(slab.bars, return_inverse=True)
     asking = Router(comm, slab_of(wanted, slab.n_nodes, comm.size))
     asked = asking.send(wanted.astype(np.int64)) - slab.first_node
@@ -225,7 +225,7 @@ def _arrange_bars(
     section: np.ndarray,
     groups: dict[str, np.ndarray],
 ) -> None:
-    """Sort the local bars by section, counted ones first, then for locality; ``bar_ids`` None: they are 0, 1, ..."""
+    """Sort the local bars by section, counted bars first, then for locality; ``bar_ids`` None: 0, 1, ..."""
     borrowed = ends[:, 0] >= mesh.n_owned
     kind = None
     if borrowed.any() or (len(section) and section.min() != section.max()) or section[:1].any():
@@ -247,12 +247,12 @@ def _arrange_bars(
 
 
 def _membership(members: np.ndarray, n: int) -> np.ndarray:
-    """(n,) bool: True for the members."""
+    """Return (n,) bool: True for the members."""
     mask = np.zeros(n, bool)
     mask[members] = True
     return mask
 
 
 def _owner(numbers: np.ndarray, starts: np.ndarray) -> np.ndarray:
-    """Rank that owns each PETSc number."""
+    """Return the rank that owns each PETSc number."""
     return np.searchsorted(starts, numbers, side="right") - 1

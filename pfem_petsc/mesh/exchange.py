@@ -1,4 +1,4 @@
-"""Rows of arrays sent to the ranks that want them, and values brought from owners to ghosts."""
+"""Exchange of rows of arrays between ranks, and updates of ghosts from their owners."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from mpi4py import MPI
 
 __all__ = ["GhostExchange", "Router", "swap"]
 
-# Tags of the ghost messages start here; the number of columns is added, so that exchanges of different width may be
-# under way at the same time.
+# First tag of the ghost messages; the number of columns is added, so that exchanges of different widths can be in
+# progress at the same time.
 _TAG = 7100
 
 
 class Router:
-    """Rows sent to stated ranks, and answers brought back in the rows' own order. Collective.
+    """Sends rows to given ranks and returns replies in the order of the rows. Collective.
 
     Parameters
     ----------
     comm : MPI.Comm
     ranks : (n,) int
-        The rank that each row goes to.
+        The destination of each row.
     """
 
     def __init__(self, comm: MPI.Comm, ranks: np.ndarray) -> None:
@@ -40,16 +40,16 @@ class Router:
         self.n_received = int(self._arriving.sum())
 
     def send(self, rows: np.ndarray) -> np.ndarray:
-        """Send row i to its rank. Returns the rows that arrive, in the order of sending ranks and their rows.
+        """Send row i to its rank; return the received rows, ordered by sending rank and its rows.
 
-        One rank alone gets its own array back, not a copy; so with :meth:`reply`.
+        On a single rank the array itself is returned, not a copy; likewise by :meth:`reply`.
         """
         if self._comm.size == 1:
             return rows
         return self._exchange(rows[self._order], self._counts, self._arriving)
 
     def reply(self, rows: np.ndarray) -> np.ndarray:
-        """Send back one row for each row received, in that order. Returns them in the order of the rows sent."""
+        """Send back one row per received row, in that order; return the replies in the order of the rows sent."""
         if self._comm.size == 1:
             return rows
         returned = self._exchange(np.ascontiguousarray(rows), self._arriving, self._counts)
@@ -59,7 +59,7 @@ class Router:
 
     def _exchange(self, rows: np.ndarray, leaving: np.ndarray, arriving: np.ndarray) -> np.ndarray:
         received = np.empty((int(arriving.sum()), *rows.shape[1:]), rows.dtype)
-        # One item is one row, so that the counts stay far from the limit of MPI's 32-bit integers.
+        # One item is one row, so that the counts stay within the 32-bit integers of MPI.
         row = MPI.BYTE.Create_contiguous(rows.dtype.itemsize * int(np.prod(rows.shape[1:], dtype=np.int64))).Commit()
         try:
             self._comm.Alltoallv(
@@ -76,7 +76,7 @@ def _starts(counts: np.ndarray) -> np.ndarray:
 
 @dataclass
 class _Buffers:
-    """Persistent requests of one width, with the rows they send and receive."""
+    """Persistent requests of one width, with their buffers."""
 
     leaving: np.ndarray
     arriving: np.ndarray
@@ -84,9 +84,9 @@ class _Buffers:
 
 
 class GhostExchange:
-    """Brings owned rows to the ranks that hold them as ghosts. Collective to make, then point to point.
+    """Sends owned rows to the ranks that have them as ghosts. Construction is collective, updates are point to point.
 
-    Buffers and persistent requests are made at the first call of a width (columns a row) and kept.
+    Buffers and persistent requests are created at the first call of a width (number of columns) and kept.
 
     Parameters
     ----------
@@ -94,9 +94,9 @@ class GhostExchange:
     starts : (size + 1,) int
         First number owned by each rank, and the end.
     ghosts : (n_ghosts,) int
-        Numbers of this rank's ghosts, ascending, so that those of one owner are neighbours.
+        Numbers of this rank's ghosts, ascending, so that those of one owner are contiguous.
     tag : int
-        First of a hundred tags of its messages: exchanges that may be under way at the same time differ in it.
+        First of a hundred tags of its messages, which must differ between exchanges in progress at the same time.
     """
 
     def __init__(self, comm: MPI.Comm, starts: np.ndarray, ghosts: np.ndarray, tag: int = _TAG) -> None:
@@ -115,12 +115,12 @@ class GhostExchange:
 
     @property
     def n_neighbours(self) -> int:
-        """Ranks that send rows to this one or receive rows from it."""
+        """Number of ranks that send rows to this rank or receive rows from it."""
         return len({rank for rank, _, _ in self._leaving} | {rank for rank, _, _ in self._arriving})
 
     @property
     def rows(self) -> np.ndarray:
-        """Owned rows that other ranks hold as ghosts, in the order in which they are sent; those of several repeat."""
+        """Owned rows that are ghosts on other ranks, in the order in which they are sent, repeated for each rank."""
         return self._rows
 
     @property
@@ -129,15 +129,15 @@ class GhostExchange:
         return not self._leaving and not self._arriving
 
     def leaving(self, width: int) -> np.ndarray:
-        """Where the values (rows, width) of :attr:`rows` are to be put for :meth:`bring`."""
+        """Return the buffer (rows, width) for the values of :attr:`rows`, to be passed to :meth:`bring`."""
         if width not in self._buffers:
             self._prepare(width)
         return self._buffers[width].leaving
 
     def bring(self, leaving: np.ndarray) -> np.ndarray:
-        """Send values (rows, k) float64 of :attr:`rows` where they are ghosts; gives those of the ghosts (ghosts, k).
+        """Send values (rows, k) float64 of :attr:`rows` to their ghosts; return those of own ghosts (ghosts, k).
 
-        What it gives is overwritten by the next call of this width.
+        The result is overwritten by the next call of this width.
         """
         if self.alone:
             return np.empty((0, leaving.shape[1]))
@@ -151,26 +151,26 @@ class GhostExchange:
 
     def _begin(self, width: int) -> _Buffers:
         if width in self._busy:
-            raise RuntimeError(f"an update of ghosts with {width} columns is already under way: end it first")
+            raise RuntimeError(f"an update of ghosts with {width} columns is already in progress: end it first")
         self._busy.add(width)
         if width not in self._buffers:
             self._prepare(width)
         return self._buffers[width]
 
     def begin(self, array: np.ndarray) -> None:
-        """Start to bring the owned rows of ``array`` (n_local, k) float64 to their ghosts elsewhere."""
+        """Start sending the owned rows of ``array`` (n_local, k) float64 to their ghosts on other ranks."""
         if self.alone:
             return
         width = array.size // array.shape[0]
         if width not in self._buffers:
             self._check(array)
         buffers = self._begin(width)
-        # mode="clip": with the default, numpy fills a temporary array first. The rows are known to be in range.
+        # mode="clip" avoids the temporary array of NumPy's default; the rows are known to be in range
         np.take(array.reshape(-1, width), self._rows, axis=0, out=buffers.leaving, mode="clip")
         MPI.Prequest.Startall(buffers.requests)
 
     def end(self, array: np.ndarray) -> None:
-        """Wait for what :meth:`begin` started, and fill the ghost rows of ``array``."""
+        """Complete the update that :meth:`begin` started, and fill the ghost rows of ``array``."""
         if self.alone:
             return
         width = array.size // array.shape[0]
@@ -180,12 +180,12 @@ class GhostExchange:
         array.reshape(-1, width)[self._n_owned :] = buffers.arriving
 
     def update(self, array: np.ndarray) -> None:
-        """Bring the owned rows of ``array`` (n_local, k) float64 to their ghosts elsewhere."""
+        """Send the owned rows of ``array`` (n_local, k) float64 to their ghosts on other ranks."""
         self.begin(array)
         self.end(array)
 
     def close(self) -> None:
-        """Free the requests; no update may be under way."""
+        """Free the requests; no update may be in progress."""
         for buffers in self._buffers.values():
             for request in buffers.requests:
                 request.Free()
@@ -208,9 +208,9 @@ class GhostExchange:
 
 
 def swap(comm: MPI.Comm, ranks: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """Rows (n, k) float64 that other ranks have for those sent to them; only the ranks named here meet.
+    """Exchange rows (n, k) float64 with other ranks; only the ranks named here communicate.
 
-    Row i goes to rank ``ranks[i]``, which sends as many rows to this rank, and in the same order.
+    Row i goes to rank ``ranks[i]``, which sends the same number of rows to this rank, in the same order.
     """
     order = np.argsort(ranks, kind="stable")
     there, counts = np.unique(ranks, return_counts=True)
@@ -226,6 +226,6 @@ def swap(comm: MPI.Comm, ranks: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 
 def _neighbours(counts: np.ndarray) -> list[tuple[int, int, int]]:
-    """(rank, first row, end of rows) of every rank with a count, for rows in the order of ranks."""
+    """Return (rank, first row, end of rows) of every rank with a nonzero count, for rows sorted by rank."""
     ends = np.cumsum(counts)
     return [(int(rank), int(ends[rank] - counts[rank]), int(ends[rank])) for rank in np.flatnonzero(counts)]

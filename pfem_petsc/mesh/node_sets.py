@@ -18,12 +18,12 @@ __all__ = ["group_hint", "resolve_node_sets"]
 
 
 def resolve_node_sets(case: Case, mesh: DistributedMesh) -> dict[str, np.ndarray]:
-    """Owned local indices (int64, ascending) of each node set. Collective.
+    """Return the owned local indices (int64, ascending) of each node set. Collective.
 
     Raises
     ------
     InputError
-        On all ranks: a group that the mesh lacks, a node number out of range, a set without nodes.
+        On all ranks, for a group that the mesh does not have, a node number out of range, or a set without nodes.
     """
     sets = {}
     for name, node_set in case.node_set.items():

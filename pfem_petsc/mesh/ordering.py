@@ -1,8 +1,8 @@
 """Orders of nodes and bars in which neighbours in space are neighbours in memory.
 
-Ranks take parts of a Hilbert curve, which are compact; within a rank nodes are swept layer by layer. Measured with a
-bar force kernel on cubic lattices of 10^6, 10^7 and 10^8 bars: the sweep takes 3.5, 3.8 and 3.6 ns a bar, the Hilbert
-curve 4.6, 5.5 and more, blocks and columns of cells lie between, a random order takes 26 at 10^7.
+Ranks own parts of a Hilbert curve, which are compact; within a rank nodes are ordered layer by layer (sweep). Measured
+with a bar force kernel on cubic lattices of 10^6, 10^7 and 10^8 bars: the sweep takes 3.5, 3.8 and 3.6 ns per bar, the
+Hilbert curve 4.6, 5.5 and more, blocks and columns of cells are in between, a random order takes 26 at 10^7.
 """
 
 from __future__ import annotations
@@ -14,12 +14,12 @@ __all__ = ["BITS", "bar_order", "hilbert_keys", "node_order", "sweep_keys"]
 BITS = 21
 """Bits of each coordinate in a key: three times this fits in 64 bits."""
 
-# Points are treated in pieces of this many, so that the temporary arrays stay in the cache.
+# Number of points processed at a time, so that temporary arrays stay in the cache.
 _PIECE = 1 << 15
 
 
 def hilbert_keys(points: np.ndarray, low: np.ndarray, extent: float) -> np.ndarray:
-    """Places of points along the Hilbert curve through the cube that starts at ``low``.
+    """Return the positions of points along the Hilbert curve through the cube that starts at ``low``.
 
     Parameters
     ----------
@@ -38,7 +38,7 @@ def hilbert_keys(points: np.ndarray, low: np.ndarray, extent: float) -> np.ndarr
     J. Skilling, "Programming the Hilbert curve", AIP Conf. Proc. 707 (2004), 381-387.
     """
     keys = np.empty(len(points), np.uint64)
-    # The last cell is closed at its upper end; a mesh of no extent (a single node) is all in one cell.
+    # The last cell is closed at its upper end; a mesh of zero extent (a single node) is in one cell.
     scale = ((1 << BITS) - 0.5) / extent if extent > 0.0 else 0.0
     for first in range(0, len(points), _PIECE):
         piece = slice(first, first + _PIECE)
@@ -48,7 +48,7 @@ def hilbert_keys(points: np.ndarray, low: np.ndarray, extent: float) -> np.ndarr
 
 
 def _hilbert(x: list[np.ndarray]) -> np.ndarray:
-    """Skilling's transform of cell coordinates (three arrays of uint32, changed in place) to places."""
+    """Apply Skilling's transform of cell coordinates (three arrays of uint32, changed in place) to positions."""
     for bit in range(BITS - 1, 0, -1):
         q = np.uint32(1 << bit)
         lower = np.uint32((1 << bit) - 1)
@@ -70,7 +70,7 @@ def _hilbert(x: list[np.ndarray]) -> np.ndarray:
 
 
 def _spread(x: np.ndarray) -> np.ndarray:
-    """Put two zero bits between the bits of 21-bit numbers."""
+    """Insert two zero bits between the bits of 21-bit numbers."""
     x = x.astype(np.uint64)
     for shift, mask in (
         (32, 0x001F00000000FFFF),
@@ -84,10 +84,10 @@ def _spread(x: np.ndarray) -> np.ndarray:
 
 
 def sweep_keys(points: np.ndarray) -> np.ndarray:
-    """Places of points in a sweep through space: layer by layer across the longest extent, row by row in a layer.
+    """Return the positions of points in a sweep: layer by layer along the longest extent, row by row in a layer.
 
-    Layers and rows are about one spacing of nodes wide, so that two layers are all that the bars of a node touch. A
-    regular lattice is swept exactly in its own order of layers.
+    Layers and rows are about one node spacing wide, so that the bars of a node extend over two layers only. A regular
+    lattice is swept exactly in its own order of layers.
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ def sweep_keys(points: np.ndarray) -> np.ndarray:
 
 
 def _spacing(extents: np.ndarray, n: int) -> float:
-    """The spacing [m] at which a grid of these extents has ``n`` nodes: the product of extent / spacing + 1 is n."""
+    """Return the spacing [m] of a grid of these extents with ``n`` nodes: the product of extent / spacing + 1 is n."""
     high = float(extents.max())
     if n == 1 or high == 0.0:
         return 1.0
@@ -127,21 +127,21 @@ def _spacing(extents: np.ndarray, n: int) -> float:
 
 
 def node_order(keys: np.ndarray, ids: np.ndarray | None = None) -> np.ndarray:
-    """The order (indices) of nodes by key; equal keys by mesh number, which ``None`` says to be ascending already."""
+    """Return the order (indices) of nodes by key, then by mesh number; ``ids`` None: numbers are ascending already."""
     if ids is None:
         return np.argsort(keys, kind="stable")
     return np.lexsort((ids, keys))
 
 
 def bar_order(bars: np.ndarray, group: np.ndarray | None, n_local: int) -> np.ndarray:
-    """The order (indices) of bars by group, then lower local end, then higher local end.
+    """Return the order (indices) of bars by group, then lower local end, then higher local end.
 
     Parameters
     ----------
     bars : (b, 2) int32
         Local ends.
-    group : (b,) small int, or None where all are in one
-        What comes before locality: section, counted or not.
+    group : (b,) small int, or None for a single group
+        Sorted before locality: section, counted or not.
     n_local : int
         Number of local nodes.
     """

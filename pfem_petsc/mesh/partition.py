@@ -1,4 +1,4 @@
-"""Which rank owns which node."""
+"""Partition of the nodes over ranks."""
 
 from __future__ import annotations
 
@@ -14,28 +14,28 @@ __all__ = ["PARTITIONERS", "bounding_cube", "partition"]
 
 PARTITIONERS = ("auto", "ptscotch", "coordinates")
 
-# Candidate places tried at once for each border between two ranks.
+# Candidate positions tested at once for each border between two ranks.
 _CANDIDATES = 256
 
 
 def partition(slab: MeshSlab, comm: MPI.Comm, partitioner: str = "auto") -> tuple[np.ndarray, str]:
-    """Owner of every node of this rank's slab. Collective.
+    """Compute the owner of every node of this rank's slab. Collective.
 
     Parameters
     ----------
     slab : MeshSlab
     comm : MPI.Comm
     partitioner : str
-        ``"ptscotch"`` cuts few bars (PETSc must have been built with it); ``"coordinates"`` cuts a space-filling
-        curve into equal parts, whatever the slabs; ``"auto"`` takes the second for structured meshes and where
-        PETSc lacks the first. Both give the same in every run; ``"ptscotch"`` draws on random numbers that go on from
+        ``"ptscotch"`` cuts few bars (PETSc must have been built with it); ``"coordinates"`` divides a space-filling
+        curve into equal parts, independent of the slabs; ``"auto"`` uses the second for structured meshes and if PETSc
+        lacks PT-Scotch. Both are reproducible from run to run; ``"ptscotch"`` uses random numbers that continue from
         call to call, so a second call in one process may differ.
 
     Returns
     -------
     owners : (nodes of the slab,) int32
     used : str
-        What was used, for the log.
+        The partitioner used, for the log.
     """
     if partitioner not in PARTITIONERS:
         raise InputError(f"partitioner: unknown value {partitioner!r}; known: {', '.join(PARTITIONERS)}")
@@ -51,7 +51,7 @@ def partition(slab: MeshSlab, comm: MPI.Comm, partitioner: str = "auto") -> tupl
 
 
 def bounding_cube(points: np.ndarray, comm: MPI.Comm) -> tuple[np.ndarray, float]:
-    """Lowest corner (3,) [m] and largest extent [m] of the points of all ranks. Collective."""
+    """Return the lowest corner (3,) [m] and largest extent [m] of the points of all ranks. Collective."""
     box = np.full((2, 3), np.inf)
     if len(points):
         box[0], box[1] = points.min(axis=0), -points.max(axis=0)
@@ -60,15 +60,15 @@ def bounding_cube(points: np.ndarray, comm: MPI.Comm) -> tuple[np.ndarray, float
 
 
 def _by_coordinates(slab: MeshSlab, comm: MPI.Comm) -> np.ndarray:
-    """Cut the Hilbert curve through the nodes where ranks have equal numbers of nodes.
+    """Divide the Hilbert curve through the nodes such that ranks have equal numbers of nodes.
 
-    The borders are found by counting keys below candidate places, ever finer around each border, so the result
-    depends on the nodes and the number of ranks alone.
+    The borders are found by counting keys below candidate positions, refined around each border, so the result depends
+    on the nodes and the number of ranks only.
     """
     keys = hilbert_keys(slab.points, *bounding_cube(slab.points, comm))
     in_order = np.sort(keys)
     wanted = (slab.n_nodes * np.arange(1, comm.size)) // comm.size
-    # Invariant: fewer keys than wanted lie below `low`, at least as many below `high`.
+    # Invariant: fewer keys than required lie below `low`, at least as many below `high`.
     low = np.zeros(comm.size - 1, np.uint64)
     width = 1 << (3 * BITS)
     while width > 1:
@@ -83,7 +83,7 @@ def _by_coordinates(slab: MeshSlab, comm: MPI.Comm) -> np.ndarray:
 
 
 def _by_graph(slab: MeshSlab, comm: MPI.Comm) -> np.ndarray | None:
-    """Partition the graph of nodes and bars by PT-Scotch; None where PETSc lacks it (the same on all ranks)."""
+    """Partition the graph of nodes and bars by PT-Scotch; None if PETSc lacks it (equal on all ranks)."""
     from petsc4py import PETSc
 
     tool = PETSc.MatPartitioning().create(comm)
@@ -109,7 +109,7 @@ def _by_graph(slab: MeshSlab, comm: MPI.Comm) -> np.ndarray | None:
 
 
 def _adjacency(slab: MeshSlab, comm: MPI.Comm) -> tuple[np.ndarray, np.ndarray]:
-    """Neighbours of every node of the slab, ascending, each once: row starts and columns."""
+    """Return the neighbours of every node of the slab, ascending and unique, as row starts and columns."""
     from petsc4py import PETSc
 
     ends = np.concatenate([slab.bars, slab.bars[:, ::-1]]).astype(np.int64)

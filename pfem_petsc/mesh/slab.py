@@ -1,4 +1,4 @@
-"""The part of a mesh that a rank holds before the mesh is distributed: contiguous ranges of its nodes and bars."""
+"""The part of a mesh on a rank before its distribution: contiguous ranges of nodes and bars."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ __all__ = ["MeshSlab", "check_length", "check_size", "index_type", "slab_of", "s
 
 @dataclass
 class MeshSlab:
-    """One rank's contiguous ranges of the nodes and bars of a mesh, in the mesh's own numbering (from 0).
+    """One rank's contiguous ranges of the nodes and bars of a mesh, in mesh numbering (from 0).
 
-    Ranges are those of :func:`slab_range`. ``structured`` is True for a mesh made by rule, which is sound by
-    construction: the checks and the graph partitioner are not worth their time there.
+    Ranges are those of :func:`slab_range`. ``structured`` is True for a generated mesh, which is valid by construction
+    and needs neither checks nor the graph partitioner.
     """
 
     n_nodes: int
@@ -34,21 +34,21 @@ class MeshSlab:
     bar_groups: dict[str, np.ndarray] = field(default_factory=dict)
     """Members (int64 mesh numbers) within this rank's bars; the same names in the same order on all ranks."""
     source: str = "mesh"
-    """For messages: the file or the generator."""
+    """The file or the generator, for messages."""
     structured: bool = False
     warnings: list[str] = field(default_factory=list)
-    """What the reader left out or the checks found odd, for the log."""
+    """Warnings of the reader and the checks, for the log."""
 
 
 def slab_range(n: int, rank: int, size: int) -> tuple[int, int]:
-    """First and one past the last of ``n`` things that a rank holds when they are dealt out evenly in order."""
+    """Return the range (first, end) of a rank if ``n`` items are distributed evenly and in order."""
     share, rest = divmod(n, size)
     first = rank * share + min(rank, rest)
     return first, first + share + (rank < rest)
 
 
 def slab_of(numbers: np.ndarray, n: int, size: int) -> np.ndarray:
-    """The rank (int64) whose :func:`slab_range` of ``n`` holds each number."""
+    """Return the rank (int64) whose :func:`slab_range` of ``n`` contains each number."""
     share, rest = divmod(n, size)
     split = rest * (share + 1)
     numbers = np.asarray(numbers, dtype=np.int64)
@@ -56,7 +56,7 @@ def slab_of(numbers: np.ndarray, n: int, size: int) -> np.ndarray:
 
 
 def index_type(n: int) -> type[np.signedinteger]:
-    """The smaller of int32 and int64 that numbers ``n`` things."""
+    """Return the smaller of int32 and int64 that can number ``n`` items."""
     return np.int32 if n <= np.iinfo(np.int32).max else np.int64
 
 
@@ -66,7 +66,7 @@ def check_size(n_nodes: int, where: str) -> None:
     Raises
     ------
     InputError
-        When three unknowns a node do not fit in PETSc's integers.
+        If three unknowns per node do not fit in PETSc's integers.
     """
     from petsc4py import PETSc
 
@@ -79,12 +79,12 @@ def check_size(n_nodes: int, where: str) -> None:
 
 
 def check_length(value: float, where: str) -> None:
-    """Refuse lengths [m] whose square is not a floating-point number: bars of them have no length.
+    """Refuse lengths [m] whose square overflows or underflows.
 
     Raises
     ------
     InputError
-        Outside 1e-150 to 1e150.
+        If the length is outside 1e-150 to 1e150.
     """
     if not 1e-150 < value < 1e150:
         raise InputError(

@@ -7,18 +7,18 @@ from typing import TextIO
 
 __all__ = ["ProgressBar", "is_terminal"]
 
-# Open MPI gives rank 0 a pseudo-terminal, so that isatty() alone would draw a bar into mpirun's line-wise forwarding.
+# Open MPI gives rank 0 a pseudo-terminal, so isatty() alone would draw a bar into the line-wise forwarding of mpirun.
 _LAUNCHERS = ("OMPI_COMM_WORLD_SIZE", "PMI_RANK", "PMIX_RANK", "SLURM_PROCID")
 
 
 def is_terminal(stream: TextIO) -> bool:
-    """Whether a bar can be drawn into a stream: not into files, pipes, or the output of a launcher."""
+    """Return whether a bar can be drawn into a stream: not into files, pipes, or the output of a launcher."""
     launched = any(name in os.environ for name in _LAUNCHERS)
     return stream.isatty() and not launched and os.environ.get("TERM", "dumb") != "dumb"
 
 
 class ProgressBar:
-    """A bar with a line of text, redrawn only when asked. All methods raise OSError when the terminal has gone.
+    """A bar with a line of text, redrawn only on request. All methods raise OSError if the terminal is closed.
 
     Parameters
     ----------
@@ -28,7 +28,7 @@ class ProgressBar:
     """
 
     def __init__(self, title: str, stream: TextIO) -> None:
-        # only a terminal pays for loading rich
+        # loaded here, so that only a terminal pays for loading rich
         from rich.console import Console
         from rich.progress import BarColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
         from rich.progress import Progress as Bar
@@ -41,13 +41,13 @@ class ProgressBar:
             TextColumn("ETA"),
             TimeRemainingColumn(),
         )
-        # no refresh thread: it would take time from the solver whenever it liked
+        # no refresh thread, which would interrupt the solver at any time
         self._bar = Bar(*columns, console=Console(file=stream), auto_refresh=False)
         self._task = self._bar.add_task(title, total=1.0, state="")
         self._bar.start()
 
     def draw(self, done: float, state: str) -> None:
-        """Redraw the bar with the fraction that is done and a text of the state, which fits into 80 columns."""
+        """Redraw the bar with the completed fraction and a text of the state that fits into 80 columns."""
         self._bar.update(self._task, completed=done, state=state)
         self._bar.refresh()
 

@@ -1,4 +1,4 @@
-"""Reading checkpoints, bit for bit and on any number of ranks; :mod:`.checkpoint_writer` writes them."""
+"""Reads checkpoints, bit for bit and on any number of ranks; :mod:`.checkpoint_writer` writes them."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ __all__ = [
 
 NAME, PREVIOUS = "checkpoint.h5", "checkpoint-previous.h5"
 
-_ATTEMPTS = 20  # to catch a file between two replacements
+_ATTEMPTS = 20  # to open a file between two replacements
 
 
 @dataclass(frozen=True)
@@ -42,9 +42,9 @@ class Checkpoint:
     Attributes
     ----------
     path : Path
-    arrays : dict of name to this rank's owned rows (n_owned, ...), in the types they were written with
+    arrays : dict of name to this rank's owned rows (n_owned, ...), in the types in which they were written
     scalars : dict
-        As written; float64 to the last bit.
+        As written; float64 exact to the last bit.
     attributes : dict
     """
 
@@ -55,10 +55,10 @@ class Checkpoint:
 
 
 class OpenCheckpoint:
-    """A checkpoint opened for reading: one file on all ranks, which does not change between header and last array.
+    """A checkpoint opened for reading: the same file on all ranks, unchanged between header and last array.
 
-    Every rank opens the file once and reads it through that descriptor, even if the run that writes checkpoints goes on
-    and replaces it. Construction is collective.
+    Every rank opens the file once and reads it through that descriptor, even if a run replaces the checkpoint
+    meanwhile. Construction is collective.
 
     Parameters
     ----------
@@ -68,12 +68,12 @@ class OpenCheckpoint:
     Attributes
     ----------
     scalars, attributes : dicts, as they were written
-    digest : of everything but the values of the arrays, whose checksums are part of it
+    digest : of everything except the values of the arrays, whose checksums are part of it
 
     Raises
     ------
     InputError
-        On all ranks: missing, damaged, of another version.
+        On all ranks, if the file is missing, damaged, or of another version.
     """
 
     def __init__(self, path: Path | str, comm: MPI.Comm) -> None:
@@ -86,12 +86,12 @@ class OpenCheckpoint:
             digests = comm.allgather(mine)
             if len(set(digests)) == 1:
                 break
-            # it was replaced while the ranks opened it
+            # the file was replaced while the ranks opened it
             self.close()
             time.sleep(0.05 * (1 + attempt))
         else:
             raise InputError(
-                f"{self.path}: is replaced all the time, or not the same file on all machines: wait until the run that "
+                f"{self.path}: is replaced repeatedly, or not the same file on all machines: wait until the run that "
                 "writes it has ended"
             )
         self.digest = digests[0]
@@ -116,18 +116,18 @@ class OpenCheckpoint:
 
         Parameters
         ----------
-        orders : mapping of array name to how this run's ranks own its rows
-            The arrays wanted; others in the file are left alone.
+        orders : mapping of array name to the distribution of its rows over this run's ranks
+            Selects the arrays; others in the file are ignored.
 
         Raises
         ------
         InputError
-            On all ranks: damaged, without one of the arrays, or with another number of rows.
+            On all ranks, if the file is damaged, lacks one of the arrays, or has another number of rows.
         """
         path = self.path
         slabs: dict[str, np.ndarray] = {}
         expected: dict[str, int] = {}
-        # Reading needs no agreement on each transfer: every rank reads its slab for itself.
+        # Reading needs no collective transfers: every rank reads its slab independently.
         with agreed(self.comm), _sound(path), h5py.File(self._raw, "r") as file:
             for name, order in orders.items():
                 if name not in file["arrays"]:
@@ -160,14 +160,14 @@ def read_checkpoint(path: Path | str, comm: MPI.Comm, orders: Mapping[str, Natur
 
 
 def read_checkpoint_header(path: Path | str, comm: MPI.Comm) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Scalars and attributes of a checkpoint, on all ranks; raises as :class:`OpenCheckpoint`. Collective."""
+    """Return scalars and attributes of a checkpoint on all ranks; raises as :class:`OpenCheckpoint`. Collective."""
     file = OpenCheckpoint(path, comm)
     file.close()
     return file.scalars, file.attributes
 
 
 def newest_checkpoint(folder: Path | str) -> Path | None:
-    """The newest checkpoint of an output folder, or None. On one rank."""
+    """Return the newest checkpoint of an output folder, or None. Not collective."""
     for name in (NAME, PREVIOUS):
         if (Path(folder) / name).is_file():
             return Path(folder) / name
@@ -197,7 +197,7 @@ def _open(path: Path) -> BinaryIO:
         try:
             return open(path, "rb")  # noqa: SIM115 - it stays open
         except FileNotFoundError:
-            # between the two renamings of a run that writes the next one
+            # a run may be between the two renamings of its next checkpoint
             if not path.with_name(PREVIOUS).exists() or path.name != NAME:
                 break
             time.sleep(0.02)

@@ -1,4 +1,4 @@
-"""Writing checkpoints, in the mesh's own numbering: a complete one exists at any moment."""
+"""Writes checkpoints in mesh numbering; at any time there is a complete one."""
 
 from __future__ import annotations
 
@@ -30,29 +30,29 @@ def write_checkpoint(
     scalars: Mapping[str, Any],
     attributes: Mapping[str, Any],
 ) -> None:
-    """Write a checkpoint so that at any moment there is a complete one.
+    """Write a checkpoint such that at any time there is a complete one.
 
-    It is written under a temporary name, flushed to the disk, and renamed; the one before remains as
+    The file is written under a temporary name, flushed to disk, and renamed; the previous checkpoint is kept as
     ``checkpoint-previous.h5``. Collective.
 
     Parameters
     ----------
     path : Path or str
-        The file, commonly ``checkpoint.h5``, in a folder that exists.
+        The file, usually ``checkpoint.h5``, in an existing folder.
     comm : MPI.Comm
     arrays : mapping of name to (order, owned rows (n_owned, ...))
         Numbers of 1, 2, 4 or 8 bytes.
     scalars, attributes : mappings
-        What JSON can hold; the attributes describe the run (case, versions), the scalars are its state.
+        Data that JSON can represent; the attributes describe the run (case, versions), the scalars are its state.
 
     Raises
     ------
     SimulationFailure
-        On all ranks: disk full, folder gone. The checkpoints before stay.
+        On all ranks, for example if the disk is full or the folder is missing. Earlier checkpoints are kept.
     """
     require_parallel_hdf5(comm)
     path = Path(path)
-    # by name: the memory of contact may be in another order on another rank
+    # sorted by name, because the memory of contact may be ordered differently on each rank
     slabs = {name: arrays[name][0].to_slab(np.asarray(arrays[name][1])) for name in sorted(arrays)}
     shapes = {name: ((arrays[name][0].n_global, *slab.shape[1:]), slab.dtype) for name, slab in slabs.items()}
     n_bytes = sum(dtype.itemsize * int(np.prod(shape, dtype=np.int64)) for shape, dtype in shapes.values())

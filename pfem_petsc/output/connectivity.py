@@ -18,17 +18,17 @@ if TYPE_CHECKING:
 
 __all__ = ["write_connectivity"]
 
-_PIECE = 2**20  # bars whose connectivity is written at once on one rank
+_PIECE = 2**20  # number of bars whose connectivity is written at once on one rank
 
 
 def write_connectivity(file: h5py.File, comm: MPI.Comm, path: Path, mesh: DistributedMesh) -> None:
     """Write the ends of all bars in mesh numbering, their offsets, and the digest of the mesh. Collective.
 
-    Bars that are evaluated on two ranks are written by the one that counts them.
+    Bars that are evaluated on two ranks are written by the rank that counts them.
     """
     vtk, order = file["VTKHDF"], mesh.bar_order
     first, count, together = order.first, order.count, comm.size > 1
-    # one rank holds all bars: pieces keep the working arrays small
+    # one rank may have all bars: pieces keep the working arrays small
     piece = count if together else min(count, _PIECE)
     total = 0
     for start in range(0, max(count, 1), max(piece, 1)):
@@ -40,7 +40,7 @@ def write_connectivity(file: h5py.File, comm: MPI.Comm, path: Path, mesh: Distri
         total += word_sum(ends.ravel(), 2 * (first + start))
         with writing(comm, path):
             write_rows(vtk["Connectivity"], 2 * (first + start), ends.ravel(), collective=together)
-        # one offset more than bars: the last rank's
+        # there is one more offset than bars, which the last rank writes
         end = first + stop + (stop == count and comm.rank == comm.size - 1)
         with writing(comm, path):
             write_rows(vtk["Offsets"], first + start, 2 * np.arange(first + start, end), collective=together)

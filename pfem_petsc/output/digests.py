@@ -1,4 +1,4 @@
-"""Checksums of what a result file holds: one a snapshot and field, one a history row, one of the mesh.
+"""Checksums of the content of a result file: one per snapshot and field, one per history row, one of the mesh.
 
 They stand in the group ``checks`` of the file itself: ``snapshots`` (snapshots, 1 + fields), whose first column is of
 step and time, the others of points and fields in the order of their names; ``history`` (rows,); ``mesh`` (1,); and
@@ -33,9 +33,9 @@ _ODD = 0x9E3779B97F4A7C15
 
 
 def snapshot_digests(comm: MPI.Comm, slabs: Mapping[str, tuple[np.ndarray, int]]) -> np.ndarray:
-    """Checksums (fields,) uint64 of arrays in slabs over the ranks, in the order of their names. Collective.
+    """Return checksums (fields,) uint64 of arrays distributed in slabs over the ranks, sorted by name. Collective.
 
-    ``slabs``: name to this rank's rows, in the type in which they are stored, and the row of the whole they begin at.
+    ``slabs``: name to this rank's rows, in the type in which they are stored, and the global index of the first row.
     """
     mine = [_seeded(name, word_sum(slab, first)) for name, (slab, first) in sorted(slabs.items())]
     total = np.array(mine, dtype=np.uint64)
@@ -44,7 +44,7 @@ def snapshot_digests(comm: MPI.Comm, slabs: Mapping[str, tuple[np.ndarray, int]]
 
 
 def mark_digest(n: int, step: int, time: float) -> int:
-    """Checksum of the step and time [s] of snapshot n."""
+    """Return the checksum of the step and time [s] of snapshot n."""
     return _number(np.array([n, step], dtype=np.int64).tobytes() + np.float64(time).tobytes())
 
 
@@ -59,16 +59,16 @@ def stored_digest(name: str, values: np.ndarray) -> int:
 
 
 def mesh_digest(comm: MPI.Comm, total: int) -> np.ndarray:
-    """Checksum (1,) of the connectivity from each rank's :func:`~.integrity.word_sum` of its part. Collective."""
+    """Return the checksum (1,) of the connectivity from :func:`~.integrity.word_sum` of each rank. Collective."""
     whole = np.array([total], dtype=np.uint64)
     comm.Allreduce(MPI.IN_PLACE, whole, op=MPI.SUM)
     return whole
 
 
 def row_digests(columns: Mapping[str, np.ndarray], first: int) -> np.ndarray:
-    """Checksums (rows,) uint64 of history rows; ``columns``: name to values (rows, ...) in the type they are stored in.
+    """Return checksums (rows,) uint64 of history rows.
 
-    ``first``: number of the first row.
+    ``columns``: name to values (rows, ...) in the type in which they are stored; ``first``: index of the first row.
     """
     n = len(next(iter(columns.values())))
     numbers = np.arange(first + 1, first + n + 1, dtype=np.uint64)
@@ -82,11 +82,11 @@ def row_digests(columns: Mapping[str, np.ndarray], first: int) -> np.ndarray:
 
 
 def damages(file: h5py.File, deep: bool = True) -> Iterator[str]:
-    """What is wrong with a result file, a line each; none for a sound one.
+    """Yield one line for each defect of a result file.
 
-    ``deep``: read the values of all snapshots, else those of mesh, marks and history only.
+    ``deep``: whether to read the values of all snapshots; else only those of mesh, steps, times and history.
     """
-    # the layout needs what writes rows, which needs this module
+    # imported here: the layout imports the writer of rows, which imports this module
     from .layout import PER_STEP, complete_rows, complete_snapshots, field_datasets
     from .modes import mode_damages
 
@@ -143,7 +143,7 @@ def _history_damages(history: h5py.Group, digests: h5py.Dataset, n_rows: int) ->
 
 
 def _stored_sum(dataset: h5py.Dataset, first: int, count: int) -> int:
-    """:func:`~.integrity.word_sum` of stored rows, read in pieces, as if the first were row 0 of an array."""
+    """Return :func:`~.integrity.word_sum` of stored rows, read in pieces and numbered from 0."""
     per_row = max(1, int(np.prod(dataset.shape[1:], dtype=np.int64)))
     piece, total = max(1, BLOCK // per_row), 0
     for start in range(0, count, piece):
@@ -153,7 +153,7 @@ def _stored_sum(dataset: h5py.Dataset, first: int, count: int) -> int:
 
 
 def _seeded(name: str, total: int) -> int:
-    """A sum that tells the arrays apart that it may be of; of all zero it stays zero, for ranks that own nothing."""
+    """Return a sum that depends on the name of its array; zero stays zero, for ranks without rows."""
     return (total * (2 * _number(name.encode()) + 1)) & (2**64 - 1)
 
 

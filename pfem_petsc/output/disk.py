@@ -1,4 +1,4 @@
-"""Free space for the next write, and files flushed to the disk."""
+"""Checks of free disk space before a write, and flushing of files to disk."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ __all__ = ["fsync_all", "require_room"]
 
 
 def require_room(comm: MPI.Comm, path: Path, n_bytes: int, target: Path | None = None) -> None:
-    """Stop before a write that does not fit, while the file is intact: a disk that fills up within HDF5 may damage it.
+    """Check that the next write fits on the disk; a disk that fills up within HDF5 may damage the file.
 
     Rank 0 decides. Collective.
 
     Raises
     ------
     SimulationFailure
-        On all ranks, when the file (or folder ``target``) is gone or fewer than ``n_bytes`` + 1 MiB are free.
+        On all ranks, if the file (or folder ``target``) is missing or fewer than ``n_bytes`` + 1 MiB are free.
     """
 
     def look() -> None:
@@ -32,7 +32,7 @@ def require_room(comm: MPI.Comm, path: Path, n_bytes: int, target: Path | None =
         except OSError as error:
             raise SimulationFailure(
                 f"{path}: gone or unreachable during the run ({os.strerror(error.errno)}); "
-                "do not move or remove the output folder of a run that is going on"
+                "do not move or remove the output folder of a running simulation"
             ) from error
         needed = n_bytes + (1 << 20)
         if free < needed:
@@ -46,7 +46,7 @@ def require_room(comm: MPI.Comm, path: Path, n_bytes: int, target: Path | None =
 
 
 def fsync_all(path: Path) -> None:
-    """Flush a file, or the entries of a folder, to the disk."""
+    """Flush a file, or the entries of a folder, to disk."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)

@@ -1,4 +1,4 @@
-"""HDF5 for all writers: datasets that grow, rows written by all ranks together, errors turned into messages."""
+"""HDF5 utilities for all writers: growing datasets, rows written by all ranks together, error messages."""
 
 from __future__ import annotations
 
@@ -34,24 +34,24 @@ __all__ = [
     "writing",
 ]
 
-# h5py turns errors of the HDF5 library into these, depending on the call: what a damaged file raises when read.
+# Exceptions that h5py raises for errors of the HDF5 library, depending on the call, such as reading a damaged file.
 HDF5_ERRORS = (OSError, RuntimeError, ValueError, KeyError)
 
 CHUNK_BYTES = 1 << 20
-# Formats of a result file, lowest and highest. With 1.8's superblock and objects as of 1.10 all that HDF5 writes about
-# the data has its checksum, and chunks along one growing direction are found through an extensible array, whose
-# entries stay where they are: the B-tree of the earlier formats is divided from time to time, and a kill between the
-# writes of a division lost the file. The superblock of 1.10 would refuse a file whose writer was killed.
+# Lowest and highest format of a result file. With the superblock of 1.8 and objects of 1.10 all HDF5 metadata have
+# checksums, and chunks along one growing dimension are indexed by an extensible array, whose entries do not move. The
+# B-tree of earlier formats is split from time to time, and a kill between the writes of a split lost the file. With the
+# superblock of 1.10 HDF5 would refuse a file whose writer was killed.
 SUPERBLOCK, OBJECTS = ("v108", "v108"), ("v110", "v110")
-# Bytes of chunks that HDF5 keeps in memory for each dataset: its own 1 MiB, times all columns and fields, would fill up
-# over a long run, and rows are never written a second time.
+# Bytes of the chunk cache per dataset: the default of 1 MiB, times all columns and fields, would fill up in a long run,
+# and rows are never written twice.
 CHUNK_CACHE = 1 << 16
-# Seconds in which the other ranks must report on an operation that failed on this one.
+# Seconds in which the other ranks must report after an operation failed on this one.
 GRACE = 5.0
 
 
 def require_parallel_hdf5(comm: MPI.Comm) -> None:
-    """Refuse several ranks with an h5py that cannot write one file from all of them.
+    """Refuse several ranks if h5py cannot write one file from all of them.
 
     Raises
     ------
@@ -75,17 +75,16 @@ def create_new(
     userblock_size: int = 0,
     checked: bool = False,
 ) -> Path:
-    """Make an HDF5 file with its whole structure on rank 0 and return its temporary name.
+    """Create an HDF5 file with its whole structure on rank 0 and return its temporary name.
 
     ``build(file, *arguments)`` fills it; the first ``userblock_size`` bytes belong to the caller; a ``checked`` file
-    has the formats in which HDF5 keeps checksums of everything but the values. Serial creation
-    makes the structure the same for any number of ranks, and an unwritable folder the same error on all of them.
-    Collective.
+    has the formats in which HDF5 stores checksums of everything except the values. With serial creation the structure
+    is the same for any number of ranks, and an unwritable folder is the same error on all of them. Collective.
 
     Raises
     ------
     InputError
-        On all ranks, when the folder cannot be written, or is not the same folder on all of them.
+        On all ranks, if the folder cannot be written, or is not the same folder on all of them.
     """
 
     temporary = path.with_name(path.name + ".new")
@@ -107,7 +106,7 @@ def create_new(
 
     on_root(comm, create)
     with agreed(comm):
-        # A network file system may take a moment to show a new file on other machines.
+        # A network file system may show a new file on other machines with a delay.
         deadline = time.monotonic() + 5.0
         while not temporary.exists():
             if time.monotonic() > deadline:
@@ -120,24 +119,24 @@ def create_new(
 
 
 def create_checked(path: Path, build: Callable[..., None], *arguments: Any) -> None:
-    """Make a file in which HDF5 keeps checksums of everything but the values; ``build(file, *arguments)`` fills it."""
+    """Create a file with HDF5 checksums of everything except the values; ``build(file, *arguments)`` fills it."""
     h5py.File(path, "w", locking=False, libver=SUPERBLOCK).close()
     with h5py.File(path, "r+", locking=False, libver=OBJECTS) as file:
         build(file, *arguments)
 
 
 def open_shared(path: Path, comm: MPI.Comm) -> h5py.File:
-    """Open an existing file for writing on all ranks; on one rank without a lock, so that others can read it."""
+    """Open an existing file for writing on all ranks; on one rank without a lock, so that it can be read meanwhile."""
     if comm.size == 1:
         return h5py.File(path, "r+", locking=False, rdcc_nbytes=CHUNK_CACHE, libver=OBJECTS)
     return h5py.File(path, "r+", driver="mpio", comm=comm, libver=OBJECTS)
 
 
 def chunk_rows(n_rows: int, row_bytes: int) -> int:
-    """Number of rows per chunk for blocks of ``n_rows`` rows: whole blocks up to 1 MiB, equal parts of larger blocks.
+    """Return the number of rows per chunk for blocks of ``n_rows`` rows: blocks up to 1 MiB, else equal parts.
 
-    Depends on the global size only, so that files from any number of ranks have the same chunks. A chunk that divides
-    the block is preferred, because then no chunk holds rows of two snapshots.
+    It depends on the global size only, so that files from any number of ranks have the same chunks. A divisor of the
+    block is preferred, because then no chunk contains rows of two snapshots.
     """
     most = max(1, CHUNK_BYTES // row_bytes)
     if n_rows <= most:
@@ -152,12 +151,12 @@ def chunk_rows(n_rows: int, row_bytes: int) -> int:
 def create_growing(
     group: h5py.Group, name: str, row_shape: tuple[int, ...], dtype: np.dtype | type, rows_per_chunk: int
 ) -> h5py.Dataset:
-    """Create an empty dataset (0, *row_shape) that grows by rows, and its parents. Collective where the file is."""
+    """Create an empty dataset (0, *row_shape) that grows by rows, and its parents. Collective for a shared file."""
     shape = (0, *row_shape)
     space = h5py.h5s.create_simple(shape, (h5py.h5s.UNLIMITED, *row_shape))
     properties = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
     properties.set_chunk((rows_per_chunk, *(max(1, extent) for extent in row_shape)))
-    # Ranks writing together need their chunks allocated when the dataset grows, also in a file made by one rank.
+    # Parallel writes need chunks allocated when the dataset grows, also in a file created by one rank.
     properties.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
     *parents, leaf = name.split("/")
     if parents:
@@ -169,19 +168,19 @@ def create_growing(
 
 
 def grow(dataset: h5py.Dataset, n_rows: int) -> None:
-    """Set the number of rows. Collective where the file is."""
+    """Set the number of rows. Collective for a shared file."""
     dataset.id.set_extent((n_rows, *dataset.shape[1:]))
 
 
 def dataset_names(group: h5py.Group) -> list[str]:
-    """Names of all datasets in a group and its groups, relative to it: ["time", "wall/floor/force"]."""
+    """Return the names of all datasets in a group and its subgroups, relative to it: ["time", "wall/floor/force"]."""
     names: list[str] = []
     group.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None)
     return names
 
 
 def write_rows(dataset: h5py.Dataset, first: int, rows: np.ndarray | None, collective: bool = False) -> None:
-    """Write rows (n, ...) from row ``first`` on; None or no rows: join a collective transfer without data."""
+    """Write rows (n, ...) starting at row ``first``; None or no rows: join a collective transfer without data."""
     transfer = h5py.h5p.create(h5py.h5p.DATASET_XFER)
     if collective:
         transfer.set_dxpl_mpio(h5py.h5fd.MPIO_COLLECTIVE)
@@ -201,7 +200,7 @@ def write_rows(dataset: h5py.Dataset, first: int, rows: np.ndarray | None, colle
 
 
 def set_text(group: h5py.Group, name: str, text: str) -> None:
-    """Store a text as a dataset of fixed length (variable lengths cannot be written by several ranks), replacing it."""
+    """Store or replace a text as a dataset of fixed length; several ranks cannot write variable lengths."""
     if name in group:
         del group[name]
     raw = text.encode("utf-8")
@@ -216,10 +215,10 @@ def set_unit(dataset: h5py.Dataset, unit: str) -> None:
 
 @contextmanager
 def writing(comm: MPI.Comm, path: Path) -> Iterator[None]:
-    """Context of one HDF5 operation of all ranks: an error on any rank becomes a SimulationFailure on all.
+    """Context of one HDF5 operation of all ranks; an error on any rank becomes a SimulationFailure on all.
 
-    When an operation fails on one rank, the others may wait in HDF5 for ever. So the rank that failed waits for them a
-    few seconds only and then raises the error alone; whoever catches it must end the job. Collective.
+    If an operation fails on one rank, the others may wait in HDF5 forever. Therefore the rank that failed waits for
+    them a few seconds only and then raises the error alone; the caller must end the job. Collective.
     """
     failure: SimulationFailure | None = None
     try:
@@ -251,8 +250,9 @@ def writing(comm: MPI.Comm, path: Path) -> Iterator[None]:
 def release(file: h5py.File, comm: MPI.Comm) -> None:
     """Abandon a file that can no longer be written.
 
-    HDF5 1.10 and later crash when a close, or the end of the process, cannot write what is still in memory. So a single
-    process redirects these writes to memory. Several ranks leave the file open: closing it together might never end.
+    HDF5 1.10 and later crash if a close, or the exit of the process, cannot write data that are still in memory.
+    Therefore a single process redirects these writes to memory. Several ranks leave the file open, because closing it
+    together might never end.
     """
     if comm.size == 1 and file.id.valid:
         nowhere = os.memfd_create("released")
@@ -262,5 +262,5 @@ def release(file: h5py.File, comm: MPI.Comm) -> None:
 
 
 def first_line(error: BaseException) -> str:
-    """First line of an error message, without the details that HDF5 adds; its type if the message is empty."""
+    """Return the first line of an error message, without the details added by HDF5; its type if it is empty."""
     return str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__

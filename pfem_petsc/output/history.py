@@ -1,4 +1,4 @@
-"""The history of a run: one row a recorded step, collected on rank 0 and written in blocks."""
+"""The history of a run: one row per recorded step, collected on rank 0 and written in blocks."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from .units import unit_of
 
 __all__ = ["HistoryWriter", "check_columns", "create_history"]
 
-# Rows a chunk: small, so that a short run makes a small file (a whole chunk is allocated for the first row).
+# Rows per chunk: few, so that a short run has a small file (the first row allocates a whole chunk).
 ROWS_PER_CHUNK = 512
 CHUNK_BYTES = 1 << 16
-# Rows kept in memory before they are written; fewer where rows are wide.
+# Rows buffered in memory before they are written; fewer if rows are wide.
 BUFFER_ROWS = 1024
 BUFFER_BYTES = 1 << 24
 
 
 def create_history(file: h5py.File, columns: Mapping[str, tuple[int, ...]], types: Mapping[str, Any]) -> None:
-    """Make ``/history`` with an empty dataset a column and the attribute ``rows``: how many rows are complete."""
+    """Create ``/history`` with an empty dataset per column and the attribute ``rows``, the number of complete rows."""
     group = file.create_group("history")
     group.attrs["rows"] = np.int64(0)
     for name, shape in columns.items():
@@ -64,8 +64,8 @@ def check_columns(file: h5py.File, path: Path, columns: Mapping[str, tuple[int, 
 class HistoryWriter:
     """Appends rows to ``/history``.
 
-    Rank 0 holds the values and writes them; the file grows on all ranks together. The attribute ``rows`` follows
-    after a flush of the data, so that a reader, or a kill between, never meets a row that is not complete.
+    Rank 0 has the values and writes them; the file grows on all ranks together. The attribute ``rows`` is updated after
+    a flush of the data, so that neither a reader nor a kill ever leaves an incomplete row counted.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ class HistoryWriter:
         Open for writing on all ranks, with the group made by :func:`create_history`.
     comm : MPI.Comm
     path : Path
-        Named in messages.
+        For messages.
     columns : collection of column names
     """
 
@@ -86,7 +86,7 @@ class HistoryWriter:
         self.n_rows = int(group.attrs["rows"])
         row_bytes = sum(d.dtype.itemsize * int(np.prod(d.shape[1:], dtype=np.int64)) for d in self._datasets.values())
         self._capacity = max(1, min(BUFFER_ROWS, BUFFER_BYTES // max(1, row_bytes)))
-        # What a write may take on disk: the rows, and a chunk begun in each column.
+        # Disk space of a write: the rows, and a new chunk in each column.
         self.reserve_bytes = self._capacity * row_bytes + len(self._datasets) * CHUNK_BYTES
         self.n_buffered = 0
         self._layout = RowLayout(
@@ -97,17 +97,17 @@ class HistoryWriter:
 
     @property
     def full(self) -> bool:
-        """Whether the buffer must be written before the next row: the same answer on all ranks."""
+        """Whether the buffer must be written before the next row; equal on all ranks."""
         return self.n_buffered == self._capacity
 
     def append(self, row: Mapping[str, Any] | None) -> None:
-        """Take one row: rank 0 gives a value for each column, the others None. No communication."""
+        """Buffer one row: rank 0 passes a value for each column, the others None. No communication."""
         if self._comm.rank == 0:
             self._buffer[self.n_buffered] = self._layout.vector(row if row is not None else {})
         self.n_buffered += 1
 
     def write(self) -> None:
-        """Write the buffered rows, not yet counted as complete: flush the file, then :meth:`commit`. Collective."""
+        """Write the buffered rows without counting them; flush the file, then call :meth:`commit`. Collective."""
         if self.n_buffered == 0:
             return
         first, self.n_rows = self.n_rows, self.n_rows + self.n_buffered
@@ -125,6 +125,6 @@ class HistoryWriter:
         self.n_buffered = 0
 
     def commit(self) -> None:
-        """Count the rows written as complete; the file is flushed after it. Collective."""
+        """Count the written rows as complete; flush the file afterwards. Collective."""
         with writing(self._comm, self._path):
             self._rows_attribute.write(np.array(self.n_rows, dtype=np.int64))

@@ -1,8 +1,8 @@
-"""Whether a checkpoint is whole: checksums of its arrays, and a seal over everything else in the file.
+"""Integrity of checkpoints: checksums of the arrays, and a seal over everything else in the file.
 
-HDF5 checks little of what it reads, and a damaged file can crash it. So the bytes that it would parse are compared
-with a digest before it opens the file. Digest, format and version stand in the file's user block, a text at its
-beginning that HDF5 passes over. Array values are left to their own checksums, which ranks compute together.
+HDF5 checks little of what it reads, and a damaged file can crash it. Therefore the bytes that it would parse are
+compared with a digest before it opens the file. Digest, format and version are stored in the user block of the file, a
+text at its beginning that HDF5 skips. Array values have their own checksums, which the ranks compute together.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ __all__ = ["check_seal", "checksum", "remedy", "seal", "seal_size", "word_sum"]
 
 FORMAT, VERSION = "pfem_petsc checkpoint", 1
 LARGEST_SEAL = 1 << 20
-# Words summed, or bytes read, at a time.
+# Number of words summed, or of bytes read, at a time.
 BLOCK = 1 << 18
 
 
 def checksum(comm: MPI.Comm, slab: np.ndarray, first: int) -> int:
-    """Checksum of an array whose rows lie in slabs over the ranks, the same for any number of ranks. Collective.
+    """Return the checksum of an array distributed in slabs, the same for any number of ranks. Collective.
 
-    The sum, modulo 2^64, of all numbers as unsigned words, each times an odd factor made from its index: any single
-    number that changes changes the sum, and numbers that swap places do, too.
+    It is the sum, modulo 2^64, of all numbers as unsigned words, each times an odd factor computed from its index. It
+    detects a change of any single number, and numbers that are swapped.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ def checksum(comm: MPI.Comm, slab: np.ndarray, first: int) -> int:
     slab : (n, ...)
         Numbers of 1, 2, 4 or 8 bytes.
     first : int
-        Row of the whole array at which the slab begins.
+        Global index of the first row of the slab.
     """
     total = np.array([word_sum(slab, first)], dtype=np.uint64)
     comm.Allreduce(MPI.IN_PLACE, total, op=MPI.SUM)
@@ -47,7 +47,7 @@ def checksum(comm: MPI.Comm, slab: np.ndarray, first: int) -> int:
 
 
 def word_sum(slab: np.ndarray, first: int) -> int:
-    """This process's part of :func:`checksum`: sums of parts add up, modulo 2^64, to that of the whole."""
+    """Return this process's part of :func:`checksum`; the parts add up, modulo 2^64, to the checksum of the whole."""
     words = np.ascontiguousarray(slab).reshape(-1).view(f"u{slab.dtype.itemsize}")
     start = first * int(np.prod(slab.shape[1:], dtype=np.int64))
     total = np.zeros(1, dtype=np.uint64)
@@ -61,12 +61,12 @@ def word_sum(slab: np.ndarray, first: int) -> int:
 
 
 def seal_size(n_arrays: int) -> int:
-    """Bytes of user block for the seal over a file with so many arrays: a power of two, as HDF5 wants."""
+    """Return the size of the user block for the seal of a file with ``n_arrays``: a power of two, as HDF5 requires."""
     return 1 << (511 + 64 * n_arrays).bit_length()
 
 
 def seal(path: Path) -> None:
-    """Write the seal into the user block of a complete file that is closed. One process."""
+    """Write the seal into the user block of a complete, closed file. Not collective."""
     with h5py.File(path, "r", locking=False) as file:
         size = file.userblock_size
         found = [(dataset.id.get_offset(), dataset.id.get_storage_size()) for dataset in file["arrays"].values()]
@@ -82,17 +82,17 @@ def seal(path: Path) -> None:
 
 
 def check_seal(path: Path, raw: BinaryIO | None = None) -> str:
-    """Compare a file with its seal, all but the values of its arrays; give the digest. One process.
+    """Compare a file, except the values of its arrays, with its seal; return the digest. Not collective.
 
     Parameters
     ----------
     path : Path
-    raw : the file opened for reading, whatever ``path`` has become since; default: opened here
+    raw : the file opened for reading, in case ``path`` was replaced since; default: opened here
 
     Raises
     ------
     InputError
-        When the file is not a checkpoint, of another version, cut, or damaged.
+        If the file is not a checkpoint, of another version, truncated, or damaged.
     """
     try:
         if raw is None:
@@ -131,7 +131,7 @@ def _checked(path: Path, raw: BinaryIO) -> str:
 
 
 def remedy(path: Path) -> str:
-    """What to do without this checkpoint."""
+    """Return what a user can do without this checkpoint."""
     previous = path.with_name(f"{path.stem}-previous{path.suffix}")
     if previous.is_file():
         return f"restart from the one before: --restart {previous}"
@@ -139,7 +139,7 @@ def remedy(path: Path) -> str:
 
 
 def _digest(raw: BinaryIO, content: dict[str, Any]) -> str:
-    """Digest of the seal's content and of all bytes after the user block that are not values of arrays."""
+    """Return a digest of the seal's content and of all bytes after the user block except values of arrays."""
     digest = hashlib.sha256(json.dumps(content, sort_keys=True).encode())
     position = int(content["seal_size"])
     for offset, length in [*content["arrays"], [int(content["size"]), 0]]:

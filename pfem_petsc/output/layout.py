@@ -1,4 +1,4 @@
-"""The groups and datasets of a result file, and which of its rows are complete."""
+"""The groups and datasets of a result file, and the number of its complete rows."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ __all__ = [
 
 VTK_LINE = 3
 STEPS_PER_CHUNK = 256
-# What a snapshot adds to /VTKHDF/Steps besides its time.
+# Entries of a snapshot in /VTKHDF/Steps besides its time.
 PER_STEP = ("PointOffsets", "CellDataRows", "CellOffsets", "ConnectivityIdOffsets", "PartOffsets", "NumberOfParts")
 
 
@@ -41,14 +41,14 @@ def create_result(
     attributes: Mapping[str, Any],
     modes: str | None = None,
 ) -> None:
-    """Make the whole structure of a result file but its fields: VTKHDF 2.0 with no step yet, history, case.
+    """Create the structure of a result file without fields: VTKHDF 2.0 without steps, history, case.
 
     The mesh is one part, whatever the number of ranks, and all steps use the same connectivity (offset 0).
     ``modes`` is the kind of those that there will be.
     """
     vtk = file.create_group("VTKHDF")
     vtk.attrs["Version"] = np.array([2, 0], dtype=np.int64)
-    # The reader wants a text of fixed length here.
+    # The VTK reader requires a text of fixed length.
     kind = b"UnstructuredGrid"
     vtk.attrs.create("Type", kind, dtype=h5py.string_dtype("ascii", len(kind)))
     for name, value in (
@@ -65,7 +65,7 @@ def create_result(
     steps.attrs["NSteps"] = np.int64(0)
     create_growing(steps, "Values", (), np.float64, STEPS_PER_CHUNK)
     for name in PER_STEP:
-        # One column for the one kind of cell there is.
+        # One column, because there is one type of cell.
         row_shape = (1,) if name in ("CellOffsets", "ConnectivityIdOffsets") else ()
         create_growing(steps, name, row_shape, np.int64, STEPS_PER_CHUNK)
     for group in ("PointData", "CellData"):
@@ -84,10 +84,10 @@ def create_result(
 
 
 def create_field(vtk: h5py.Group, kind: str, name: str, row_shape: tuple[int, ...], dtype: np.dtype) -> h5py.Dataset:
-    """Make a field, ``kind`` "PointData" or "CellData". Collective where the file is.
+    """Create a field, ``kind`` "PointData" or "CellData". Collective for a shared file.
 
-    All point fields start at the same row in a snapshot, as do all cell fields: their offsets are one dataset under
-    several names (hard links), so that they cannot disagree.
+    All point fields of a snapshot start at the same row, as do all cell fields. Their offsets are one dataset with
+    several names (hard links), so they are always consistent.
     """
     n_rows = int(vtk["NumberOfPoints" if kind == "PointData" else "NumberOfCells"][0])
     row_bytes = dtype.itemsize * int(np.prod(row_shape, dtype=np.int64))
@@ -98,14 +98,14 @@ def create_field(vtk: h5py.Group, kind: str, name: str, row_shape: tuple[int, ..
 
 
 def create_snapshot_checks(file: h5py.File) -> h5py.Dataset:
-    """Make the checksums of snapshots once all fields are there. Collective where the file is."""
+    """Create the checksums of snapshots, after all fields. Collective for a shared file."""
     return create_growing(
         file[CHECKS], "snapshots", (1 + len(field_datasets(file["VTKHDF"])),), np.uint64, STEPS_PER_CHUNK
     )
 
 
 def field_datasets(vtk: h5py.Group) -> dict[str, h5py.Dataset]:
-    """Points and fields with their rows a snapshot: {"Points": …, "PointData/velocity": …, "CellData/stress": …}."""
+    """Return the datasets of points and fields: {"Points": …, "PointData/velocity": …, "CellData/stress": …}."""
     found = {"Points": vtk["Points"]}
     for kind in ("PointData", "CellData"):
         for name in vtk[kind]:
@@ -114,7 +114,7 @@ def field_datasets(vtk: h5py.Group) -> dict[str, h5py.Dataset]:
 
 
 def complete_snapshots(file: h5py.File) -> int:
-    """How many snapshots are complete: a run that was killed may have left parts of one more."""
+    """Return the number of complete snapshots; a killed run may have left parts of another one."""
     vtk, steps = file["VTKHDF"], file["VTKHDF/Steps"]
     lengths = [
         int(steps.attrs["NSteps"]),
@@ -132,7 +132,7 @@ def complete_snapshots(file: h5py.File) -> int:
 
 
 def complete_rows(file: h5py.File) -> int:
-    """How many rows of the history are complete."""
+    """Return the number of complete rows of the history."""
     history = file["history"]
     return min(
         [

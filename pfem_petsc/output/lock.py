@@ -1,10 +1,10 @@
-"""The lock of an output folder: one run at a time writes into it.
+"""The lock of an output folder: only one run at a time writes into it.
 
-A file beside the folder, ``NAME.lock``, says who has it: machine, process, and when that process started. It is made
-by a hard link, which is atomic on network file systems too; where there are none, by exclusive creation. A run that is
-killed leaves its file behind. On the machine that it ran on, the process number and its start time tell that it has
-ended, and the next run takes the lock over. From another machine nothing can be told but how long ago the owner has
-last renewed the file: one that is older than an hour is taken over, a younger one is refused.
+A file beside the folder, ``NAME.lock``, identifies the owner: machine, process, and start time of that process. It is
+created by a hard link, which is atomic on network file systems too, or by exclusive creation if there are no hard
+links. A killed run leaves its file behind. On the same machine, process number and start time show that it has ended,
+and the next run takes the lock over. On another machine only the time of the last renewal is known: a lock not renewed
+for an hour is taken over, a more recent one is respected.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from .units import duration
 __all__ = ["FolderLock"]
 
 RENEWAL = 30.0  # seconds between renewals
-ABANDONED = 3600.0  # seconds without renewal after which a lock of another machine counts as left behind
-_UNFINISHED = 5.0  # seconds in which a file made by exclusive creation gets its content
+ABANDONED = 3600.0  # seconds without renewal after which a lock of another machine counts as abandoned
+_UNFINISHED = 5.0  # seconds in which a file made by exclusive creation must get its content
 _ATTEMPTS = 200
 
 
 class FolderLock:
-    """The right to write into one output folder, for one process (rank 0 of a run).
+    """The lock of one output folder, held by one process (rank 0 of a run).
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ class FolderLock:
     Attributes
     ----------
     path : Path
-        The file of the lock.
+        The lock file.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -49,7 +49,7 @@ class FolderLock:
         beside = folder.parent
         while not beside.exists():
             beside = beside.parent
-        # where the folder is all that this user can write to, the folder cannot be moved aside either
+        # if the user can write only into the folder itself, the folder cannot be moved aside either
         inside = folder.is_dir() and not os.access(beside, os.W_OK | os.X_OK)
         self.path = folder / "run.lock" if inside or not folder.name else folder.with_name(folder.name + ".lock")
         self._token: str | None = None
@@ -57,11 +57,11 @@ class FolderLock:
 
     @property
     def held(self) -> bool:
-        """Whether this object has the lock."""
+        """Whether this object holds the lock."""
         return self._token is not None
 
     def check(self) -> None:
-        """Refuse a folder that another run has now, without taking it.
+        """Refuse a folder that another run has locked, without taking the lock.
 
         Raises
         ------
@@ -77,7 +77,7 @@ class FolderLock:
         Raises
         ------
         InputError
-            Another run has it, or its file cannot be written.
+            If another run holds it, or its file cannot be written.
         """
         if self.held:
             return
@@ -98,22 +98,22 @@ class FolderLock:
             raise InputError(
                 f"{self.folder}: cannot write the results there: {error.strerror} ({self.path}); choose another with -o"
             ) from error
-        raise InputError(f"{self.folder}: its lock {self.path} changes all the time; choose another folder with -o")
+        raise InputError(f"{self.folder}: its lock {self.path} changes repeatedly; choose another folder with -o")
 
     def renew(self) -> None:
-        """Show that the owner is alive, from time to time; costs a look at the clock between.
+        """Renew the lock if the renewal interval has elapsed; otherwise this only reads the clock.
 
         Raises
         ------
         SimulationFailure
-            The lock is no longer this run's.
+            If this run no longer holds the lock.
         """
         if self._token is None or time.monotonic() - self._renewed < RENEWAL:
             return
         self._renewed = time.monotonic()
         with contextlib.suppress(OSError):
             owner = _read(self.path)
-            if owner == {}:  # unreadable for the moment
+            if owner == {}:  # temporarily unreadable
                 return
             if owner is None or owner.get("token") != self._token:
                 self._token = None
@@ -124,7 +124,7 @@ class FolderLock:
             os.utime(self.path)
 
     def release(self) -> None:
-        """Give the lock back; without it: nothing."""
+        """Release the lock if it is held."""
         token, self._token = self._token, None
         if token is None:
             return
@@ -142,8 +142,8 @@ class FolderLock:
         way = "wait until it has ended, stop it (SIGTERM), or choose another folder with -o"
         if not _is_here(owner):
             way += (
-                f"; it has shown itself {duration(_age(self.path))} ago: if it is dead, remove {self.path}, which is "
-                f"done without asking after {duration(ABANDONED)}"
+                f"; it renewed its lock {duration(_age(self.path))} ago: if it is dead, remove {self.path}; this "
+                f"happens automatically after {duration(ABANDONED)}"
             )
         raise InputError(f"{self.folder}: another run is writing into this folder: {who}; {way}")
 
@@ -165,7 +165,7 @@ def _identity() -> dict[str, Any]:
 
 
 def _machine() -> str:
-    """The space in which a process number means a process: a machine since its last start, a container of it."""
+    """Return the scope of process numbers: a machine since its last boot, and a container on it."""
     try:
         boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
         return f"{boot} {os.readlink('/proc/self/ns/pid')}"
@@ -174,7 +174,7 @@ def _machine() -> str:
 
 
 def _start_time(pid: int) -> str | None:
-    """When a process started, in ticks since the machine did; None where it is gone, "" where that is not known."""
+    """Return the start time of a process in ticks since boot; None if it has ended, "" if unknown."""
     if not Path("/proc/self/stat").exists():
         try:
             os.kill(pid, 0)
@@ -196,8 +196,8 @@ def _is_here(owner: dict[str, Any]) -> bool:
 
 
 def _abandoned(path: Path, owner: dict[str, Any]) -> bool:
-    """Whether the run that made this lock has certainly ended."""
-    if not owner:  # no content: its maker was killed, or is just about to write it
+    """Return whether the run that created this lock has certainly ended."""
+    if not owner:  # no content: its owner was killed, or is about to write it
         return _age(path) > _UNFINISHED
     if _is_here(owner) and isinstance(owner.get("pid"), int):
         return _start_time(owner["pid"]) != owner.get("start")
@@ -205,7 +205,7 @@ def _abandoned(path: Path, owner: dict[str, Any]) -> bool:
 
 
 def _age(path: Path) -> float:
-    """Seconds since a file was renewed, by the clock of its file system."""
+    """Return the seconds since a file was renewed, by the clock of its file system."""
     probe = _beside(path)
     try:
         probe.touch()
@@ -220,7 +220,7 @@ def _age(path: Path) -> float:
 
 
 def _read(path: Path) -> dict[str, Any] | None:
-    """Who has a lock: None for nobody, empty where the file does not say."""
+    """Return the owner of a lock: None for nobody, empty if the file has no valid content."""
     try:
         content = json.loads(path.read_bytes())
     except FileNotFoundError:
@@ -231,12 +231,12 @@ def _read(path: Path) -> dict[str, Any] | None:
 
 
 def _beside(path: Path) -> Path:
-    """A name that nobody else has."""
+    """Return a unique name beside a path."""
     return path.with_name(f".{path.name}.{os.getpid()}.{uuid.uuid4().hex[:12]}")
 
 
 def _create(path: Path, content: dict[str, Any]) -> bool:
-    """Make a lock with its content, at once and by one process alone; False where there is one."""
+    """Create a lock with its content atomically; return False if it exists."""
     raw = json.dumps(content).encode()
     temporary = _beside(path)
     try:
@@ -248,7 +248,7 @@ def _create(path: Path, content: dict[str, Any]) -> bool:
         except FileExistsError:
             return False
         except OSError:
-            # a network file system may have made the link and lost the answer
+            # a network file system may have created the link and lost the reply
             if temporary.stat().st_nlink == 2:
                 return True
     finally:
@@ -263,9 +263,9 @@ def _create(path: Path, content: dict[str, Any]) -> bool:
 
 
 def _remove_abandoned(path: Path) -> None:
-    """Remove a lock that was left behind; of several processes that want to, one at a time looks again and does it.
+    """Remove an abandoned lock; of several processes, one at a time checks again and removes it.
 
-    So nobody removes the lock that another has just taken in its place.
+    Thus no process removes a lock that another one has just taken instead.
     """
     guard = path.with_name(path.name + ".broken")
     mine = _identity()

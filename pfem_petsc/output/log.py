@@ -1,4 +1,4 @@
-"""The log file of a run: one line a text, with date and level, never worth losing the run for."""
+"""The log file of a run: one line per message, with date and level. Its loss does not end the run."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ __all__ = ["LogFile"]
 
 
 class LogFile:
-    """Append lines to a log; an existing one is continued.
+    """Appends lines to a log; an existing one is continued.
 
-    A file that cannot be opened at the start is refused. One that is lost on the way (its folder removed, disk full)
-    is said once on stderr, and later lines are dropped: the run is worth more than its log.
+    A file that cannot be opened at the start is an error. If it is lost during the run (folder removed, disk full), a
+    warning is printed once on stderr, later lines are dropped, and the run continues.
 
     Raises
     ------
     InputError
-        When the file cannot be created; its folder is made where missing.
+        If the file cannot be created; a missing folder is created.
     """
 
     def __init__(self, path: Path | str) -> None:
@@ -39,7 +39,7 @@ class LogFile:
             return
         stamp = datetime.datetime.now().strftime("%Y-%m-%d %H:%M:%S")
         try:
-            if not self.path.exists():  # an unlinked file would take the line and lose it
+            if not self.path.exists():  # lines written to an unlinked file would be lost
                 self._file.close()
                 self._file = self.path.open("a", buffering=1, encoding="utf-8")
             self._file.write(f"{stamp} {level:<7} {text}\n")

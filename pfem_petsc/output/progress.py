@@ -1,4 +1,4 @@
-"""The report of a run in progress: a summary, a bar or lines, messages, and the same in ``log.txt``."""
+"""The progress report of a run: a summary, a bar or lines, and messages, also written to ``log.txt``."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 
 __all__ = ["Progress"]
 
-FIRST_LINE = 2.0  # seconds until the first line, and between the first ones
-LAST_LINE = 10.0  # seconds between lines, at most
-BAR_REFRESH = 0.1  # seconds between two drawings of the bar
+FIRST_LINE = 2.0  # seconds until the first line, and between the first lines
+LAST_LINE = 10.0  # maximum number of seconds between lines
+BAR_REFRESH = 0.1  # seconds between two updates of the bar
 
 
 def _speed(rate: float) -> str:
@@ -30,26 +30,26 @@ def _speed(rate: float) -> str:
 
 
 class Progress:
-    """Report of a run. Rank 0 writes; on the other ranks every call returns at once.
+    """Progress report of a run. Rank 0 writes; on the other ranks every call returns at once.
 
     On a terminal a bar is drawn; elsewhere (files, pipes, under ``mpirun``) a line is printed after 2 s and then at
-    intervals that stretch to 10 s. ``log.txt`` gets the lines in any case, each with date and level; an existing log
-    is continued. Between two reports :meth:`update` costs a few additions and one look at the clock.
+    intervals that grow to 10 s. ``log.txt`` gets the lines in any case, each with date and level; an existing log is
+    continued. Between two reports :meth:`update` costs a few additions and one reading of the clock.
 
     A log that cannot be opened at the start is an :class:`~pfem_petsc.errors.InputError` on all ranks (the constructor
-    is collective); for one that is lost during the run see :class:`~pfem_petsc.output.log.LogFile`. If the reader of
-    stdout goes away (``| head``), the log records it and the run goes on.
+    is collective); for a log that is lost during the run see :class:`~pfem_petsc.output.log.LogFile`. If the reader of
+    stdout exits (``| head``), the log records it and the run continues.
 
     Parameters
     ----------
-    title : what the bar and the log are headed with
-    n_steps : number of the last step, None where unknown (then progress is measured by time)
+    title : heading of the bar and the log
+    n_steps : number of the last step, None if unknown (then progress is measured by time)
     end_time : [s], or in the unit of the axis
-    quiet : nothing on stdout; the log is written nevertheless, and warnings still go to stderr
+    quiet : print nothing on stdout; the log is still written, and warnings still go to stderr
     log_path : file of the log, None for no log
-    start_step, start_time : where a restarted run begins; rates and remaining time count from there
+    start_step, start_time : at which a restarted run begins; rates and remaining time count from there
     axis : of the times
-    stream, clock : stdout and the wall clock [s], to be replaced in tests
+    stream, clock : stdout and the wall clock [s], replaceable in tests
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class Progress:
         self._newton = self._linear = 0
         self._last = (start_step, start_time, 0.0, 0, None)
         self._marked = (self._begin, start_step, start_time, 0, 0)  # state at the last line, for rates and means
-        self._rate: tuple[float, float] | None = None  # steps and simulated seconds a second of wall time
+        self._rate: tuple[float, float] | None = None  # steps and simulated seconds per second of wall time
         self._interval = FIRST_LINE
         self._next_line = self._due = self._begin + FIRST_LINE
         self._closed = False
@@ -98,7 +98,7 @@ class Progress:
         self.close("done" if kind is None else "stopped")
 
     def summary(self, entries: dict[str, str]) -> None:
-        """Print the start-up block: label and text of each entry, in a column."""
+        """Print the start-up block: label and text of each entry, aligned."""
         if not self._root:
             return
         width = max((len(label) for label in entries), default=0)
@@ -115,14 +115,14 @@ class Progress:
         contacts: int = 0,
         energy_drift: float | None = None,
     ) -> None:
-        """Record a finished step; report it when a report is due.
+        """Record a finished step; report it if a report is due.
 
         Parameters
         ----------
-        step, time, dt : number of the step, its time and its length [s]
+        step, time, dt : number of the step, its time and its size [s]
         newton, linear : Newton and linear-solver iterations of this step
-        contacts : nodes in contact now
-        energy_drift : balance error of the energies relative to the largest of them, None where there is none
+        contacts : number of nodes in contact
+        energy_drift : energy imbalance relative to the largest energy, None without energy
         """
         if not self._root:
             return
@@ -132,13 +132,13 @@ class Progress:
         self._last = (step, time, dt, contacts, energy_drift)
         now = self._clock()
         if first:
-            # compiling, loading and waiting for ranks that do so, which no later step does
+            # the first step includes compiling, loading, and waiting for ranks that do so
             self._marked = (now, step, time, self._newton, self._linear)
         if now >= self._due:
             self._report(now)
 
     def compiled(self, seconds: float) -> None:
-        """Exclude this time [s] from rates and from the remaining time: the run does not spend it again."""
+        """Exclude compilation time [s] from rates and from the remaining time, because it does not recur."""
         self._compiling += seconds
         self._marked = (self._marked[0] + seconds, *self._marked[1:])
 
@@ -149,7 +149,7 @@ class Progress:
                 self._write(line, level)
 
     def warning(self, text: str) -> None:
-        """Log a warning and print it on stderr (above the bar, where there is one), also when quiet."""
+        """Log a warning and print it on stderr (above the bar, if there is one), even if quiet."""
         if not self._root:
             return
         self._log_line(text, "WARNING")
@@ -209,7 +209,7 @@ class Progress:
         step, time, *_ = self._last
         if wall > 0 and step > self._marked[1]:
             new = ((step - self._marked[1]) / wall, (time - self._marked[2]) / wall)
-            # half of what was is forgotten with each line
+            # exponential smoothing with weight 1/2 per line
             self._rate = new if self._rate is None else tuple(0.5 * a + 0.5 * b for a, b in zip(self._rate, new))
         if self._rate is None:
             return float("inf")
@@ -219,14 +219,14 @@ class Progress:
         return max(left, 0.0) / rate if rate > 0 else float("inf")
 
     def _done(self) -> float:
-        """Fraction of the run that is done."""
+        """Return the completed fraction of the run."""
         step, time, *_ = self._last
         if self._n_steps:
             return min(1.0, step / self._n_steps)
         return min(1.0, time / self._end_time) if self._end_time > 0 else 1.0
 
     def _counters(self) -> list[str]:
-        """Iterations per step since the last line, contacts and drift; what does not occur is left out."""
+        """Return iterations per step since the last line, contacts and drift; items that do not occur are omitted."""
         step, _, _, contacts, drift = self._last
         steps = max(1, step - self._marked[1])
         newton, linear = self._newton - self._marked[3], self._linear - self._marked[4]
@@ -250,7 +250,7 @@ class Progress:
     def _draw_bar(self) -> None:
         step, time, _, contacts, _ = self._last
         total = f"/{self._n_steps}" if self._n_steps is not None else ""
-        # must fit into 80 columns; the lines of the log have the rest
+        # must fit into 80 columns; the lines of the log have more details
         state = f"{step}{total}  {self._axis.place(time)}" + (f"  contacts {contacts:,}" if contacts else "")
         try:
             self._bar.draw(self._done(), state)
@@ -271,9 +271,9 @@ class Progress:
             self._let_go_of_stdout()
 
     def _let_go_of_stdout(self) -> None:
-        """Stop writing to stdout: its reader or terminal has gone, or its disk is full."""
+        """Stop writing to stdout, because its reader or terminal is closed, or its disk is full."""
         if self._stream is sys.stdout:
-            # what Python itself flushes at exit must find an open end
+            # Python flushes stdout at exit and needs a valid target
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         self._stream = self._bar = None
         self._log_line("stdout is closed: the run continues and reports here only", "WARNING")

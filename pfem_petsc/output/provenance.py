@@ -1,4 +1,4 @@
-"""What a result file says about the run that made it: case, versions, ranks, options."""
+"""Provenance of a result file: case, versions, ranks and options of the run."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from .hdf5 import dataset_names, set_text
 
 __all__ = ["describe_run", "read_attributes", "write_case"]
 
-# HDF5 1.10's own limit is 64 KiB for an attribute with all that belongs to it.
+# HDF5 1.10 limits an attribute, including its metadata, to 64 KiB.
 LONGEST_ATTRIBUTE = 1 << 15
 
 
 def describe_run(comm: MPI.Comm, attributes: Mapping[str, Any]) -> dict[str, Any]:
-    """Versions, number of ranks and PETSc options of this run, and the given attributes, which win."""
+    """Return versions, number of ranks and PETSc options of this run, updated with the given attributes."""
     from petsc4py import PETSc
 
     try:
@@ -44,9 +44,9 @@ def describe_run(comm: MPI.Comm, attributes: Mapping[str, Any]) -> dict[str, Any
 
 
 def write_case(file: h5py.File, case_text: str, attributes: Mapping[str, Any]) -> None:
-    """Store the case in ``/case``: dataset ``text``, attributes. What is not a number or text is stored as JSON.
+    """Store the case in ``/case``: dataset ``text`` and attributes. Values other than numbers or texts become JSON.
 
-    Attributes too long for HDF5's become datasets of the same name.
+    Attributes that exceed the limit of HDF5 become datasets of the same name.
     """
     group = file.require_group("case")
     for name, value in attributes.items():
@@ -66,7 +66,7 @@ def write_case(file: h5py.File, case_text: str, attributes: Mapping[str, Any]) -
 
 
 def read_attributes(group: h5py.Group) -> dict[str, Any]:
-    """The attributes stored by :func:`write_case`, with their types."""
+    """Return the attributes stored by :func:`write_case`, with their types."""
     found: dict[str, Any] = {}
     long = {name: group[name][()] for name in dataset_names(group) if name != "text"}
     for name, value in [*group.attrs.items(), *long.items()]:

@@ -1,4 +1,4 @@
-"""Bring a result file back to what is complete in it, and to an earlier step for a restart."""
+"""Truncates a result file to its complete data, and to an earlier step for a restart."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ from .verify import examine
 __all__ = ["reopen", "repair"]
 
 COPIED = 1 << 28
-"""Files up to this size [B] are made anew for a restart, and then take the file's place."""
+"""Files up to this size [B] are rewritten for a restart and then replaced."""
 PIECE = 1 << 24
-"""Bytes that are read and written at once."""
+"""Number of bytes that are read and written at once."""
 
 
 def repair(path: Path | str, last: tuple[int, int] | None = None) -> tuple[int, int]:
-    """Cut off what a killed run left incomplete, and everything after the ``last`` steps. One process.
+    """Remove incomplete data of a killed run, and everything after the ``last`` steps. Not collective.
 
     Parameters
     ----------
@@ -50,19 +50,19 @@ def repair(path: Path | str, last: tuple[int, int] | None = None) -> tuple[int, 
     Returns
     -------
     (int, int)
-        Snapshots and history rows that the file has now.
+        Number of snapshots and of history rows that the file has now.
 
     Raises
     ------
     InputError
-        When there is no such file, or it is not a readable result.
+        If there is no such file, or it is not a readable result.
     """
     path = Path(path)
     with readable(path), h5py.File(path, "r+", locking=False) as file:
         n_snapshots, n_rows = _kept(file, last)
         vtk, steps, history = file["VTKHDF"], file["VTKHDF/Steps"], file["history"]
-        # A kill in between leaves a file that VTK reads: it crashes on more times than steps, so the times go first; it
-        # finds nothing for steps without data, so the data go last.
+        # A kill in between must leave a file that VTK can read: VTK crashes on more times than steps, so the times are
+        # removed first; it shows nothing for steps without data, so the data are removed last.
         if len(steps["Values"]) > n_snapshots:
             grow(steps["Values"], n_snapshots)
         write_rows(steps["Values"], 0, file["snapshots/time"][: len(steps["Values"])])
@@ -75,7 +75,7 @@ def repair(path: Path | str, last: tuple[int, int] | None = None) -> tuple[int, 
         for name in ("step", "time"):
             grow(file["snapshots"][name], n_snapshots)
         if n_snapshots == 0:
-            # The first snapshot makes the fields, perhaps not all of them were made.
+            # The first snapshot creates the fields, possibly not all of them.
             file[CHECKS].pop("snapshots", None)
             for kind in ("PointData", "CellData"):
                 for name in list(vtk[kind]):
@@ -104,13 +104,13 @@ def reopen(
     case_text: str,
     attributes: Mapping[str, Any],
 ) -> None:
-    """Prepare a result file to be continued after a step, with mesh and fields as before. One process.
+    """Prepare a result file to be continued after a step, with mesh and fields unchanged. Not collective.
 
     Parameters
     ----------
     path : Path
     after_step : int
-        The step that the run goes on from.
+        The step from which the run continues.
     last : (int, int)
         Steps of the last snapshot and of the last history row that are kept.
     sizes : (int, int)
@@ -118,12 +118,12 @@ def reopen(
     fields : mapping of "PointData" and "CellData" to sorted names
     columns : mapping of history column to the shape of one row's value
     case_text, attributes
-        Replace what ``/case`` holds; the step is added to its ``restarts_after_step``.
+        Replace the content of ``/case``; the step is added to its ``restarts_after_step``.
 
     Raises
     ------
     InputError
-        When the file is missing, damaged, or of another mesh, other fields or columns.
+        If the file is missing or damaged, or has another mesh, other fields or other columns.
     """
     _refuse_damaged(path)
     with _replaced(path) as target:
@@ -170,8 +170,8 @@ def _check_same(
     for kind, names in fields.items():
         if n_snapshots and sorted(vtk[kind]) != names:
             raise InputError(
-                f"{path}: has the fields {', '.join(sorted(vtk[kind])) or 'none'} ({kind}), the case asks for "
-                f"{', '.join(names) or 'none'}: keep [output] fields as it was, or write elsewhere (-o)"
+                f"{path}: has the fields {', '.join(sorted(vtk[kind])) or 'none'} ({kind}), the case requests "
+                f"{', '.join(names) or 'none'}: keep [output] fields unchanged, or write elsewhere (-o)"
             )
     check_columns(file, path, columns)
 
@@ -184,7 +184,7 @@ def _rebuild(
     case_text: str,
     attributes: Mapping[str, Any],
 ) -> None:
-    """Fill a new file with what is kept of another: nothing that a kill or damage has left in that one comes along."""
+    """Copy the kept data of a file to a new one, without remains of a kill or damage."""
     vtk, history = source["VTKHDF"], source["history"]
     n_nodes, n_bars = int(vtk["NumberOfPoints"][0]), int(vtk["NumberOfCells"][0])
     columns = {name: history[name].shape[1:] for name in dataset_names(history)}
@@ -214,7 +214,7 @@ def _rebuild(
 
 
 def _kept(file: h5py.File, last: tuple[int, int] | None) -> tuple[int, int]:
-    """Complete snapshots and history rows, up to the ``last`` steps."""
+    """Return the numbers of complete snapshots and history rows, up to the ``last`` steps."""
     n_snapshots, n_rows = complete_snapshots(file), complete_rows(file)
     if last is not None:
         n_snapshots = int(np.searchsorted(file["snapshots/step"][:n_snapshots], last[0], side="right"))
@@ -224,10 +224,10 @@ def _kept(file: h5py.File, last: tuple[int, int] | None) -> tuple[int, int]:
 
 @contextmanager
 def _replaced(path: Path) -> Iterator[Path]:
-    """The file to make for a restart, which takes the place of ``path`` in the end; messages name that.
+    """Context that yields the file to write for a restart, which replaces ``path`` at the end; messages name ``path``.
 
-    A kill between the few writes that replace the case would leave a file that HDF5 cannot open; a new file costs
-    little but where it is large: that one is worked on itself.
+    A kill between the few writes that replace the case would leave a file that HDF5 cannot open. A new file avoids this
+    and costs little unless it is large; large files are modified in place.
     """
     size = path.stat().st_size if path.is_file() else 0
     copied = 0 < size <= COPIED and shutil.disk_usage(path.parent).free > 2 * size

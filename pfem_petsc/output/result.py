@@ -1,4 +1,4 @@
-"""Read the results of a run, finished, going on or killed."""
+"""Reads the results of a finished, running or killed run."""
 
 from __future__ import annotations
 
@@ -27,32 +27,32 @@ if TYPE_CHECKING:
 __all__ = ["History", "Modes", "Result", "open_result", "readable", "result_file"]
 
 RESULT_NAME = "result.vtkhdf"
-# A file that is being written may be caught between two states; how often, and after how many seconds, to look again.
+# A file that is being written may be read between two states: number of attempts, and seconds between them.
 ATTEMPTS, PAUSE = 8, 0.15
 
 T = TypeVar("T")
 
 
 def open_result(path: Path | str) -> Result:
-    """Open a result file, or the one in a folder, for reading; also while the run goes on.
+    """Open a result file, or that of a folder, for reading, also during the run.
 
     Raises
     ------
     InputError
-        When there is no such file, or it is not a readable result of pfem_petsc.
+        If there is no such file, or it is not a readable result of pfem_petsc.
     """
     return Result(result_file(path))
 
 
 def result_file(path: Path | str) -> Path:
-    """The result file of a folder, or the file itself."""
+    """Return the result file of a folder, or the file itself."""
     path = Path(path)
     return path / RESULT_NAME if path.is_dir() else path
 
 
 @contextmanager
 def readable(path: Path) -> Iterator[None]:
-    """Around opening a result file: what is wrong with it as an InputError."""
+    """Context that converts errors in reading a result file to an InputError."""
     if not path.is_file():
         raise InputError(f"{path}: there is no such result file; give a {RESULT_NAME} or the folder that holds one")
     try:
@@ -67,10 +67,10 @@ def readable(path: Path) -> Iterator[None]:
 
 
 class Result:
-    """The results of a run. Fields are in the mesh's own numbering; a snapshot that is not complete is not seen.
+    """The results of a run. Fields are in mesh numbering; an incomplete snapshot is not visible.
 
-    What there is, is found once, and again by :meth:`reload`. The file is open only during a read: HDF5 shows a file
-    that the process has open already as it was then, without what the run has written since.
+    The content is listed once, and again by :meth:`reload`. The file is open only during a read, because HDF5 does not
+    show data that a run has written since the process opened the file.
 
     Attributes
     ----------
@@ -93,7 +93,7 @@ class Result:
         self.reload()
 
     def reload(self) -> None:
-        """See what the run has written since."""
+        """List the data that the run has written since."""
         self._patiently(self._look)
 
     def _look(self, file: h5py.File) -> None:
@@ -117,7 +117,7 @@ class Result:
 
     @property
     def history(self) -> History:
-        """The history's columns: ``result.history["wall/floor/force"]``, (rows, 3)."""
+        """The columns of the history: ``result.history["wall/floor/force"]``, (rows, 3)."""
         return History(self, self._columns, self._n_rows)
 
     @property
@@ -142,20 +142,20 @@ class Result:
 
     @property
     def bars(self) -> np.ndarray:
-        """Nodes at the ends of each bar: (bars, 2) int64."""
+        """Return the end nodes of each bar, (bars, 2) int64."""
         return self.read("VTKHDF/Connectivity", slice(None)).reshape(-1, 2)
 
     def positions(self, i: int) -> np.ndarray:
-        """Positions at snapshot i (-1: the last): (nodes, 3) float64 [m]."""
+        """Return the positions at snapshot i (-1: the last), (nodes, 3) float64 [m]."""
         return self._snapshot("VTKHDF/Points", i, self.n_nodes)
 
     def field(self, name: str, i: int) -> np.ndarray:
-        """A field at snapshot i (-1: the last): (nodes, 3), (nodes,) or (bars,), SI units.
+        """Return a field at snapshot i (-1: the last), (nodes, 3), (nodes,) or (bars,), in SI units.
 
         Raises
         ------
         InputError
-            When the file has no such field.
+            If the file has no such field.
         """
         if name in self.point_fields:
             return self._snapshot(f"VTKHDF/PointData/{name}", i, self.n_nodes)
@@ -165,7 +165,7 @@ class Result:
         raise InputError(f"{self.path}: has no field {name!r}{nearest(name, known)}")
 
     def mesh(self, i: int) -> pyvista.UnstructuredGrid:
-        """Snapshot i (-1: the last) as a pyvista grid of lines with all its fields."""
+        """Return snapshot i (-1: the last) as a pyvista grid of lines with all its fields."""
         import pyvista
 
         cells = np.column_stack([np.full(self.n_bars, 2), self.bars]).ravel()
@@ -185,7 +185,7 @@ class Result:
         return self.read(name, slice(first, first + n_rows))
 
     def read(self, name: str, rows: slice) -> np.ndarray:
-        """Rows of a dataset, named by its path in the file."""
+        """Return rows of a dataset, named by its path in the file."""
         return self._patiently(lambda file: file[name][rows])
 
     def _patiently(self, look: Callable[[h5py.File], T]) -> T:
@@ -195,7 +195,7 @@ class Result:
                     with h5py.File(self.path, "r", locking=False) as file:
                         return look(file)
                 except HDF5_ERRORS:
-                    # A file that nobody is writing will not get better.
+                    # Retrying does not help if no run is writing the file.
                     if not left or time.time() - self.path.stat().st_mtime > 60.0:
                         raise
                     time.sleep(PAUSE)
@@ -205,7 +205,7 @@ class Result:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Nothing to do: nothing is open."""
+        """Do nothing: no file is open."""
 
     def __repr__(self) -> str:
         return (
@@ -215,9 +215,9 @@ class Result:
 
 
 class History(Mapping[str, np.ndarray]):
-    """Columns of the history by name, one row a recorded step: ``history["kinetic_energy"]``.
+    """Columns of the history by name, one row per recorded step: ``history["kinetic_energy"]``.
 
-    Names with slashes can be walked as well: ``history["wall"]["floor"]["force"]`` or ``history.wall.floor.force``.
+    Names with slashes can be accessed by parts: ``history["wall"]["floor"]["force"]`` or ``history.wall.floor.force``.
     """
 
     def __init__(self, result: Result, columns: list[str], n_rows: int, prefix: str = "") -> None:

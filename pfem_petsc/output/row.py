@@ -1,4 +1,4 @@
-"""A row of the history as one vector of numbers, read by column name."""
+"""A row of the history as one vector of numbers, accessed by column name."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ __all__ = ["Row", "RowLayout"]
 
 
 class RowLayout:
-    """Where each column lies in the vector of a row.
+    """Positions of the columns in the vector of a row.
 
     Parameters
     ----------
-    columns : name to shape of a row's value
-    types : name to dtype where it is not float64; integers are kept as floating-point numbers, exact below 2^53
+    columns : name to shape of a value
+    types : name to dtype if it is not float64; integers are stored as floating-point numbers, exact below 2^53
 
     Attributes
     ----------
-    places : name to (first, end, shape, kind of a number)
+    places : name to (first, end, shape, type of a number)
     width : length of the vector
     """
 
@@ -36,7 +36,7 @@ class RowLayout:
         self._alike: RowLayout | None = None
 
     def vector(self, row: Mapping[str, Any]) -> np.ndarray:
-        """The vector (width,) of a row."""
+        """Return the vector (width,) of a row."""
         if isinstance(row, Row) and self._is_alike(row.layout):
             return row.vector
         if set(row) != set(self.places):

@@ -28,7 +28,7 @@ class SnapshotIndex:
         Open on all ranks.
     comm : MPI.Comm
     path : Path
-        Its name in messages.
+        For messages.
     mesh : DistributedMesh
     """
 
@@ -40,7 +40,7 @@ class SnapshotIndex:
         self._times = steps["Values"]
         self._marks = {name: file["snapshots"][name] for name in ("step", "time")}
         self._n_steps = h5py.h5a.open(steps.id, b"NSteps")
-        # made with the first snapshot, which knows the fields
+        # created with the first snapshot, which defines the fields
         self._digests = file[CHECKS]["snapshots"] if steps.attrs["NSteps"] else None
 
     def create_checks(self) -> None:
@@ -69,7 +69,7 @@ class SnapshotIndex:
                 write_rows(self._digests, n, np.concatenate([mark, digests])[None])
 
     def publish(self, n: int, time: float) -> None:
-        """Count snapshot n, whose data are already flushed, and then write its time [s]. Collective."""
+        """Count snapshot n, whose data have been flushed, and then write its time [s]. Collective."""
         with writing(self.comm, self.path):
             self._n_steps.write(np.array(n + 1, dtype=np.int64))
             self._file.flush()

@@ -1,8 +1,8 @@
-"""Where the sums of a history row lie: one layout of names that compiled loops and Python share.
+"""Layout of the sums of a history row, by names that compiled loops and Python share.
 
 A rank's share of a row is a vector: :data:`HEAD`, then for cases with walls the changes of the active set and one
-:data:`WALL` for each, one :data:`PAIR` for each table of contact pairs, and the probes. Loops take the places as
-integers at module level, which are constants of the machine code.
+:data:`WALL` per wall, one :data:`PAIR` per table of contact pairs, and the probes. Loops use the positions as integers
+at module level, which are constants of the machine code.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ __all__ = ["HEAD", "PAIR", "WALL", "Places"]
 
 
 class Places:
-    """Places of named numbers and vectors, one after the other.
+    """Positions of consecutive named numbers and vectors.
 
     Attributes
     ----------
-    sizes : name to its count of numbers
-    width : numbers in all
+    sizes : name to its number of components
+    width : total number of components
     """
 
     def __init__(self, sizes: Iterable[tuple[str, int]]) -> None:
@@ -32,12 +32,12 @@ class Places:
             self.width += size
 
     def __getitem__(self, name: str) -> slice:
-        """The numbers of a name."""
+        """The slice of a name."""
         first = self._first[name]
         return slice(first, first + self.sizes[name])
 
     def first(self, name: str) -> int:
-        """The place of a name's first number, which is its only one for scalars."""
+        """Return the position of the first component of a name, the only one of a scalar."""
         return self._first[name]
 
 
@@ -52,7 +52,7 @@ HEAD = Places(
         ("alarm", 1),
     ]
 )
-"""Sums of every case; ``centre_of_mass`` is mass times position there."""
+"""Sums of all cases; ``centre_of_mass`` holds the sum of mass times position."""
 
 WALL = Places(
     [

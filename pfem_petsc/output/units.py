@@ -1,4 +1,4 @@
-"""Units of fields and history columns, and numbers with engineering prefixes, shared by log, curves and pictures."""
+"""Units of fields and history columns, and numbers with SI prefixes, shared by log, curves and pictures."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ AXES = {axis.symbol: axis for axis in (TIME, LOAD_FACTOR, POINT, MODE)}
 
 
 def unit_of(name: str) -> str:
-    """SI unit of a history column (``"wall/floor/force"`` -> ``"N"``); empty for pure numbers."""
+    """Return the SI unit of a history column (``"wall/floor/force"`` -> ``"N"``); empty for pure numbers."""
     last = name.rsplit("/", 1)[-1]
     if last.endswith("_impulse"):
         return "N s"
@@ -94,7 +94,7 @@ def unit_of(name: str) -> str:
 
 
 def field_unit(name: str) -> str:
-    """SI unit of a field, or of an internal variable of a material law; empty for pure numbers."""
+    """Return the SI unit of a field, or of an internal variable of a material law; empty for pure numbers."""
     units = {field.name: field.unit for field in FIELDS}
     return units[name] if name in units else _units_of_variables().get(name, "")
 
@@ -105,15 +105,15 @@ def _units_of_variables() -> dict[str, str]:
 
 
 def prefix_for(magnitude: float, unit: str) -> tuple[float, str]:
-    """Factor and unit that bring a magnitude into 1 .. 1000: ``(0.0024, "s")`` -> ``(1e3, "ms")``.
+    """Return factor and unit that scale a magnitude to 1 .. 1000: ``(0.0024, "s")`` -> ``(1e3, "ms")``.
 
-    Powers (``m²``), temperatures and pure numbers keep their unit, because a prefix would be read wrongly there;
-    so does zero and all that is not finite. Kilograms have their prefix already.
+    Powers (``m²``), temperatures and pure numbers keep their unit, because a prefix would be misread; so do zero and
+    values that are not finite. Kilograms already have a prefix.
     """
     plain = unit in ("s", "m", "m/s", "m/s²", "N", "Pa", "J", "B")
     if not plain or not math.isfinite(magnitude) or magnitude == 0.0:
         return 1.0, unit
-    # a hair of tolerance, so that 999.9999999 ms reads 1 s
+    # with a small tolerance, so that 999.9999999 ms is shown as 1 s
     power = 3 * math.floor(math.log10(abs(magnitude) * (1 + 1e-9)) / 3)
     if unit in ("m/s", "m/s²", "m") and power > 0:
         power = min(power, 3) if unit != "m/s²" else 0
@@ -122,7 +122,7 @@ def prefix_for(magnitude: float, unit: str) -> tuple[float, str]:
 
 
 def engineering(value: float, unit: str, digits: int = 4) -> str:
-    """Text of a value with a fitting prefix: ``engineering(2.4e-6, "s")`` -> ``"2.400 µs"``."""
+    """Return the text of a value with a suitable prefix: ``engineering(2.4e-6, "s")`` -> ``"2.400 µs"``."""
     factor, name = prefix_for(value, unit)
     scaled = value * factor
     if scaled == 0.0 or not math.isfinite(scaled):
@@ -134,7 +134,7 @@ def engineering(value: float, unit: str, digits: int = 4) -> str:
 
 
 def duration(seconds: float) -> str:
-    """Wall time for people: ``"0.42 s"``, ``"12.3 s"``, ``"3:07"``, ``"2:05:41"``."""
+    """Return the text of a wall time: ``"0.42 s"``, ``"12.3 s"``, ``"3:07"``, ``"2:05:41"``."""
     if not math.isfinite(seconds):
         return "?"
     if seconds < 60:

@@ -1,7 +1,7 @@
-"""Whether a result file can be read and is what was written, found out by a process that it may end.
+"""Verification of a result file in a separate process.
 
-HDF5 may crash on a damaged file, so a process of its own reads it first: ``python -m pfem_petsc.output.verify FILE
-deep|quick`` prints what is wrong, a line each. :func:`examine` starts it.
+HDF5 may crash on a damaged file, so a separate process reads it first: ``python -m pfem_petsc.output.verify FILE
+deep|quick`` prints one line for each defect. :func:`examine` starts it.
 """
 
 from __future__ import annotations
@@ -19,28 +19,28 @@ from ..errors import InputError
 __all__ = ["examine"]
 
 QUICK = 1 << 28
-"""Files up to this size [B] are read whole where nothing else is asked for."""
+"""Files up to this size [B] are read completely by default."""
 SHOWN = 5
 LAUNCHERS = ("OMPI_", "PMIX_", "PMI_", "OPAL_", "ORTE_", "PRTE_", "MPI_LOCALRANKID", "SLURM_PROCID", "PALS_")
 
 
 def examine(path: Path, deep: bool | None = None) -> list[str]:
-    """What is wrong with the values in a result file, a line each; none for a sound one. One process.
+    """Return one line for each defect of the values in a result file. Not collective.
 
     Parameters
     ----------
     path : Path
         An existing file.
     deep : bool, optional
-        Read the values of all snapshots; without it only structure, mesh and history of files over 256 MiB.
+        Whether to read the values of all snapshots; by default only structure, mesh and history of files over 256 MiB.
 
     Raises
     ------
     InputError
-        When the file cannot be opened or read, or ends the process that reads it.
+        If the file cannot be opened or read, or crashes the process that reads it.
     """
     found = path.stat()
-    # a restart asks several times
+    # cached, because a restart calls this several times
     lines, trouble = _examined(path, found.st_size, found.st_mtime_ns, bool(deep) or found.st_size <= QUICK)
     if trouble:
         raise InputError(trouble)
@@ -49,10 +49,10 @@ def examine(path: Path, deep: bool | None = None) -> list[str]:
 
 @functools.lru_cache(maxsize=4)
 def _examined(path: Path, size: int, changed: int, deep: bool) -> tuple[tuple[str, ...], str]:
-    """Lines about values, or why the file cannot be read, of a file of this size and time of change [ns]."""
+    """Return lines about values, or why a file of this size and modification time [ns] cannot be read."""
     for left in reversed(range(4)):
         done = _read_apart(path, deep)
-        # A run that is going on may have been met between two of its writes.
+        # A running simulation may be between two of its writes.
         if (done.returncode == 0 and not done.stdout) or not left or time.time() - changed * 1e-9 > 60.0:
             break
         time.sleep(0.3)
@@ -68,7 +68,7 @@ def _examined(path: Path, size: int, changed: int, deep: bool) -> tuple[tuple[st
 
 
 def _read_apart(path: Path, deep: bool) -> subprocess.CompletedProcess:
-    # Not one of the ranks: with their variables h5py would start MPI.
+    # Without the environment variables of the ranks, with which h5py would start MPI.
     variables = {name: value for name, value in os.environ.items() if not name.startswith(LAUNCHERS)}
     root = str(Path(__file__).parents[2])
     variables["PYTHONPATH"] = os.pathsep.join([root, *filter(None, [variables.get("PYTHONPATH")])])
@@ -90,14 +90,14 @@ def _main(path: Path, deep: bool) -> int:
 
     try:
         with readable(path), h5py.File(path, "r", locking=False) as file:
-            # all that describes the data, what no checksum of ours covers included
+            # all metadata, including those without a checksum of this program
             dataset_names(file)
             for name in ("VTKHDF", "VTKHDF/Steps", "history", "case"):
                 dict(file[name].attrs)
             if CHECKS not in file:
                 raise InputError(
                     f"{path}: has no checksums: it was written by an earlier version of pfem_petsc; "
-                    "run the case anew, or read it with that version"
+                    "run the case again, or read it with that version"
                 )
             for line in damages(file, deep):
                 print(line, flush=True)

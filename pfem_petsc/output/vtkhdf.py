@@ -1,4 +1,4 @@
-"""Results in one VTKHDF file, written by all ranks together and readable by ParaView, also during the run."""
+"""Results in one VTKHDF file, written by all ranks together and readable by ParaView, even during the run."""
 
 from __future__ import annotations
 
@@ -41,36 +41,36 @@ __all__ = ["ResultWriter"]
 
 
 class ResultWriter:
-    """Writes snapshots and history of a run to one file: the same for any number of ranks.
+    """Writes snapshots and history of a run to one file, the same for any number of ranks.
 
-    ``/VTKHDF`` is a temporal UnstructuredGrid of lines in the mesh's own numbering: connectivity once, points (the
-    current positions) and fields a snapshot. A kill may come at any moment, also within a flush, which writes in an
-    order of its own. So a snapshot's data and offsets are flushed before it is counted, and its count is flushed before
-    its time is written: VTK cannot read a step without data, and crashes on more times than steps.
-    ``/history`` has a row a recorded step, ``/case`` what is needed to run the case again, ``/snapshots`` step and
+    ``/VTKHDF`` is a temporal UnstructuredGrid of lines in mesh numbering: the connectivity once, and points (the
+    current positions) and fields for each snapshot. A kill may occur at any time, even within a flush, whose order of
+    writes is undefined. Therefore the data and offsets of a snapshot are flushed before it is counted, and its count is
+    flushed before its time is written: VTK cannot read a step without data, and crashes on more times than steps.
+    ``/history`` has one row per recorded step, ``/case`` the data needed to run the case again, ``/snapshots`` step and
     time of each snapshot.
 
-    All methods are collective. After a :class:`SimulationFailure` they raise it again, and the
-    writer can only be closed.
+    All methods are collective. After a :class:`SimulationFailure` they raise it again, and the writer can only be
+    closed.
 
     Parameters
     ----------
     path : Path or str
-        The file; replaced when it exists, unless ``append_after_step`` is given. Missing folders are made.
+        The file; replaced if it exists, unless ``append_after_step`` is given. Missing folders are created.
     comm : MPI.Comm
     mesh : DistributedMesh
     point_fields, cell_fields : sequences of str
-        Names given to each snapshot; the shape of their rows is taken from the first snapshot.
+        Names of the fields; the shape of their rows is that in the first snapshot.
     columns : mapping of history column ("wall/floor/force") to the shape of one row's value, () for a number
-    column_types : mapping of history column to type, float64 for those not in it
+    column_types : mapping of history column to type; default: float64
     case_text : str
         The resolved case.
     attributes : mapping
-        Stored as attributes of ``/case``: numbers, texts, or anything JSON can hold.
+        Stored as attributes of ``/case``: numbers, texts, or any JSON data.
     precision : "float64" or "float32"
-        Of the fields. Points stay float64: strain from positions in single precision is noise.
+        Of the fields. Points are always float64, because strains from positions in single precision are noise.
     append_after_step : int, optional
-        Continue an existing file: what is later than this step is dropped.
+        Continue an existing file; data after this step are removed.
     last : (int, int), optional
         Steps of the last snapshot and of the last history row that are kept then, where not all up to that step are.
     modes : "vibration" or "buckling", optional
@@ -79,8 +79,8 @@ class ResultWriter:
     Raises
     ------
     InputError
-        On all ranks: unwritable folder, serial h5py on several ranks, a file to append to that is missing, damaged
-        or of another case.
+        On all ranks, for an unwritable folder, serial h5py on several ranks, or a file to append to that is missing,
+        damaged or of another case.
     """
 
     def __init__(
@@ -104,14 +104,14 @@ class ResultWriter:
         self.path, self.comm = Path(path), comm
         self.n_nodes, self.n_bars = int(mesh.n_nodes), int(mesh.n_bars)
         self._precision = np.dtype(precision)
-        # Bars evaluated on two ranks are written by the one that counts them.
+        # Bars evaluated on two ranks are written by the rank that counts them.
         self.counted = mesh.counted
         self.node_order = mesh.node_order
         self.bar_order = mesh.bar_order
-        self._unpublished: Path | None = None  # what the file is called until something complete is in it
+        self._unpublished: Path | None = None  # temporary name until the file has complete data
         self._fields = {"PointData": sorted(point_fields), "CellData": sorted(cell_fields)}
         self._file: h5py.File | None = None
-        # Why no more can be written, and whether the open file can still be closed.
+        # The failure after which nothing can be written, and whether the open file can still be closed.
         self._failure: SimulationFailure | None = None
         self._broken = False
 
@@ -130,7 +130,7 @@ class ResultWriter:
             self._file = open_shared(self._unpublished or self.path, comm)
         vtk = self._file["VTKHDF"]
         self.n_snapshots = int(vtk["Steps"].attrs["NSteps"])
-        # Points and fields; made with the first snapshot, which knows the shapes.
+        # Points and fields, created with the first snapshot, which defines the shapes.
         self._data = field_datasets(vtk) if self.n_snapshots else {}
         self._index = SnapshotIndex(self._file, comm, self.path, mesh)
         self._history = HistoryWriter(self._file, comm, self.path, columns)
@@ -146,24 +146,24 @@ class ResultWriter:
         point_data: Mapping[str, np.ndarray],
         cell_data: Mapping[str, np.ndarray],
     ) -> None:
-        """Append a snapshot, and the history rows that are in memory. Collective.
+        """Append a snapshot, and write the buffered history rows. Collective.
 
         Parameters
         ----------
         time : float
             [s]
         step : int
-            Number of the time step, larger than that of the snapshot before.
+            Number of the time step, larger than that of the previous snapshot.
         points : (n_owned, 3) float64
             Current positions [m].
         point_data : mapping of name to (n_owned, 3) or (n_owned,)
         cell_data : mapping of name to (n local bars, ...)
-            Of these the counted bars are written.
+            Only the counted bars are written.
 
         Raises
         ------
         SimulationFailure
-            On all ranks: disk full, file gone.
+            On all ranks, for example if the disk is full or the file is missing.
         """
         file = self._ready()
         given = {"PointData": point_data, "CellData": cell_data}
@@ -201,14 +201,14 @@ class ResultWriter:
     def append_history(self, row: Mapping[str, Any] | None) -> None:
         """Add a row: rank 0 passes a value for each column, the other ranks None. Collective.
 
-        Rows are kept in memory until a snapshot, :meth:`flush_history`, :meth:`close`, or a thousand of them.
+        Rows are buffered until a snapshot, :meth:`flush_history`, :meth:`close`, or a thousand rows.
         """
         if self._history.full:
             self.flush_history()
         self._history.append(row)
 
     def flush_history(self) -> None:
-        """Write the rows kept in memory. Collective."""
+        """Write the buffered rows. Collective."""
         file = self._ready()
         if self._history.n_buffered == 0:
             return
@@ -232,7 +232,7 @@ class ResultWriter:
             self._publish()
 
     def close(self) -> None:
-        """Write what is in memory and close the file; a second call does nothing. Collective."""
+        """Write buffered rows and close the file; a second call does nothing. Collective."""
         if self._file is None:
             return
         try:
@@ -251,7 +251,7 @@ class ResultWriter:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, traceback: object) -> None:
-        # An unforeseen error may have come on this rank alone: closing together would wait for ever.
+        # An unexpected error may have occurred on this rank only, and a collective close would wait forever.
         if kind is None or self.comm.size == 1 or isinstance(error, PfemError):
             self.close()
 
@@ -273,9 +273,10 @@ class ResultWriter:
             raise
 
     def _publish(self) -> None:
-        """Rename the file to its final name at the first flush: HDF5 may be unable to open what a kill before leaves.
+        """Rename the file to its final name after the first flush.
 
-        The first flush writes links to new objects before the superblock, which contains the end of the file.
+        The first flush writes links to new objects before the superblock, which contains the end of the file, so HDF5
+        may be unable to open a file that was killed before.
         """
         if self._unpublished is None:
             return

@@ -1,1 +1,1 @@
-"""What all ranks do together: agreeing on errors, moving arrays between numberings."""
+"""Parallel utilities: collective errors, arrays in different numberings, logging stages of PETSc."""

@@ -1,4 +1,4 @@
-"""Collective handling of errors: when one rank fails in a known way, all ranks raise the same error."""
+"""Collective handling of errors: if one rank raises a known error, all ranks raise the same error."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ T = TypeVar("T")
 
 @contextmanager
 def agreed(comm: MPI.Comm) -> Iterator[None]:
-    """Run a block on all ranks; if any raises a :class:`PfemError`, all raise that of the lowest such rank.
+    """Context that runs a block on all ranks; if any raises a :class:`PfemError`, all raise that of the lowest rank.
 
-    The block must not communicate (a rank that has left it early would be missed there). Collective.
+    The block must not communicate, because ranks may leave it early. Collective.
     """
     error: PfemError | None = None
     try:
@@ -32,7 +32,7 @@ def agreed(comm: MPI.Comm) -> Iterator[None]:
 
 
 def on_root(comm: MPI.Comm, function: Callable[..., T], *arguments: Any) -> T:
-    """Call a function on rank 0 and give its result (pickled) to all; its :class:`PfemError` is raised on all."""
+    """Call a function on rank 0 and broadcast its result (pickled); its :class:`PfemError` is raised on all ranks."""
     result = None
     with agreed(comm):
         if comm.rank == 0:

@@ -1,4 +1,4 @@
-"""Arrays between the numbering of a distributed mesh and slabs: contiguous ranges of the mesh's own numbering."""
+"""Moves arrays between the numbering of a distributed mesh and slabs, contiguous ranges of the mesh numbering."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ __all__ = ["NaturalOrder"]
 
 
 class NaturalOrder:
-    """Moves arrays between the rows a rank owns (any order) and its slab of the mesh's own numbering.
+    """Moves arrays between the rows that a rank owns (any order) and its slab of the mesh numbering.
 
-    Rank r of p holds the r-th contiguous range of the n rows, the first n mod p ranks one row more (PETSc's split).
-    Everything that does not depend on the values is worked out once here; a transfer is then one ``Alltoallv``,
-    and on one rank a permutation, or nothing at all where the numberings agree.
+    Rank r of p has the r-th contiguous range of the n rows; the first n mod p ranks have one more row (as in PETSc).
+    Everything that does not depend on the values is computed once. A transfer is then one ``Alltoallv``, and on one
+    rank a permutation, or nothing if the numberings are equal.
 
     Parameters
     ----------
     comm : MPI.Comm
     ids : (n,) int64
-        Mesh numbers of the rows owned by this rank. Over all ranks each number appears exactly once.
+        Mesh numbers of the rows owned by this rank. Each number appears exactly once over all ranks.
     n_global : int
-        How many rows there are over all ranks.
+        Total number of rows over all ranks.
 
     Attributes
     ----------
@@ -33,7 +33,7 @@ class NaturalOrder:
     Raises
     ------
     ValueError
-        On all ranks, when a number is missing, owned twice or out of range.
+        On all ranks, if a number is missing, owned twice or out of range.
     """
 
     def __init__(self, comm: MPI.Comm, ids: np.ndarray, n_global: int) -> None:
@@ -54,7 +54,7 @@ class NaturalOrder:
             raise ValueError(f"the {self.n_global} mesh numbers are not owned exactly once each")
 
     def _order_alone(self, ids: np.ndarray) -> bool:
-        """One rank: the row of each number, in the smallest integers that hold it."""
+        """Store the row of each number on one rank, in the smallest sufficient integer type."""
         kind = np.int32 if self.n_global < 2**31 else np.int64
         self._owned_rows = np.full(self.n_global, -1, dtype=kind)
         self._owned_rows[ids] = np.arange(self.n_owned, dtype=kind)
@@ -79,13 +79,13 @@ class NaturalOrder:
         )
 
     def owned_rows(self, first: int, last: int) -> np.ndarray:
-        """On one rank: rows of the numbers first to last - 1."""
+        """Return the rows of the numbers first to last - 1; on one rank only."""
         return self._owned_rows[first:last]
 
     def to_slab(self, array: np.ndarray) -> np.ndarray:
-        """Owned rows (n_owned, ...) to this rank's slab (count, ...). Collective.
+        """Move owned rows (n_owned, ...) to this rank's slab (count, ...). Collective.
 
-        On one rank whose rows are in mesh order already the result is ``array`` itself.
+        On one rank with rows in mesh order the result is ``array`` itself.
         """
         self._check(array, self.n_owned)
         if self._identity:
@@ -98,7 +98,7 @@ class NaturalOrder:
         return slab
 
     def from_slab(self, slab: np.ndarray) -> np.ndarray:
-        """This rank's slab (count, ...) to owned rows (n_owned, ...): undoes :meth:`to_slab`. Collective."""
+        """Move this rank's slab (count, ...) to owned rows (n_owned, ...); inverse of :meth:`to_slab`. Collective."""
         self._check(slab, self.count)
         if self._identity:
             return slab
@@ -112,7 +112,7 @@ class NaturalOrder:
         owned, slab = (self._owned_counts, self._owned_starts), (self._slab_counts, self._slab_starts)
         sending, receiving = (owned, slab) if to_slab else (slab, owned)
         received = np.empty((int(receiving[0].sum()), *rows.shape[1:]), dtype=rows.dtype)
-        # Counting in rows, not bytes, keeps the counts within MPI's 32 bits.
+        # Counts in rows instead of bytes stay within the 32-bit integers of MPI.
         row = MPI.BYTE.Create_contiguous(rows.dtype.itemsize * int(np.prod(rows.shape[1:], dtype=np.int64)))
         row.Commit()
         try:

@@ -1,7 +1,6 @@
 """Stages and events of a run for PETSc's ``-log_view``.
 
-They are laid over the methods of one simulation when PETSc logs, and only then: a run that does not ask for them calls
-its methods directly.
+They wrap the methods of a simulation only if PETSc logs; otherwise a run calls its methods directly.
 """
 
 from __future__ import annotations
@@ -29,13 +28,13 @@ EVENTS: dict[str, tuple[str, ...]] = {
     "pfemSnapshot": ("outputs.snapshots.write",),
     "pfemCheckpoint": ("outputs.checkpointing.write",),
 }
-"""Event: the methods of a simulation that it covers. Those within another are counted in both."""
+"""Event to the methods of a simulation that it measures. Nested events are counted in both."""
 
 Method = TypeVar("Method", bound=Callable[..., Any])
 
 
 def staged(method: Method) -> Method:
-    """Decorate a method that belongs to the set-up."""
+    """Decorate a method of the set-up stage."""
 
     @functools.wraps(method)
     def in_stage(*arguments: Any, **keywords: Any) -> Any:
@@ -54,7 +53,7 @@ def staged(method: Method) -> Method:
 
 
 def instrument(simulation: Any) -> None:
-    """Lay the stage of the steps and all events over a simulation that is set up, if PETSc logs."""
+    """Wrap the stage of the steps and all events around the methods of a simulation, if PETSc logs."""
     from petsc4py import PETSc
 
     if not PETSc.Log.isActive():
@@ -68,7 +67,7 @@ def instrument(simulation: Any) -> None:
 
 
 def _cover(root: Any, path: str, begin: Callable[[], None], end: Callable[[], None]) -> None:
-    """Put a method of one object between ``begin`` and ``end``; what this run does not have is passed by."""
+    """Wrap a method of one object in ``begin`` and ``end``; methods that this run does not have are skipped."""
     *way, name = path.split(".")
     for step in way:
         root = getattr(root, step, None)

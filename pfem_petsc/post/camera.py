@@ -1,4 +1,4 @@
-"""A camera that stays where it is over all frames and has the whole motion in view."""
+"""A camera that is fixed for all frames and has the whole motion in view."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["VIEWS", "Camera", "aim"]
 
 VIEWS = ("auto", "xy", "xz", "yz", "iso")
 
-_FLAT = {  # direction from the structure to the eye, and what is up
+_FLAT = {  # direction from the structure to the eye, and the upward direction
     "xy": ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0)),
     "xz": ((0.0, -1.0, 0.0), (0.0, 0.0, 1.0)),
     "yz": ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
@@ -24,15 +24,15 @@ _OPENING = 25.0  # degrees, vertical
 
 @dataclass(frozen=True)
 class Camera:
-    """Where the eye is.
+    """Position and orientation of the camera.
 
     Parameters
     ----------
     towards, up, right : (3,) unit vectors: from the structure to the eye, and the picture's axes
-    centre : (3,) [m], what is in the middle of the picture
+    centre : (3,) [m], the point in the middle of the picture
     distance : [m], from the centre to the eye
-    half_height : [m], half of what the picture shows vertically, at the centre
-    parallel : without perspective
+    half_height : [m], half of the vertical extent of the picture, at the centre
+    parallel : whether there is no perspective
     """
 
     towards: np.ndarray
@@ -63,17 +63,17 @@ def aim(
     upward: Sequence[float] = (0.0, 0.0, 1.0),
     margin: float = 1.05,
 ) -> Camera:
-    """Camera that has all ``points`` in view.
+    """Return a camera that has all ``points`` in view.
 
     Parameters
     ----------
-    points : (n, 3) [m], all that is to be seen (corners suffice)
-    bounds : (2, 3) [m], bounds of the structure's motion, from which ``"auto"`` sees whether it is flat
+    points : (n, 3) [m], points that must be visible (corners suffice)
+    bounds : (2, 3) [m], bounds of the structure's motion, from which ``"auto"`` determines whether it is flat
     normals : allowed sides of the walls; the oblique view looks at walls from there
     view : one of :data:`VIEWS`
     aspect : width over height of the picture
-    upward : what is up in the oblique view
-    margin : how much more than the points is shown
+    upward : upward direction of the oblique view
+    margin : factor on the visible extent
 
     Raises
     ------
@@ -97,7 +97,7 @@ def aim(
     half = 0.5 * max(np.ptp(along), np.ptp(across) / aspect) * margin or 1.0
     if view in _FLAT:
         return Camera(towards, up, right, centre, 10.0 * (half * max(1.0, aspect) + np.ptp(deep)), half, True)
-    # with perspective each point asks for its own distance; nearer ones for more of it
+    # with perspective each point requires its own distance, larger for nearer points
     slope = np.tan(np.radians(_OPENING) / 2)
     needed = np.maximum(np.abs(along - middle[1]), np.abs(across - middle[0]) / aspect) * margin / slope
     distance = float((needed + deep - middle[2]).max()) or 1.0
@@ -114,12 +114,12 @@ def _flat_view(bounds: np.ndarray) -> str:
 
 
 def _oblique(normals: Sequence[np.ndarray], upward: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Direction of the eye: slightly from above, from the quarter that sees most walls from their allowed side."""
+    """Return the direction of the eye: slightly from above, from the quadrant that sees most walls from the front."""
     first = np.array([1.0, 0.0, 0.0]) if abs(upward[0]) < 0.9 else np.array([0.0, 1.0, 0.0])
     first -= (first @ upward) * upward
     first /= np.linalg.norm(first)
     second = np.cross(upward, first)
-    # -second is towards the reader in a right-handed picture: the quarter taken where walls do not say otherwise
+    # -second points towards the viewer in a right-handed picture, the default quadrant
     quarters = [a * first + b * second for b in (-1.3, 1.3) for a in (0.9, -0.9)]
     quarters += [1.3 * a * first + 0.9 * b * second for b in (-1.0, 1.0) for a in (1.0, -1.0)]
     directions = [quarter + 0.65 * upward for quarter in quarters]

@@ -1,4 +1,4 @@
-"""A house style for curves, and the few things every chart over time needs."""
+"""The style of curves, and utilities for charts over time."""
 
 from __future__ import annotations
 
@@ -41,11 +41,11 @@ STYLE: dict[str, Any] = {
     "figure.facecolor": "white",
 }
 
-_POINTS = 3000  # a curve has at most about so many: more than a picture has columns
+_POINTS = 3000  # approximate maximum number of points of a curve, more than a picture has columns
 
 
 def thinned(time: np.ndarray, values: np.ndarray, points: int = _POINTS) -> tuple[np.ndarray, np.ndarray]:
-    """A curve (n,) with fewer points that looks the same: lowest and highest value of each stretch of time."""
+    """Return a curve (n,) with fewer points that looks the same: lowest and highest value of each time interval."""
     if len(time) <= points:
         return time, values
     stretch = -(-len(time) // (points // 2))
@@ -54,16 +54,16 @@ def thinned(time: np.ndarray, values: np.ndarray, points: int = _POINTS) -> tupl
     with np.errstate(invalid="ignore"):
         picked = np.stack([np.argmin(body, axis=1), np.argmax(body, axis=1)], axis=1)
     picked = np.sort(picked, axis=1) + stretch * np.arange(whole)[:, None]
-    rest = values[whole * stretch - 1 :]  # shorter than a stretch; it overlaps by a point so that it is never empty
+    rest = values[whole * stretch - 1 :]  # shorter than an interval; it overlaps by a point, so that it is never empty
     last = whole * stretch - 1 + np.array([np.argmin(rest), np.argmax(rest)])
     picked = np.unique(np.concatenate([picked.ravel(), last, [0, len(time) - 1]]))
     return time[picked], values[picked]
 
 
 def window_mean(time: np.ndarray, values: np.ndarray, width: float) -> np.ndarray:
-    """Mean of a piecewise linear curve over the time of this width [s] before each point, cut at the start.
+    """Return the mean of a piecewise linear curve over a window [s] before each point, truncated at the start.
 
-    It rises with what has been, never before it. The integral is exact whatever the spacing of the points.
+    It depends on past values only. The integral is exact for any spacing of the points.
     """
     if len(time) < 2 or width <= 0:
         return values.copy()
@@ -82,7 +82,7 @@ def window_mean(time: np.ndarray, values: np.ndarray, width: float) -> np.ndarra
 
 
 def literal(text: str) -> str:
-    """A text as it stands: dollar signs begin no formula."""
+    """Return a text in which dollar signs do not start a formula."""
     return text.replace("$", r"\$")
 
 
@@ -131,7 +131,7 @@ class Chart:
         styles: Sequence[dict[str, Any]] | None = None,
         legend: bool = True,
     ) -> tuple[float, str]:
-        """Draw named curves (n,) of one unit into a panel; give the factor and unit of its axis."""
+        """Draw named curves (n,) of one unit into a panel; return the factor and unit of its axis."""
         finite = [np.abs(values[np.isfinite(values)]).max(initial=0.0) for _, values in curves]
         factor, shown = prefix_for(float(max(finite, default=0.0)), unit)
         for number, (name, values) in enumerate(curves):
@@ -145,7 +145,7 @@ class Chart:
         return factor, shown
 
     def counts(self, axes: Any, label: str, values: np.ndarray, colour: str = COLOURS[0]) -> None:
-        """Draw whole numbers (n,) a step into a panel."""
+        """Draw integers (n,) as steps into a panel."""
         from matplotlib.ticker import MaxNLocator
 
         time, thin = thinned(self.time, np.asarray(values, dtype=float))
@@ -161,7 +161,7 @@ class Chart:
         Raises
         ------
         InputError
-            When it cannot be written.
+            If it cannot be written.
         """
         try:
             file.parent.mkdir(parents=True, exist_ok=True)

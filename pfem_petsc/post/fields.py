@@ -1,4 +1,4 @@
-"""What a picture is coloured by: a field of a result as one number a bar or node, its range, and its colours."""
+"""Colours of a picture: a field of a result as one number per bar or node, its range, and its colour map."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from ..registry import nearest
 
 __all__ = ["ColourField", "ColourScale"]
 
-# Middle and start are a dark grey: bars at rest must stand out from a white page as well as strained ones.
+# Middle and start are a dark grey, so that bars at rest stand out from a white page as well as strained ones.
 DIVERGING = ("#16b1f3", "#1f74d4", "#535b68", "#d2402f", "#fb8a1e")
 SEQUENTIAL = ("#535b68", "#6b429f", "#b5307c", "#ea5a3d", "#f9a11b")
 
 _SIGNED = ("stress", "strain", "axial_force")
 _COMPONENTS = {"x": 0, "y": 1, "z": 2, 0: 0, 1: 1, 2: 2}
-_SAMPLES = 60  # snapshots that a range is taken from, at most
+_SAMPLES = 60  # maximum number of snapshots from which a range is determined
 
 
 class ColourField:
-    """A point or cell field of a result, reduced to one value a node or bar.
+    """A point or cell field of a result, reduced to one value per node or bar.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ class ColourField:
     Raises
     ------
     InputError
-        For a field that the result does not hold (with the nearest one it does), or a component it has not.
+        For a field that the result does not have (with the nearest name), or a component that it does not have.
     """
 
     def __init__(self, result: Any, name: str, component: str | int | None = None) -> None:
@@ -53,17 +53,17 @@ class ColourField:
         self.title = f"{title} {'xyz'[self._component]}" if self._component is not None else title
 
     def values(self, index: int) -> np.ndarray:
-        """Values of a snapshot, (nodes,) or (bars,) float64."""
+        """Return the values of a snapshot, (nodes,) or (bars,) float64."""
         values = np.asarray(self._result.field(self.name, index), dtype=float)
         if values.ndim == 1:
             return values
         return np.linalg.norm(values, axis=1) if self._component is None else values[:, self._component]
 
     def limits(self, indices: Iterable[int]) -> tuple[float, float]:
-        """Range for all frames: symmetric about zero for signed fields.
+        """Return the range for all frames, symmetric about zero for signed fields.
 
-        In each snapshot one value in a hundred may lie beyond (a spike at an impact would leave the rest without
-        contrast), unless the range that holds all of them is not much larger.
+        In each snapshot one value in a hundred may lie outside (a spike at an impact would leave the rest without
+        contrast), unless the full range is not much larger.
         """
         indices = list(indices)
         chosen = [indices[k] for k in np.unique(np.linspace(0, len(indices) - 1, _SAMPLES).astype(int))]
@@ -76,7 +76,7 @@ class ColourField:
             sizes = np.abs(values)
             bulk = max(bulk, float(np.quantile(sizes, 0.99)))
             largest = max(largest, float(sizes.max()))
-            # not for what rounding leaves of a field that cannot be negative
+            # not for rounding in a field that cannot be negative
             signed = signed or bool((values < -1e-9 * sizes.max()).any())
         limit = largest if largest <= 2.0 * bulk or bulk == 0.0 else bulk
         limit = limit or 1.0
@@ -84,7 +84,7 @@ class ColourField:
 
 
 class ColourScale:
-    """Values to colours, by a table of 256.
+    """Maps values to colours by a table of 256 entries.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ class ColourScale:
     Raises
     ------
     InputError
-        When the limits are not two increasing numbers, or for an unknown colour map.
+        If the limits are not two increasing numbers, or for an unknown colour map.
     """
 
     def __init__(self, limits: tuple[float, float], cmap: Any = None, unit: str = "") -> None:
@@ -117,6 +117,6 @@ class ColourScale:
         self._table = (255 * cmap(np.linspace(0.0, 1.0, 256))[:, :3] + 0.5).astype(np.uint8)
 
     def colours(self, values: np.ndarray) -> np.ndarray:
-        """Colours (n, 3) uint8 of values (n,): the end ones beyond the limits, the low one for not-a-numbers."""
+        """Return colours (n, 3) uint8 of values (n,), clipped at the limits; NaN has the lowest colour."""
         place = np.nan_to_num((values - self.low) * (255.0 / (self.high - self.low)), nan=0.0, posinf=255, neginf=0)
         return self._table[np.clip(place, 0, 255).astype(np.uint8)]

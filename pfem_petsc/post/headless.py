@@ -1,4 +1,4 @@
-"""Drawing without a display: find an OpenGL that works before VTK is asked to use one, because VTK crashes hard."""
+"""Drawing without a display: finds a working OpenGL library before VTK uses one, because VTK would crash."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ __all__ = ["require_rendering"]
 
 VARIABLE = "VTK_DEFAULT_OPENGL_WINDOW"
 
-# Nothing is shown, so a display is not asked first: it may be gone, or far away behind ssh.
+# Nothing is shown, so a display is not tried first: it may be closed, or remote over ssh.
 _HEADLESS = ("vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow")
 
-# Draw a red square where a library is there at all: a crash, a hang or an empty image all count as "does not work". So
+# Draw a red square if there is a library: a crash, a hang or an empty image all count as "does not work". So
 # does a window of another kind than asked for, which VTK takes where the library is missing, with warnings each time.
 _PROBE = """
 import os
@@ -51,15 +51,15 @@ def _works(window: str | None) -> bool:
 
 @functools.cache
 def require_rendering() -> None:
-    """Make sure that VTK can draw in this process, choosing EGL or OSMesa, whichever works.
+    """Ensure that VTK can draw in this process, with EGL or OSMesa, whichever works.
 
-    A choice made by the user in ``VTK_DEFAULT_OPENGL_WINDOW`` is tried first, what VTK takes by itself last. Call
-    before the first render window.
+    The user's choice in ``VTK_DEFAULT_OPENGL_WINDOW`` is tried first, the default of VTK last. Call this before the
+    first render window.
 
     Raises
     ------
     InputError
-        When no OpenGL works; the message says what to install.
+        If no OpenGL library works; the message states what to install.
     """
     own = [os.environ[VARIABLE]] if VARIABLE in os.environ else []
     for window in [*own, *_HEADLESS, None]:

@@ -1,4 +1,4 @@
-"""The page around a drawing: title, time, colour bar, scale and axes; drawn once, only the time changes."""
+"""The page around a drawing: title, time, colour bar, scale and axes. It is drawn once, and only the time changes."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Page:
     field : title of the field
     scale : its colours
     camera : for the length scale and the axes
-    drawn_height : pixels that the camera's view takes vertically; None: the region's height
+    drawn_height : vertical extent of the camera's view in pixels; None: the region's height
     """
 
     def __init__(
@@ -57,25 +57,25 @@ class Page:
 
     @staticmethod
     def region_of(size: tuple[int, int]) -> tuple[int, int, int, int]:
-        """Left, top, width and height of the part of a page that the drawing takes, in pixels."""
+        """Return left, top, width and height of the part of a page with the drawing, in pixels."""
         unit = min(size[0] / 1280, size[1] / 720)
         left, top, right, bottom = (round(pixels * unit) for pixels in (20, 64, 150, 52))
         return left, top, size[0] - left - right, size[1] - top - bottom
 
     @staticmethod
     def strip_of(size: tuple[int, int]) -> int:
-        """Height of the strip above a tile, in pixels."""
+        """Return the height of the strip above a tile, in pixels."""
         return round(34 * min(size[0] / 1280, size[1] / 720))
 
     def compose(self, drawing: np.ndarray, time: str) -> np.ndarray:
-        """The page (height, width, 3) uint8 with a drawing of the region's size, and a text for the time."""
+        """Return the page (height, width, 3) uint8 with a drawing of the region's size, and a text for the time."""
         left, top, width, height = self.region
         page = self._background.copy()
         page[top : top + height, left : left + width] = drawing
         return self._written(page, [(left + width, round(22 * self._unit), time)], "ra")
 
     def compose_tiles(self, drawings: list[np.ndarray], times: list[str], columns: int) -> np.ndarray:
-        """The page with several drawings of one size, row by row, each below a strip with its time."""
+        """Return the page with several drawings of one size, row by row, each below a strip with its time."""
         left, top, _, _ = self.region
         page = self._background.copy()
         texts = []
@@ -103,7 +103,7 @@ class Page:
         figure = Figure(figsize=(width / 100, height / 100), dpi=100, facecolor="white")
         canvas = FigureCanvasAgg(figure)
         left, top, inner_width, inner_height = self.region
-        # room for the time is kept free
+        # space for the time is left empty
         room = inner_width - 230 * self._unit
         text = figure.text(
             left / width, 1 - 22 * self._unit / height, literal(title), va="top", color=INK, weight="bold"
@@ -120,7 +120,7 @@ class Page:
         return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
     def _points(self, pixels: float) -> float:
-        """Font size in points (at 100 dots an inch) for pixels of a page of 1280 by 720."""
+        """Return the font size in points (at 100 dots per inch) for pixels of a page of 1280 by 720."""
         return max(6.0, 0.72 * pixels * self._unit)
 
     def _colour_bar(self, figure: Figure, field: str, scale: ColourScale) -> None:
@@ -187,7 +187,7 @@ class Page:
         )
 
     def _axes(self, figure: Figure, camera: Camera) -> None:
-        """Axes of space as seen by the camera, below the colour bar."""
+        """Draw the coordinate axes as seen by the camera, below the colour bar."""
         width, height = self.size
         size = 34 * self._unit
         centre = np.array([width - 92 * self._unit, 62 * self._unit])

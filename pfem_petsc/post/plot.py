@@ -19,7 +19,7 @@ from .chart import COLOURS, STYLE, Chart, window_mean
 
 __all__ = ["plot"]
 
-WINDOW = 0.02  # width of the mean that smooths wall forces, as a part of the run
+WINDOW = 0.02  # width of the moving average of wall forces, relative to the run
 
 History = Mapping[str, np.ndarray]
 
@@ -33,8 +33,8 @@ def plot(
     ----------
     result_path : result file or its folder, or an open result
     output : folder of the pictures; None: beside the result
-    curves : names of history columns, drawn into ``curves.png`` in place of the other pictures; the ``curves.png`` of
-        other columns stays, and the new one is ``curves_2.png`` and so on
+    curves : names of history columns, drawn into ``curves.png`` instead of the other pictures; an existing
+        ``curves.png`` is kept, and the new one is ``curves_2.png`` and so on
 
     Returns
     -------
@@ -44,8 +44,8 @@ def plot(
     Raises
     ------
     InputError
-        For a column that the history does not hold (with the nearest one it does), an empty history, or a folder
-        that cannot be written.
+        For a column that the history does not have (with the nearest name), an empty history, or a folder that cannot
+        be written.
     """
     import matplotlib
 
@@ -79,7 +79,7 @@ def _opened(result: Path | str | Any) -> Any:
 
 
 def _free(file: Path) -> Path:
-    """The name, or the next with a number that is not taken."""
+    """Return the file name, with the next free number if it exists."""
     numbered = (file.with_name(f"{file.stem}_{k}{file.suffix}") for k in itertools.count(2))
     return next(path for path in itertools.chain([file], numbered) if not path.exists())
 
@@ -98,7 +98,7 @@ def _words(name: str) -> str:
 
 
 def balance_error(history: History) -> np.ndarray | None:
-    """What stored, lost and supplied energies leave over since the first row, (n,) [J]; None where none is held."""
+    """Return the imbalance of stored, lost and supplied energies since the first row, (n,) [J]; None without them."""
     signs = {**dict.fromkeys((*STORED, *LOST), 1.0), **dict.fromkeys(SUPPLIED, -1.0)}
     parts = [sign * _read(history, name) for name, sign in signs.items() if name in history]
     if not parts:
@@ -135,9 +135,9 @@ def _energies(history: History, title: str, file: Path) -> Path | None:
 
 
 def _components(values: np.ndarray, scale: float = 0.0) -> list[tuple[str, np.ndarray]]:
-    """Named components of (n, 3) that are not zero to rounding throughout; all, as zero, when all are.
+    """Return named components of (n, 3) that are not zero up to rounding; all, as zero, if all are.
 
-    Rounding is relative to the largest value, or to a ``scale`` where the vector is a difference of larger ones.
+    Rounding is relative to the largest value, or to ``scale`` if the vector is a difference of larger ones.
     """
     floor = 1e-9 * max(float(np.nanmax(np.abs(values), initial=0.0)), scale)
     curves = [(name, values[:, k]) for k, name in enumerate("xyz")]
@@ -146,7 +146,7 @@ def _components(values: np.ndarray, scale: float = 0.0) -> list[tuple[str, np.nd
 
 
 def _colours_of(curves: Sequence[tuple[str, np.ndarray]]) -> list[dict[str, Any]]:
-    """The same colour for x, y, z in all panels, also where some are left out."""
+    """Return the styles of curves, with the same colours for x, y, z in all panels."""
     return [{"color": COLOURS["xyz".index(name)]} for name, _ in curves]
 
 
@@ -184,7 +184,7 @@ def _probes(history: History, title: str, file: Path) -> Path | None:
             probes.setdefault("/".join(parts[1:-1]), {})[parts[-1]] = np.asarray(history[name], dtype=float)
     if not probes:
         return None
-    # a support's reaction is worth a column only where there is one; accelerations of impacts are mostly noise
+    # reactions have a column only if there are any; accelerations in impacts are mostly noise
     columns = [q for q in quantities if q != "acceleration" and any(_wanted(q, held) for held in probes.values())]
     chart = _chart(history, title, len(probes), len(columns))
     labels = {"position": "displacement"}
@@ -197,7 +197,7 @@ def _probes(history: History, title: str, file: Path) -> Path | None:
             if quantity == "position":
                 values = values - values[:1]
             nodes = values.shape[1]
-            # what a support carries is the sum of its nodes
+            # the reaction of a support is the sum over its nodes
             total = quantity == "reaction"
             how = f"sum of {nodes} nodes" if total else f"mean and range of {nodes} nodes"
             name = f"{probe} ({how})" if nodes > 1 else probe
@@ -213,7 +213,7 @@ def _wanted(quantity: str, held: dict[str, np.ndarray]) -> bool:
 
 
 def _range(chart: Chart, axes: Any, quantity: str, values: np.ndarray) -> None:
-    """Shade lowest to highest of the nodes, in the units the panel has already."""
+    """Shade the range of the nodes, in the units of the panel."""
     from ..output.units import prefix_for
 
     mean = values.mean(axis=1)
@@ -240,7 +240,7 @@ def _forces(history: History, source: str, walls: Iterable[Any], title: str, fil
     panels = iter(chart.axes[:, 0])
     width = WINDOW * float(time[-1] - time[0])
     for name, counts in zip(names, counted, strict=True):
-        # peaks (the inertia of a node that is stopped within a step) and means need scales of their own
+        # peaks (the inertia of a node that is stopped within a step) and means need different scales
         force = _read(history, f"{source}/{name}/force")
         if name in normals:
             values, label = force @ normals[name] / np.linalg.norm(normals[name]), "normal force"
@@ -263,7 +263,7 @@ def _solver(history: History, title: str, file: Path) -> Path | None:
         "active_contacts": "nodes in\ncontact",
     }
     names = [name for name in labels if name in history]
-    # an explicit scheme iterates nowhere, and a truss without walls touches nothing: these panels would be empty
+    # without iterations (explicit schemes) or without walls these panels would be empty
     walls = any(name.startswith("wall/") for name in history)
     names = [name for name in names if (walls and name == "active_contacts") or np.any(history[name])]
     if not names or (names == ["active_contacts"] and _is_shown(history)):

@@ -1,4 +1,4 @@
-"""Which instants tell the story of a run, and how they are laid out on a page."""
+"""The instants of a run shown on a poster, and their layout on the page."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ __all__ = ["grid", "instants"]
 
 
 def instants(result: Any, frames: Sequence[int], count: int) -> list[int]:
-    """Snapshots to show: first, last, first contact, most deformed, and those that fill the longest gaps.
+    """Select snapshots: first, last, first contact, most deformed, and those that fill the longest gaps.
 
     Parameters
     ----------
-    result : an open result; its history tells of contact and deformation
+    result : an open result, whose history has contact and deformation
     frames : snapshots to choose from
-    count : how many, at most
+    count : maximum number of snapshots
     """
     frames = sorted(set(frames))
     if len(frames) <= count:
@@ -38,7 +38,7 @@ def instants(result: Any, frames: Sequence[int], count: int) -> list[int]:
 
 
 def grid(count: int, aspect: float, room: tuple[int, int]) -> tuple[int, int]:
-    """Columns and rows of tiles in which pictures of this aspect (width over height) come out largest."""
+    """Return the columns and rows of tiles that make pictures of this aspect (width over height) largest."""
 
     def drawn_width(columns: int) -> float:
         rows = -(-count // columns)

@@ -22,10 +22,10 @@ from .walls import Surface, wall_shifts, wall_surfaces
 __all__ = ["render"]
 
 VIDEOS = ("mp4", "gif", "both", "none")
-MOST_FRAMES = 300  # where frames are not asked for: more make a film of over ten seconds
+MOST_FRAMES = 300  # default limit: more frames make a film of over ten seconds
 POSTER_TILES = 6
-SHORT = 2.0  # seconds of a film that is over before one has seen it
-TELL = 5.0  # seconds between two words on the progress
+SHORT = 2.0  # seconds below which a film is too short to follow
+TELL = 5.0  # seconds between two progress messages
 
 
 def render(
@@ -56,19 +56,19 @@ def render(
     output : folder of the pictures; None: beside the result
     field : point or cell field that colours the bars
     component : "x", "y" or "z" of a vector field; None: its length
-    frames : numbers of snapshots, or how many of them (evenly taken); None: all, up to 300
-    fps : frames a second of the film
+    frames : numbers of snapshots, or how many of them (evenly spaced); None: all, up to 300
+    fps : frames per second of the film
     size : of a frame in pixels
     view : "xy", "xz", "yz", "iso", or "auto": along the flat direction of a flat structure, oblique otherwise
     video : "mp4", "gif", "both" or "none"
     poster : also draw six instants on one page
     clim : range of the colours in the field's SI unit; None: from the snapshots, symmetric for signed fields
     cmap : matplotlib colour map or its name
-    scale : of the nodes' displacements since the first snapshot; walls are where they are
+    scale : factor on the nodes' displacements since the first snapshot; walls are not scaled
     bar_width : in pixels
-    nodes : draw nodes as balls; None: for small models
-    title : None: the case's
-    note : takes what is to be said, such as walls that cannot be drawn, and how far the drawing is
+    nodes : whether to draw nodes as balls; None: for small models
+    title : None: that of the case
+    note : receives messages, such as walls that cannot be drawn, and progress
 
     Returns
     -------
@@ -77,7 +77,7 @@ def render(
     Raises
     ------
     InputError
-        For options that do not fit the result, a folder that cannot be written, or when nothing can be drawn here.
+        For options that do not fit the result, a folder that cannot be written, or if rendering is not available.
     """
     if view not in VIEWS:
         raise InputError(f"render: view = {view!r} is not known; it is one of {', '.join(VIEWS)}")
@@ -144,7 +144,7 @@ def _chosen(frames: int | Iterable[int] | None, count: int, note: Callable[[str]
 
 
 def _emptied(folder: Path) -> Path:
-    """The folder of the frames, without frames of an earlier film, which would end up in this one."""
+    """Create the folder of the frames and remove frames of an earlier film, which would end up in this one."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for old in folder.glob("frame_*.png"):
@@ -158,7 +158,7 @@ def _emptied(folder: Path) -> Path:
 
 @dataclass
 class _Film:
-    """What all frames share: where the structure and its walls go, and its colours."""
+    """Data shared by all frames: motion of the structure and its walls, and colours."""
 
     result: Any
     colour: ColourField
@@ -184,7 +184,7 @@ class _Film:
         self.time_factor, self.time_unit = prefix_for(float(np.abs(times).max()), self.result.axis.unit)
 
     def _moved(self, walls: Sequence[Any]) -> dict[int, list[Surface]]:
-        """Frame to the surfaces of the walls where they are then; a wall at rest has the same one in all."""
+        """Return, by frame, the surfaces of the walls at that time; a wall at rest has the same one in all frames."""
         displacements = dict(
             zip(self.frames, wall_shifts(self.result, self.result.times[list(self.frames)]), strict=True)
         )
@@ -203,7 +203,7 @@ class _Film:
 
     @property
     def places(self) -> Iterator[np.ndarray]:
-        """Points (n, 3) [m] of all different wall surfaces."""
+        """Yield the points (n, 3) [m] of all distinct wall surfaces."""
         for surface in {id(s): s for surfaces in self.surfaces.values() for s in surfaces}.values():
             yield surface.points
 
@@ -220,7 +220,7 @@ class _Film:
         near = [corners]
         size = float(np.linalg.norm(self.bounds[1] - self.bounds[0])) or 1.0
         for points in self.places:
-            # a wall far away would make the structure a dot: it is drawn, but not aimed at
+            # a distant wall would shrink the structure to a dot: it is drawn but does not affect the view
             gap = np.maximum(points.min(axis=0) - self.bounds[1], self.bounds[0] - points.max(axis=0))
             if gap.max() < 0.6 * size:
                 near.append(points)
@@ -289,7 +289,7 @@ def _save(picture: np.ndarray, file: Path) -> Path:
     from PIL import Image
 
     try:
-        # quick compression: a film has hundreds of them
+        # fast compression, because a film has hundreds of frames
         Image.fromarray(picture).save(file, compress_level=3)
     except OSError as error:
         raise InputError(f"{file}: the picture cannot be written ({error}); give another folder") from error

@@ -1,4 +1,4 @@
-"""Bars and walls in a VTK window that is set up once; a frame moves the nodes and changes the colours."""
+"""Bars and walls in a VTK window that is set up once; each frame moves the nodes and changes the colours."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from .walls import Surface
 
 __all__ = ["Scene"]
 
-TUBE_LIMIT = 5000  # bars up to which shaded tubes are drawn; beyond, lines that are shaded through their colours
+TUBE_LIMIT = 5000  # maximum number of bars drawn as shaded tubes; more are lines shaded through their colours
 WALL_COLOUR = (116, 125, 138)
 EDGE_COLOUR = "#4b5563"
 NODE_COLOUR = "#1f242c"
 
 
 class Scene:
-    """A picture of bars without text, to be drawn many times.
+    """A picture of bars without text, which can be drawn repeatedly.
 
     Parameters
     ----------
@@ -30,7 +30,7 @@ class Scene:
     surfaces : walls of the first frame
     size : width and height in pixels
     bar_width : in pixels; None: from the length of the bars in the picture
-    nodes : draw nodes as balls; None: for small models
+    nodes : whether to draw nodes as balls; None: for small models
     """
 
     def __init__(
@@ -48,14 +48,14 @@ class Scene:
 
         self._camera, self._bars = camera, bars
         self._tubes = len(bars) <= TUBE_LIMIT
-        # twice the pixels and then their means: smooth edges whatever the OpenGL library offers
+        # draw twice the pixels and average them: smooth edges with any OpenGL library
         self._factor = 2 if self._tubes else 1
         window = (size[0] * self._factor, size[1] * self._factor)
         pixels = size[1] / (2.0 * camera.half_height)
         lengths = pixels * np.linalg.norm(points[bars[:, 1]] - points[bars[:, 0]], axis=1)
         shortest = float(np.quantile(lengths, 0.1))
         if bar_width is None:
-            # not so thick that the chords of a slender truss grow together
+            # thin enough that the chords of a slender truss do not merge
             scale = min(size[0] / 1100, size[1] / 600)
             wish = min(0.11 * float(lengths.mean()), 0.4 * shortest)
             bar_width = float(np.clip(wish, (2.0 if self._tubes else 1.2) * scale, 6.0 * scale))
@@ -69,7 +69,7 @@ class Scene:
         if not self._tubes:
             plotter.enable_anti_aliasing("msaa", multi_samples=4)
         self._walls = [self._add_wall(surface) for surface in surfaces]
-        # reference points far from the origin lose digits in the single precision of the graphics
+        # points far from the origin lose digits in the single precision of the graphics
         self._origin = camera.centre.copy()
         lines = np.column_stack([np.full(len(bars), 2), bars]).ravel()
         self._lines = pyvista.PolyData((points - self._origin).astype(np.float32), lines=lines)
@@ -101,7 +101,7 @@ class Scene:
         points : (n, 3) float64 [m]
         colours : (n, 3) uint8 of nodes or (b, 3) of bars
         on_nodes : whether the colours are those of nodes
-        surfaces : the walls where they are now; None: where they were
+        surfaces : the walls at their current positions; None: unchanged
 
         Returns
         -------
@@ -151,7 +151,7 @@ class Scene:
         self._plotter.close()
 
     def _lit(self, points: np.ndarray, colours: np.ndarray) -> np.ndarray:
-        """Colours of bars as light falls on thin round ones, for lines that the graphics does not shade."""
+        """Return colours of bars shaded like thin cylinders, for lines that the graphics does not shade."""
         along = points[self._bars[:, 1]] - points[self._bars[:, 0]]
         length = np.linalg.norm(along, axis=1)
         light = self._camera.towards + 0.7 * self._camera.up - 0.4 * self._camera.right
@@ -159,25 +159,25 @@ class Scene:
         return colours * (0.5 + 0.5 * np.sqrt(np.clip(1.0 - cosine**2, 0.0, 1.0)))[:, None]
 
     def _paler(self, colours: np.ndarray, places: np.ndarray) -> np.ndarray:
-        """Colours that fade with the depth of their places (n, 3): thousands of bars stay a body in space."""
+        """Return colours that fade with the depth of their positions (n, 3), to show thousands of bars in space."""
         depth = np.clip((self._near - places @ self._camera.towards) / self._deep, 0.0, 1.0)
         return (colours + (255.0 - colours) * (0.5 * depth)[:, None]).astype(np.uint8)
 
     def _behind(self, points: np.ndarray) -> np.ndarray:
-        """Points of a wall as drawn: without perspective behind all bars, so that it never dims one that touches it."""
+        """Return the points of a wall as drawn; without perspective it is behind all bars, so that it hides none."""
         if self._camera.parallel:
             points = points - 3.0 * self._camera.half_height * self._camera.towards
         return points
 
     def _add_wall(self, surface: Surface) -> list[Any]:
-        """Draw a wall; its meshes, whose points move with it."""
+        """Draw a wall; return its meshes, whose points move with it."""
         import pyvista
 
         points = self._behind(surface.points)
         first = points[surface.faces[0]]
         normal = np.cross(first[1] - first[0], first[2] - first[1])
         facing = float(normal @ self._camera.towards) / (np.linalg.norm(normal) or 1.0)
-        # between the eye and the structure a wall must be seen through
+        # a wall between the eye and the structure must be transparent
         strength = 150 if self._camera.parallel else (110 if facing > 0 else 35)
         faces = np.column_stack([np.full(len(surface.faces), surface.faces.shape[1]), surface.faces]).ravel()
         body = pyvista.PolyData(points, faces=faces)

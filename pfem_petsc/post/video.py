@@ -1,4 +1,4 @@
-"""Numbered pictures to an MP4 or a GIF, through ffmpeg."""
+"""Encodes numbered pictures to an MP4 or a GIF with ffmpeg."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from ..errors import InputError
 
 __all__ = ["encode"]
 
-# H.264 with 4:2:0 colours plays everywhere, and asks for even sizes
+# H.264 with 4:2:0 colours is supported everywhere, and requires even sizes
 _FILTERS = {
     "mp4": ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2:color=white", "-c:v", "libx264", "-preset", "medium", "-crf", "18"],
     "gif": [
@@ -20,18 +20,18 @@ _FILTERS = {
 
 
 def encode(pattern: Path, target: Path, fps: float) -> Path:
-    """Make a film of pictures.
+    """Encode pictures to a film.
 
     Parameters
     ----------
     pattern : path with a ``%04d`` for the number, from 0
     target : ``.mp4`` (H.264, yuv420p) or ``.gif`` (at most 800 pixels wide)
-    fps : pictures a second
+    fps : pictures per second
 
     Raises
     ------
     InputError
-        When ffmpeg cannot be found or fails, with its last words.
+        If ffmpeg cannot be found or fails, with the last line of its output.
     """
     import imageio_ffmpeg
 

@@ -1,4 +1,4 @@
-"""Surfaces that stand for walls in pictures, one function a wall type."""
+"""Surfaces that represent walls in pictures, one function per wall type."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ __all__ = ["plane", "wall_shifts", "wall_surfaces"]
 
 
 def plane(wall: Any, bounds: np.ndarray) -> Surface:
-    """Slab behind a plane wall, as wide as the structure's shadow on it and a margin.
+    """Return a slab behind a plane wall, as wide as the projection of the structure on it plus a margin.
 
     Parameters
     ----------
     wall : has ``name``, ``point`` (3,) [m] and ``normal`` (3,), which points to the allowed side
-    bounds : (2, 3) [m], lower and upper corner of all the structure passes through
+    bounds : (2, 3) [m], lower and upper corner of the structure's motion
     """
     normal = np.asarray(wall.normal, dtype=float)
     normal = normal / np.linalg.norm(normal)
-    # two tangents, the first one in the plane of least normal component: axis-aligned walls get axis-aligned edges
+    # two tangents, the first one in the plane of least normal component, so that axis-aligned walls get such edges
     helper = np.eye(3)[np.argmin(np.abs(normal))]
     first = np.cross(helper, normal)
     first /= np.linalg.norm(first)
@@ -35,7 +35,7 @@ def plane(wall: Any, bounds: np.ndarray) -> Surface:
     spans = []
     for tangent in (first, second):
         along = corners @ tangent
-        # a structure without extent in this direction still gets a wall that can be seen
+        # a structure without extent in this direction still gets a visible wall
         margin = 0.04 * size + 0.5 * max(0.0, 0.2 * size - np.ptp(along))
         spans.append((along.min() - margin, along.max() + margin))
     foot = normal * (np.asarray(wall.point, dtype=float) @ normal)
@@ -48,7 +48,7 @@ _OWN: dict[str, Callable[[Any, np.ndarray], Surface]] = {"plane": plane}
 
 
 def _drawing_of(kind: str) -> Callable[[Any, np.ndarray], Any] | None:
-    """The drawing function of a wall type: of its own module (``surface``) where it offers one, else the one here."""
+    """Return the drawing function of a wall type: ``surface`` of its module if it exists, else the one here."""
     try:
         module = lookup("pfem_petsc.contact.walls", kind, "wall.type")
     except InputError:
@@ -57,9 +57,9 @@ def _drawing_of(kind: str) -> Callable[[Any, np.ndarray], Any] | None:
 
 
 def wall_surfaces(walls: Iterable[Any], bounds: np.ndarray, note: Callable[[str], None] = print) -> list[Surface]:
-    """Surfaces of a case's walls; a wall whose type has no drawing is skipped, and ``note`` is told.
+    """Return the surfaces of a case's walls; a wall whose type has no drawing is skipped with a message to ``note``.
 
-    A wall module may offer ``surface(parameters, bounds)``, which gives a :class:`Surface`, or points (n, 3) and
+    A wall module may define ``surface(parameters, bounds)``, which returns a :class:`Surface`, or points (n, 3) and
     quadrilaterals (f, 4).
     """
     drawn = []
@@ -78,9 +78,9 @@ def wall_surfaces(walls: Iterable[Any], bounds: np.ndarray, note: Callable[[str]
 
 
 def wall_shifts(result: Any, times: Sequence[float]) -> np.ndarray:
-    """Displacements (times, walls, 3) [m] of a result's walls from where the case puts them.
+    """Return displacements (times, walls, 3) [m] of a result's walls from their initial positions.
 
-    Walls with mass are where the history has them, linear between its rows; the others where the case moves them.
+    Positions of walls with mass are interpolated linearly between rows of the history; others follow from the case.
     """
     walls = list(result.case.wall)
     motion = WallMotion(walls)

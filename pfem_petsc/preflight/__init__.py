@@ -1,1 +1,1 @@
-"""What is looked at before a run: is the truss connected and braced, are the numbers sane, will it fit."""
+"""Checks before a run: connectivity and bracing of the truss, plausible values, memory, time and disk space."""

@@ -1,4 +1,4 @@
-"""Chains of collinear bars, the result of a mesh generator that divides the lines of a truss."""
+"""Chains of collinear bars, which result from mesh generators that subdivide the members of a truss."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ _STRAIGHT = 1e-4  # angle between two bars that count as collinear [rad]
 
 
 def chain_nodes(model: Model) -> tuple[int, int]:
-    """How many nodes no support holds and only two collinear bars meet at; and the first of them. Collective.
+    """Return the number of unsupported nodes with exactly two collinear bars, and the first of them. Collective.
 
-    A straight rod has such nodes and is meant: of a truss on one line there are none.
+    A straight rod is excluded: its nodes are intended, so a truss on one line has no such nodes.
     """
     mesh, owned = model.mesh, model.mesh.n_owned
     if len(model_directions(model)) < 2:
@@ -38,7 +38,7 @@ def chain_nodes(model: Model) -> tuple[int, int]:
 
 
 def chain_warning(count: int, first: int) -> str:
-    """What to tell about nodes of :func:`chain_nodes`."""
+    """Return the warning about nodes of :func:`chain_nodes`."""
     nodes = "1 node is" if count == 1 else f"{count} nodes are"
     return (
         f"{nodes} only connected to two collinear bars, and nothing supports them laterally; the first is node "

@@ -1,4 +1,4 @@
-"""How much memory, time and disk a run will take."""
+"""Estimates of the memory, time and disk space of a run."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ if TYPE_CHECKING:
 
 __all__ = ["checkpoint_bytes", "forecast", "memory_of_machine", "memory_warning", "result_bytes"]
 
-# Resident memory of a rank beyond an empty one, a bar of it [B]; measured with lattices of 10^5 to 5 x 10^5 bars: 131
-# explicit, 171 matrix-free, 510 assembled, 1580 with multigrid; factorised by MUMPS 4,200 at 2.7 x 10^4 and 8,200 at
-# 1.7 x 10^5 bars.
+# Resident memory of a rank per bar, in excess of an empty process [B]; measured with lattices of 10^5 to 5 x 10^5 bars:
+# 131 explicit, 171 matrix-free, 510 assembled, 1580 with multigrid; factorised by MUMPS 4,200 at 2.7 x 10^4 and 8,200
+# at 1.7 x 10^5 bars.
 _PER_BAR = {"": 150.0, "jacobi": 200.0, "pbjacobi": 550.0, "icc": 800.0, "ilu": 800.0, "gamg": 1700.0}
 _PER_BAR_FACTORISED, _FACTORISED_AT = 4200.0, 2.7e4
 _EMPTY = 2.2e8  # of a process with all libraries loaded [B]
-# Seconds a bar and step or iteration, one core, and seconds a step beyond.
+# Seconds per bar and step or iteration on one core, and additional seconds per step.
 _SECONDS_EXPLICIT = 1.5e-8
 _SECONDS_PER_ITERATION = 4e-8
 _SECONDS_PER_STEP = 2.5e-4
@@ -42,7 +42,7 @@ def forecast(
     columns: Mapping[str, tuple[int, ...]],
     types: Mapping[str, Any],
 ) -> dict[str, str]:
-    """Label and text: memory, time, disk. Collective."""
+    """Return label and text of the estimates of memory, time and disk space. Collective."""
     size = result_bytes(case, model.mesh, plan.steps, fields.points, fields.cells, columns, types)
     held = model.comm.allreduce(_needed(model, plan))
     entries = {
@@ -65,7 +65,7 @@ def result_bytes(
     columns: Mapping[str, tuple[int, ...]],
     types: Mapping[str, Any],
 ) -> float:
-    """Size of the result file [B]: snapshots and rows that the case asks for, and the structure around them."""
+    """Return the size of the result file [B]: snapshots, history rows, and the structure of the file."""
     output = case.output
     item = 4 if output.precision == "float32" else 8
     snapshots = 2 + (steps - 1) // output.fields_every if output.fields_every else 2
@@ -78,12 +78,12 @@ def result_bytes(
 
 
 def checkpoint_bytes(model: Model) -> float:
-    """Size of a checkpoint [B]."""
+    """Return the size of a checkpoint [B]."""
     return 1e4 + model.mesh.n_nodes * 24.0 * 8 + 8.0 * len(model.bars.kept_names) * model.mesh.n_bars
 
 
 def memory_warning(case: Case, model: Model, plan: Plan) -> list[str]:
-    """A text where the ranks of some machine will need more memory than it has. Collective."""
+    """Return a warning if the ranks on a machine need more memory than it has. Collective."""
     comm = model.comm
     machine = comm.Split_type(MPI.COMM_TYPE_SHARED)
     try:
@@ -103,7 +103,7 @@ def memory_warning(case: Case, model: Model, plan: Plan) -> list[str]:
 
 
 def memory_of_machine() -> float:
-    """Memory that this machine, or the container that this process is in, has [B]."""
+    """Return the memory of this machine, or of the container of this process [B]."""
     found = [float(os.sysconf("SC_PAGE_SIZE")) * os.sysconf("SC_PHYS_PAGES")]
     for path in ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"):
         try:
@@ -116,11 +116,11 @@ def memory_of_machine() -> float:
 
 
 def _needed(model: Model, plan: Plan) -> float:
-    """Of this rank, at most [B]."""
+    """Return the maximum memory of this rank [B]."""
     bars = len(model.mesh.bars)
     kind = "" if plan.linear is None else plan.linear.preconditioner
     if kind in DIRECT:
-        # fill in three dimensions: the factors of n unknowns have of the order of n^(4/3) entries
+        # fill-in in three dimensions: the factors of n unknowns have O(n^(4/3)) entries
         each = _PER_BAR_FACTORISED * (model.mesh.n_bars / _FACTORISED_AT) ** (1.0 / 3.0)
     else:
         each = _PER_BAR.get(kind, max(_PER_BAR.values()))
@@ -128,7 +128,7 @@ def _needed(model: Model, plan: Plan) -> float:
 
 
 def _seconds(model: Model, plan: Plan) -> float:
-    """Of all steps, by the slowest rank; an order of magnitude for implicit schemes, whose iterations are not known."""
+    """Return the time of all steps on the slowest rank [s], an order of magnitude only for implicit schemes."""
     bars = max(model.comm.allgather(len(model.mesh.bars)))
     if plan.linear is None:
         return plan.steps * (_SECONDS_PER_STEP + _SECONDS_EXPLICIT * bars)

@@ -1,4 +1,4 @@
-"""All that is looked at before a run, in one call."""
+"""All checks before a run."""
 
 from __future__ import annotations
 
@@ -24,23 +24,23 @@ __all__ = ["inspect", "warnings_before"]
 
 
 def warnings_before(case: Case, model: Model, plan: Plan) -> list[str]:
-    """What looks wrong and is cheap to find: for every start. Collective."""
+    """Return warnings of the cheap checks, which run at every start. Collective."""
     texts = odd_numbers(case, model) + memory_warning(case, model, plan) + wall_gaps(model)[1]
     texts += jumping_motions(case, plan) + bars_larger_than_walls(case, model)
     count, nodes, first = count_parts(model.mesh)
-    if count > 1 and not model.links:  # which are between bodies
+    if count > 1 and not model.links:  # links connect bodies
         texts.append(
             f"the truss is in {count} parts that no bar connects; the smallest has {nodes} nodes, node {first} among "
             "them"
         )
-    # what is generated is sound by construction
+    # generated meshes are valid by construction
     pairs, shown = overlapping_bars(model.mesh) if case.mesh.generator is None else (0, [])
     if pairs:
         texts.append(
             f"{pairs} pair{'s' if pairs > 1 else ''} of bars overlap{'' if pairs > 1 else 's'} from a common node on: "
             f"{_list(pairs, shown)}; if a node is intended to divide the longer one, remove that bar"
         )
-    # what is generated is of members in one piece
+    # generated meshes have undivided members
     chained, first_chained = chain_nodes(model) if case.mesh.generator is None else (0, -1)
     if chained:
         texts.append(chain_warning(chained, first_chained))
@@ -54,7 +54,7 @@ def warnings_before(case: Case, model: Model, plan: Plan) -> list[str]:
 
 
 def inspect(case: Case, model: Model) -> tuple[dict[str, str], list[str]]:
-    """Label and text of what ``check`` tells besides, and what looks wrong. Collective."""
+    """Return label and text of further entries of ``check``, and warnings. Collective."""
     entries, warnings = {}, []
     count, _, _ = count_parts(model.mesh)
     entries["parts"] = "all bars are connected" if count == 1 else f"{count} that no bar connects"

@@ -1,4 +1,4 @@
-"""Motions of supports and walls whose velocity jumps."""
+"""Check of motions of supports and walls with velocity jumps."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["jumping_motions"]
 
 
 def jumping_motions(case: Case, plan: Plan) -> list[str]:
-    """Warn of linear interpolation with a scheme that keeps the vibrations that its jumps of velocity cause."""
+    """Warn about linear interpolation with a scheme that does not damp the vibrations by its velocity jumps."""
     if plan.scheme.dissipates:
         return []
     moved = [(f"support[{k}]", entry) for k, entry in enumerate(case.support)]

@@ -1,7 +1,7 @@
 """Overlapping bars, and nodes that lie on bars they are not connected to.
 
-The commonest slip of the kind: a bar from node 0 to node 2, and bars 0-1 and 1-2 on the same line. The truss is then
-stiffer and heavier there than meant. Bars that cross at an angle, like bracings, are sound and not told.
+A common mistake is a bar from node 0 to node 2 together with bars 0-1 and 1-2 on the same line. The truss is then
+stiffer and heavier there than intended. Bars that cross at an angle, such as bracings, are valid and not reported.
 """
 
 from __future__ import annotations
@@ -19,24 +19,24 @@ if TYPE_CHECKING:
 __all__ = ["LARGEST", "NodesOnBars", "nodes_on_bars", "overlapping_bars"]
 
 ANGLE = 1e-6
-"""Bars that leave a node at a smaller angle overlap [rad]; a node nearer to a bar than that fraction of
-its length lies on it. Coordinates saved in single precision are that exact."""
+"""Bars that meet at a node at a smaller angle overlap [rad]; a node whose distance from a bar is less than this
+fraction of its length lies on it. Coordinates saved in single precision have this accuracy."""
 
 LARGEST = 20_000_000
-"""Nodes up to which :func:`nodes_on_bars` looks: every rank holds the coordinates of all of them."""
+"""Maximum number of nodes for :func:`nodes_on_bars`: every rank has the coordinates of all of them."""
 
 _SHOWN = 5
 _WINDOW = 64  # neighbours in the order of directions that are compared with a bar
 
-# Any direction that no mesh is likely to have bars at right angles to.
+# A generic direction, to which bars of a mesh are unlikely to be perpendicular.
 _GENERIC = np.array([0.6180339887, 0.4656766723, 0.6335178142])
 
-# Work a bar that is put up with: cells that it is searched in, and nodes in a cell.
+# Maximum work per bar: cells to be searched, and nodes per cell.
 _PIECES, _CROWD = 50.0, 200.0
 
 
 class NodesOnBars(NamedTuple):
-    """How often a node lies on a bar between its ends, and how many nodes are where another is; the first as texts."""
+    """Numbers of nodes on bars between their ends and of coinciding nodes, with descriptions of the first ones."""
 
     between: int
     shown_between: list[str]
@@ -45,14 +45,14 @@ class NodesOnBars(NamedTuple):
 
 
 def overlapping_bars(mesh: DistributedMesh) -> tuple[int, list[str]]:
-    """How many pairs of bars leave a common node in the same direction; the first few as texts. Collective.
+    """Return the number of pairs of bars with a common node and direction, and the first few as texts. Collective.
 
     The bars of a node are compared in the order of their directions along a generic line: O(n log n) for n bars.
     """
     along = _directions(mesh, np.arange(len(mesh.bars))) @ _GENERIC
-    # bar k leaves its ends as halves 2 k and 2 k + 1, the second of them backwards
+    # bar k has the halves 2 k and 2 k + 1 at its ends, the second one reversed
     half = np.flatnonzero(mesh.bars.ravel() < mesh.n_owned)
-    # one number sorts by node, then by direction; of 10^7 nodes its last digit is 1e-9
+    # one number sorts by node, then by direction; for 10^7 nodes its last digit is 1e-9
     key = along[half // 2]
     key[half % 2 == 1] *= -1.0
     key *= 0.25
@@ -81,14 +81,14 @@ def overlapping_bars(mesh: DistributedMesh) -> tuple[int, list[str]]:
 
 
 def nodes_on_bars(mesh: DistributedMesh) -> NodesOnBars | None:
-    """Nodes that lie on bars which do not end there. Collective.
+    """Find nodes that lie on bars to which they are not connected. Collective.
 
-    Every rank looks along its bars through a grid that holds all nodes: time and memory go with their number, where
-    bars and the distances of nodes are not of too different lengths.
+    Every rank searches along its bars in a grid of all nodes. Time and memory are proportional to their number if the
+    lengths of bars and the distances of nodes do not differ too much.
 
     Returns
     -------
-    NodesOnBars, or None where this would take too long: more nodes than :data:`LARGEST`, or lengths too different
+    NodesOnBars, or None if this would take too long: more nodes than :data:`LARGEST`, or lengths that differ too much
     """
     comm = mesh.comm
     if mesh.n_nodes > LARGEST:
@@ -108,7 +108,7 @@ def nodes_on_bars(mesh: DistributedMesh) -> NodesOnBars | None:
     total = comm.allreduce(float(length.sum()))
     cell = total / mesh.n_bars
     while True:
-        # a cell more on each side, for what lies on the border
+        # one more cell on each side, for nodes on the border
         shape = np.ceil((high - low) / cell).astype(np.float64) + 3.0
         if comm.allreduce(float((length / cell + 1.0).sum())) > _PIECES * mesh.n_bars or shape.prod() > 2.0**62:
             return None
@@ -133,7 +133,7 @@ def nodes_on_bars(mesh: DistributedMesh) -> NodesOnBars | None:
         else:
             texts[1].append((min(at, node), max(at, node)))
     on_bars = sorted(line for some in comm.allgather(sorted(texts[0])[:_SHOWN]) for line in some)
-    # a pair is found from all bars of its nodes
+    # a pair is found once for each bar of its nodes
     together = sorted({pair for some in comm.allgather(sorted(set(texts[1]))[:_SHOWN]) for pair in some})
     return NodesOnBars(
         comm.allreduce(between),
@@ -145,8 +145,8 @@ def nodes_on_bars(mesh: DistributedMesh) -> NodesOnBars | None:
 
 @kernel
 def _look(points, bars, length, low, cell, across, keys, order, found, twins):
-    """How often nodes lie between the ends of bars, and how many rows ``found`` has taken: bar, node, and the end that
-    the node coincides with or -1; ``twins`` marks the nodes that coincide."""
+    """Return the number of nodes between the ends of bars, and of rows of ``found``: bar, node, and the coinciding end
+    or -1; ``twins`` marks coinciding nodes."""
     between = taken = 0
     first = np.empty(3, np.int64)
     last = np.empty(3, np.int64)
@@ -202,7 +202,7 @@ def _look(points, bars, length, low, cell, across, keys, order, found, twins):
 
 
 def _directions(mesh: DistributedMesh, bars: np.ndarray) -> np.ndarray:
-    """Unit vectors (n, 3) of bars from their first ends on."""
+    """Return unit vectors (n, 3) of bars from their first to their second ends."""
     direction = mesh.points[mesh.bars[bars, 1]]
     direction -= mesh.points[mesh.bars[bars, 0]]
     direction /= np.sqrt(np.einsum("ij,ij->i", direction, direction))[:, None]

@@ -1,4 +1,4 @@
-"""Parts of a truss that no bar connects."""
+"""Disconnected parts of a truss."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["count_parts"]
 
 @kernel
 def _spread(bars, label):
-    """Give both ends of each bar the lower of their labels until nothing changes; sweeps forth and back."""
+    """Assign the lower label to both ends of each bar until nothing changes, in forward and backward sweeps."""
     changed = True
     while changed:
         changed = False
@@ -35,9 +35,9 @@ def _spread(bars, label):
 
 
 def count_parts(mesh: DistributedMesh) -> tuple[int, int, int]:
-    """Number of connected parts, nodes of the smallest, and its lowest mesh number of a node. Collective.
+    """Return the number of connected parts, and the size and lowest node number of the smallest one. Collective.
 
-    Every node takes the lowest mesh number that it is connected to: within a rank in compiled sweeps, between ranks by
+    Every node gets the lowest mesh number that it is connected to: within a rank by compiled sweeps, between ranks by
     the exchange of ghosts, repeated until no rank changes anything.
     """
     comm, owned = mesh.comm, mesh.n_owned
@@ -46,12 +46,12 @@ def count_parts(mesh: DistributedMesh) -> tuple[int, int, int]:
         before = label[:owned].copy()
         _spread(mesh.bars, label[:, 0])
         mesh.update_ghosts(label)
-        # a ghost may have brought a lower number; and this rank's own may still have to travel
+        # a ghost may have a lower number, and this rank's own numbers may still have to propagate
         if comm.allreduce(int(not np.array_equal(before, label[:owned])), op=MPI.MAX) == 0:
             break
     names, sizes = np.unique(label[:owned, 0].astype(np.int64), return_counts=True)
     total: dict[int, int] = {}
-    # one entry a part and rank: few, unless the truss is in pieces
+    # one entry per part and rank: few, unless the truss consists of many parts
     for some in comm.allgather(dict(zip(names.tolist(), sizes.tolist(), strict=True))):
         for name, size in some.items():
             total[name] = total.get(name, 0) + size

@@ -1,4 +1,4 @@
-"""Walls that bars could pass around: those smaller than the bars near their path."""
+"""Walls smaller than the bars near their path, which can pass between the nodes of these bars."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ if TYPE_CHECKING:
 
 __all__ = ["bars_larger_than_walls"]
 
-_SAMPLES = 64  # places of a wall on its way that are looked at
-_LARGEST = 5_000_000  # bars of a rank beyond which only their lengths are looked at
+_SAMPLES = 64  # positions of a wall along its path that are checked
+_LARGEST = 5_000_000  # number of bars of a rank beyond which only their lengths are checked
 
 
 def bars_larger_than_walls(case: Case, model: Model) -> list[str]:
-    """Warn of small walls with longer bars near the way that they seem to take. Collective.
+    """Warn about small walls with longer bars near their expected path. Collective.
 
-    The way is straight: that of the wall as given, relative to the mean velocity of the truss at the start, and under
-    gravity where it falls.
+    The path follows from the given motion of the wall, relative to the mean initial velocity of the truss, and from
+    gravity if it acts on the wall.
     """
     contact, mesh = model.contact, model.mesh
     small = small_walls(contact.walls)
@@ -48,7 +48,7 @@ def bars_larger_than_walls(case: Case, model: Model) -> list[str]:
             way += np.outer(0.5 * times**2, float(keys.gravity) * gravity - (0.0 if model.supports.any else gravity))
             near = np.zeros(len(longer), dtype=bool)
             for place, following in zip(way[:-1], way[1:], strict=True):
-                # nearer to the middle of a piece than its half and the wall's reach
+                # closer to the middle of a piece than half its length plus the wall's reach
                 middle, half = 0.5 * (place + following), 0.5 * float(np.linalg.norm(following - place))
                 away = distances(starts[longer], ends[longer], middle, getattr(wall, "axis", None))
                 near |= away <= reach + half
@@ -67,7 +67,7 @@ def bars_larger_than_walls(case: Case, model: Model) -> list[str]:
 
 
 def _way(keys: WallKeys, motion: WallMotion, k: int, times: np.ndarray) -> np.ndarray:
-    """Displacements (times, 3) [m] of a wall as given; with its first velocity, where it has mass."""
+    """Return displacements (times, 3) [m] of a wall by its given motion, or by its initial velocity if it has mass."""
     if keys.mass is not None:
         return np.outer(times, keys.velocity if keys.velocity is not None else (0.0, 0.0, 0.0))
     return np.array([motion.displacements(time)[k] for time in times])

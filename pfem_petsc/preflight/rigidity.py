@@ -1,7 +1,7 @@
-"""Is a truss braced? A test node by node, and for small models a global one by the equilibrium matrix.
+"""Bracing of a truss: a test for each node, and for small models a global one by the equilibrium matrix.
 
-Mechanisms are no error in dynamics: chains and cables are made of them. They are told, because one that is not meant is
-the commonest mistake in a truss.
+Mechanisms are not an error in dynamics: chains and cables consist of them. They are reported because unintended ones
+are a common mistake in a truss.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ if TYPE_CHECKING:
 __all__ = ["LARGEST", "Rigidity", "global_rigidity", "model_directions", "unbraced_nodes"]
 
 LARGEST = 600
-"""Unknowns up to which the global test is made: a singular value decomposition of a dense matrix."""
+"""Maximum number of unknowns for the global test, a singular value decomposition of a dense matrix."""
 
 _RANK = 1e-9
 
 
 class Rigidity(NamedTuple):
-    """Of a whole model: free unknowns, rank of the equilibrium matrix, rigid motions, mechanisms, states of
+    """Results of the global test: free unknowns, rank of the equilibrium matrix, rigid motions, mechanisms, states of
     self-stress."""
 
     unknowns: int
@@ -49,7 +49,7 @@ def _directions(points, bars, owned, total):
 
 
 def model_directions(model: Model) -> np.ndarray:
-    """Orthonormal directions (r, 3) that the bars span: 1 for a straight rod, 2 for a plane truss. Collective."""
+    """Return orthonormal directions (r, 3) that the bars span: r = 1 for a rod, 2 for a plane truss. Collective."""
     tensors = np.zeros((model.mesh.n_owned, 3, 3))
     _directions(model.mesh.points, model.mesh.bars, model.mesh.n_owned, tensors)
     values, vectors = np.linalg.eigh(model.comm.allreduce(tensors.sum(axis=0)))
@@ -57,9 +57,9 @@ def model_directions(model: Model) -> np.ndarray:
 
 
 def unbraced_nodes(model: Model) -> tuple[int, int]:
-    """How many nodes can move freely, to first order, because too few directions hold them; and the first. Collective.
+    """Return the number of nodes that can move freely, to first order, and the first of them. Collective.
 
-    Directions count within the line or plane that the whole truss lies in: a plane truss is not braced out of it.
+    Only directions within the line or plane of the whole truss count: a plane truss is never braced out of its plane.
     """
     mesh, owned = model.mesh, model.mesh.n_owned
     held = np.zeros((owned, 3, 3))
@@ -67,7 +67,7 @@ def unbraced_nodes(model: Model) -> tuple[int, int]:
     held += np.eye(3) * model.supports.fixed[:, :, None]
     span = model_directions(model)
     inside = np.einsum("ri,nij,sj->nrs", span, held, span)
-    # det / trace^(r-1) is below the smallest eigenvalue: where it is clear of zero nothing more is to be known
+    # det / trace^(r-1) is a lower bound of the smallest eigenvalue; if it is well above zero, no more work is needed
     trace = np.trace(inside, axis1=1, axis2=2)
     with np.errstate(divide="ignore", invalid="ignore"):
         doubtful = np.flatnonzero(~(np.linalg.det(inside) / trace ** (len(span) - 1) > _RANK))
@@ -80,9 +80,8 @@ def unbraced_nodes(model: Model) -> tuple[int, int]:
 def global_rigidity(model: Model) -> Rigidity | None:
     """Count mechanisms and states of self-stress; None for models beyond :data:`LARGEST` unknowns. Collective.
 
-    The equilibrium matrix A (free unknowns, bars) gives the nodal forces of unit bar forces. With rank r there are
-    b - r states of self-stress and n - r free motions (Maxwell, Calladine), of which those of the truss as a rigid body
-    are not mechanisms.
+    The equilibrium matrix A (free unknowns, bars) maps bar forces to nodal forces. With rank r there are b - r states
+    of self-stress and n - r free motions (Maxwell, Calladine); rigid-body motions of the truss are not mechanisms.
     """
     mesh, comm = model.mesh, model.comm
     if 3 * mesh.n_nodes > LARGEST:
@@ -108,7 +107,7 @@ def global_rigidity(model: Model) -> Rigidity | None:
 
 
 def _free(span: np.ndarray, fixed: np.ndarray) -> np.ndarray:
-    """Orthonormal directions within the span that supports leave to a node."""
+    """Return orthonormal directions within the span that supports leave free at a node."""
     held = np.diag(fixed) @ span.T
     _, values, vectors = np.linalg.svd(held, full_matrices=True)
     rank = int((values > 1e-12).sum())
@@ -116,7 +115,7 @@ def _free(span: np.ndarray, fixed: np.ndarray) -> np.ndarray:
 
 
 def _rigid_motions(arms: np.ndarray, fixed: np.ndarray, span: np.ndarray) -> int:
-    """Rigid-body motions within the span that no support stops."""
+    """Return the number of unsupported rigid-body motions within the span."""
     size = max(float(np.abs(arms).max()), np.finfo(float).tiny)
     axes = np.eye(3)
     motions = np.stack(

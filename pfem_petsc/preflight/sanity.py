@@ -1,4 +1,4 @@
-"""Numbers out of any engineering range: mostly another unit than SI. Told, never refused."""
+"""Values out of any engineering range, mostly due to units other than SI. They are reported, never refused."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _HINT = "case files are in SI units (m, kg, s, N, Pa)"
 
 
 def odd_numbers(case: Case, model: Model) -> list[str]:
-    """One text for each value that looks wrong: key, value, why. Collective."""
+    """Return one message for each suspicious value: key, value, reason. Collective."""
     texts = [*_materials(case), *_sections(case), *_mesh(case, model)]
     return [f"{case.source}: {text}" for text in texts]
 
@@ -61,7 +61,7 @@ def _mesh(case: Case, model: Model) -> Iterator[str]:
             "origin: strains lose that ratio in digits; move it to the origin"
         )
     v = model.initial_velocity()
-    with np.errstate(over="ignore"):  # told below, as what it is
+    with np.errstate(over="ignore"):  # reported below
         speed = np.linalg.norm(v, axis=1)
     mine = (float(speed.max()), int(mesh.node_ids[int(speed.argmax())])) if len(speed) else (0.0, -1)
     fastest, node = max(comm.allgather(mine))

@@ -1,4 +1,4 @@
-"""What a user checks before a run: sizes, distribution, time step, solver."""
+"""Summary before a run: sizes, distribution, time step, solver."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["summarise"]
 
 
 def summarise(case: Case, model: Model, plan: Plan) -> dict[str, str]:
-    """Label and text. Collective."""
+    """Return label and text of the entries. Collective."""
     mesh, comm = model.mesh, model.comm
     counts = comm.allgather((mesh.n_owned, mesh.n_local - mesh.n_owned))
     # kibibytes on Linux
@@ -36,12 +36,12 @@ def summarise(case: Case, model: Model, plan: Plan) -> dict[str, str]:
         "wave speed": engineering(model.wave_speed, "m/s"),
         **plan.entries(case),
         **describe_modes(model),
-        "linear solver": plan.linear.why if plan.linear is not None else "none: every node on its own",
+        "linear solver": plan.linear.why if plan.linear is not None else "none: nodes are solved independently",
         "walls": ", ".join(map(_described, case.wall)) or "none",
         "memory": f"{engineering(peak, 'B', 3)} in use on all ranks",
     }
 
 
 def _described(wall: WallKeys) -> str:
-    """Name of a wall, and the mass of one that has any."""
+    """Return the name of a wall, with its mass if it has one."""
     return wall.name if wall.mass is None else f"{wall.name} ({engineering(wall.mass, 'kg')})"

@@ -15,7 +15,7 @@ __all__ = ["wall_gaps"]
 
 
 def wall_gaps(model: Model) -> tuple[dict[str, str], list[str]]:
-    """Wall name to the nearest node, gap and approach at the start; and warnings. Collective."""
+    """Return, by wall name, nearest node, gap and approach velocity at the start; and warnings. Collective."""
     contact, mesh, comm = model.contact, model.mesh, model.comm
     told: dict[str, str] = {}
     warnings: list[str] = []
@@ -23,17 +23,17 @@ def wall_gaps(model: Model) -> tuple[dict[str, str], list[str]]:
         return told, warnings
     points = mesh.points[: mesh.n_owned]
     v = model.initial_velocity()
-    # a short way ahead, a thousandth of the model's size: the rate of the gap along it
+    # the rate of the gap over a short displacement, a thousandth of the model's size
     fastest = max(comm.allgather(float(np.abs(v).max(initial=0.0))))
     ahead = 1e-6 * model.length / fastest if fastest > 0.0 else 1e-9
     now, then = contact.gaps(points, 0.0), contact.gaps(points + ahead * v, ahead)
-    bodies = contact.motion.bodies  # not under way yet: the nodes' way as these walls see it
+    bodies = contact.motion.bodies  # not moving yet: displacements of nodes relative to these walls
     for k, speed in zip(bodies.at, bodies.state.v, strict=True):
         seen = contact.gap(k, points + ahead * (v - speed), contact.motion.displacements(0.0))
         then[:, k] = np.where(contact.members[:, k], seen, np.inf)
     with np.errstate(invalid="ignore"):
         rate = (then - now) / ahead
-    # a wall that moves, or the other node of a link, may push the truss against this one
+    # a moving wall, or the other node of a link, may push the truss against this wall
     pushed = model.external.active or contact.moving.any() or bool(model.links)
     for k, name in enumerate(contact.names):
         at = int(np.argmin(now[:, k])) if len(now) else -1

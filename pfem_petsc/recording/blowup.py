@@ -1,4 +1,4 @@
-"""Divergence of the motion: detected by the energy, reported with the fastest node."""
+"""Divergence of the motion, detected by the energy and reported with the fastest node."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ if TYPE_CHECKING:
 
 __all__ = ["BlowUp"]
 
-_CREATED = 1e3  # energy created by the integration, over all that was ever put in: far beyond any error of a sound run
-_ROWS = 10  # in succession: after a start from rest, or when a wall first strikes, nothing is there to compare with
-_ROUNDING = 1e-12  # strains that are rounding: their energy is the least that counts as put in
+_CREATED = 1e3  # energy created by the integration relative to the input, far beyond any error of a valid run
+_ROWS = 10  # consecutive rows; after a start from rest, or when a wall first strikes, there is no input to compare with
+_ROUNDING = 1e-12  # strains below are rounding; their energy is the minimum energy input
 
 
 class BlowUp:
-    """Watches the history rows of a run. Collective where it speaks; the rows are the same on all ranks."""
+    """Checks the history rows of a run, which are the same on all ranks; collective if it reports."""
 
     def __init__(self, model: Model) -> None:
         self.model = model
@@ -30,20 +30,20 @@ class BlowUp:
         self._most = model.total_mass * (_ROUNDING * model.wave_speed) ** 2  # [J]
 
     def kept(self) -> dict[str, Any]:
-        """What a checkpoint must hold: rows so far, how many of the last were strange, and the most put in [J]."""
+        """Return the state for a checkpoint: number of rows, of consecutive suspicious rows, and energy input [J]."""
         return {"rows": self._rows, "strange": self._strange, "most": self._most}
 
     def load_state(self, kept: dict[str, Any]) -> None:
-        """Go on as the run that is continued would have."""
+        """Restore the state from a checkpoint."""
         self._rows, self._strange, self._most = int(kept["rows"]), int(kept["strange"]), float(kept["most"])
 
     def check(self, row: dict[str, Any], state: State) -> None:
-        """Look at a row.
+        """Check a row.
 
         Raises
         ------
         SimulationFailure
-            On all ranks, when the energy is not finite, or a thousand times what was put in.
+            On all ranks, if the energy is not finite, or a thousand times the energy input.
         """
         held = row["kinetic_energy"] + row["elastic_energy"]
         when = f"step {state.step}, t = {state.time:.6g} s"
@@ -69,7 +69,7 @@ class BlowUp:
             )
 
     def _where(self, state: State) -> str:
-        """The first node and bar, by mesh number, whose positions or velocities are not finite."""
+        """Return the first node and bar, by mesh number, with positions or velocities that are not finite."""
         mesh = self.model.mesh
         bad = ~(np.isfinite(state.position).all(axis=1) & np.isfinite(state.v).all(axis=1))
         node = min(mesh.node_ids[: mesh.n_owned][bad], default=mesh.n_nodes)
@@ -81,7 +81,7 @@ class BlowUp:
         return text + (f" and bar {bar}" if bar < mesh.n_bars else "")
 
     def _fastest(self, state: State) -> str:
-        """Node with the highest speed, and one of its bars."""
+        """Return the fastest node and one of its bars."""
         mesh = self.model.mesh
         speed = np.linalg.norm(state.v, axis=1)
         mine = (-1.0, -1, -1)

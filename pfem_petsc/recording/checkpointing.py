@@ -1,4 +1,4 @@
-"""Checkpoints in the course of a run."""
+"""Checkpoints during a run."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ __all__ = ["Checkpointing"]
 
 
 class Checkpointing(Observer):
-    """Writes checkpoints after so many steps, and when the ranks agree that one is due by the clock.
+    """Writes checkpoints at intervals of steps, and when the ranks agree that one is due by wall-clock time.
 
     Parameters
     ----------
     checkpoints : Checkpoints
-    history, snapshots : what a checkpoint goes on from
+    history, snapshots : from which a restart continues
     synchroniser : Synchroniser
     """
 
@@ -36,21 +36,21 @@ class Checkpointing(Observer):
         self._synchroniser = synchroniser
 
     def due(self, step: int) -> bool:
-        """By the number of the step, or by the clock."""
+        """Return whether a checkpoint is due by the number of the step or by wall-clock time."""
         return super().due(step) or self._synchroniser.checkpoint_due
 
     def observe(self, made: Step) -> None:
-        """Write one."""
+        """Write a checkpoint."""
         self.write()
 
     def write(self) -> None:
-        """Write a checkpoint. Results come first: what the checkpoint goes on from must be in them."""
+        """Flush the results, from which a restart continues, then write a checkpoint."""
         history = self._history
         history.writer.flush_history()
         self._checkpoints.write(history.ledger, history.recorder, history.blow_up, history.row, self._snapshots.last)
         self._synchroniser.checkpoint_written()
 
     def complete(self) -> None:
-        """The checkpoint of the last step, in a case that asks for checkpoints."""
+        """Write the checkpoint of the last step, if the case requests checkpoints."""
         if self._checkpoints.wanted:
             self.write()

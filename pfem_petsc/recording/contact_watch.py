@@ -12,34 +12,32 @@ if TYPE_CHECKING:
 
 __all__ = ["ContactWatch", "NoContactWatch"]
 
-_SHARE = 0.02  # of the energy that the run started with or was given: more than schemes' own energies swing by
-_ROWS = 4  # rows in succession that gain without contact: a peak that passes is none
+_SHARE = 0.02  # of the initial and supplied energy; more than the oscillation of the schemes' own energies
+_ROWS = 4  # consecutive rows with a gain without contact; a short peak is not reported
 
 
 class ContactWatch:
-    """Compares energy with what was put in: once nodes have touched walls or each other, and at implicit steps.
+    """Compares the energy with the energy input, after contact of nodes and for implicit steps.
 
-    A step may be so large that bars yield, or damping stops nodes, within it: the forces of its balance then work less
-    than is dissipated. The energy of an explicit scheme swings near the limit of its steps where nothing is dissipated
-    either: by h^2/8 a.Ma with central differences, which within the limit is no more than the elastic energy (h times a
-    load's acceleration is small). So much of a gain is let pass, and all of it where nothing dissipates.
-
-    What is stored, and dissipated by plasticity and damping, less what was supplied, cannot grow beyond what it was at
-    the start: friction, impact and integration only take from it. Its rows are the same on all ranks, so that all tell
-    it, or none.
+    The stored energy plus the energy dissipated by plasticity and damping, minus the energy supplied, cannot exceed its
+    initial value: friction, impact and integration only reduce it. In large steps, within which bars yield or damping
+    stops nodes, the work of the forces of the balance is less than the dissipation. The energy of an explicit scheme
+    oscillates near its stability limit even without dissipation: by h^2/8 a.Ma with central differences, which within
+    the limit is at most the elastic energy (h times the acceleration by a load is small). A gain up to this amount is
+    accepted, and any gain if nothing dissipates. The rows are the same on all ranks, so all ranks report, or none.
 
     Parameters
     ----------
     model : Model
-    tell : takes the warning
-    explicit : whether the scheme is
+    tell : receives the warning
+    explicit : whether the scheme is explicit
     """
 
     def __init__(self, model: Model, tell: Callable[[str], None], explicit: bool) -> None:
         self.tell = tell
         self.told = False
         self.explicit = explicit
-        self.rounding = model.rounding * model.length  # of energies [J]: what is at rest has no other
+        self.rounding = model.rounding * model.length  # of energies [J]; the only energy of a model at rest
         self.rows = 0
         contact, time = model.case.contact, model.case.time
         self.what = f'{time.integrator} with contact.treatment = "{contact.treatment}" and time.mass = "{time.mass}"'
@@ -48,7 +46,7 @@ class ContactWatch:
         self.touched = False
 
     def check(self, row: dict[str, Any]) -> None:
-        """Look at a row of the history."""
+        """Check a row of the history."""
         if self.told:
             return
         given = sum(row[name] for name in SUPPLIED)
@@ -81,14 +79,14 @@ class ContactWatch:
 
     @staticmethod
     def _swing(row: dict[str, Any]) -> float:
-        """What an explicit scheme's own energy may have gained for a while [J]: all of it where nothing dissipates."""
+        """Return the possible oscillation of an explicit scheme's energy [J]; unlimited if nothing dissipates."""
         if not row["plastic_dissipation"] > 0.0 and not row["damping_dissipation"] > 0.0:
             return float("inf")
         return row["elastic_energy"]
 
     @staticmethod
     def _causes(row: dict[str, Any]) -> str:
-        """What dissipates, as a part of a sentence."""
+        """Return the sources of dissipation as part of a sentence."""
         causes = {"plastic_dissipation": "bars yield", "damping_dissipation": "damping stops nodes"}
         found = [text for name, text in causes.items() if row[name] > 0.0]
         return f" ({' and '.join(found)})" if found else ""

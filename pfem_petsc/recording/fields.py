@@ -1,4 +1,4 @@
-"""The fields of a snapshot: which ones a case wants, and their values."""
+"""The fields of a snapshot: the selection of a case, and their values."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ __all__ = ["Fields", "Snapshot"]
 
 
 class Snapshot:
-    """What the values of fields are taken from.
+    """The data from which fields are computed.
 
     Attributes
     ----------
     model : Model
     state : State
     start : (owned, 3) positions in the mesh [m]
-    acceleration : gives the acceleration to record (owned, 3) [m/s2]; collective where the mass is consistent
+    acceleration : returns the acceleration to record (owned, 3) [m/s2]; collective with consistent mass
     """
 
     def __init__(self, model: Model, state: State, acceleration: Callable[[], np.ndarray] | None = None) -> None:
@@ -38,7 +38,7 @@ class Snapshot:
         return self.model.bars.fields(self.state.x)
 
     def temperature(self) -> np.ndarray:
-        """(local bars,) above reference [K], zero where the case has none."""
+        """(local bars,) temperature above reference [K], zero if the case has none."""
         temperatures = self.model.temperatures
         return temperatures.values if temperatures.any else 0.0 * self.bars["strain"]
 
@@ -48,8 +48,8 @@ class Fields:
 
     Attributes
     ----------
-    points, cells : names of the fields that the case asks for; by default all that it has, internal variables of
-        material laws other than the plastic strain aside
+    points, cells : names of the fields that the case selects; by default all that it has, except internal variables of
+        material laws other than the plastic strain
     """
 
     def __init__(self, model: Model) -> None:
@@ -65,11 +65,11 @@ class Fields:
         self.cells = [field.name for field in self._cells]
 
     def at_nodes(self, state: State, acceleration: Callable[[], np.ndarray]) -> dict[str, np.ndarray]:
-        """Name to (owned, 3). Collective where ``acceleration`` is."""
+        """Return name to (owned, 3). Collective if ``acceleration`` is."""
         now = Snapshot(self.model, state, acceleration)
         return {field.name: field.value(now) for field in self._points}
 
     def at_bars(self, state: State) -> dict[str, np.ndarray]:
-        """Name to (local bars,)."""
+        """Return name to (local bars,)."""
         now = Snapshot(self.model, state)
         return {field.name: field.value(now) for field in self._cells}

@@ -1,4 +1,4 @@
-"""The rows of the history: energies accumulated step by step, rows written, and checked for divergence."""
+"""The history: accumulates energies step by step, writes rows, and checks them for divergence."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ __all__ = ["History"]
 
 
 class History(Observer):
-    """Records rows, and watches them. Construction is collective, after the start of the stepper.
+    """Records and checks rows. Construction is collective, after the start of the stepper.
 
-    The reduction that makes a row also carries the news of a fault on any rank.
+    The reduction that computes a row also communicates a fault on any rank.
 
     Parameters
     ----------
     stepper : Stepper
     synchroniser : Synchroniser
-    warn : takes a warning
+    warn : receives a warning
 
     Attributes
     ----------
-    row : the last one
+    row : the last row
     writer : of the result file
     """
 
@@ -54,12 +54,12 @@ class History(Observer):
         stepper.booking = self._book
 
     def _book(self) -> None:
-        """Energies and iterations of a step, or of each part of a halved one."""
+        """Add energies and iterations of a step, or of each part of a bisected step."""
         self.ledger.update()
         self.recorder.count(self._stepper.solution.newton, self._stepper.solution.linear)
 
     def steps_left(self, step: int) -> int:
-        """None must be waited for: rows of steps that are made together come by :meth:`take`."""
+        """Return no limit: rows of fused steps are passed to :meth:`take`."""
         return NEVER
 
     def observe(self, made: Step) -> None:
@@ -67,32 +67,32 @@ class History(Observer):
         self.record()
 
     def record(self) -> None:
-        """A history row, unless a rank has a fault, which is raised on all."""
+        """Record a row, unless a rank has a fault, which is raised on all ranks."""
         row = self.recorder.row(alarm=self._synchroniser.alarm)
         if self.recorder.alarmed:
             self._synchroniser.synchronise()
         self.take(row)
 
     def take(self, row: Row) -> None:
-        """Look at a row, keep it and add it to the history."""
+        """Check a row, store it and add it to the history."""
         self.blow_up.check(row, self._stepper.state)
         self.contact_watch.check(row)
         self.row = row
         self.writer.append_history(row if self._model.comm.rank == 0 else None)
 
     def complete(self) -> None:
-        """The row of the last step."""
+        """Record the row of the last step."""
         if self.row["step"] != self._stepper.state.step:
             self.record()
 
     @property
     def drift(self) -> float | None:
-        """Imbalance of energy of the last row, of the largest energy so far; None while there is none."""
+        """Energy imbalance of the last row relative to the largest energy so far; None without energy."""
         scale = self.recorder.energy_scale
         return self.row["energy_imbalance"] / scale if scale > 0.0 else None
 
     def remarks(self) -> list[str]:
-        """Walls without a contact, which may not be what was meant."""
+        """Return remarks about walls without contact, which may be unintended."""
         contact = self._model.contact
         times = contact.log.times(self._model.comm)
         touched = np.array(times["sum"]) > 0.0

@@ -29,16 +29,16 @@ _PROBED = ("position", "velocity", "acceleration", "reaction")
 
 
 class Recorder:
-    """Builds history rows; :meth:`row` is collective and gives the row to every rank.
+    """Builds history rows; :meth:`row` is collective and returns the row on all ranks.
 
     Attributes
     ----------
-    columns : name to shape of a row's value
-    types : name to dtype where it is not float64
-    energy_scale : the largest that any energy was in the rows so far [J]
+    columns : name to shape of a value
+    types : name to dtype if it is not float64
+    energy_scale : largest energy of any kind in the rows so far [J]
     iterations : Newton and linear-solver iterations since the last row
-    alarmed : whether any rank raised an alarm with the last row
-    probe_nodes : probe name to the mesh numbers of its nodes, ascending: the order of rows in a probe's columns
+    alarmed : whether any rank raised a fault flag with the last row
+    probe_nodes : probe name to the mesh numbers of its nodes, ascending, the order of rows in a probe's columns
     """
 
     def __init__(self, stepper: Stepper, ledger: Ledger) -> None:
@@ -79,7 +79,7 @@ class Recorder:
         # where the sums of walls, links and probes begin
         self._starts = np.cumsum([HEAD.width, self._contact.size, links, probed])
         self._sums = np.zeros(self._starts[-1])
-        # where the numbers of the head go in a row, and where walls, links and probes begin there
+        # indices of the numbers of the head in a row, and where walls, links and probes begin there
         self._from = np.array([k for name in HEAD.sizes if name != "alarm" for k in range(HEAD.width)[HEAD[name]]])
         places = [self.layout.places[name][:2] for name in HEAD.sizes if name != "alarm"]
         self._to = np.concatenate([np.arange(*place) for place in places])
@@ -89,11 +89,11 @@ class Recorder:
 
     @property
     def width(self) -> int:
-        """Numbers that a row sums up."""
+        """Number of sums in a row."""
         return len(self._sums)
 
     def probed(self) -> tuple[np.ndarray, np.ndarray]:
-        """Nodes of all probes in the order of their columns, where one rank has all of them, and where each starts."""
+        """Return the nodes of all probes in the order of their columns, on one rank, and the start of each probe."""
         nodes = [local[np.argsort(place)] for _, local, place in self._probes]
         starts = np.cumsum([0, *(len(part) for part in nodes)])
         return np.concatenate(nodes or [np.empty(0)]).astype(np.int64), starts.astype(np.int64)
@@ -104,9 +104,9 @@ class Recorder:
         self.iterations[1] += linear
 
     def row(self, alarm: bool = False) -> Row:
-        """The history row of the present state. Collective.
+        """Return the history row of the present state. Collective.
 
-        ``alarm``: this rank has something that all must speak about; :attr:`alarmed` is then true on all.
+        ``alarm``: whether this rank has a fault; :attr:`alarmed` is then true on all ranks.
         """
         model, sums = self.model, self._sums
         self._fill(sums, alarm)
@@ -115,14 +115,14 @@ class Recorder:
         return self.row_of(sums)
 
     def row_of(self, sums: np.ndarray) -> Row:
-        """The row of the state's step and time from its sums (width,) over all ranks. Collective."""
+        """Return the row at the state's step and time from its sums (width,) over all ranks. Collective."""
         model = self.model
         self.alarmed = sums[HEAD.first("alarm")] > 0.0
         model.contact.log.meet(model.comm, self._contact.contacts(sums[HEAD.width :]))
         return Row(self.layout, self._unpack(sums))
 
     def _fill(self, sums: np.ndarray, alarm: bool) -> None:
-        """This rank's share of a row."""
+        """Write this rank's share of a row."""
         stepper, state, ledger = self.stepper, self.stepper.state, self.ledger
         energy, solution = stepper.energy, stepper.solution
         sums[: HEAD.width] = ledger.sums
@@ -144,7 +144,7 @@ class Recorder:
             at += size
 
     def _unpack(self, sums: np.ndarray) -> np.ndarray:
-        """The vector of a row from the sums over the ranks."""
+        """Return the values of a row from the sums over ranks."""
         stepper, state = self.stepper, self.stepper.state
         vector, at = np.empty(self.layout.width), self._at
         vector[self._to] = sums[self._from]

@@ -11,7 +11,7 @@ __all__ = ["ProgressReport"]
 
 
 class ProgressReport(Observer):
-    """Tells the progress bar, or the lines in its place, of each step."""
+    """Reports each step to the progress bar, or to the lines that replace it."""
 
     every = 1
 
@@ -19,11 +19,11 @@ class ProgressReport(Observer):
         self._progress, self._analysis, self._history = progress, analysis, history
 
     def steps_left(self, step: int) -> int:
-        """None must be waited for: of steps that are made together the last is told."""
+        """Return no limit: the last of fused steps is reported."""
         return NEVER
 
     def observe(self, made: Step) -> None:
-        """Tell of a step."""
+        """Report a step."""
         history = self._history
         contacts = history.row["active_contacts"]
         self._progress.update(

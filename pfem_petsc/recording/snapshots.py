@@ -1,4 +1,4 @@
-"""Snapshots of the fields; positions are checked against the walls before each."""
+"""Snapshots of the fields; before each, positions are checked against the walls."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ __all__ = ["Snapshots"]
 
 
 class Snapshots(Observer):
-    """Writes snapshots, at the start and the end of a run at least. Construction is collective.
+    """Writes snapshots, including the start and the end of a run. Construction is collective.
 
     Parameters
     ----------
     analysis : Analysis
     fields : Fields
-    warn : takes a warning
+    warn : receives a warning
 
     Attributes
     ----------
@@ -40,11 +40,11 @@ class Snapshots(Observer):
         self.writer: ResultWriter | None = None
 
     def observe(self, made: Step) -> None:
-        """Write one."""
+        """Write a snapshot."""
         self.write()
 
     def write(self) -> None:
-        """A snapshot of the present state, once nodes are known to keep the walls."""
+        """Check the nodes against the walls, then write a snapshot of the present state."""
         state, fields = self._stepper.state, self._fields
         if not self.every and 0 < state.step < self._analysis.last_step:
             return
@@ -56,10 +56,10 @@ class Snapshots(Observer):
             self._warn(text)
 
     def complete(self) -> None:
-        """The snapshot of the last step."""
+        """Write the snapshot of the last step."""
         if self.last != self._stepper.state.step:
             self.write()
 
     def remarks(self) -> list[str]:
-        """Bars across walls."""
+        """Return remarks about bars across walls."""
         return self._piercing.summary()

@@ -1,1 +1,1 @@
-"""Checkpoints of a run and their way back: what is saved, which one is taken, and what may have changed since."""
+"""Restart: the content of checkpoints, the choice of one, and the changes that are allowed since it was written."""

@@ -1,4 +1,4 @@
-"""Writes the checkpoints of a run, and takes one back."""
+"""Writes and restores the checkpoints of a run."""
 
 from __future__ import annotations
 
@@ -45,21 +45,21 @@ class Checkpoints:
 
     @property
     def wanted(self) -> bool:
-        """Whether the case asks for checkpoints at all."""
+        """Whether the case requests checkpoints."""
         return bool(self.case.output.checkpoint_every or self.case.output.checkpoint_minutes)
 
     def due(self, step: int) -> bool:
-        """Whether the case wants one after this step."""
+        """Return whether the case requests a checkpoint after this step."""
         every = self.case.output.checkpoint_every
         return bool(every) and step % every == 0
 
     def write(self, ledger: Ledger, recorder: Recorder, blow_up: BlowUp, row: dict[str, Any], snapshot: int) -> None:
-        """Write one, with the last history row and the step of the last snapshot. It becomes the newest. Collective.
+        """Write a checkpoint with the last history row and the step of the last snapshot. Collective.
 
         Raises
         ------
         SimulationFailure
-            On all ranks; those before stay.
+            On all ranks; earlier checkpoints are kept.
         """
         scalars = self.state.scalars(ledger, recorder, blow_up, row, snapshot)
         if scalars["step"] == self.last_step:
@@ -77,12 +77,12 @@ class Checkpoints:
         self.last_step = scalars["step"]
 
     def restore(self, restart: Restart) -> Checkpoint:
-        """Set the stepper to a checkpoint, instead of its start; give what was read. Collective.
+        """Restore the stepper from a checkpoint, instead of starting it; return the checkpoint. Collective.
 
         Raises
         ------
         InputError
-            On all ranks: damaged, or of another mesh.
+            On all ranks, if the checkpoint is damaged or belongs to another mesh.
         """
         check_mesh_is_the_same(restart.path, self._mark, restart.attributes, self.case.source)
         checkpoint = restart.file.read(self.state.orders(restart.scalars))

@@ -1,4 +1,4 @@
-"""Is a checkpoint one of this case? What may have changed since it was written, and what may not."""
+"""Comparison of a case with that of a checkpoint: which keys have changed, and which changes are allowed."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ FREE = ("title", "time.end", "static.end", "modes", "output", "solver")
 
 
 def changed_keys(path: Path, before: Mapping[str, Any], now: Mapping[str, Any], source: str) -> list[str]:
-    """What a restart changes: ``time.end: 1.0 -> 2.0`` for every key that differs.
+    """Return the changes of a restart, ``time.end: 1.0 -> 2.0`` for every key that differs.
 
     Parameters
     ----------
@@ -37,9 +37,9 @@ def changed_keys(path: Path, before: Mapping[str, Any], now: Mapping[str, Any], 
     Raises
     ------
     InputError
-        Where a key differs that a restart cannot change.
+        If a key differs that a restart cannot change.
     """
-    # tuples become lists, as they are in the checkpoint
+    # tuples become lists, as in the checkpoint
     old, new = _flat(before), _flat(json.loads(json.dumps(now)))
     keys = [key for key in dict.fromkeys([*old, *new]) if old.get(key) != new.get(key)]
     lines = {key: f"{key}: {_text(old, key)} -> {_text(new, key)}" for key in keys}
@@ -55,7 +55,7 @@ def changed_keys(path: Path, before: Mapping[str, Any], now: Mapping[str, Any], 
 
 
 def check_version(path: Path, attributes: Mapping[str, Any]) -> None:
-    """Refuse a checkpoint whose content has another meaning than this program's.
+    """Refuse a checkpoint with another version of the state.
 
     Raises
     ------
@@ -71,7 +71,7 @@ def check_version(path: Path, attributes: Mapping[str, Any]) -> None:
 
 
 def check_mesh_is_the_same(path: Path, mark: int, attributes: Mapping[str, Any], source: str) -> None:
-    """Refuse a checkpoint of a mesh with other nodes or bars (a mesh file may change under the same name).
+    """Refuse a checkpoint of a mesh with other nodes or bars (the content of a mesh file may have changed).
 
     Raises
     ------
@@ -79,13 +79,13 @@ def check_mesh_is_the_same(path: Path, mark: int, attributes: Mapping[str, Any],
     """
     if attributes.get("mesh_mark") != mark:
         raise InputError(
-            f"{path}: the mesh of {source} is not the one that it was written with (other nodes or bars): bring the "
-            "mesh back, or start without --restart"
+            f"{path}: the mesh of {source} is not the one that it was written with (other nodes or bars): restore "
+            "the mesh, or start without --restart"
         )
 
 
 def mesh_mark(model: Model, node_order: NaturalOrder, bar_order: NaturalOrder, counted: np.ndarray) -> int:
-    """A number that any change of a coordinate or a bar's ends changes; the same on any number of ranks. Collective."""
+    """Return a checksum of coordinates and bar ends, the same on any number of ranks. Collective."""
     mesh = model.mesh
     points = node_order.to_slab(mesh.points[: mesh.n_owned])
     ends = bar_order.to_slab(mesh.node_ids[mesh.bars[counted]].astype(np.int64).reshape(-1, 2))
@@ -94,7 +94,7 @@ def mesh_mark(model: Model, node_order: NaturalOrder, bar_order: NaturalOrder, c
 
 
 def _flat(value: Any, prefix: str = "") -> dict[str, Any]:
-    """Nested tables and lists of tables as one level: {"wall[0].point": ...}."""
+    """Flatten nested tables and lists of tables: {"wall[0].point": ...}."""
     found: dict[str, Any] = {}
     if isinstance(value, Mapping):
         for key, item in value.items():

@@ -1,4 +1,4 @@
-"""The output folder at the start of a run: what is in it is moved aside, continued, or found to be finished."""
+"""The output folder at the start of a run: existing results are moved aside, continued, or found to be finished."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ ASIDE = "checkpoint-later.h5"
 
 @dataclass(frozen=True)
 class Restart:
-    """From where a run goes on.
+    """The checkpoint from which a run continues.
 
     Attributes
     ----------
     path : the checkpoint
-    file : the same, open
+    file : the open checkpoint
     changed : keys of the case that differ, as lines
     continues : whether the results in the output folder are continued; else they are moved aside and new ones begin
     """
@@ -53,31 +53,31 @@ class Restart:
 
     @property
     def attributes(self) -> dict[str, Any]:
-        """What it says about the run that wrote it."""
+        """Attributes of the run that wrote the checkpoint."""
         return self.file.attributes
 
     @property
     def step(self) -> int:
-        """The step after which it was written."""
+        """The step after which the checkpoint was written."""
         return int(self.scalars["step"])
 
     @property
     def last(self) -> tuple[int, int]:
-        """Steps of the last snapshot and of the last history row before it."""
+        """Steps of the last snapshot and of the last history row before the checkpoint."""
         return int(self.scalars["snapshot"]), int(self.scalars["row"]["step"])
 
 
 def find_restart(case: Case, comm: MPI.Comm, folder: Path, asked: bool | Path | None) -> Restart | str | None:
-    """What ``--restart`` means for an output folder. Collective.
+    """Find the checkpoint for ``--restart`` in an output folder. Collective.
 
     Returns
     -------
-    Restart, or a text for the user that says why the run starts from zero, or None where no restart was asked for
+    Restart, or a message that states why the run starts from zero, or None if no restart was requested
 
     Raises
     ------
     InputError
-        A named file that is missing; any that is damaged, of another case or another version.
+        If a named file is missing, or a checkpoint is damaged, or belongs to another case or version.
     """
     if asked is None or asked is False:
         return None
@@ -92,7 +92,7 @@ def find_restart(case: Case, comm: MPI.Comm, folder: Path, asked: bool | Path | 
 
 
 def finished(case: Case, comm: MPI.Comm, folder: Path, end: float | None) -> float | None:
-    """Up to when the output folder holds results of this case [s], None where not up to its end. Collective."""
+    """Return the last time [s] of results of this case in the folder, None if they are incomplete. Collective."""
     return None if end is None else on_root(comm, _finished, case, folder / RESULT, end)
 
 
@@ -108,13 +108,13 @@ def _finished(case: Case, path: Path, end: float) -> float | None:
             if case.modes is not None and (not result.n_modes or before.get("modes") != now["modes"]):
                 return None
     except InputError:
-        # of another case, or not readable: it is moved aside
+        # results of another case, or unreadable ones, are moved aside
         return None
     return max(reached) if reached and min(reached) >= end * (1.0 - TIME) else None
 
 
 def finished_message(folder: Path, reached: float, plan: Plan) -> str:
-    """The message about a run whose results have ``reached`` its end [s]."""
+    """Return the message about a run whose results have ``reached`` its end [s]."""
     if not plan.end:
         return f"{folder}: finished already: the results have the modes of the initial state"
     axis = plan.axis
@@ -127,33 +127,33 @@ def _continues(folder: Path, path: Path) -> bool:
 
 
 def prepare_folder(comm: MPI.Comm, folder: Path, restart: Restart | None, plan: Plan) -> Path | None:
-    """Make the output folder; what it holds is moved aside to a numbered name, unless a restart continues it.
+    """Create the output folder; existing results are moved aside to a numbered name unless a restart continues them.
 
-    The caller has the folder's lock. ``plan`` says how far the run goes: results beyond that are not cut.
+    The caller holds the lock of the folder. ``plan`` defines the end of the run: results beyond it are not truncated.
 
     Returns
     -------
-    The new name of what was moved aside, or None
+    The new name of results that were moved aside, or None
 
     Raises
     ------
     InputError
-        On all ranks, where the folder cannot be written, or a restart would lose what it holds.
+        On all ranks, if the folder cannot be written, or a restart would lose results.
     """
     return on_root(comm, _prepare, folder, restart, plan)
 
 
 def _refuse_other(restart: Restart) -> None:
-    """The checkpoint was read before the lock was taken: another run may have written one since, and results."""
+    """Refuse a checkpoint that another run has overwritten before this one got the lock."""
     if check_seal(restart.path) != restart.file.digest:
         raise InputError(
-            f"{restart.path}: another run has written this checkpoint anew while this one was set up: nothing is "
+            f"{restart.path}: another run has overwritten this checkpoint while this one was set up: nothing is "
             "changed; start again with --restart"
         )
 
 
 def _refuse_loss(path: Path, plan: Plan) -> None:
-    """Results beyond the end of the run would be cut off."""
+    """Refuse a restart that would truncate results beyond the end of the run."""
     with results.open_result(path) as result:
         steps, times = result.history["step"], result.history["time"]
         snapshots = int(plan.beyond(result.steps, result.times).sum())
@@ -162,15 +162,15 @@ def _refuse_loss(path: Path, plan: Plan) -> None:
         reached = max([*times[-1:], *result.times[-1:]])
         raise InputError(
             f"{path}: the results reach {plan.axis.place(reached)}, beyond {plan.axis.key} = "
-            f"{engineering(plan.end, plan.axis.unit)}: to continue from the checkpoint up to there would cut off "
-            f"{rows} rows of the history and {snapshots} snapshots; take a later end (--set "
-            f"{plan.axis.key}={reached:.6g} or more), another folder (-o), or start without --restart, which moves the "
-            "results aside"
+            f"{engineering(plan.end, plan.axis.unit)}: continuing from the checkpoint up to there would remove "
+            f"{rows} rows of the history and {snapshots} snapshots; set a later end (--set "
+            f"{plan.axis.key}={reached:.6g} or more), choose another folder (-o), or start without --restart, which "
+            "moves the results aside"
         )
 
 
 def _refuse_gap(path: Path, restart: Restart) -> None:
-    """Results that end before the checkpoint cannot be continued from it."""
+    """Refuse a restart whose results end before the checkpoint."""
     examine(path, deep=False)
     with results.open_result(path) as result:
         steps = result.history["step"]
@@ -190,7 +190,7 @@ def _prepare(folder: Path, restart: Restart | None, plan: Plan) -> Path | None:
             _refuse_gap(folder / RESULT, restart)
             _refuse_loss(folder / RESULT, plan)
             if restart.path.name == PREVIOUS and (folder / NAME).exists():
-                # A later one than the results will reach back to must not be taken for the newest.
+                # A checkpoint later than the truncated results must not be used as the newest.
                 os.replace(folder / NAME, folder / ASIDE)
         elif any((folder / name).exists() for name in (RESULT, NAME, PREVIOUS)):
             if folder.resolve() in (here := Path.cwd().resolve(), *here.parents):

@@ -1,4 +1,4 @@
-"""Values of --set that a restart keeps from the run that it continues."""
+"""Values of --set that a restart keeps from the continued run."""
 
 from __future__ import annotations
 
@@ -17,24 +17,24 @@ __all__ = ["joined_overrides", "kept_overrides"]
 
 
 def kept_overrides(name: str, folder: Path, restart: bool | Path) -> list[str]:
-    """Texts ``KEY=VALUE`` that the run which a restart continues was given. One process.
+    """Return the texts ``KEY=VALUE`` of the run that a restart continues. Not collective.
 
     Parameters
     ----------
-    name : of the case; a run of another one has nothing to keep
+    name : of the case; texts of a run of another case are not kept
     folder : of the output
     restart : True for the newest checkpoint of the folder, else its file or folder
 
     Raises
     ------
     InputError
-        The checkpoint is missing or damaged.
+        If the checkpoint is missing or damaged.
     """
     path = asked_checkpoint(folder, restart)
     if path is not None:
         _, found = read_checkpoint_header(path, MPI.COMM_SELF)
     else:
-        # finished without a checkpoint, perhaps
+        # the run may have finished without a checkpoint
         try:
             with open_result(folder / RESULT) as result:
                 found = result.attributes
@@ -44,7 +44,7 @@ def kept_overrides(name: str, folder: Path, restart: bool | Path) -> list[str]:
 
 
 def joined_overrides(kept: Iterable[str], given: Iterable[str]) -> list[str]:
-    """Those kept, but for keys that are given anew, and then those given."""
+    """Return the kept texts, except for keys that are given again, followed by the given texts."""
     given = list(given)
     keys = {_key(text) for text in given}
     return [*(text for text in kept if _key(text) not in keys), *given]

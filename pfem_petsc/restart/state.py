@@ -1,21 +1,26 @@
-"""Everything that determines the future of a run, as arrays and numbers that a checkpoint holds.
+"""Everything that determines the future of a run, as arrays and numbers of a checkpoint.
 
-Nodal arrays are those of the state, of the scheme's memory and of the stepper; bar arrays are what the material laws
-keep, each variable under its name, and the thermal strains. Internal forces and energies are saved rather than computed
-again: of a bar that yields the second evaluation may differ from the first in the last digit. Sums that each rank has
-for itself (works, energies, wall forces) are saved rank by rank, and given back so on as many ranks; on others the
-total goes to rank 0.
+Nodal arrays are those of the state, of the scheme's memory and of the stepper. Bar arrays are the data that material
+laws keep, each variable under its name, and the thermal strains. Internal forces and energies are saved rather than
+recomputed, because for a yielding bar a second evaluation may differ in the last digit. Sums of each rank (works,
+energies, wall forces) are saved rank by rank and restored on the same number of ranks; on another number, rank 0 gets
+the totals.
 
-Where what decides is kept: positions, velocities, accelerations, forces and the scheme's memory (tied nodes and what a
-treatment of impact changed are part of it): arrays of the state. Who touches walls, nodes held in the last step, place
-of the kept preconditioner: arrays of the stepper. Level of halving, part and smallest part of the step, counts of the
-kept preconditioner: its numbers. What laws keep, thermal strains, history of the kept preconditioner: arrays of the
-bars. Walls with mass: ``free_walls``, their last increment included. Forces of constraints: by their key. Forces of
-pairs, and which of them have met: arrays of their second nodes. Works and energies: ``ranks``. Energy at the start, the
-largest energy, iterations since the last row: the recorder's. Rows seen, strange ones and energy put in: ``blow_up``.
-Contact times and impulses: the contact log's. Time step and linear solver: the plan in the attributes. Newton's method,
-Krylov methods, candidates for contact and friction begin anew each step. What goes with the clock (meetings, progress,
-wall time) begins anew with each run, and decides nothing of the results.
+Where the data are stored:
+
+- Arrays of the state: positions, velocities, accelerations, forces, and the scheme's memory (including tied nodes and
+  changes by a treatment of impact).
+- Arrays of the stepper: contacts with walls, nodes in contact in the last step, positions of the lagged preconditioner.
+- Numbers of the stepper: level of bisection, part and smallest part of the step, counts of the lagged preconditioner.
+- Arrays of the bars: data of the laws, thermal strains, history of the lagged preconditioner.
+- ``free_walls``: walls with mass, including their last increment. Forces of constraints: under their key. Forces of
+  pairs and which of them are closed: arrays at their second nodes.
+- ``ranks``: works and energies. Recorder: energy at the start, largest energy, iterations since the last row.
+  ``blow_up``: number of rows, suspicious rows, and energy input. Contact log: contact times and impulses.
+- Attributes (plan): time step and linear solver.
+
+Newton's method, Krylov methods, candidates for contact and friction start from scratch in each step. Data that depend
+on wall-clock time (synchronisation, progress, wall time) start from scratch in each run and do not affect the results.
 """
 
 from __future__ import annotations
@@ -40,7 +45,7 @@ if TYPE_CHECKING:
 __all__ = ["STATE_VERSION", "RunState"]
 
 STATE_VERSION = 4
-"""Changed with the meaning of what is saved."""
+"""Incremented whenever the meaning of the saved data changes."""
 
 _MEMORY = "memory."
 _KEPT = "stepper."
@@ -48,7 +53,7 @@ _LAW = "law."
 
 
 class RunState:
-    """Collects the state of a run, and puts it back. Construction is collective.
+    """Collects and restores the state of a run. Construction is collective.
 
     Parameters
     ----------
@@ -65,13 +70,13 @@ class RunState:
 
     @property
     def bar_order(self) -> NaturalOrder:
-        """Made at the first checkpoint: it takes memory of the order of the bars."""
+        """Order of the bars, created at the first checkpoint to save memory."""
         return self.model.mesh.bar_order
 
     def arrays(self) -> dict[str, tuple[NaturalOrder, np.ndarray]]:
-        """Name to (order, rows owned by this rank) of all arrays; the same names on all ranks."""
+        """Return name to (order, rows owned by this rank) of all arrays; the same names on all ranks."""
         own = self._node_arrays()
-        # what a scheme or a treatment keeps may be on the ranks alone where something happened
+        # arrays of a scheme or a treatment may exist only on some ranks
         kinds: dict[str, tuple[tuple[int, ...], str]] = {}
         for other in self.comm.allgather({name: (array.shape[1:], array.dtype.str) for name, array in own.items()}):
             kinds |= other
@@ -85,7 +90,7 @@ class RunState:
     def scalars(
         self, ledger: Ledger, recorder: Recorder, blow_up: BlowUp, row: dict[str, Any], snapshot: int
     ) -> dict[str, Any]:
-        """The numbers; the last history row, and the step of the last snapshot. Collective."""
+        """Return the numbers, including the last history row and the step of the last snapshot. Collective."""
         stepper, energy, walls = self.stepper, self.stepper.energy, self.stepper.solution.walls
         mine = {
             "ledger": ledger.kept(),
@@ -115,13 +120,13 @@ class RunState:
         }
 
     def orders(self, scalars: dict[str, Any]) -> dict[str, NaturalOrder]:
-        """How the arrays of a checkpoint with these numbers are to be read: nodal rows by owner, bars in slabs."""
+        """Return the orders of the arrays of a checkpoint with these numbers: nodal rows by owner, bars in slabs."""
         slab = np.arange(self.bar_order.first, self.bar_order.first + self.bar_order.count)
         bars = NaturalOrder(self.comm, slab, self.model.mesh.n_bars)
         return dict.fromkeys(scalars["node_arrays"], self.node_order) | dict.fromkeys(scalars["bar_arrays"], bars)
 
     def load_state(self, checkpoint: Checkpoint) -> None:
-        """Set the stepper to what a checkpoint holds; instead of its ``start``. Collective."""
+        """Restore the stepper from a checkpoint, instead of its ``start``. Collective."""
         stepper, state, owned = self.stepper, self.stepper.state, self.model.mesh.n_owned
         scalars = checkpoint.scalars
         links = self.model.links.arrays()
@@ -137,7 +142,7 @@ class RunState:
             elif name in ("x", "f"):
                 getattr(state, name)[:owned] = values
             else:
-                # not in place: a force that does not act may be an array that others share
+                # not in place: an absent force may be a shared array
                 setattr(state, name, values.copy())
         if len(scalars["memories"]) == self.comm.size:
             mine = scalars["memories"][self.comm.rank]
@@ -159,7 +164,7 @@ class RunState:
         self.model.contact.log.load_state(mine["contact_log"], scalars["contact_times"], stepper.touching)
 
     def load_sums(self, checkpoint: Checkpoint, ledger: Ledger, recorder: Recorder, blow_up: BlowUp) -> dict[str, Any]:
-        """Set ledger, recorder and watch, made after :meth:`load_state`; gives what is known of the last row."""
+        """Restore ledger, recorder and divergence check, created after :meth:`load_state`; return the last row."""
         scalars = checkpoint.scalars
         ledger.load_state(self._share(scalars["ranks"])["ledger"])
         recorder.iterations = [int(n) for n in scalars["iterations"]]
@@ -169,13 +174,13 @@ class RunState:
         return dict(scalars["row"])
 
     def _share(self, ranks: list[dict[str, Any]]) -> dict[str, Any]:
-        """This rank's share of the sums: its own on as many ranks, else all on rank 0 and nothing elsewhere."""
+        """Return this rank's share of the sums: its own on the same number of ranks, else all on rank 0."""
         if len(ranks) == self.comm.size:
             return ranks[self.comm.rank]
         return _summed(ranks) if self.comm.rank == 0 else _summed(ranks[:1], 0.0)
 
     def _node_arrays(self) -> dict[str, np.ndarray]:
-        """Rows of owned nodes, by name: every array of the state, so that none added later is forgotten."""
+        """Return the rows of owned nodes, by name, of every array of the state, including any added later."""
         state, owned = self.stepper.state, self.model.mesh.n_owned
         found = {}
         for item in dataclasses.fields(state):
@@ -189,7 +194,7 @@ class RunState:
         return {name: array for name, array in found.items() if 0 not in array.shape[1:]}
 
     def _bar_arrays(self) -> dict[str, np.ndarray]:
-        """Rows of all local bars, by name."""
+        """Return the rows of all local bars, by name."""
         bars = self.model.bars
         found = {}
         if bars.kept_names:
@@ -200,7 +205,7 @@ class RunState:
         return found | {name: array for name, array in kept.items() if array.shape[1]}
 
     def _load_bars(self, checkpoint: Checkpoint) -> None:
-        """Bars evaluated on two ranks get the same values on both."""
+        """Restore the bar arrays; bars evaluated on two ranks get the same values on both."""
         mesh, bars = self.model.mesh, self.model.bars
         asking = Router(self.comm, slab_of(mesh.bar_ids, mesh.n_bars, self.comm.size))
         asked = asking.send(mesh.bar_ids) - self.bar_order.first
@@ -218,7 +223,7 @@ class RunState:
 
 
 def _summed(shares: list[Any], factor: float = 1.0) -> Any:
-    """Sums over ranks, times a factor, in the same nested dictionaries."""
+    """Return sums over ranks, times a factor, in the same nested dictionaries."""
     if isinstance(shares[0], dict):
         return {name: _summed([share[name] for share in shares], factor) for name in shares[0]}
     return factor * sum(np.array(share) for share in shares)

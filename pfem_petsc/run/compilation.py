@@ -11,11 +11,11 @@ __all__ = ["ReportedCompilation"]
 
 
 class ReportedCompilation(Compilation):
-    """Tells once that loops are compiled, and leaves that time out of the rate of steps.
+    """Reports once that loops are compiled, and excludes the compilation time from the rate of steps.
 
     Attributes
     ----------
-    progress : the report of the run; None before it is open: then rank 0 prints, unless told to be quiet
+    progress : the progress report of the run; None before it is open, when rank 0 prints unless it is quiet
     """
 
     def __init__(self, comm: MPI.Comm, quiet: bool) -> None:

@@ -1,4 +1,4 @@
-"""What a run opens at its start: the report of its progress, and the result file."""
+"""Opens the progress report and the result file at the start of a run."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ __all__ = ["open_progress", "open_result_file"]
 def open_progress(
     model: Model, plan: Plan, start: tuple[int, float], folder: Path, quiet: bool, notes: Iterable[str]
 ) -> Progress:
-    """The report, with summary, warnings and notes told. Collective.
+    """Open the progress report and write summary, warnings and notes. Collective.
 
-    ``start``: step and time [s] from which the run goes on.
+    ``start``: step and time [s] from which the run continues.
     """
     case = model.case
     progress = Progress(
@@ -52,7 +52,7 @@ def open_progress(
 def open_result_file(
     model: Model, plan: Plan, recorder: Recorder, fields: Fields, folder: Path, restart: Restart | None, step: int
 ) -> ResultWriter:
-    """The result file, new or, where a restart continues it, with what came after ``step`` cut off. Collective."""
+    """Open the result file, new or, if a restart continues it, truncated after ``step``. Collective."""
     case = model.case
     continues = restart is not None and restart.continues
     return ResultWriter(

@@ -35,8 +35,8 @@ class Outputs:
     analysis : TimeStepping
     synchroniser : Synchroniser
     folder : of the results
-    quiet : print nothing on stdout
-    compilation : ReportedCompilation, which speaks through the report of progress once that is open
+    quiet : whether to print nothing on stdout
+    compilation : ReportedCompilation, which uses the progress report once that is open
 
     Attributes
     ----------
@@ -82,7 +82,7 @@ class Outputs:
         self._callbacks.append(Callback(function, every))
 
     def open(self, restart: Restart | None, notes: list[str]) -> None:
-        """Complete the state at the start, or restore it from a checkpoint, and open all outputs. Collective.
+        """Initialise the state, or restore it from a checkpoint, and open all outputs. Collective.
 
         Raises
         ------
@@ -93,7 +93,7 @@ class Outputs:
         stepper, model, plan = analysis.stepper, analysis.model, analysis.plan
         checkpoints = Checkpoints(model.case, stepper, plan, folder)
         if restart is not None:
-            # before anything in the folder changes: it may be refused
+            # before any change to the folder, because the checkpoint may be refused
             checkpoint = checkpoints.restore(restart)
         aside = prepare_folder(model.comm, folder, restart, plan)
         notes = [*notes, *([] if aside is None else [f"{folder}: held results, which are in {aside} now"])]
@@ -125,13 +125,13 @@ class Outputs:
         history.writer = self.snapshots.writer = self._writer
 
     def record_start(self) -> None:
-        """The row and the snapshot of the start, unless the results that are continued have them. Collective."""
+        """Record the first row and snapshot, unless the continued results contain them. Collective."""
         if not self._continues:
             self.history.record()
             self.snapshots.write()
 
     def after(self, made: Step) -> Step:
-        """Serve what is due after a step; gives the step with its row. Collective."""
+        """Serve the observers that are due after a step; return the step with its row. Collective."""
         step, synchroniser = made.step, self._synchroniser
         last = step == self._analysis.last_step
         history, *others = self._recording
@@ -155,23 +155,23 @@ class Outputs:
         return made
 
     def steps_left(self, step: int) -> int:
-        """Steps from this one to the next after which an observer must act or the ranks synchronise."""
+        """Return the number of steps until an observer must act or the ranks synchronise."""
         return min(self._synchroniser.steps_left(step), *(each.steps_left(step) for each in self._observers))
 
     def advance_together(self, batches: Batches) -> None:
-        """Make the steps before the next after which more is to be done than rows, where that can be. Collective.
+        """Fuse the steps that need only rows of the history, if possible. Collective.
 
         Raises
         ------
         SimulationFailure
-            As a single step does.
+            As for a single step.
         """
         left = self.steps_left(self._analysis.state.step)
         if not batches.advance(self._analysis, self.history, left):
             self._synchroniser.synchronise()
 
     def stop_early(self) -> None:
-        """Leave with a checkpoint where the ranks have agreed to stop, unless the run is at its end. Collective.
+        """Stop with a checkpoint if the ranks have agreed to stop, unless the run is at its end. Collective.
 
         Raises
         ------
@@ -189,10 +189,10 @@ class Outputs:
         )
 
     def complete(self) -> None:
-        """Bring checkpoint and results to the end of the run. Collective.
+        """Write the last checkpoint, row and snapshot of the run. Collective.
 
-        The checkpoint comes before a row and a snapshot off their schedule: a run that is given a later end goes on as
-        if they had not been.
+        The checkpoint precedes a row and a snapshot that are off their schedule, so that a run extended to a later end
+        continues as if they had not been written.
         """
         for observer in (self.checkpointing, self.history, self.snapshots):
             observer.complete()
@@ -209,23 +209,23 @@ class Outputs:
             record_modes(self._analysis.stepper, self._writer, self._folder, self.progress)
 
     def tell_remarks(self) -> None:
-        """Tell what became of the walls, where it may not be what was meant. Collective."""
+        """Report the observers' remarks, such as walls that were never touched. Collective."""
         for observer in self._observers:
             for text in observer.remarks():
                 self.progress.message(text)
 
     def close(self, outcome: str) -> None:
-        """Close the result file; the report of progress stays open. Collective."""
+        """Close the result file; the progress report stays open. Collective."""
         writer, self._writer = self._writer, None
         try:
             if writer is not None:
                 writer.close()
         except SimulationFailure:
-            # after a failure, that one is told
+            # after a failure, the first failure is reported
             if outcome == "done":
                 raise
 
     def leave(self, outcome: str) -> None:
-        """Close the report of progress, which this rank can do alone."""
+        """Close the progress report. Not collective."""
         if self.progress is not None:
             self.progress.close(outcome)

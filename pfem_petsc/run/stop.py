@@ -10,15 +10,15 @@ from ..signals import SignalNotes, early
 
 __all__ = ["StopRequest"]
 
-_WALL_TIME = 1000  # code of the wall time, beyond all signals
+_WALL_TIME = 1000  # code of the wall time, larger than all signal numbers
 
 
 class StopRequest(SignalNotes):
-    """Asks a run to end at the end of a step: because of a signal, or of the wall time, but not before its first step.
+    """Requests that a run stops at the end of a step, after a signal or the wall time, but not before its first step.
 
     Parameters
     ----------
-    wall_time : [s], from now on; None for no limit
+    wall_time : limit from now on [s]; None for no limit
 
     Attributes
     ----------
@@ -32,13 +32,13 @@ class StopRequest(SignalNotes):
         self._begin = time.monotonic()
 
     def watch(self) -> None:
-        """Take the signals over, those included that came since the program began."""
+        """Install the signal handlers; signals received since the start of the program count."""
         super().watch()
         self.adopt(early())
 
     @property
     def code(self) -> int:
-        """Zero while the run may go on."""
+        """Code of the request, zero if there is none."""
         if self._signal:
             return self._signal
         if self.wall_time is not None and self.stepped and time.monotonic() - self._begin >= self.wall_time:
@@ -46,7 +46,7 @@ class StopRequest(SignalNotes):
         return 0
 
     def reason(self, code: int) -> str:
-        """In words."""
+        """Describe a code."""
         if code == _WALL_TIME:
             return f"the wall time of {duration(self.wall_time or 0.0)} is over"
         return f"{signal.Signals(code).name} received"

@@ -1,4 +1,4 @@
-"""How the ranks agree, at little cost, on what only some of them know: faults, requests to stop."""
+"""Synchronisation of the ranks, at low cost, about faults and requests to stop that only some of them know."""
 
 from __future__ import annotations
 
@@ -15,27 +15,27 @@ from .stop import StopRequest
 __all__ = ["Synchroniser"]
 
 _INTERVAL = 0.2  # seconds between synchronisations
-_MOST = 100  # steps between them, so that a fault is known to all within a bounded number of steps
+_MOST = 100  # maximum number of steps between them, so that all ranks know of a fault within a bounded number of steps
 
 
 class Synchroniser:
-    """Rare agreements of all ranks on what some may know alone: a fault, a request to stop, a checkpoint that is due.
+    """Infrequent agreement of all ranks on faults, requests to stop, and checkpoints that are due.
 
-    Every few tenths of a second, and at most every hundred steps, one reduction of four numbers; the ranks agree on the
-    step of the next.
+    About every 0.2 s, and at most every hundred steps, the ranks make one reduction of four numbers, in which they also
+    agree on the step of the next one.
 
     Parameters
     ----------
     comm : MPI.Comm
     analysis : Analysis
     stop : StopRequest
-    lock : FolderLock, renewed each time
+    lock : FolderLock, renewed at each synchronisation
     interval : wall-clock time between checkpoints [s], None for none
 
     Attributes
     ----------
-    request : code of a request to stop that all ranks know of, zero for none
-    checkpoint_due : whether the time between checkpoints is over
+    request : code of a request to stop that all ranks know, zero for none
+    checkpoint_due : whether the time between checkpoints has elapsed
     """
 
     def __init__(
@@ -56,24 +56,24 @@ class Synchroniser:
 
     @property
     def alarm(self) -> bool:
-        """Whether this rank has something that all must know of."""
+        """Whether this rank has a fault."""
         return self._analysis.fault is not None or self.stop.code != 0
 
     def due(self, step: int) -> bool:
-        """Whether all ranks synchronise after this step: the same answer on all."""
+        """Return whether all ranks synchronise after this step; equal on all ranks."""
         return step >= self._next
 
     def steps_left(self, step: int) -> int:
-        """Steps from here to the next synchronisation."""
+        """Return the number of steps to the next synchronisation."""
         return self._next - step
 
     def synchronise(self) -> int:
-        """Agree; gives the code of a request to stop, or zero. Collective.
+        """Synchronise; return the code of a request to stop, or zero. Collective.
 
         Raises
         ------
         PfemError
-            On all ranks, the fault of the lowest rank that has one.
+            On all ranks: the fault of the lowest rank that has one.
         """
         fault, step = self._analysis.fault, self._analysis.state.step
         try:
@@ -96,6 +96,6 @@ class Synchroniser:
         return code
 
     def checkpoint_written(self) -> None:
-        """Count the interval from now."""
+        """Restart the interval between checkpoints."""
         self.checkpoint_due = False
         self._last_checkpoint = time.monotonic()

@@ -1,9 +1,9 @@
-"""A preconditioner from an assembled Hessian that serves many Newton iterations, of free steps and those with bounds.
+"""A lagged preconditioner from an assembled Hessian, reused for many Newton iterations with and without bounds.
 
-The matrix has the geometric stiffness of bars in tension only, and is definite where the Hessian is not: beyond
-buckling. It is that of all unknowns. Where walls hold some of them, their rows and columns are those of a unit matrix;
-the residual of the reduced system, of the inactive unknowns, is extended by zeros. So the blocks of three unknowns and
-the rigid motions stay what multigrid needs, and an active set that changes costs no set-up.
+The matrix contains the geometric stiffness of bars in tension only, so it is definite beyond buckling, where the
+Hessian is not. It covers all unknowns. Rows and columns of active unknowns are those of the identity, and the residual
+of the reduced system of inactive unknowns is extended by zeros. This preserves the 3 x 3 blocks and the rigid body
+modes that multigrid needs, and a change of the active set requires no set-up.
 """
 
 from __future__ import annotations
@@ -26,19 +26,20 @@ if TYPE_CHECKING:
 
 __all__ = ["LaggedPreconditioner", "Preconditioning"]
 
-# A set-up costs about as much as this many iterations: a new one is due when the iterations beyond those of the first
-# solve after the last one add up to it. 101,706 bars, one core: multigrid 0.33 s and 3.7 ms, MUMPS 2.3 s and 0.04 s.
+# A set-up costs about as much as this many iterations: it is repeated when the iterations in excess of those of the
+# first solve after the last set-up add up to this number. 101,706 bars, one core: multigrid 0.33 s and 3.7 ms, MUMPS
+# 2.3 s and 0.04 s.
 _SET_UP = {"gamg": 90, "lu": 40, "mumps": 55}
-_DENSE = 3.0  # entries of coarse matrices over those of the finest: cubic and octet lattices have 0.2 to 0.5
+_DENSE = 3.0  # entries of coarse matrices relative to the finest; cubic and octet lattices have 0.2 to 0.5
 _PREFIX = "pfem_assembled_"
 
 
 class LaggedPreconditioner:
-    """The preconditioner, and when to make it anew.
+    """The preconditioner and the decision when to set it up again.
 
-    It is kept through the Newton iterations of a problem, and from step to step as long as temperatures are constant
-    and the unknowns are those of the nodes, neither oblique walls nor links in contact: it can then be made again after
-    a restart from the place and the history of the bars it belongs to, which checkpoints hold.
+    It is kept during the Newton iterations of a problem, and from step to step as long as temperatures are constant and
+    the unknowns are nodal displacements (no oblique walls, no links in contact). After a restart it can then be set up
+    again from the positions and the bars' history at its last set-up, which checkpoints contain.
 
     Options: prefix ``pfem_assembled_``.
 
@@ -46,26 +47,26 @@ class LaggedPreconditioner:
     ----------
     model : Model
     kind : of preconditioner, ``gamg``, ``lu`` or ``mumps``
-    symmetric : whether the Hessian is, friction included
-    definite : whether it is without friction, and so has a definite part
-    matrix_free : whether multigrid smooths on the finest level with products bar by bar, of the same matrix: it saves a
-        third of the time
+    symmetric : whether the Hessian, including friction, is symmetric
+    definite : whether the Hessian without friction is symmetric, and thus has a definite part
+    matrix_free : whether multigrid smooths on the finest level with matrix-free products of the same matrix, which
+        saves a third of the time
 
     Attributes
     ----------
-    place : (owned, 6) positions where the Hessian was taken [m] and whether walls held a component; (owned, 0) where
-        the next problem needs a new one
-    history : (b, names) what material laws kept there, see ``Bars.history``; (b, 0) where they keep nothing
-    count : what else decides when it is made anew: the Hessian's coefficients, iterations of the first solve with it,
-        iterations of later solves beyond that, and those of the last solve
-    carried : whether it was made for an earlier problem
+    place : (owned, 6) positions at which the Hessian was evaluated [m], and whether a component was active; (owned, 0)
+        if the next problem needs a set-up
+    history : (b, names) data of the material laws there, see ``Bars.history``; (b, 0) if they keep none
+    count : other data that decide on a set-up: the coefficients of the Hessian, iterations of the first solve with it,
+        excess iterations of later solves, and iterations of the last solve
+    carried : whether it was set up for an earlier problem
     """
 
     def __init__(self, model: Model, kind: str, symmetric: bool, definite: bool, matrix_free: bool) -> None:
         mesh = model.mesh
         self.mesh = mesh
         self.kind = kind
-        # of symmetric schemes: the stiffness of the bars, and its products
+        # for symmetric schemes: the stiffness of the bars and its products
         self.product = MatrixFreeHessian(model) if definite else None
         self._smooth = matrix_free and kind == "gamg"
         self.matrix = HessianMatrix(mesh, model.supports.fixed, model.supports.any, symmetric)
@@ -81,20 +82,20 @@ class LaggedPreconditioner:
         self._problem = None
         self._kept: np.ndarray | None = None
         self._right, self._left = self.matrix.mat.createVecs()
-        self._new_inner(self.matrix.mat)  # options that PETSc refuses are found before the first step
+        self._new_inner(self.matrix.mat)  # reports invalid PETSc options before the first step
 
     def drop(self) -> None:
-        """Have the next Newton iteration make a new one."""
+        """Require a set-up in the next Newton iteration."""
         self._problem = None
         self.place = self.place[:, :0]
 
     def renew(self, problem: StepProblem, kept: np.ndarray | None) -> None:
-        """Make it anew if that is due; called at each Newton iteration. Collective.
+        """Set the preconditioner up again if necessary; called at each Newton iteration. Collective.
 
         Parameters
         ----------
-        problem : StepProblem, placed where the Hessian is wanted
-        kept : this rank's unknowns that the system has, local and ascending; None for all
+        problem : StepProblem, at the positions at which the Hessian is required
+        kept : this rank's unknowns in the system, local and ascending; None for all
         """
         *coefficients, first, beyond, last = self.count
         if last and not first:
@@ -128,7 +129,7 @@ class LaggedPreconditioner:
         self.count = [*wanted, first, beyond, 0.0]
 
     def _make_again(self, problem: StepProblem) -> None:
-        """After a restart: what was there before, from the operator where it was made."""
+        """Recreate the preconditioner after a restart, from the Hessian at its last set-up."""
         here, owned = problem.x.copy(), self.mesh.n_owned
         held = np.zeros((self.mesh.n_local, 3))
         problem.x[:owned], held[:owned] = self.place[:, :3], self.place[:, 3:]
@@ -158,7 +159,8 @@ class LaggedPreconditioner:
         final = matrix.fill_held(add, held, problem.scale, problem.transform)
         self._set_up(final, problem)
         if self._inner.getType() == "gamg" and self._fill() > _DENSE:
-            # PETSc 3.18's independent sets hardly coarsen a body-centred lattice: a set-up and a step take 5 x as long
+            # the independent sets of PETSc 3.18 hardly coarsen a body-centred lattice: set-up and steps take 5 x as
+            # long
             options = PETSc.Options(_PREFIX)
             if not options.hasName("mat_coarsen_type"):
                 options["mat_coarsen_type"] = "hem"
@@ -166,24 +168,24 @@ class LaggedPreconditioner:
                 options.delValue("mat_coarsen_type")
 
     def _fill(self) -> float:
-        """Entries of multigrid's coarse matrices over those of the finest. Collective."""
+        """Return the entries of multigrid's coarse matrices relative to the finest. Collective."""
         solvers = [self._inner.getMGSmoother(level) for level in range(1, self._inner.getMGLevels())]
         solvers.insert(0, self._inner.getMGCoarseSolve())
         entries = [solver.getOperators()[1].getInfo()["nz_used"] for solver in solvers]
         return sum(entries[:-1]) / max(entries[-1], 1.0)
 
     def _set_up(self, matrix: PETSc.Mat, problem: StepProblem) -> None:
-        # from nothing: a hierarchy that was made before would be another one after a restart
+        # from scratch: a reused hierarchy would differ from that after a restart
         self._new_inner(matrix)
         x = problem.x[: self.mesh.n_owned]
         centre = self.mesh.comm.allreduce(x.sum(axis=0)) / self.mesh.n_nodes
-        # multigrid makes the rigid motions from them, which it must not damp. MatNullSpaceCreateRigidBody would make
-        # them orthogonal, with rounding that PETSc 3.26 does not repeat
+        # multigrid builds the rigid body modes from them, which it must not damp. MatNullSpaceCreateRigidBody would
+        # orthogonalise them, with rounding that is not reproducible in PETSc 3.26
         self._inner.setCoordinates(x - centre)
         options = PETSc.Options()
         ours = self.mesh.comm.size > 1 and not options.hasName("matptap_via")
         if ours:
-            # PETSc's default adds up what other ranks send in the order of arrival: no two runs are the same
+            # PETSc's default sums contributions of other ranks in the order of arrival, so runs are not reproducible
             options["matptap_via"] = "allatonce_merged"
         self._inner.setUp()
         if ours:
@@ -200,7 +202,7 @@ class LaggedPreconditioner:
         self._inner.setFromOptions()
 
     def apply(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """Y = P x for the unknowns kept, see :meth:`renew`. Collective."""
+        """Compute y = P x for the unknowns kept, see :meth:`renew`. Collective."""
         self.count[-1] += 1.0
         kept = self._kept
         if kept is None:
@@ -214,7 +216,7 @@ class LaggedPreconditioner:
         y.setArray(self._left.getArray(readonly=True)[kept])
 
     def _hold(self, y: PETSc.Vec) -> None:
-        """Multigrid's coarse corrections would move prescribed components, whose residual is zero whatever they are."""
+        """Set prescribed components to zero, which coarse corrections of multigrid would otherwise move."""
         if len(self._fixed):
             with y as out:
                 out[self._fixed] = 0.0
@@ -228,7 +230,7 @@ class LaggedPreconditioner:
 
 
 class Preconditioning:
-    """What PETSc calls for one nonlinear solver; the preconditioner behind it is the same for all."""
+    """Python preconditioner of one nonlinear solver; all solvers share the lagged preconditioner."""
 
     def __init__(self, shared: LaggedPreconditioner, solver: NewtonSolver, snes: PETSc.SNES, bounded: bool) -> None:
         self.shared = shared
@@ -240,17 +242,17 @@ class Preconditioning:
         atexit.register(_let_go, self.snes)
 
     def setUp(self, pc: PETSc.PC) -> None:  # noqa: N802 - PETSc's name
-        """The operator has changed; called by PETSc."""
+        """Handle a change of the operator; called by PETSc."""
         kept = self.snes().getVIInactiveSet().getIndices() - self.first if self.bounded else None
         self.shared.renew(self.solver().problem, kept)
 
     def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """Y = P x; called by PETSc."""
+        """Compute y = P x; called by PETSc."""
         self.shared.apply(x, y)
 
 
 def _let_go(reference: weakref.ref) -> None:
-    """Take our preconditioner from a solver that is still there when Python ends: PETSc 3.18 would call it later."""
+    """Detach the preconditioner from a solver that still exists when Python exits; PETSc 3.18 would call it later."""
     snes = reference()
     if snes:
         snes.getKSP().getPC().setType("none")

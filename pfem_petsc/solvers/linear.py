@@ -1,4 +1,4 @@
-"""Which linear solver a Newton step uses, from the case and the model alone."""
+"""Choice of the linear solver of a Newton step, from the case and the model."""
 
 from __future__ import annotations
 
@@ -12,12 +12,13 @@ from ..errors import InputError
 __all__ = ["DIRECT", "LinearChoice", "choose_linear", "configure", "has_mumps", "set_preconditioner", "unsymmetric"]
 
 DIRECT = ("lu", "mumps")
-"""Preconditioners that solve: PETSc's own factorisation, for small matrices, and MUMPS where PETSc has it."""
+"""Direct solvers: PETSc's own factorisation, for small matrices, and MUMPS if PETSc has it."""
 
 _DIRECT_BELOW = 500  # unknowns; a lattice of 3,993 takes 0.06 s to factorise, and 1 to 4 ms with conjugate gradients
-# Steps over the explicit limit up to which each is chosen, from scripts/linear_solvers.py (docs/linear_solvers.md)
+# Step, relative to the explicit limit, up to which each is chosen; see scripts/linear_solvers.py,
+# docs/linear_solvers.md
 _JACOBI_FREE_UP_TO = 30.0
-_MULTIGRID_FROM = 10  # steps, over which its first set-up pays
+_MULTIGRID_FROM = 10  # steps after which the first set-up pays off
 # with an assembled matrix
 _JACOBI_UP_TO = 5.0
 _CHOLESKY_UP_TO = 50.0
@@ -25,7 +26,7 @@ _CHOLESKY_UP_TO = 50.0
 
 @dataclass(frozen=True)
 class LinearChoice:
-    """A Krylov method and preconditioner, with or without a matrix, and the words that the log shows."""
+    """A Krylov method and preconditioner, with or without a matrix, and the description in the log."""
 
     krylov: str
     preconditioner: str
@@ -34,7 +35,7 @@ class LinearChoice:
 
     @property
     def lagged(self) -> bool:
-        """Whether the preconditioner has a matrix of its own, of an earlier iteration."""
+        """Whether the preconditioner has its own matrix from an earlier iteration."""
         return self.preconditioner == "gamg" or (self.matrix_free and self.preconditioner in DIRECT)
 
 
@@ -54,22 +55,22 @@ def choose_linear(
     request : str
         ``auto``, ``cg``, ``gamg`` or ``mumps``.
     unknowns : int
-        Of the whole model.
+        Number of unknowns of the whole model.
     step_ratio : float
-        Time step over the critical step of central differences: how much stiffness weighs against mass.
+        Time step relative to the critical step of central differences, a measure of stiffness relative to mass.
     symmetric : bool
-        Whether the matrix is; GMRES and incomplete LU stand in for conjugate gradients and Cholesky where it is not.
+        Whether the matrix is symmetric; if not, GMRES and incomplete LU replace conjugate gradients and Cholesky.
     operator : str
         ``auto``, ``assembled`` or ``matrix_free``.
     steps : int
-        Of the run.
+        Number of steps of the run.
     impact : bool
-        Whether there is contact or yielding, where tangents change too much for a preconditioner to last.
+        Whether there is contact or yielding, with which tangents change too fast for a lagged preconditioner.
 
     Raises
     ------
     InputError
-        Where an operator without matrix is asked for together with what needs one.
+        If a matrix-free operator is requested together with a method that needs a matrix.
     """
     if operator == "matrix_free" and not symmetric:
         raise InputError('solver.operator = "matrix_free": this integrator needs a matrix; take "assembled" or "auto"')
@@ -103,7 +104,7 @@ def choose_linear(
 
 
 def unsymmetric(choice: LinearChoice) -> LinearChoice:
-    """The same choice for a matrix that is not symmetric."""
+    """Return the corresponding choice for an unsymmetric matrix."""
     if choice.krylov == "preonly":
         return choice
     preconditioner = "ilu" if choice.preconditioner == "icc" else choice.preconditioner
@@ -111,14 +112,14 @@ def unsymmetric(choice: LinearChoice) -> LinearChoice:
 
 
 def configure(ksp: PETSc.KSP, choice: LinearChoice, reduced: bool, ours: object = None) -> None:
-    """Set a linear solver up; options of the same prefix given by the user override it afterwards.
+    """Configure a linear solver; options of the same prefix given by the user override this afterwards.
 
     Parameters
     ----------
     ksp : the solver
-    choice : what it is to be
-    reduced : whether it works on the inactive unknowns of a contact problem, whose matrix has no blocks
-    ours : a preconditioner of our own that PETSc is to call, instead of the choice's
+    choice : method and preconditioner
+    reduced : whether it solves for the inactive unknowns of a contact problem, whose matrix has no blocks
+    ours : Python preconditioner to use instead of that of the choice
     """
     ksp.setType(choice.krylov)
     if choice.krylov == "gmres":
@@ -135,7 +136,7 @@ def configure(ksp: PETSc.KSP, choice: LinearChoice, reduced: bool, ours: object 
 
 
 def set_preconditioner(pc: PETSc.PC, kind: str, reduced: bool = False) -> None:
-    """Make a preconditioner one of the kinds of :class:`LinearChoice`, with our defaults for its options."""
+    """Set the type of a preconditioner as in :class:`LinearChoice`, with the defaults of this program."""
     comm = pc.comm
     if kind in DIRECT:
         pc.setType("lu")

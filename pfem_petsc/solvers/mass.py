@@ -1,4 +1,4 @@
-"""Accelerations from forces with consistent mass: M a = f by conjugate gradients."""
+"""Accelerations from forces with consistent mass: solves M a = f by conjugate gradients."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _PREFIX = "pfem_mass_"
 
 
 class MassSolver:
-    """The consistent mass matrix, which does not change in a run, and its solver. Construction is collective.
+    """The consistent mass matrix, constant during a run, and its solver. Construction is collective.
 
     Options: prefix ``pfem_mass_``.
 
@@ -50,12 +50,12 @@ class MassSolver:
         self._ksp.setFromOptions()
 
     def solve(self, load: np.ndarray) -> np.ndarray:
-        """Accelerations (owned, 3) [m/s2] for forces (owned, 3) [N], zero on prescribed components. Collective.
+        """Return accelerations (owned, 3) [m/s2] for forces (owned, 3) [N], zero on prescribed components. Collective.
 
         Raises
         ------
         SimulationFailure
-            On all ranks, where the solver does not converge.
+            On all ranks, if the solver does not converge.
         """
         right = load.copy()
         right[self._fixed] = 0.0

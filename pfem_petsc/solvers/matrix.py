@@ -1,4 +1,4 @@
-"""The Hessian as a PETSc matrix with a fixed pattern, filled by the bars' loops through precomputed places."""
+"""The Hessian as a PETSc matrix with a fixed pattern, filled by the loops over bars through precomputed indices."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ __all__ = ["BlockPattern", "HessianMatrix"]
 
 
 class BlockPattern:
-    """Block-compressed rows of the owned nodes: one 3 x 3 block for each node and each neighbour by a bar.
+    """Block-compressed rows of the owned nodes, with one 3 x 3 block per node and per neighbour connected by a bar.
 
     Attributes
     ----------
     ptr : (owned + 1,) int32, first block of each block row
     columns : (blocks,) int64, PETSc node number of each block's column, ascending in a row
-    slots : (b, 4) int32, blocks (a, a), (a, b), (b, b), (b, a) of each bar, -1 where the row is not owned
+    slots : (b, 4) int32, blocks (a, a), (a, b), (b, b), (b, a) of each bar, -1 if the row is not owned
     diagonal : (owned,) int32, the diagonal block of each row
     """
 
@@ -57,7 +57,7 @@ class BlockPattern:
         self.slots[second, 3] = place[owned + len(first) :]
 
     def scalar_rows(self) -> tuple[np.ndarray, np.ndarray]:
-        """Row pointers and PETSc column numbers of the same pattern in scalar compressed rows (PETSc integers)."""
+        """Return row pointers and PETSc column numbers of the pattern in scalar compressed rows (PETSc integers)."""
         blocks = np.repeat(np.diff(self.ptr), 3)
         pointers = np.zeros(len(blocks) + 1, dtype=PETSc.IntType)
         np.cumsum(3 * blocks, out=pointers[1:])
@@ -130,14 +130,14 @@ def _constrain_columns(ptr, local_columns, diagonal, fixed, values):
 
 
 class HessianMatrix:
-    """Assembled Hessian of the owned rows; one interface over the two ways PETSc takes values into a fixed pattern.
+    """Assembled Hessian of the owned rows; one interface to the two ways of setting values in a fixed PETSc pattern.
 
-    ``fill(callback)`` zeroes the values, lets the callback add to them and hands them to PETSc.
+    ``fill(callback)`` zeroes the values, lets the callback add to them, and passes them to PETSc.
 
     Attributes
     ----------
     mat : PETSc matrix
-    bounded : the matrix that steps with bounds take: ``mat``, or with coordinates of links T^T mat T
+    bounded : the matrix of steps with bounds: ``mat``, or T^T mat T with coordinates of links
     """
 
     def __init__(self, mesh: DistributedMesh, fixed: np.ndarray, any_fixed: bool, symmetric: bool = True) -> None:
@@ -149,7 +149,7 @@ class HessianMatrix:
         self.mat = PETSc.Mat().create(comm=mesh.comm)
         self.mat.setSizes(((local, total), (local, total)), bsize=3)
         self.mat.setType(PETSc.Mat.Type.AIJ)
-        # setPreallocationCOO came to petsc4py with PETSc 3.19; it takes the values as they are, without index searches
+        # setPreallocationCOO is available in petsc4py since PETSc 3.19; it sets values without index searches
         self._by_coordinates = hasattr(self.mat, "setPreallocationCOO")
         if self._by_coordinates:
             rows = np.repeat(3 * mesh.first_node + np.arange(local, dtype=PETSc.IntType), np.diff(pointers))
@@ -159,7 +159,7 @@ class HessianMatrix:
             self.mat.setPreallocationCSR((pointers, columns))
         self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, symmetric)
         self.bounded = self.mat
-        self._chain: list[tuple[object, PETSc.Mat, PETSc.Mat]] = []  # coordinates, T, and what T makes
+        self._chain: list[tuple[object, PETSc.Mat, PETSc.Mat]] = []  # coordinates, T, and the product with T
         self._symmetric = symmetric
         self.any_fixed = any_fixed
         if any_fixed:
@@ -169,11 +169,11 @@ class HessianMatrix:
 
     @cached_property
     def local_columns(self) -> np.ndarray:
-        """Local node index (int32) of each block's column; worked out where supports or oblique walls first need it."""
+        """Local node index (int32) of each block's column, computed when supports or oblique walls first need it."""
         return local_columns(self.mesh, self.pattern.columns)
 
     def fill(self, add: Callable[[np.ndarray], None]) -> PETSc.Mat:
-        """Assemble: ``add(values)`` adds the Hessian of the owned rows to the zeroed values."""
+        """Assemble the matrix; ``add(values)`` adds the Hessian of the owned rows to the zeroed values."""
         self.values[:] = 0.0
         add(self.values)
         if self._by_coordinates:
@@ -184,7 +184,7 @@ class HessianMatrix:
         return self.mat
 
     def couple(self, links: Iterable) -> None:
-        """Give steps with bounds the coordinates of links (``contact.links.LinkCoordinates``). Collective."""
+        """Set the coordinates of links (``contact.links.LinkCoordinates``) for steps with bounds. Collective."""
         for link in links:
             matrix = link.matrix()
             if not self._chain:
@@ -200,7 +200,7 @@ class HessianMatrix:
             self._change_coordinates(problem.transform)
 
     def _change_coordinates(self, transform: Transform) -> None:
-        """Make ``bounded`` from ``mat``. Collective."""
+        """Compute ``bounded`` from ``mat``. Collective."""
         last = self.mat
         for link, matrix, product in self._chain:
             if link in transform.links:
@@ -214,8 +214,8 @@ class HessianMatrix:
     def fill_held(
         self, add: Callable[[np.ndarray], None], held: np.ndarray, scale: float, transform: Transform
     ) -> PETSc.Mat:
-        """Assemble in the coordinates of a transform, with rows and columns of components (local nodes, 3) of which
-        ``held`` is not zero replaced by ``scale`` on the diagonal. Collective."""
+        """Assemble in the coordinates of a transform; rows and columns of components (local nodes, 3) with nonzero
+        ``held`` are replaced by ``scale`` on the diagonal. Collective."""
         if not transform.links:
 
             def add_held(values: np.ndarray) -> None:
@@ -237,11 +237,11 @@ class HessianMatrix:
         _add_lumped(self.pattern.ptr, self.pattern.diagonal, inertia, values)
 
     def add_bars(self, stored: np.ndarray, values: np.ndarray) -> None:
-        """Add the bars' stiffness from what :meth:`~pfem_petsc.mechanics.bars.Bars.linearise` stores, (b, 5)."""
+        """Add the bars' stiffness from the data of :meth:`~pfem_petsc.mechanics.bars.Bars.linearise`, (b, 5)."""
         _add_bars(self.mesh.bars, stored, self.pattern.ptr, self.pattern.slots, values)
 
     def add_blocks(self, nodes: np.ndarray, blocks: np.ndarray, values: np.ndarray) -> None:
-        """Add blocks (k, 3, 3) to the diagonal blocks of owned nodes (k,), each there once."""
+        """Add blocks (k, 3, 3) to the diagonal blocks of owned nodes (k,), which must be distinct."""
         ptr = self.pattern.ptr.astype(np.int64)
         start = 6 * ptr[nodes] + 3 * self.pattern.diagonal[nodes]
         width = 3 * (ptr[nodes + 1] - ptr[nodes])
@@ -269,7 +269,7 @@ class HessianMatrix:
 
 
 def local_columns(mesh: DistributedMesh, columns: np.ndarray) -> np.ndarray:
-    """Local node indices (int32) of PETSc node numbers that are owned or ghosts here."""
+    """Return the local node indices (int32) of PETSc node numbers of owned nodes or ghosts."""
     local = (columns - mesh.first_node).astype(np.int64)
     outside = (local < 0) | (local >= mesh.n_owned)
     order = np.argsort(mesh.ghost_numbers, kind="stable")

@@ -1,7 +1,7 @@
-"""The Hessian as an operator: the bars' stiffness is applied bar by bar, and never assembled.
+"""The Hessian as a matrix-free operator: the stiffness is applied bar by bar and never assembled.
 
-Five numbers a bar are kept (n and the two stiffnesses), against 36 matrix entries and their columns: a product reads a
-quarter of the memory. Contact problems take the restriction of the operator to their inactive unknowns.
+Five numbers per bar are stored (n and the two stiffnesses) instead of 36 matrix entries and their columns, so a product
+reads a quarter of the memory. Contact problems use the restriction of the operator to their inactive unknowns.
 """
 
 from __future__ import annotations
@@ -80,10 +80,10 @@ def _diagonal(bars, stored, blocks):
 
 
 class _Restriction:
-    """H restricted to some of the unknowns of each rank: what is left of a contact problem's inactive set.
+    """H restricted to some of the unknowns of each rank, the inactive set of a contact problem.
 
-    It does not refer to its PETSc matrix, which refers to it: such a cycle passes through PETSc, where Python's
-    garbage collector does not see it, and would never be freed.
+    It holds no reference to its PETSc matrix, which refers to it: Python's garbage collector cannot see a cycle through
+    PETSc, so it would never be freed.
     """
 
     def __init__(self, whole: MatrixFreeHessian, kept: np.ndarray) -> None:
@@ -91,7 +91,7 @@ class _Restriction:
         self.kept = kept.astype(np.int64)
 
     def matrix(self) -> PETSc.Mat:
-        """A PETSc matrix of it. Collective."""
+        """Create a PETSc matrix for it. Collective."""
         n = len(self.kept)
         matrix = PETSc.Mat().createPython(((n, None), (n, None)), self, comm=self.whole.mesh.comm)
         matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
@@ -99,7 +99,7 @@ class _Restriction:
         return matrix
 
     def mult(self, mat: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """Y = H x with zeros for the unknowns left out; called by PETSc."""
+        """Compute y = H x with zeros for the other unknowns; called by PETSc."""
         whole = self.whole
         u = whole._u[: whole.mesh.n_owned].reshape(-1)
         u[:] = 0.0
@@ -108,12 +108,12 @@ class _Restriction:
         y.setArray(whole._out[: whole.mesh.n_owned].reshape(-1)[self.kept])
 
     def getDiagonal(self, mat: PETSc.Mat, d: PETSc.Vec) -> None:  # noqa: N802 - PETSc's name
-        """Diagonal of the restriction; called by PETSc."""
+        """Write the diagonal of the restriction; called by PETSc."""
         d.setArray(self.whole.diagonal().reshape(-1)[self.kept])
 
 
 class _Context:
-    """What PETSc calls for an operator that owns its PETSc matrix; it does not keep the operator alive."""
+    """Python context of an operator that owns its PETSc matrix; does not keep the operator alive."""
 
     def __init__(self, operator: _Extension | MatrixFreeHessian) -> None:
         self.operator = weakref.ref(operator)
@@ -123,19 +123,19 @@ class _Context:
         self.operator().mult(mat, x, y)
 
     def getDiagonal(self, mat: PETSc.Mat, d: PETSc.Vec) -> None:  # noqa: N802 - PETSc's name
-        """Diagonal of H; called by PETSc."""
+        """Write the diagonal of H; called by PETSc."""
         d.setArray(self.operator().diagonal().ravel())
 
     def createSubMatrix(  # noqa: N802 - PETSc's name
         self, mat: PETSc.Mat, rows: PETSc.IS, columns: PETSc.IS, out: PETSc.Mat | None = None
     ) -> PETSc.Mat:
-        """The restriction of H to some unknowns; called by PETSc."""
+        """Return the restriction of H to some unknowns; called by PETSc."""
         whole = self.operator()
         return _Restriction(whole, rows.getIndices() - 3 * whole.mesh.first_node).matrix()
 
 
 class _Extension:
-    """H of all unknowns, where rows and columns of those that walls hold are those of a unit matrix, scaled."""
+    """H of all unknowns, with rows and columns of active unknowns replaced by those of a scaled identity."""
 
     def __init__(self, whole: MatrixFreeHessian) -> None:
         self.whole = whole
@@ -165,13 +165,13 @@ class _Extension:
 
 
 class MatrixFreeHessian:
-    """Stands where :class:`~pfem_petsc.solvers.matrix.HessianMatrix` stands, for symmetric schemes.
+    """Matrix-free replacement of :class:`~pfem_petsc.solvers.matrix.HessianMatrix` for symmetric schemes.
 
     Attributes
     ----------
     mat : PETSc matrix of type python
-    bounded : the matrix that steps with bounds take: the same
-    stored : (b, 5) what the product needs of each bar, see :meth:`~pfem_petsc.mechanics.bars.Bars.linearise`
+    bounded : the matrix of steps with bounds, equal to ``mat``
+    stored : (b, 5) data of each bar for the product, see :meth:`~pfem_petsc.mechanics.bars.Bars.linearise`
     """
 
     _extension: _Extension | None = None
@@ -199,20 +199,20 @@ class MatrixFreeHessian:
         self.mat.stateIncrease()
 
     def linearise(self, problem: StepProblem) -> None:
-        """As :meth:`update`, at the positions where the problem is placed."""
+        """As :meth:`update`, at the current positions of the problem."""
         self._problem = problem
         self._left = problem.transform.left()
         self.model.bars.linearise(problem.x, problem.balance.weight, self.stored)
 
     def make_definite(self) -> None:
-        """Leave out what the stiffness of bars has of negative eigenvalues: in compression, and of laws that soften."""
+        """Drop negative eigenvalues of the bars' stiffness, due to compression or softening laws."""
         axial = np.maximum(self.stored[:, 3] + self.stored[:, 4], 0.0)
         np.maximum(self.stored[:, 4], 0.0, out=self.stored[:, 4])
         np.subtract(axial, self.stored[:, 4], out=self.stored[:, 3])
 
     @property
     def extension(self) -> _Extension:
-        """The operator with rows and columns of a unit matrix for unknowns that walls hold."""
+        """Return the operator with rows and columns of the identity for active unknowns."""
         if self._extension is None:
             self._extension = _Extension(self)
         return self._extension
@@ -225,7 +225,7 @@ class MatrixFreeHessian:
         y.setArray(self._out[:owned].ravel())
 
     def apply(self) -> None:
-        """Apply H to the owned rows of :attr:`_u`, giving those of :attr:`_out`. Collective."""
+        """Apply H to the owned rows of :attr:`_u`, and write those of :attr:`_out`. Collective."""
         problem, owned = self._problem, self.mesh.n_owned
         u, out = self._u, self._out
         fixed = self._fixed if self.model.supports.any else None
@@ -253,7 +253,7 @@ class MatrixFreeHessian:
             out[:owned][fixed] = held
 
     def diagonal(self) -> np.ndarray:
-        """Diagonal of H (owned, 3)."""
+        """Return the diagonal of H (owned, 3)."""
         problem, owned = self._problem, self.mesh.n_owned
         blocks = np.zeros((self.mesh.n_local, 6))
         _diagonal(self.mesh.bars, self.stored, blocks)
@@ -261,7 +261,7 @@ class MatrixFreeHessian:
             moved = self.model.inertia.redistribution
             upper = moved.tensors.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
             blocks[moved.touched] += problem.balance.alpha * upper
-        # consistent mass has two thirds of the lumped one on its diagonal
+        # the diagonal of the consistent mass is two thirds of the lumped one
         nodal = problem.nodal * (2.0 / 3.0 if self.model.inertia.consistent else 1.0)
         diagonal = blocks[:owned][:, [0, 3, 5]] + nodal[:, None]
         problem.transform.diagonal(self._left, lambda nodes: self._blocks(blocks, nodal, nodes), diagonal)
@@ -271,12 +271,12 @@ class MatrixFreeHessian:
 
     @staticmethod
     def _blocks(stiffness: np.ndarray, nodal: np.ndarray, nodes: np.ndarray) -> np.ndarray:
-        """Diagonal blocks (k, 3, 3) of H at nodes (k,)."""
+        """Return the diagonal blocks (k, 3, 3) of H at nodes (k,)."""
         full = stiffness[nodes][:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
         return full + nodal[nodes, None, None] * np.eye(3)
 
     def couple(self, links: Iterable) -> None:
-        """Nothing to prepare: coordinates of links are applied with the bars."""
+        """Do nothing: coordinates of links are applied with the bars."""
 
     def destroy(self) -> None:
         """Free the PETSc matrices."""

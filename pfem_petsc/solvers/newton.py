@@ -1,4 +1,4 @@
-"""Newton's method by PETSc's SNES, plain or as a variational inequality with bounds."""
+"""Newton's method by PETSc's SNES, unconstrained or as a variational inequality with bounds."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ _STAGNATION = 100.0  # a residual within this many rounding floors that no longe
 
 
 def zero_tolerance(length: float) -> float:
-    """Distance to a bound [m] that counts as on it, for a model of an extent [m]: rounding of a position."""
+    """Return the distance from a bound [m] that counts as zero for a model of ``length`` [m]: rounding of positions."""
     return ROUNDING * length
 
 
 class Problem(Protocol):
-    """What is solved: g(u) = 0, or complementary to bounds on u."""
+    """The problem g(u) = 0, or g(u) complementary to bounds on u."""
 
     def residual(self, u: np.ndarray, g: np.ndarray) -> None:
         """Write g(u) (owned, 3) [N]."""
@@ -43,7 +43,7 @@ class Problem(Protocol):
 
 @dataclass(frozen=True)
 class NewtonReport:
-    """How a solve went; ``why`` is empty where it converged."""
+    """Statistics of a solve; ``why`` is empty if it converged."""
 
     converged: bool
     newton: int
@@ -52,23 +52,23 @@ class NewtonReport:
     why: str
 
     def then(self, later: NewtonReport) -> NewtonReport:
-        """The report of a later attempt, with the iterations of both."""
+        """Return the report of a later attempt, with the iterations of both."""
         return NewtonReport(
             later.converged, self.newton + later.newton, self.linear + later.linear, later.norm, later.why
         )
 
 
 class NewtonSolver:
-    """Solves for the position increment of a step; made once for a run.
+    """Solves for the position increment of a step; created once per run.
 
-    Options: prefix ``pfem_`` for free steps, ``pfem_contact_`` for steps with bounds, and
-    ``pfem_contact_full_`` where these are tried again without a line search. Steps with bounds have a linear solver of
-    their own, ``bounded``.
+    Options: prefix ``pfem_`` for free steps, ``pfem_contact_`` for steps with bounds, and ``pfem_contact_full_`` for
+    steps with bounds that are repeated without a line search. Steps with bounds have their own linear solver,
+    ``bounded``.
 
     Attributes
     ----------
-    problem : the one being solved
-    lagged : preconditioner for all of them, None where PETSc makes one from the operator
+    problem : the current problem
+    lagged : preconditioner of all solvers, None if PETSc builds one from the operator
     """
 
     def __init__(
@@ -112,9 +112,9 @@ class NewtonSolver:
         u : (owned, 3) float64
             Guess on entry, solution on exit [m].
         tolerance, floor : float
-            Of the 2-norm of the residual [N]: what is asked, and what rounding allows.
+            Required 2-norm of the residual [N], and the norm that rounding allows.
         bounds : pair of (owned, 3) arrays, optional
-            Lower and upper bounds on u [m]; infinite where there is none.
+            Lower and upper bounds on u [m]; infinite where there is no bound.
         """
         snes = self._solver(bounds is not None)
         self.problem = problem
@@ -140,12 +140,12 @@ class NewtonSolver:
         return report
 
     def prepare(self, contact: bool) -> None:
-        """Make the solvers of free steps, and of those with bounds, before any is needed. Collective.
+        """Create the solvers of free steps and, if ``contact``, of steps with bounds in advance. Collective.
 
         Raises
         ------
         InputError
-            On all ranks, where PETSc refuses an option.
+            On all ranks, if PETSc refuses an option.
         """
         try:
             for bounded in (False, True) if contact else (False,):
@@ -196,7 +196,7 @@ class NewtonSolver:
         snes.destroy()
 
     def _without_definiteness(self, snes: PETSc.SNES, start: np.ndarray, first: NewtonReport) -> NewtonReport:
-        """Conjugate gradients met an indefinite tangent: the same step with a method that needs no definiteness."""
+        """Repeat the solve with a method for indefinite tangents after conjugate gradients has failed."""
         ksp = snes.getKSP()
         bounds = snes.getType() == "vinewtonrsls"
         choice = self.bounded if bounds else self.choice
@@ -209,7 +209,7 @@ class NewtonSolver:
         )
 
     def _with_full_steps(self, start: np.ndarray, first: NewtonReport) -> NewtonReport:
-        """In oblique coordinates the residual need not fall on the way to the right active set: go there at once."""
+        """Repeat the solve with full steps: in oblique coordinates the residual may grow before it decreases."""
         snes = self._solver(True, full_steps=True)
         snes.setVariableBounds(self._lower, self._upper)
         return first.then(self._attempt(snes, start))
@@ -224,8 +224,8 @@ class NewtonSolver:
         if full_steps:
             PETSc.Options(prefix)["snes_linesearch_type"] = "basic"
         snes.setType("vinewtonrsls" if contact else "newtonls")
-        # Methods are looked up at each call: they may be covered by log events after this. PETSc's solver must not keep
-        # this object alive, which owns it: Python's garbage collector does not see such a cycle.
+        # Methods are looked up at each call, because log events may be wrapped around them later. PETSc's solver must
+        # not keep this object alive, which owns it: Python's garbage collector cannot see such a cycle.
         this = weakref.ref(self)
         snes.setFunction(lambda *arguments: this()._residual(*arguments), self._g)
         matrix = self.hessian.bounded if contact else self.hessian.mat
@@ -233,7 +233,7 @@ class NewtonSolver:
         snes.setTolerances(rtol=0.0, atol=0.0, stol=0.0, max_it=self.max_newton)
         snes.setConvergenceTest(lambda *arguments: this()._converged(*arguments))
         if contact:
-            # PETSc's default 1e-8 is absolute: a node that near its bound would be held there, off it
+            # PETSc's default of 1e-8 is absolute: a node that close to its bound would be fixed there, off the bound
             options = PETSc.Options(snes.getOptionsPrefix())
             ours = not options.hasName("snes_vi_zero_tolerance")
             if ours:
@@ -243,7 +243,7 @@ class NewtonSolver:
         configure(snes.getKSP(), self.bounded if contact else self.choice, contact, self._ours.get(key))
         snes.setFromOptions()
         if contact and ours:
-            # options belong to the process: the next model has a length of its own
+            # options are global to the process, but the next model has another length
             options.delValue("snes_vi_zero_tolerance")
         self._solvers[key] = snes
         atexit.register(outlive, weakref.ref(snes))

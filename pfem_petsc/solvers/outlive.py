@@ -1,4 +1,4 @@
-"""What PETSc still holds when Python ends: objects that it could not call any more."""
+"""Handling of Python objects that PETSc still refers to when Python exits and that it can no longer call."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ __all__ = ["outlive"]
 
 
 def outlive(reference: weakref.ref) -> None:
-    """Keep PETSc from freeing operators that are Python objects; to be called when Python ends.
+    """Prevent PETSc from freeing operators that are Python objects; to be called when Python exits.
 
     Parameters
     ----------
-    reference : to a matrix, or to a SNES, whose operators are meant: the last restriction to inactive unknowns is one
+    reference : to a matrix, or to a SNES, whose operators include the last restriction to inactive unknowns
     """
     thing = reference()
     if not thing:

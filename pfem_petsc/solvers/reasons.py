@@ -42,10 +42,10 @@ def _words(table: type, known: dict[str, str], reason: int) -> str:
 
 
 def newton_reason(reason: int) -> str:
-    """Words for a SNES converged reason."""
+    """Describe a SNES converged reason."""
     return _words(PETSc.SNES.ConvergedReason, _NEWTON, reason)
 
 
 def linear_reason(reason: int) -> str:
-    """Words for a KSP converged reason."""
+    """Describe a KSP converged reason."""
     return _words(PETSc.KSP.ConvergedReason, _LINEAR, reason)

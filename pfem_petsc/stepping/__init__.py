@@ -1,1 +1,1 @@
-"""From a case to steps: the model, its critical step, explicit and implicit steps, and the energy ledger."""
+"""Time stepping: the model, its critical step, explicit and implicit steps, and the energy ledger."""

@@ -1,4 +1,4 @@
-"""What to tell about a bar that collapsed: what is known, and the likelier cause."""
+"""The message about a bar that collapsed: the facts and the likely cause."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ if TYPE_CHECKING:
 __all__ = ["tell_collapse"]
 
 _STRONG = 1.0
-"""Speed of an impact over the bars' wave speed from which on it crushes them: the strain behind the wave is v/c."""
+"""Ratio of impact speed to the wave speed of bars beyond which it crushes them; the strain behind the wave is v/c."""
 
 
 def tell_collapse(stepper: Stepper, bar: int) -> str:
-    """Message about a bar (local index) that failed in the step being made. Of this rank alone."""
+    """Return the message about a bar (local index) that failed in the current step. Not collective."""
     model, state = stepper.model, stepper.state
     mesh = model.mesh
     a, b = mesh.bars[bar]
@@ -42,7 +42,7 @@ def tell_collapse(stepper: Stepper, bar: int) -> str:
 
 
 def _cause(stepper: Stepper, wave: float) -> str:
-    """Impact, load or time integration, and the way out."""
+    """Return the likely cause (impact, load or time integration) and the remedy."""
     model = stepper.model
     case = model.case
     fastest = _speed_of_case(case)
@@ -70,7 +70,7 @@ def _cause(stepper: Stepper, wave: float) -> str:
 
 
 def _speed_of_case(case: Case) -> float:
-    """Upper bound on the speed [m/s] at which bodies and walls of a case start towards each other; turning aside."""
+    """Return an upper bound on the initial relative speed [m/s] of bodies and walls of a case, without rotations."""
     given = [item.velocity for item in (*case.initial, *case.wall) if item.velocity is not None]
     found = [float(np.linalg.norm(velocity)) for velocity in given]
     for wall in case.wall:

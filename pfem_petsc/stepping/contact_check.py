@@ -1,4 +1,4 @@
-"""Whether contact gains energy with what a case asks for: judged before the first step, by impacts on a small rod."""
+"""Check before the first step whether contact gains energy with the settings of a case, by impacts of a small rod."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ if TYPE_CHECKING:
 __all__ = ["BOUND", "contact_gain", "overshoots", "warn_of_gain"]
 
 BOUND = 0.005
-"""Part of the energy that impacts on the small rod may gain without a warning."""
+"""Relative energy gain in impacts of the small rod above which a warning is given."""
 
 _RODS = 1, 20
-"""Fewest and most bars of the rods: a wave passes some trusses within a step, which longer rods do not show."""
-_STEPS = 0.1, 50.0  # over the explicit limit: smaller and larger ones do as these
+"""Smallest and largest number of bars of the rods: in some trusses a wave passes within a step, as in short rods."""
+_STEPS = 0.1, 50.0  # relative to the explicit limit; smaller and larger steps behave like these
 
 
 @cache
 def contact_gain(integrator: str, parameters: str, asked: Asked) -> float:
-    """Largest part of the energy that impacts gain in any phase, at steps of this size and a quarter of it.
+    """Return the largest relative energy gain of impacts over all phases, at this step and at a quarter of it.
 
-    A quarter, because a truss has nodes that are slower than its fastest one, and chatter depends on the step.
+    The smaller step represents nodes that are slower than the fastest one, because chatter depends on the step.
     ``parameters`` are those of the integrator as JSON.
     """
     module = lookup("pfem_petsc.integrators", integrator, "time.integrator")
@@ -40,26 +40,26 @@ def contact_gain(integrator: str, parameters: str, asked: Asked) -> float:
 
 
 def overshoots(integrator: str, step: float) -> bool:
-    """Whether impacts may gain energy by overshoot that the small rod does not show.
+    """Return whether impacts may gain energy by an overshoot that the small rod does not show.
 
-    ``wilson`` takes what stops a node at t + theta h for an acceleration that grows linearly up to there. Beyond the
-    explicit limit the first steps after such a jump overshoot, by more the larger the step, at any theta; whether a
-    truss gains by it depends on what its nodes do in those steps.
+    ``wilson`` treats the force that stops a node at t + theta h as an acceleration that grows linearly up to that time.
+    Beyond the explicit limit the first steps after such a jump overshoot for any theta, and more so for larger steps;
+    whether a truss gains energy depends on the motion of its nodes in these steps.
     """
     return integrator == "wilson" and step > 1.0
 
 
 def warn_of_gain(case: Case, step: float, across: float = np.inf) -> str:
-    """What to tell of a case whose contact gains energy beyond :data:`BOUND`; empty for nothing, and for
-    treatments that the small rods do not have.
+    """Return the warning about a case whose contact gains energy beyond :data:`BOUND`; empty if it does not, and for
+    treatments that the small rods do not implement.
 
-    ``step`` : over the limit of central differences with lumped mass; ``across`` : how many such limits a wave takes
-    through the truss.
+    ``step`` : relative to the limit of central differences with lumped mass; ``across`` : time in which a wave crosses
+    the truss, in units of that limit.
     """
     if case.contact.treatment not in KNOWN:
         return ""
     time = case.time
-    step = float(f"{step:.2g}")  # so that much the same cases are judged once
+    step = float(f"{step:.2g}")  # rounded, so that similar cases share one scan
     elements = int(np.clip(np.round(across), *_RODS))
     gains = {}
     for restitution in sorted({0.0, *(float(f"{wall.restitution:.2g}") for wall in case.wall)}):
@@ -87,7 +87,7 @@ def warn_of_gain(case: Case, step: float, across: float = np.inf) -> str:
 
 
 def _remedies(time: Time, asked: Asked) -> str:
-    """What else does not gain energy, nearest first: two at most."""
+    """Return at most two settings that do not gain energy, closest to the case first."""
     parameters = time.scheme.model_dump_json()
     tries = []
     for other in ("stick", "scheme"):
@@ -112,5 +112,5 @@ def _remedies(time: Time, asked: Asked) -> str:
                 tries.append((text, time.integrator, parameters, replace(asked, restitution=less)))
     found = [text for text, *what in tries if contact_gain(*what) <= BOUND and not overshoots(what[0], what[2].step)]
     smaller = [text for text in found if text.startswith("a time.step")]
-    found = [text for text in found if text not in smaller[1:]]  # where one size does, a smaller one is no news
+    found = [text for text in found if text not in smaller[1:]]  # of several step sizes keep the largest
     return ", or ".join(found[:2]) if found else newmark

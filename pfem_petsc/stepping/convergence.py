@@ -16,11 +16,11 @@ if TYPE_CHECKING:
 
 __all__ = ["failure_message", "residual_tolerance"]
 
-_MASS_RTOL = 1e-3  # of solver.rtol, for systems of the mass matrix alone
+_MASS_RTOL = 1e-3  # factor on solver.rtol for systems with the mass matrix only
 
 
 def residual_tolerance(model: Model, state: State, balance: Balance, step: float) -> float:
-    """Tolerance of the residual's 2-norm [N] in a step of the given length [s]. Collective.
+    """Return the tolerance of the residual's 2-norm [N] in a step of the given size [s]. Collective.
 
     It is ``solver.rtol`` times the largest of momentum per step, loads and internal forces, but not below
     ``solver.atol``.
@@ -34,7 +34,7 @@ def residual_tolerance(model: Model, state: State, balance: Balance, step: float
         ]
     )
     model.comm.Allreduce(MPI.IN_PLACE, sums)
-    # an explicit scheme's balance is a well-conditioned linear system: what is left of it would be an impulse
+    # an explicit scheme's balance is a well-conditioned linear system, and its residual would act as an impulse
     rtol = solver.rtol if balance.weight else _MASS_RTOL * solver.rtol
     return max(rtol * float(np.sqrt(sums.max())), solver.atol or 0.0)
 
@@ -47,13 +47,13 @@ def failure_message(
     tolerance: float,
     remedy: str,
 ) -> str:
-    """Iterations, reason, worst node and remedy of a solve that did not converge. Collective.
+    """Return the message about a solve that did not converge: iterations, reason, worst node, remedy. Collective.
 
     Parameters
     ----------
     problem : StepProblem
     w : (owned, 3) last iterate, in the coordinates of the problem
-    bounds : (lower, upper) of w, None where there are none
+    bounds : (lower, upper) of w, None if there are none
     report : NewtonReport
     tolerance : of the residual's 2-norm [N]
     remedy : what the user can do
@@ -61,7 +61,7 @@ def failure_message(
     model = problem.model
     g = np.empty_like(w)
     problem.residual(w, g)
-    if bounds is not None:  # what walls bear is no error
+    if bounds is not None:  # forces on active bounds are not part of the error
         g[((w <= bounds[0]) & (g > 0.0)) | ((w >= bounds[1]) & (g < 0.0))] = 0.0
     size = np.linalg.norm(np.nan_to_num(g, nan=np.inf), axis=1)
     worst = (0.0, -1)

@@ -1,4 +1,4 @@
-"""Explicit steps with lumped mass: every node on its own, contact by exact projection."""
+"""Explicit steps with lumped mass: nodes are solved independently, contact by exact projection."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class ExplicitStepper(Stepper):
 
     Attributes
     ----------
-    other_force : (local, 3) internal force before the last evaluation [N], to be written to by the next
+    other_force : (local, 3) internal force before the last evaluation [N], overwritten by the next one
     """
 
     renews_forces = True
@@ -50,7 +50,7 @@ class ExplicitStepper(Stepper):
 
     @contextmanager
     def _faults(self, balance: Balance) -> Iterator[None]:
-        """Keep the first failure of this rank, until all ranks meet."""
+        """Record the first failure of this rank until ranks synchronise."""
         try:
             yield
         except SimulationFailure as failure:
@@ -83,7 +83,7 @@ class ExplicitStepper(Stepper):
         with self._faults(balance):
             state.contact = model.links.explicit(balance, state, u, stiffness, self.zero, tolerance)
         if model.contact.any:
-            # also where links have failed: walls with mass have all ranks solve for them
+            # also after a failure of links: with walls with mass this call is collective
             with self._faults(balance):
                 nodes, force, walls = model.contact.explicit(balance.predictor, u, stiffness, balance.time, tolerance)
                 if len(nodes):

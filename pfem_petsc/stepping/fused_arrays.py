@@ -1,4 +1,4 @@
-"""Arrays that the loop over steps reads and writes, by name."""
+"""Named arrays that the fused loop reads and writes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ __all__ = ["BarArrays", "Buffers", "ImpulseArrays", "NodeArrays", "ProbeArrays",
 
 
 class BarArrays(NamedTuple):
-    """Arguments of a law's loop over the bars; see :mod:`~pfem_petsc.mechanics.kernels`."""
+    """Arguments of the bar loop of a law; see :mod:`~pfem_petsc.mechanics.kernels`."""
 
     ends: np.ndarray
     sweep: tuple
@@ -23,7 +23,7 @@ class BarArrays(NamedTuple):
 
 
 class NodeArrays(NamedTuple):
-    """What stays as it is at the nodes; ``damping`` (0,) and ``external`` (0, 3) for none."""
+    """Constant arrays at the nodes; ``damping`` (0,) and ``external`` (0, 3) if there are none."""
 
     mass: np.ndarray
     damping: np.ndarray
@@ -52,7 +52,7 @@ class WallArrays(NamedTuple):
 
 
 class ImpulseArrays(NamedTuple):
-    """Particles (rows, 3) of :mod:`~pfem_petsc.stepping.impulses`: what they remember, and their state."""
+    """Particles (rows, 3) of :mod:`~pfem_petsc.stepping.impulses`: the scheme's memory and their state."""
 
     half: np.ndarray
     a: np.ndarray
@@ -60,16 +60,16 @@ class ImpulseArrays(NamedTuple):
 
 
 class ProbeArrays(NamedTuple):
-    """Nodes (m,) of all probes, one after the other, and where each probe starts (probes + 1,)."""
+    """Nodes (m,) of all probes, concatenated, and the start of each probe (probes + 1,)."""
 
     nodes: np.ndarray
     starts: np.ndarray
 
 
 class Buffers(NamedTuple):
-    """Arrays (n, 3) that are filled in turn: of the last step, and to be filled by the next.
+    """Arrays (n, 3) used alternately: those of the last step, and those that the next step fills.
 
-    Those for the forces of walls hold zeros, but for what the last step has put into the first of them.
+    The arrays of wall forces are zero except for the entries that the last step has set in the first one.
     """
 
     f: np.ndarray

@@ -1,8 +1,8 @@
-"""Many steps of central differences in one compiled call, where nothing between them needs Python.
+"""The fused loop: many steps of central differences in one compiled call, if nothing between them needs Python.
 
-One rank, lumped mass, bars of one section, flat walls at rest or none, loads and supports that do not change: the loops
-are those of single steps, in the same order, so the results are the same. A step of a few thousand bars takes about as
-long as Python takes to call its loops one by one; here it does not.
+It applies to one rank, lumped mass, bars of one section, no walls or flat walls at rest, and constant loads and
+supports. It calls the loops of single steps in the same order, so the results are bitwise identical. For a few thousand
+bars a step takes about as long as the calls from Python to its loops, which the fused loop avoids.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ _CONTACTS, _ALARM = HEAD.first("active_contacts"), HEAD.first("alarm")
 
 @cache
 def make_fused_loop(forces: Callable, drift: Callable, kick: Callable) -> Callable:
-    """The loop over steps for the bars' loop ``forces`` of a law and strain measure, and the loops of a scheme.
+    """Return the fused loop for the bar loop ``forces`` of a law and strain measure, and the loops of a scheme.
 
-    Its arguments: most steps; step [s]; positions, those of the step before, velocities at half steps (n, 3); arrays of
-    bars, nodes, walls, probes and buffers; nodes (m,) that touch walls; nodes (k,) that have met walls; the
-    ledger's sums; its particles; the kinetic energy, and those of
-    the bars [J]; and ``sums`` (count, width), which takes what a row of the history sums up, of each step.
+    Its arguments are the maximum number of steps; the step [s]; positions, positions of the previous step, and
+    velocities at half steps (n, 3); arrays of bars, nodes, walls, probes and buffers; nodes (m,) that touch walls;
+    nodes (k,) that have touched walls and not left them; the ledger's sums; its particles; the kinetic energy and the
+    energies of the bars [J]; and ``sums`` (count, width), which receives the sums of a history row for each step.
 
-    It gives the number of steps made; of the last of them the first bar that collapsed and the first that went through
-    zero length, or -1, and the node that found no room, or -1, with the offsets of its planes; the buffers; the
-    kinetic energy; increments (n, 3); what :func:`~pfem_petsc.contact.flat.press_planes` tells of nodes and walls; and
-    the nodes that touch walls, and that have met them.
+    It returns the number of steps made; for the last step the first bar that collapsed and the first that went through
+    zero length, or -1, and the infeasible node, or -1, with the offsets of its planes; the buffers; the kinetic energy;
+    increments (n, 3); the results of :func:`~pfem_petsc.contact.flat.press_planes` for nodes and walls; and the nodes
+    that touch walls, and those that have touched them.
     """
 
     @kernel

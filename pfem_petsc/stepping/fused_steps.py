@@ -1,4 +1,4 @@
-"""Runs of steps between which nothing happens but rows of the history: made by one compiled call where that can be."""
+"""Driver of the fused loop: makes consecutive steps that need only rows of the history in one compiled call."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ if TYPE_CHECKING:
 __all__ = ["MOST", "WORTH", "Batch", "Batches"]
 
 MOST = 512
-"""Steps of one call, at most: their sums are kept."""
+"""Maximum number of steps per call, whose sums are buffered."""
 
 WORTH = 1000
-"""Steps of a run for which the loop over steps is compiled: some seconds, once."""
+"""Minimum number of steps of a run for which the fused loop is compiled, which takes some seconds once."""
 
-_FEWEST = 8  # steps that are worth one call
-_NODES = 50_000  # beyond, what Python needs between the loops is less than a hundredth, and memory counts
+_FEWEST = 8  # minimum number of steps for one call
+_NODES = 50_000  # beyond this the overhead of Python is below one percent, and memory traffic dominates
 
 
 class Batch:
@@ -40,7 +40,7 @@ class Batch:
 
     Attributes
     ----------
-    sums : (:data:`MOST`, width) of each step, what :meth:`~pfem_petsc.recording.recorder.Recorder.row` sums up
+    sums : (:data:`MOST`, width) for each step, the sums that :meth:`~pfem_petsc.recording.recorder.Recorder.row` uses
     """
 
     def __init__(self, stepper: Stepper, ledger: Ledger, recorder: Recorder) -> None:
@@ -70,12 +70,12 @@ class Batch:
 
     @staticmethod
     def serves(stepper: Stepper) -> bool:
-        """Whether the steps of this run are so plain that one loop can make several."""
+        """Return whether the fused loop applies to the steps of this run."""
         from petsc4py import PETSc
 
         model = stepper.model
         return (
-            # what is logged are the methods of single steps
+            # -log_view measures the methods of single steps
             not PETSc.Log.isActive()
             and model.comm.size == 1
             and model.mesh.n_nodes <= _NODES
@@ -87,9 +87,10 @@ class Batch:
         )
 
     def make(self, count: int) -> tuple[int, np.ndarray]:
-        """Make up to ``count`` steps; the number made, and who touched walls in each (steps, walls) bool.
+        """Make up to ``count`` steps; return their number and the walls touched in each (steps, walls) bool.
 
-        Fewer are made where a bar fails, a node finds no room or the energy is lost: the stepper has the fault.
+        Fewer steps are made if a bar fails, a node is infeasible or the energy is not finite; the stepper then has a
+        fault.
         """
         stepper, ledger, state = self.stepper, self.ledger, self.stepper.state
         log, scheme = self.model.contact.log, stepper.scheme
@@ -151,11 +152,11 @@ class Batch:
 
 
 class Batches:
-    """Finds the steps of a run that can be made together, and makes them.
+    """Finds steps of a run that can be fused, and makes them.
 
     Parameters
     ----------
-    worth : fewest steps of a run for which the loop over steps is compiled
+    min_steps : minimum number of steps of a run for which the fused loop is compiled
     """
 
     def __init__(self, min_steps: int = WORTH) -> None:
@@ -164,24 +165,24 @@ class Batches:
         self._refused = False
 
     def advance(self, analysis: TimeStepping, history: History, left: int) -> bool:
-        """Make steps together, after which nothing is to be done but rows of the history.
+        """Make fused steps that need only rows of the history.
 
         Parameters
         ----------
         analysis : TimeStepping
         history : History
-            Takes the rows.
-        left : steps to the next after which more is to be done
+            Receives the rows.
+        left : number of steps before other outputs are due
 
         Returns
         -------
         bool
-            False where a step failed: the stepper has the fault.
+            False if a step failed; the stepper then has a fault.
         """
         stepper, state, end = analysis.stepper, analysis.state, analysis.last_step
         begin = state.step
         count = min(left, end - begin, MOST + 1) - 1
-        # the first step is damped by velocities that are not those of the state, where walls stop nodes at once
+        # if walls stop nodes immediately, damping in the first step uses velocities other than those of the state
         if self._refused or count < _FEWEST or end < self._min_steps or begin == 0:
             return True
         if self._batch is None:

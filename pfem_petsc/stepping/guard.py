@@ -1,28 +1,27 @@
-"""The guard of implicit steps: a converged step may be a solution that has nothing to do with the state before it.
+"""The guard of implicit steps, which rejects converged solutions that are unrelated to the previous state.
 
-The equations of a large step have many solutions: a dome turned inside out, a layer of cells that is mirrored. Newton's
-method gives one of them, and residual, energy ledger and bar lengths look the same in all. Three checks tell them
-apart, on nothing but the positions before and after, those that the motion so far predicts, and the energy at hand, so
-that they serve steps in time and steps of load alike:
+The equations of a large step have many solutions, such as a dome turned inside out or a mirrored layer of cells.
+Newton's method finds one of them, and residual, energy ledger and bar lengths look plausible in all. Three checks
+distinguish them. They use only the positions before and after the step, the positions predicted from the previous
+motion, and the available energy, so they apply to time steps and load steps alike:
 
-1. **Unpredicted turns.** The vector d of a bar changes by |d1 - d0|, and differs from the prediction d_p by |d1 - d_p|.
-   Where the smaller of both is more than :data:`LARGEST` of the bar's length, the step is not small enough to follow
-   the motion. A rotation by the angle phi in a step leaves phi^2/2, so that 40 degrees a step pass; an impact leaves
-   v h/l. A mirrored bar leaves up to 2, also where its length, and with it its energy, is what it was.
-2. **Energy.** The bars hold much more energy than before, and more than there was to give: kinetic energy at the start
-   and the work of loads, supports and walls on the way.
-3. **Barriers.** Between the positions before and after, the bars hold more energy than at either, and more than there
-   was to give: kinetic energy at the start and the work to there. A motion cannot have
-   come that way. The lower of two ways counts, the straight one and the parabola that starts as predicted, which a
-   rotation follows but for 0.003 phi^4. Shallow arches and domes that snap are found by this alone.
+1. **Unpredicted turns.** The vector d of a bar changes by |d1 - d0| and differs from the prediction d_p by |d1 - d_p|.
+   If the smaller of both exceeds :data:`LARGEST` times the length of the bar, the step is too large to follow the
+   motion. A rotation by the angle phi per step gives phi^2/2, so 40 degrees per step are accepted; an impact gives
+   v h/l. A mirrored bar gives up to 2, even if its length, and thus its energy, is unchanged.
+2. **Energy.** The bars store much more energy than before, and more than was available: the kinetic energy at the start
+   plus the work of loads, supports and walls.
+3. **Barriers.** Between the positions before and after, the bars store more energy than at either, and more than was
+   available: the kinetic energy at the start plus the work up to that point. No motion can follow such a path. The
+   lower of two paths counts: the straight line, and the parabola that starts as predicted, which matches a rotation up
+   to 0.003 phi^4. Only this check finds shallow arches and domes that snap through.
 
-Energies are only looked at where a bar has changed by more than :data:`NOTICEABLE` of its length without being
-predicted.
+Energies are evaluated only if the unpredicted change of a bar exceeds :data:`NOTICEABLE` times its length.
 
-Chosen by measurement: the built-in cases with all implicit schemes at their steps stay below 0.1 in the first (bars
-next to an impact, v h/l = 0.1), below 0.03 of the energy at hand in the second, and have no barrier at all; Wilson's
-chatter at theta = 1.4 reaches 0.2 and 0.16. The jumps seen have 0.39 lengths, 120 times the energy, or barriers of
-two to seven times.
+The limits are based on measurements. The built-in cases with all implicit schemes at their steps stay below 0.1 in the
+first check (bars next to an impact, v h/l = 0.1), below 0.03 of the available energy in the second, and have no
+barrier; Wilson's chatter at theta = 1.4 reaches 0.2 and 0.16. Observed jumps have 0.39 lengths, 120 times the energy,
+or barriers of two to seven times the available energy.
 """
 
 from __future__ import annotations
@@ -38,17 +37,17 @@ if TYPE_CHECKING:
 __all__ = ["GAIN", "LARGEST", "NOTICEABLE", "OVER", "StepGuard"]
 
 LARGEST = 0.25
-"""Unpredicted change of a bar's vector over its rest length that is too much for a step."""
+"""Largest accepted unpredicted change of a bar's vector in a step, relative to its rest length."""
 NOTICEABLE = 0.01
-"""Unpredicted change from which on the energy on the way is looked at."""
+"""Unpredicted change above which energies along the path are checked."""
 GAIN = 4.0
-"""Energy that the bars gain over that at hand up to the middle of the way; the trapezoidal rule from rest has 2."""
+"""Largest energy gain of the bars relative to that available up to mid-path; the trapezoidal rule from rest has 2."""
 OVER = 1.0
-"""Height of a barrier over the energy at hand that no motion passes."""
+"""Largest accepted height of a barrier relative to the available energy."""
 
 
 class _Worst(NamedTuple):
-    """The bar of a rank with the largest unpredicted change: in lengths, number, nodes, change, turn [degrees]."""
+    """The bar of a rank with the largest unpredicted change: value in lengths, bar, nodes, change, turn [degrees]."""
 
     value: float
     bar: int = -1
@@ -58,7 +57,7 @@ class _Worst(NamedTuple):
 
 
 class StepGuard:
-    """Looks at solutions before they become the state. It remembers nothing.
+    """Checks solutions before they become the state; has no memory of its own.
 
     Parameters
     ----------
@@ -73,14 +72,15 @@ class StepGuard:
         self._force = np.zeros((mesh.n_local, 3))
 
     def check(self, before: np.ndarray, after: np.ndarray, predicted: np.ndarray, energy: float) -> str | None:
-        """What is wrong with a step, None for nothing; the same on all ranks. Collective.
+        """Return why a step is rejected, None if it is accepted; the same on all ranks. Collective.
 
         Parameters
         ----------
         before, after : (local, 3) positions with ghosts at its start and end [m]
-        predicted : (owned, 3) positions at its end if the motion went on as it was; of a step of load as the last one
-        energy : this rank's share of the energy at hand [J]: kinetic at the start, and half of the
-            work done on the truss, as up to the middle of the way
+        predicted : (owned, 3) positions at its end if the motion continues unchanged; for a load step, if the last step
+            is repeated
+        energy : this rank's share of the available energy [J]: kinetic energy at the start, and half of the work done
+            on the truss, as up to mid-path
         """
         comm, mesh = self.model.comm, self.model.mesh
         self._predicted[: mesh.n_owned] = predicted
@@ -94,12 +94,12 @@ class StepGuard:
             return (
                 f"the solution is too far from the previous state: bar {worst.bar} between nodes "
                 f"{worst.nodes[0]} and {worst.nodes[1]} changes by {worst.change:.3g} of its length and turns by "
-                f"{worst.turn:.3g} degrees, {worst.value:.3g} lengths from where its motion leads"
+                f"{worst.turn:.3g} degrees, {worst.value:.3g} lengths from the predicted position"
             )
         return self._barrier(before, after, energy)
 
     def _unpredicted(self, before: np.ndarray, after: np.ndarray) -> _Worst:
-        """The bar of this rank that is least where its motion leads."""
+        """Return the bar of this rank with the largest unpredicted change."""
         mesh, rest = self.model.mesh, self.model.bars.rest
         a, b = mesh.bars.T
         if len(a) == 0:
@@ -115,7 +115,7 @@ class StepGuard:
         return _Worst(float(values[k]), int(mesh.bar_ids[k]), nodes, float(change[k] / rest[k]), float(turn))
 
     def _barrier(self, before: np.ndarray, after: np.ndarray, energy: float) -> str | None:
-        """Energies of the bars at both ends and half way, all from the internal variables at the start. Collective."""
+        """Check energies of bars at both ends and at mid-path, with the initial internal variables. Collective."""
         middle = self._middle
         np.add(before, after, out=middle)
         middle *= 0.5
@@ -139,6 +139,6 @@ class StepGuard:
         )
 
     def _stored(self, x: np.ndarray) -> float:
-        """Energy of this rank's bars, what yielding takes included [J]; infinite where a bar has no length."""
+        """Return the energy of this rank's bars, including plastic dissipation [J]; infinite if a bar has no length."""
         found = self.model.bars.forces(x, self._force, commit=False)
         return found.total if np.isfinite(found.total) else np.inf

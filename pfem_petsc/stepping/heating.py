@@ -1,4 +1,4 @@
-"""The work of changing temperatures on bars, for the energy ledger."""
+"""Work of temperature changes on bars, for the energy ledger."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ __all__ = ["Heating"]
 
 
 class Heating:
-    """Keeps what the next step must know of the bars."""
+    """Stores the state of the bars before a step and computes the work in it."""
 
     def __init__(self, stepper: Stepper) -> None:
         self.stepper, self.model = stepper, stepper.model
         self.keep()
 
     def keep(self) -> None:
-        """Keep stresses, internal variables and thermal strains of the present."""
+        """Store the current stresses, internal variables and thermal strains."""
         if self.model.temperatures.varying:
             bars = self.model.bars
             self._stress = bars.fields(self.stepper.state.x)["stress"]
@@ -26,8 +26,8 @@ class Heating:
             self._thermal = bars.heat[0].copy()
 
     def work(self) -> float:
-        """Work [J] of the step just made on the counted bars: -A l0 S (change of thermal strain), with the mean
-        stress S of :mod:`~pfem_petsc.mechanics.conserving`, (s0 + s1)/2 with the law's correction."""
+        """Return the work [J] on the counted bars in the last step, -A l0 S (change of thermal strain), with the mean
+        stress S of :mod:`~pfem_petsc.mechanics.conserving`: (s0 + s1)/2 with the correction of the law."""
         model = self.model
         if not model.temperatures.varying:
             return 0.0

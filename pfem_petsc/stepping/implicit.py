@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from ..integrators.base import Scheme
     from .model import Model
 
-# PETSc is finalised after Python and cannot call it any more, so matrices and preconditioners written in Python that
-# wait in reference cycles are freed before.
+# PETSc is finalised after Python and can no longer call it, so matrices and preconditioners written in Python that are
+# held by reference cycles are freed first.
 atexit.register(gc.collect)
 
 __all__ = ["ImplicitStepper"]
@@ -42,7 +42,7 @@ _HALVINGS = 10  # most halvings of a step: to 1/1024
 
 
 class ImplicitStepper(Stepper):
-    """Newton's method on the free step; a variational inequality once a node can reach a wall."""
+    """Solves steps by Newton's method, or as a variational inequality if contact is possible."""
 
     kept_numbers = (*Stepper.kept_numbers, "level", "lagged_count")
     kept_arrays = (*Stepper.kept_arrays, "held", "lagged_place")
@@ -73,7 +73,7 @@ class ImplicitStepper(Stepper):
         self._after = np.zeros_like(self.state.x)
         self.level = 0  # the next step is made in 2**level parts
         self.message: Callable[[str], None] = lambda text: None
-        self.held = np.zeros(model.mesh.n_owned, dtype=bool)  # nodes held by walls in the last step
+        self.held = np.zeros(model.mesh.n_owned, dtype=bool)  # nodes in contact with walls in the last step
         self._mass: MassSolver | None = None
 
     def step(self) -> None:
@@ -82,7 +82,7 @@ class ImplicitStepper(Stepper):
         Raises
         ------
         NotConverged
-            On all ranks, when the smallest part does not converge either.
+            On all ranks, if the smallest part does not converge.
         """
         state, ticks = self.state, 2**_HALVINGS
         start, done = state.time, 0
@@ -97,7 +97,7 @@ class ImplicitStepper(Stepper):
                 if size == 1:
                     raise NotConverged(f"{failure} (the step was bisected {_HALVINGS} times)") from failure
                 if self.model.temperatures.varying:
-                    # the failed solve has heated the bars to its own end
+                    # the failed solve has applied the temperatures of its end
                     self.model.temperatures.apply(self.state.time)
                 size //= 2
                 self.level += 1
@@ -183,7 +183,7 @@ class ImplicitStepper(Stepper):
         return solution
 
     def _suspicion(self, balance: Balance, solution: Solution) -> str | None:
-        """Why the guard rejects a solution, None if it does not. Collective."""
+        """Return why the guard rejects a solution, None if it accepts it. Collective."""
         state, model = self.state, self.model
         owned, h = model.mesh.n_owned, balance.time - state.time
         self._after[:owned] = balance.predictor + solution.u
@@ -268,7 +268,7 @@ class ImplicitStepper(Stepper):
         g -= problem.nodal[:, None] * shift
 
     def _guess(self, balance: Balance) -> np.ndarray:
-        """Increments for an unchanged acceleration; prescribed components at their exact positions."""
+        """Return increments for an unchanged acceleration, with prescribed components at their exact positions."""
         guess = self.state.a / balance.alpha
         supports = self.model.supports
         if supports.any:
@@ -280,7 +280,7 @@ class ImplicitStepper(Stepper):
 def _free_left_over(comm: MPI.Comm) -> None:
     """Free the PETSc objects of earlier steppers that were not destroyed. Collective.
 
-    Python collects objects at any time; PETSc, whose objects belong to all ranks, only puts them aside then.
+    Python may collect objects at any time; PETSc, whose objects are collective, then only defers their destruction.
     """
     gc.collect()
     if hasattr(PETSc, "garbage_cleanup"):

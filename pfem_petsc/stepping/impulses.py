@@ -1,15 +1,16 @@
-"""The impulse ledger: what forces and jumps have made of the truss's momentum, by the scheme's own rule.
+"""The impulse ledger: impulses of forces and velocity jumps on the truss, integrated by the scheme itself.
 
-Momentum is linear in the forces. What a scheme makes of a history of forces is what it makes of one particle of unit
-mass that they push: its velocity is their impulse. Each source of force has such a particle, so that
+Momentum is linear in the forces, so the scheme integrates a history of forces for the truss as for a single particle of
+unit mass that they act on; the velocity of that particle is their impulse. Each source of force has such a particle, so
+that
 
     momentum(t) - momentum(0) = external + support + damping + sum over walls (impulse + jump_impulse)
 
-to rounding with any scheme, whatever it remembers, and with steps that are halved. Where a treatment of impact changes
-what is known of nodes (velocity, acceleration, the scheme's memory), the same changes, times the nodes' masses, are
-made to a particle that no force pushes: its velocity is the impulse of the jumps. The forces of contact pairs cancel in
-the sum; their impulse is that on the second nodes. What a jump of a pair takes from a node that a support holds goes to
-the support, and so does what a prescribed motion puts in place of the scheme's own velocities.
+holds to rounding with any scheme, including multistep schemes and bisected steps. If a treatment of impact changes the
+velocity, acceleration or scheme memory of nodes, the same changes, times the nodal masses, are applied to a particle
+without forces; its velocity is the impulse of the jumps. The forces of contact pairs cancel in the sum; their impulse
+is that on the second nodes. Momentum that a jump of a pair removes from a supported node is transferred to the support,
+and so is the difference between prescribed velocities and those of the scheme.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ _DAMPING = HEAD.first("damping_impulse")
 
 @kernel
 def fill_impulses(sums, v) -> None:
-    """Impulses of supports, external forces and damping, from the velocities of their particles (rows, 3)."""
+    """Write impulses of supports, external forces and damping from the velocities of their particles (rows, 3)."""
     for c in range(3):
         sums[_SUPPORT + c] = v[SUPPORT, c]
         sums[_EXTERNAL + c] = v[EXTERNAL, c]
@@ -48,7 +49,7 @@ pairs, then the jumps of walls and pairs."""
 
 
 def wall_shares(stepper: Stepper, nodes: np.ndarray, jumps: np.ndarray) -> np.ndarray:
-    """What of vectors (m, 3) at nodes (m,) belongs to which of the walls that they touch: (m, walls, 3)."""
+    """Divide vectors (m, 3) at nodes (m,) among the walls that they touch; return (m, walls, 3)."""
     contact = stepper.model.contact
     touching = stepper.touching[nodes]
     shares = np.where(touching[:, :, None], jumps[:, None, :], 0.0)
@@ -87,20 +88,20 @@ class Impulses:
         self.force = np.zeros((rows, 3))
 
     def start(self, totals: np.ndarray) -> None:
-        """Begin, from this rank's sums (3, 3) of support, external and damping force at the start [N]."""
+        """Initialise from this rank's sums (3, 3) of support, external and damping force at the start [N]."""
         scheme, h = self.stepper.scheme, self.stepper.part
         self.state.a = self.forces(totals, self.stepper.walls_at_start, self.stepper.links_at_start).copy()
         scheme.start(self.state, h)
 
     def forces(self, totals: np.ndarray, walls: np.ndarray, links: np.ndarray) -> np.ndarray:
-        """Put forces into :attr:`force`: totals (3, 3), of walls (walls, 3), of links' tables (tables, 3) [N]."""
+        """Write totals (3, 3) and the forces of walls (walls, 3) and links (tables, 3) into :attr:`force` [N]."""
         self.force[:WALLS] = totals
         self.force[WALLS : WALLS + self.n_walls] = walls
         self.force[WALLS + self.n_walls : self.jumps] = links
         return self.force
 
     def step(self, totals: np.ndarray) -> None:
-        """Add the forces of the balance just solved, of which (3, 3) are support, external and damping [N]."""
+        """Add the forces of the last balance; ``totals`` (3, 3) are support, external and damping force [N]."""
         stepper, state = self.stepper, self.state
         walls = stepper.solution.walls.force
         if stepper.step_changed:
@@ -117,7 +118,7 @@ class Impulses:
             particles[SUPPORT] += inertia.mass_times(every, np.empty_like(every)).sum(axis=0)
 
     def jump(self) -> None:
-        """Add what the treatment has changed in this step."""
+        """Add the velocity jumps of the treatment in this step."""
         stepper, state = self.stepper, self.state
         jump = stepper.treatment.jump
         for name, before in (("v", jump.v), ("a", jump.a), *jump.memory.items()):
@@ -138,33 +139,33 @@ class Impulses:
         table = self.links.tables(len(inertia.mass))[nodes]
         for k in range(self.n_links):
             particles[first + self.n_walls + k] += momentum[table == k].sum(axis=0)
-        # links keep momentum, but for what supports at their nodes take
+        # links conserve momentum except for the part that supports at their nodes receive
         particles[SUPPORT] += momentum.sum(axis=0)
 
     def fill(self, head: np.ndarray) -> None:
-        """Put the impulses of the truss's own forces into the sums of a row."""
+        """Write the impulses of support, external and damping forces into the sums of a row."""
         fill_impulses(head, self.state.v)
 
     def fill_walls(self, share: np.ndarray) -> None:
-        """The same of walls, into (walls, width of WALL)."""
+        """Write the impulses of walls into (walls, width of WALL)."""
         share[:, WALL["impulse"]] = self.state.v[WALLS : WALLS + self.n_walls]
         share[:, WALL["jump_impulse"]] = self.state.v[self.jumps : self.jumps + self.n_walls]
 
     def fill_links(self, share: np.ndarray) -> None:
-        """The same of links, into (tables, width of PAIR), and their forces in the last step."""
+        """Write the impulses of links, and their forces in the last step, into (tables, width of PAIR)."""
         share[:, PAIR["force"]] = self.links.totals()
         share[:, PAIR["impulse"]] = self.state.v[WALLS + self.n_walls : self.jumps]
         share[:, PAIR["jump_impulse"]] = self.state.v[self.jumps + self.n_walls :]
 
     def kept(self) -> dict[str, Any]:
-        """This rank's share, for a checkpoint: numbers that may be summed over ranks."""
+        """Return this rank's share for a checkpoint: numbers that can be summed over ranks."""
         state = self.state
         return {"v": state.v.tolist(), "a": state.a.tolist()} | {
             f"memory.{name}": array.tolist() for name, array in state.memory.items()
         }
 
     def load_state(self, kept: dict[str, Any]) -> None:
-        """Take the share from a checkpoint."""
+        """Restore this rank's share from a checkpoint."""
         shape = self.state.v.shape
         self.state.memory = {}
         for name, values in kept.items():

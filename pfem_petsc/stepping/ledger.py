@@ -1,17 +1,17 @@
-"""The energy ledger: every term by its own formula, so that their balance is a check and not a definition.
+"""The energy ledger: every term has its own formula, so that their balance is a check and not a definition.
 
-For a scheme whose balance holds at the ends of steps (``balance_at_endpoints``), works follow the trapezoidal rule:
-with dx = x1 - x0, external work = (e0 + e1) dx/2, contact work (r0 + r1) dx/2, damping dissipation (C v0 + C v1) dx/2,
-and the numerical dissipation is what inertia and internal force work beyond the change of their energies:
-(M a0 + M a1) dx/2 - dT + (f0 + f1) dx/2 - dU - dD + dH, with the work dH of changing temperatures. For the others the
-forces of the one balance work over the whole step, and damping takes C dx . dx/h.
-The sum of all changes is then the work of the residual, zero up to the solver's tolerance.
+For a scheme whose balance holds at the ends of steps (``balance_at_endpoints``), works follow the trapezoidal rule.
+With dx = x1 - x0, the external work is (e0 + e1) dx/2, the contact work (r0 + r1) dx/2, and the damping dissipation
+(C v0 + C v1) dx/2. The numerical dissipation is the work of inertia and internal forces in excess of the change of
+their energies: (M a0 + M a1) dx/2 - dT + (f0 + f1) dx/2 - dU - dD + dH, with the work dH of changing temperatures. For
+other schemes the forces of the single balance act over the whole step, and damping dissipates C dx . dx/h. The sum of
+all changes is then the work of the residual, which is zero up to the tolerance of the solver.
 
-What contact does is told apart by formulas that are the same for all schemes and treatments: ``contact_work`` is the
-work of the walls' motion, F . dX by the rule above and J . V for jumps J of momentum; ``friction_dissipation`` that of
-the drag on the slip which it was found with; ``impact_dissipation`` is that of :mod:`pfem_petsc.contact.impact`. The
-rest of the contact forces' work on the nodes is what the scheme makes of impact: it belongs to the numerical
-dissipation. Walls with mass are part of the balance: their kinetic energy, and the work of their weight.
+The work of contact is split by formulas that are the same for all schemes and treatments. ``contact_work`` is the work
+of moving walls, F . dX by the rule above and J . V for jumps J of momentum. ``friction_dissipation`` is the work of
+friction forces on the slip used to determine them. ``impact_dissipation`` is given by :mod:`pfem_petsc.contact.impact`.
+The remaining work of contact forces on nodes is an effect of the scheme in impact and belongs to the numerical
+dissipation. Walls with mass are part of the balance, with their kinetic energy and the work of their weight.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Ledger:
         self.sums = np.zeros(HEAD.width)
         inertia = self.model.inertia
         ones = np.ones_like(inertia.mass)
-        # the loops multiply by these: lumped values, or one where the products with the matrices are given
+        # factors in the loops: lumped values, or one if products with the matrices are given
         self._mass = ones if inertia.products else inertia.mass
         self._damping = ones if inertia.products else inertia.damping
         self._damping = self._damping if inertia.damped else np.empty(0)
@@ -74,20 +74,20 @@ class Ledger:
             self.impulses.start(stepper.totals_at_start)
             if stepper.scheme.solves_next_position:
                 self.impulses.step(stepper.totals_solved)
-                self.impulses.state.v[:] = 0.0  # as the velocities of nodes, which have not jumped yet
+                self.impulses.state.v[:] = 0.0  # like the nodal velocities, which have not jumped yet
                 self._pending = [self._impact(self._before, started=True), stepper.solution.walls.friction]
-                if inertia.damped:  # nodes that walls stop at once are damped as if they were stopped already
+                if inertia.damped:  # damping treats nodes that walls stop at the start as already stopped
                     v = stepper.velocity_solved
                     self._before.v = inertia.damping_times(v, np.empty_like(v)) if inertia.products else v
 
     def update(self) -> None:
-        """Book the step just made."""
+        """Add the last step."""
         stepper, owned = self.stepper, self.model.mesh.n_owned
         present = after = moment_of(self.stepper)
         before, self._before = self._before, after
         jumped = 0.0
         jump = stepper.treatment.jump if stepper.treatment is not None else None
-        if jump is not None and not self.model.inertia.products:  # where nodes lack mass, none of it jumps
+        if jump is not None and not self.model.inertia.products:  # massless nodes carry no momentum that jumps
             after, jumped = self._before_jump(after)
         first, second = (before, after) if stepper.scheme.balance_at_endpoints else 2 * (balanced(stepper, before),)
         self._book(present, first, second, stepper.before[:owned])
@@ -108,10 +108,10 @@ class Ledger:
         add_works(self.sums, self._works, stored, heating, impact, friction, work, given, weight, lost, jumped)
 
     def _damped(self) -> float:
-        """What damping takes in the step just made, C dx . dx / h [J]: never negative.
+        """Return the damping dissipation of the last step, C dx . dx / h [J]; never negative.
 
-        The velocity of a balance within the step, or beyond its end, may point against the way of the step: what the
-        damping force of the balance works otherwise is the scheme's.
+        The velocity of a balance within the step, or beyond its end, may be opposite to the displacement of the step;
+        the difference to the work of the damping force is numerical dissipation.
         """
         stepper = self.stepper
         way = stepper.state.position - stepper.before[: self.model.mesh.n_owned]
@@ -119,18 +119,18 @@ class Ledger:
         return float((drag * way).sum()) / stepper.part
 
     def _dissipated(self, before: Moment) -> tuple[float, float]:
-        """What impact and friction take in the step just made [J]."""
+        """Return the impact and friction dissipation of the last step [J]."""
         stepper = self.stepper
         impact, friction = self._impact(before), stepper.solution.walls.friction
         if not stepper.scheme.solves_next_position:
-            if not stepper.scheme.solves_end:  # the slip of friction is that to the place solved for
+            if not stepper.scheme.solves_end:  # friction is determined with the slip to the position solved for
                 friction *= stepper.part / (stepper.balance.time - (stepper.state.time - stepper.part))
             return impact, friction
         pending, self._pending = self._pending, [0.0, friction]
         return impact + pending[0], pending[1]
 
     def _impact(self, before: Moment, started: bool = False) -> float:
-        """What closing contacts take [J], those of the next step where the scheme has solved it in advance."""
+        """Return the dissipation of closing contacts [J], of the next step if the scheme has solved it in advance."""
         stepper, state = self.stepper, self.stepper.state
         if stepper.scheme.solves_next_position and not started:
             displacements = self.model.contact.motion.displacements(state.time)
@@ -142,8 +142,10 @@ class Ledger:
         return self.impacts.step(x[: len(state.v)], motion, load, time, self._displacements)
 
     def _before_contact(self, before: Moment) -> tuple[np.ndarray, np.ndarray]:
-        """Velocity and acceleration (owned, 3) of a balance solved in advance, less what a treatment made of them;
-        where a force changes more than its own node's, they go on as before."""
+        """Return velocity and acceleration (owned, 3) of a balance solved in advance, without changes by a treatment.
+
+        With a consistent mass, where a force accelerates other nodes too, the acceleration is that before the step.
+        """
         state, balance, jump = self.stepper.state, self.stepper.balance, None
         if self.stepper.treatment is not None:
             jump = self.stepper.treatment.jump
@@ -157,7 +159,7 @@ class Ledger:
         return v, a
 
     def _walls_before(self) -> None:
-        """Keep what the next step must know of walls that move."""
+        """Store the state of moving walls for the next step."""
         contact = self.model.contact
         self._displacements = contact.motion.displacements(self.stepper.state.time)
         if not contact.moving.any():
@@ -172,8 +174,8 @@ class Ledger:
         self.sums[_AT["wall_kinetic_energy"]] = bodies.kinetic if self.model.comm.rank == 0 else 0.0
 
     def _work_of_walls(self, before: Moment) -> tuple[float, float, float, float]:
-        """Work on the truss of walls whose motion is prescribed and of walls with mass, work of the weight of these,
-        and their numerical dissipation [J]: this rank's share."""
+        """Return this rank's share of the work on the truss by walls with prescribed motion and by walls with mass, the
+        work of the weight of the latter, and their numerical dissipation [J]."""
         stepper, contact = self.stepper, self.model.contact
         if not contact.moving.any():
             return 0.0, 0.0, 0.0, 0.0
@@ -200,7 +202,7 @@ class Ledger:
         return work, given, float((bodies.weight * way).sum()), lost
 
     def _book(self, present: Moment, first: Moment, second: Moment, start: np.ndarray) -> None:
-        """Kinetic energy and totals of the present, and the works from positions ``start`` (owned, 3)."""
+        """Add kinetic energy and totals at the present state, and the works from positions ``start`` (owned, 3)."""
         state, inertia = self.stepper.state, self.model.inertia
         present.kinetic = book_nodes(
             start,
@@ -227,34 +229,34 @@ class Ledger:
         add_totals(self.sums, self._totals)
 
     def _pair(self, first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Two arrays, or what stands for two of zeros."""
+        """Return two arrays, or the placeholder for two arrays of zeros."""
         zero = self.stepper.zero
         return (_NOTHING, _NOTHING) if first is zero and second is zero else (first, second)
 
     def _before_jump(self, after: Moment) -> tuple[Moment, float]:
-        """The end of the step before contact changed velocities, and the energy that it gave [J]: work of contact."""
+        """Return the end of the step before velocity jumps, and the energy of the jumps [J], a work of contact."""
         jump = self.stepper.treatment.jump
         a, v = after.a.copy(), after.v.copy()
         a[jump.nodes], v[jump.nodes] = jump.a, jump.v
         return replace(after, a=a, v=v, contact=self.stepper.state.contact), jump.energy
 
     def resume(self, kinetic: float) -> None:
-        """Go on from the present state, with its kinetic energy [J], after steps that others booked in :attr:`sums`."""
+        """Continue from the present state with its kinetic energy [J] after the fused loop updated :attr:`sums`."""
         self._before = moment_of(self.stepper)
         self._before.kinetic = kinetic
 
     def take_pending(self) -> None:
-        """Book what a step solved in advance takes, before steps that others book."""
+        """Add the dissipation of a step solved in advance, before steps of the fused loop."""
         self.sums[_AT["impact_dissipation"]] += self._pending[0]
         self.sums[_AT["numerical_dissipation"]] -= self._pending[0]
         self._pending = [0.0, 0.0]
 
     def kept(self) -> dict[str, Any]:
-        """This rank's share, for a checkpoint: numbers that may be summed over ranks."""
+        """Return this rank's share for a checkpoint: numbers that can be summed over ranks."""
         return {"sums": self.sums.tolist(), "pending": list(self._pending), "impulses": self.impulses.kept()}
 
     def load_state(self, kept: dict[str, Any]) -> None:
-        """Take the share from a checkpoint; the present state is that of it already."""
+        """Restore this rank's share from a checkpoint, after the state."""
         present = self.sums[_TOTALS].copy()
         self.sums[:] = kept["sums"]
         self.sums[_TOTALS] = present

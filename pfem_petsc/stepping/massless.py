@@ -1,4 +1,4 @@
-"""Nodes without mass along their walls' normals: they are in equilibrium there, or on the wall, at all times."""
+"""Nodes without mass along their walls' normals, which are always in equilibrium along the normal or on the wall."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ if TYPE_CHECKING:
 __all__ = ["MasslessNodes"]
 
 _ITERATIONS = 200
-_CALMER, _BOLDER = 0.7, 1.3  # by which moves become smaller while they swing, and larger again, up to whole ones
-_FARTHEST = 0.25  # of a node's shortest bar: the longest single move
-_STEEPEST = 0.05  # cosine squared to the normal that bars are taken to have at least
-_SOFTEST = 1e-4  # secant stiffness over the elastic one, or the other way round, that is taken for more than rounding
+_CALMER, _BOLDER = 0.7, 1.3  # factors that shorten moves while they oscillate, and lengthen them up to full moves
+_FARTHEST = 0.25  # longest single move, relative to the shortest bar of the node
+_STEEPEST = 0.05  # minimum squared cosine between bars and the normal in the stiffness
+_SOFTEST = 1e-4  # smallest accepted ratio between secant and elastic stiffness, either way; below it is rounding
 
 
 class MasslessNodes:
-    """The contact nodes of a model whose mass is redistributed."""
+    """Contact nodes whose mass is redistributed."""
 
     def __init__(self, model: Model) -> None:
         self.model = model
@@ -33,8 +33,8 @@ class MasslessNodes:
     def settle(self, x: np.ndarray, time: float, now: float) -> float:
         """Move nodes of ``x`` (local, 3), in place, along their normals into equilibrium or onto the wall.
 
-        Forces, walls and temperatures are those of ``time``; temperatures are then as they were at ``now`` [s]. Gives
-        the last and largest move, which is rounding of the model's length unless they have found no equilibrium.
+        Forces, walls and temperatures are those of ``time``; afterwards temperatures are reset to ``now`` [s]. Returns
+        the largest of the last moves, which is rounding of the model's length unless no equilibrium was found.
         Collective.
         """
         model, moved = self.model, self.moved
@@ -55,14 +55,14 @@ class MasslessNodes:
             last, force = force, np.einsum("mi,mi->m", external[nodes] - self._force[nodes], n)
             with np.errstate(invalid="ignore", divide="ignore"):
                 secant = (last - force) / step
-            # where bars yield or turn, the elastic stiffness would take hundreds of moves
+            # where bars yield or rotate, the elastic stiffness would need hundreds of moves
             stiffness = np.where((secant > _SOFTEST * elastic) & (secant < elastic / _SOFTEST), secant, elastic)
-            swings = step * force < 0.0  # neighbours that have no mass either push each other to and fro
+            swings = step * force < 0.0  # massless neighbours may push each other back and forth
             part = np.where(swings, _CALMER * part, np.minimum(_BOLDER * part, 1.0))
             move = np.clip(part * force / stiffness, -farthest, farthest)
             step = np.maximum(move, -np.maximum(gap, 0.0))
             x[nodes] += step[:, None] * n
-            # a bar square to the normal may leave the place open that a force of rounding decides over
+            # with a bar perpendicular to the normal, forces within rounding may leave the position undetermined
             open_way = np.minimum(np.abs(step), np.abs(force) / elastic)
             largest = model.comm.allreduce(float(open_way.max(initial=0.0)), op=MPI.MAX)
             if largest <= ROUNDING * model.length:
@@ -73,14 +73,14 @@ class MasslessNodes:
         return largest
 
     def gaps(self, x: np.ndarray, time: float) -> np.ndarray:
-        """How far the nodes (m,) can move along their vectors until they are on the wall [m]."""
+        """Return the distances (m,) of the nodes from the wall along their vectors [m]."""
         gaps = self.model.contact.gaps(x[self.moved.nodes], time, self.moved.nodes)
         return gaps[np.arange(len(gaps)), self.moved.walls] / self.moved.across
 
     def press(self, x: np.ndarray, load: np.ndarray, time: float) -> tuple[np.ndarray, WallForces]:
-        """Forces (owned, 3) of the walls that keep nodes at x (owned, 3) in equilibrium with a load, and their sums.
+        """Return wall forces (owned, 3) that balance a load on nodes at x (owned, 3), and their sums.
 
-        A node without mass that is in equilibrium feels its wall alone.
+        The residual force on a massless node in equilibrium is the force of its wall.
         """
         moved, contact = self.moved, self.model.contact
         n, nodes = moved.normals, moved.nodes
@@ -98,9 +98,9 @@ class MasslessNodes:
         return force, contact.sums(nodes, each, x[nodes], touched)
 
     def _stiffness(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Stiffness (m,) of the nodes along their normals, their neighbours at rest [N/m], and their longest moves [m].
+        """Return stiffness (m,) of nodes along their normals at fixed neighbours [N/m], and their longest moves [m].
 
-        A bar that is square to the normal has its force alone to give stiffness: it is taken to lean a little.
+        A bar perpendicular to the normal has geometric stiffness only, so a minimum inclination is assumed.
         """
         mesh, model = self.model.mesh, self.model
         a, b = mesh.bars.T

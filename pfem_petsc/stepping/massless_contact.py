@@ -1,4 +1,4 @@
-"""Central differences with contact nodes that have no mass along their walls' normals."""
+"""Central differences with contact nodes that are massless along their walls' normals."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ __all__ = ["RedistributedStepper"]
 
 
 class RedistributedStepper(Stepper):
-    """Nodes with mass step by the balance at t_n; those without are in equilibrium along the normal at x_{n+1} as well.
+    """Advances nodes with mass by the balance at t_n; massless nodes are in equilibrium along the normal at x_{n+1}.
 
-    Each step costs a few evaluations of the bars more than one without: the equilibrium of the contact nodes is found
-    by each one's own secants.
+    Each step needs a few additional evaluations of the bars, because the equilibrium of each contact node is found by a
+    secant method.
     """
 
     def __init__(self, model: Model, scheme: Scheme, h: float) -> None:
@@ -49,9 +49,9 @@ class RedistributedStepper(Stepper):
             at = (supports.nodes, supports.components)
             held = np.zeros_like(load)
             held[at] = supports.positions(balance.time) - balance.predictor[at]
-            # mass that is a matrix couples the free components to those that supports move
+            # a mass matrix couples the free components to prescribed ones
             carried = balance.alpha * held
-            if balance.a_hat is not None:  # the acceleration of supports that move
+            if balance.a_hat is not None:  # the acceleration of moving supports
                 carried += balance.a_hat
             pull[moved.touched] -= np.einsum("kij,kj->ki", moved.tensors, carried[moved.touched])
         u = self.accelerate(pull) / balance.alpha

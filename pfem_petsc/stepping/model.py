@@ -1,4 +1,4 @@
-"""Everything that a case describes, on the ranks: mesh, bars, inertia, forces, supports, walls."""
+"""The model of a case, distributed over ranks: mesh, bars, inertia, forces, supports, walls."""
 
 from __future__ import annotations
 
@@ -45,10 +45,10 @@ class Model:
     length : largest extent of the mesh [m]
     reach : largest coordinate magnitude [m], which sets the rounding of positions
     nodal_stiffness : (owned,) sum of E A/l0 of a node's bars [N/m]
-    rounding : 2-norm of the residual that rounding of positions leaves [N]
-    warnings : of the mesh
-    links : what couples nodes to nodes, see :mod:`pfem_petsc.contact.links`
-    can_touch : whether there is anything that nodes can touch: walls, or each other
+    rounding : 2-norm of the residual due to rounding of positions [N]
+    warnings : about the mesh
+    links : pairs and constraints that couple nodes to nodes, see :mod:`pfem_petsc.contact.links`
+    can_touch : whether nodes can touch walls or each other
     """
 
     def __init__(self, case: Case, comm: MPI.Comm) -> None:
@@ -57,7 +57,7 @@ class Model:
         try:
             slab = load_slab(case.mesh, comm)
         except InputError as error:
-            # a generator knows its keys, but not the file that they are in
+            # a generator knows its keys, but not the file that contains them
             raise error if case.mesh.generator is None else InputError(f"{case.source}: {error}") from error
         self.warnings = list(slab.warnings)
         with agreed(comm):
@@ -91,7 +91,7 @@ class Model:
             axial = block.area * block.modulus
             _node_stiffness(mesh.bars, self.bars.rest, block.start, block.stop, axial, stiffness)
         self.nodal_stiffness = stiffness[: mesh.n_owned].copy()
-        with np.errstate(over="ignore"):  # what is too stiff to be computed with is refused by the plan
+        with np.errstate(over="ignore"):  # stiffness that overflows is refused by the plan
             squares = comm.allreduce(float((self.nodal_stiffness**2).sum()))
         self.rounding = 4.0 * np.finfo(float).eps * self.reach * np.sqrt(squares)
         self.total_mass = comm.allreduce(float(self.inertia.mass.sum()))
@@ -100,12 +100,12 @@ class Model:
 
     @property
     def steady(self) -> bool:
-        """Whether nothing in it changes over time, and bars and contact are those of the loop over many steps."""
+        """Whether the model is constant in time, and the fused loop supports its bars and contact."""
         moving = self.supports.moving or self.temperatures.varying or bool(self.links)
         return not moving and len(self.bars.blocks) == 1 and self.external.steady and self.contact.steady
 
     def initial_velocity(self) -> np.ndarray:
-        """(owned, 3) [m/s] from the case's ``[initial]`` tables; later tables override earlier ones. Collective."""
+        """Return initial velocities (owned, 3) [m/s]; later ``[initial]`` tables override earlier ones. Collective."""
         mesh, comm = self.mesh, self.comm
         v = np.zeros((mesh.n_owned, 3))
         points = mesh.points[: mesh.n_owned]

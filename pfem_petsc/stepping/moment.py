@@ -1,4 +1,4 @@
-"""What the energy ledger needs of a moment: motion and forces of this rank's nodes, energies of its bars."""
+"""Data of the energy ledger at an instant: motion and forces of this rank's nodes, energies of its bars."""
 
 from __future__ import annotations
 
@@ -17,11 +17,10 @@ __all__ = ["Moment", "balanced", "moment_of"]
 
 @dataclass
 class Moment:
-    """What the ledger needs of a moment; arrays (owned, 3).
+    """Data of the ledger at an instant; arrays (owned, 3).
 
-    Where the mass is lumped, ``momentum``, ``a`` and ``v`` are velocity, acceleration and velocity; where it is
-    consistent, M v [kg m/s], M a and C v [N].
-    ``velocity`` and ``acceleration`` are these in any case.
+    With lumped mass ``momentum``, ``a`` and ``v`` are velocity, acceleration and velocity; with consistent mass they
+    are M v [kg m/s], M a and C v [N]. ``velocity`` and ``acceleration`` are always velocity and acceleration.
     """
 
     momentum: np.ndarray
@@ -38,12 +37,12 @@ class Moment:
 
 
 def moment_of(stepper: Stepper) -> Moment:
-    """The present moment of a stepper."""
+    """Return the data at the present state of a stepper."""
     state, inertia = stepper.state, stepper.model.inertia
     owned = stepper.model.mesh.n_owned
     a, v, momentum = state.a, state.v, state.v
     contact = state.contact
-    if "contact_change" in state.memory:  # what a treatment of impact made of the accelerations
+    if "contact_change" in state.memory:  # changes of accelerations by a treatment of impact
         contact = contact + state.memory["contact_change"]
     if inertia.products:
         momentum = inertia.mass_times(state.v, np.empty_like(state.v))
@@ -65,7 +64,7 @@ def moment_of(stepper: Stepper) -> Moment:
 
 
 def balanced(stepper: Stepper, before: Moment) -> Moment:
-    """The forces of the last balance, where it does not hold at the ends of steps."""
+    """Return the forces of the last balance, for schemes whose balance does not hold at the ends of steps."""
     inertia, balance = stepper.model.inertia, stepper.balance
     state, u = stepper.state, stepper.solution.u
     owned = stepper.model.mesh.n_owned

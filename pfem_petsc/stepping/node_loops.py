@@ -1,4 +1,4 @@
-"""Loops over the owned nodes of explicit steps and of the energy ledger: one pass each over the nodal arrays."""
+"""Compiled loops over owned nodes for explicit steps and the energy ledger, each one pass over the nodal arrays."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from ..mechanics.compiled import kernel
 __all__ = ["TOTALS", "WORKS", "book_nodes", "explicit_increments", "hold", "react"]
 
 WORKS = ("external", "contact", "damping", "inertial", "internal")
-"""Works that :func:`book_nodes` gives [J], in this order; the first with supports."""
+"""Works that :func:`book_nodes` returns [J], in this order; the first includes supports."""
 
 TOTALS = ("momentum", "angular_momentum", "mass_times_position", "support", "external", "damping")
-"""Vectors that :func:`book_nodes` gives, in this order: the last two are sums of forces."""
+"""Vectors that :func:`book_nodes` returns, in this order; the last two are sums of forces."""
 
 
 @kernel
@@ -40,7 +40,7 @@ def explicit_increments(external, f, mass, damping, alpha, eta, a_hat, v_hat, st
 
 @kernel
 def hold(nodes, components, positions, predictor, stiffness, u, load):
-    """Put prescribed components (k,) of ``u`` (owned, 3) where supports have them; ``load`` (k,) out: what would move
+    """Set prescribed components (k,) of ``u`` (owned, 3) to their values; ``load`` (k,) output: force that would move
     them [N]."""
     for k in range(len(nodes)):
         i, c = nodes[k], components[k]
@@ -50,7 +50,7 @@ def hold(nodes, components, positions, predictor, stiffness, u, load):
 
 @kernel
 def react(nodes, components, load, contact, stiffness, u, support):
-    """Forces of supports into ``support`` (owned, 3) [N], from the loads that :func:`hold` found."""
+    """Write support forces into ``support`` (owned, 3) [N], from the loads that :func:`hold` computed."""
     for k in range(len(nodes)):
         i, c = nodes[k], components[k]
         support[i, c] = stiffness[i] * u[i, c] - load[k] - contact[i, c]
@@ -60,19 +60,19 @@ def react(nodes, components, load, contact, stiffness, u, support):
 def book_nodes(
     x0, x1, mass, factor, v, p, support, damping, a0, a1, v0, v1, f0, f1, e0, e1, s0, s1, r0, r1, totals, works
 ):
-    """Kinetic energy [J] at the end of a step, sums over the nodes there, and works over dx = x1 - x0 by the mean of 2
-    sets of forces.
+    """Return the kinetic energy [J] at the end of a step; sum over nodes there, and works over dx = x1 - x0 by the mean
+    of two sets of forces.
 
     Parameters
     ----------
     x0, x1 : (owned, 3) positions at start and end
     mass : (owned,); the momentum of a node is ``factor`` (owned,) times ``p``: m v, or M v with factor one
     v, p, support : (owned, 3) at the end
-    damping : (owned,), (0,) for none; like ``factor`` it multiplies what ``v0`` and ``v1`` hold
+    damping : (owned,), (0,) for none; like ``factor`` it multiplies ``v0`` and ``v1``
     a0, a1, v0, v1, f0, f1, e0, e1, s0, s1, r0, r1 : acceleration, velocity, internal, external, support and contact
         force at start and end of the works' rule (owned, 3); the last six may be (0, 3) for zero, in pairs
-    totals : (6, 3) out, see :data:`TOTALS`; external and damping force are those at the end of the works' rule
-    works : (5,) out [J], see :data:`WORKS`
+    totals : (6, 3) output, see :data:`TOTALS`; external and damping force are those at the end of the works' rule
+    works : (5,) output [J], see :data:`WORKS`
     """
     damped = len(damping) > 0
     loaded = len(e0) > 0

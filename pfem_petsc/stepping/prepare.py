@@ -1,4 +1,4 @@
-"""Choices that are made once before the first step: scheme, time step, linear solver, stepper."""
+"""Choices made once before the first step: scheme, time step, linear solver, stepper."""
 
 from __future__ import annotations
 
@@ -32,22 +32,22 @@ if TYPE_CHECKING:
 
 __all__ = ["Plan", "make_plan", "make_stepper"]
 
-_DAMPED = 0.2  # of a step: the time in which damping alone takes a velocity to 1/e, inverted
-_MOST_STEPS = 2.0**53  # beyond, the time of a step is not a number of its own
+_DAMPED = 0.2  # largest damping rate times step for an accurate ledger; at the rate 1/s a velocity decays to 1/e in 1 s
+_MOST_STEPS = 2.0**53  # beyond this, consecutive steps do not have distinct times
 
 TREATMENTS = "pfem_petsc.contact.treatments"
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What a run will do.
+    """The resolved settings of a run.
 
     Attributes
     ----------
     scheme : the integrator
     step : time step [s]
     steps : number of steps to the end
-    critical_step : largest stable step of the scheme [s], infinite where unconditionally stable
+    critical_step : largest stable step of the scheme [s], infinite if unconditionally stable
     frequency : bounds on the highest natural frequency [rad/s]
     linear : linear solver, None where every node is solved on its own
     asked : what the case asks for of it, ``solver.linear`` and ``solver.operator``
@@ -83,13 +83,13 @@ class Plan:
         }
 
     def record(self) -> dict[str, Any]:
-        """What a restart must not work out anew, in numbers that keep their last bit."""
+        """Return the numbers that a restart must not compute again, exact to the last bit."""
         linear = None if self.linear is None else {"asked": list(self.asked), "choice": asdict(self.linear)}
         return {"step": self.step, "frequency": list(self.frequency), "linear": linear}
 
 
 def make_plan(model: Model, recorded: Mapping[str, Any] | None = None) -> Plan:
-    """Resolve what the case leaves open. Collective.
+    """Resolve the settings that the case leaves open. Collective.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ def make_plan(model: Model, recorded: Mapping[str, Any] | None = None) -> Plan:
     Raises
     ------
     InputError
-        On all ranks, where the step is certainly unstable.
+        On all ranks, if the step is certainly unstable.
     """
     case = model.case
     time = case.time
@@ -114,7 +114,7 @@ def make_plan(model: Model, recorded: Mapping[str, Any] | None = None) -> Plan:
             f"{case.source}: material: the stiffness of the bars over their mass overflows double precision: correct "
             "young_modulus, density and area (SI units)"
         )
-    # mass-proportional damping: xi = c_m / (2 rho omega) is largest where c_m / rho is
+    # mass-proportional damping: xi = c_m / (2 rho omega) is largest for the largest c_m / rho
     ratio = max(m.damping / m.density for m in case.material.values()) / (2.0 * max(frequency.lower, 1e-300))
     limit = scheme.limit(min(ratio, 1e3))
     if limit == 0.0:
@@ -158,18 +158,18 @@ def make_plan(model: Model, recorded: Mapping[str, Any] | None = None) -> Plan:
 
 
 def _check_laws(case: Case, scheme: Scheme) -> None:
-    """Refuse material laws that the scheme cannot have."""
+    """Refuse material laws that are not compatible with the scheme."""
     for name, material in case.material.items():
         reason = law_of(material).refuses(scheme)
         if reason is not None:
             raise InputError(
-                f'{case.source}: material.{name}.law = "{law_name(dict(material))}" does not go with time.integrator = '
-                f'"{case.time.integrator}": {reason}; take another integrator or law'
+                f'{case.source}: material.{name}.law = "{law_name(dict(material))}" is not compatible with '
+                f'time.integrator = "{case.time.integrator}": {reason}; use another integrator or law'
             )
 
 
 def _linear(model: Model, scheme: Scheme, over: float, steps: int) -> LinearChoice:
-    """The choice for steps ``over`` times the limit of central differences."""
+    """Choose the linear solver for steps of ``over`` times the limit of central differences."""
     case = model.case
     impact = model.can_touch or not all(law_of(material).smooth for material in case.material.values())
     solver, unknowns = case.solver, 3 * model.mesh.n_nodes
@@ -185,19 +185,19 @@ def _linear(model: Model, scheme: Scheme, over: float, steps: int) -> LinearChoi
 def _steps_to(end: float, step: float, source: str) -> int:
     if not end / step < _MOST_STEPS:
         raise InputError(
-            f"{source}: time.end = {end:g} s in steps of {step:g} s is more steps than can be counted; take a larger "
+            f"{source}: time.end = {end:g} s in steps of {step:g} s needs more steps than can be counted; use a larger "
             "time.step or a smaller time.end"
         )
     return max(int(np.ceil(end / step * (1.0 - 1e-12) - 1e-9)), 1)
 
 
 def make_stepper(model: Model, plan: Plan) -> Stepper:
-    """The stepper of a plan, with the case's treatment of impact. Collective.
+    """Create the stepper of a plan, with the case's treatment of impact. Collective.
 
     Raises
     ------
     InputError
-        On all ranks, where the scheme does not go with the treatment.
+        On all ranks, if the scheme is not compatible with the treatment.
     """
     treatment = _treatment(model, plan)
     _check_walls(model, plan, treatment)
@@ -215,7 +215,7 @@ def make_stepper(model: Model, plan: Plan) -> Stepper:
 
 
 def _treatment(model: Model, plan: Plan) -> type[Treatment] | None:
-    """What the case asks for; None for the formulas of the scheme, and where nothing can touch."""
+    """Return the treatment of the case; None for the formulas of the scheme, and if nothing can touch."""
     name = model.case.contact.treatment
     if name == "scheme" or not model.can_touch:
         return None
@@ -230,7 +230,7 @@ def _treatment(model: Model, plan: Plan) -> type[Treatment] | None:
 
 
 def _warn_of_gain(model: Model, plan: Plan) -> None:
-    """Warn where contact gains energy with this scheme, treatment, mass and step."""
+    """Warn if contact gains energy with this scheme, treatment, mass and step."""
     fastest = plan.frequency.upper / (np.sqrt(3.0) if model.inertia.consistent else 1.0)
     across = 0.5 * fastest * model.length / model.wave_speed
     warning = warn_of_gain(model.case, 0.5 * fastest * plan.step, across)
@@ -239,18 +239,18 @@ def _warn_of_gain(model: Model, plan: Plan) -> None:
 
 
 def _warn_of_damping(model: Model, plan: Plan) -> None:
-    """Warn where damping stops nodes within a few steps: no rule over steps knows then what it dissipates."""
+    """Warn if damping stops nodes within a few steps, when no rule over steps gives its dissipation accurately."""
     rate = max(material.damping / material.density for material in model.case.material.values())
     if rate * plan.step > _DAMPED:
         model.warnings.append(
             f"time.step = {plan.step:.4g} s: damping stops nodes within a few steps (material.damping / density * step "
-            f"= {rate * plan.step:.2g}), so that the energy it dissipates is booked with an error of this order; take "
+            f"= {rate * plan.step:.2g}), so the recorded damping dissipation has an error of this order; use "
             f"a time.step of at most {_DAMPED / rate:.2g} s, or less damping"
         )
 
 
 def _check_walls(model: Model, plan: Plan, treatment: type[Treatment] | None) -> None:
-    """Refuse what a wall asks for and the scheme cannot do."""
+    """Refuse features of walls that the scheme does not support."""
     walls = model.case.wall
     if any(wall.mass is not None for wall in walls):
         if treatment is not None:
@@ -271,7 +271,7 @@ def _check_walls(model: Model, plan: Plan, treatment: type[Treatment] | None) ->
 
 
 def _check_serves(treatment: type[Treatment] | None, what: str, key: str) -> None:
-    """Refuse a key of walls that the treatment does not go with."""
+    """Refuse a key of walls that the treatment does not support."""
     if treatment is None or what in treatment.serves:
         return
     known = {name: lookup(TREATMENTS, name, "").Treatment for name in choices(TREATMENTS)}
@@ -288,7 +288,7 @@ def _check_restitution(model: Model, plan: Plan, treatment: type[Treatment] | No
             raise InputError(f'{key}: with {model.case.time.integrator} restitution needs contact.treatment = "scheme"')
         return
     _check_serves(treatment, "restitution", key)
-    # the jump has an impulse of its own, which neither drags nor pushes a wall
+    # the impulse of a velocity jump causes no friction and does not move walls with mass
     if model.contact.static_friction[k]:
         raise InputError(f"{key}: restitution together with friction needs central_differences")
     if model.case.wall[k].mass is not None:

@@ -1,4 +1,4 @@
-"""Motion of supports in steps: exactly the positions, velocities and accelerations of their tables."""
+"""Prescribed motion of supports in steps: exact positions, velocities and accelerations from their tables."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ __all__ = ["NoRates", "PrescribedMotion"]
 
 
 class PrescribedMotion:
-    """Puts what supports prescribe into balances and states of a stepper.
+    """Sets prescribed components in the balances and the state of a stepper.
 
     Attributes
     ----------
-    change : what motions of supports have put in place of the scheme's velocity, acceleration and memory of their
-        components (k,) in the last step, by name; empty without such motions
+    change : changes of velocity, acceleration and scheme memory of prescribed components (k,) relative to those of the
+        scheme in the last step, by name; empty without moving supports
     """
 
     def __init__(self, stepper: Stepper) -> None:
@@ -30,13 +30,13 @@ class PrescribedMotion:
         self.change: dict[str, np.ndarray] = {}
 
     def place(self, end: float) -> None:
-        """Put prescribed components where they are at a time [s]."""
+        """Set prescribed components of the positions to their values at a time [s]."""
         if self.moving:
             self.stepper.state.position[self.supports.at] = self.supports.positions(end)
 
     def prescribe(self, balance: Balance) -> None:
-        """Put what supports prescribe into a balance, whose increments are zero there: exact position, velocity and
-        acceleration, where the scheme's formulas would make velocity and acceleration of positions, and ring."""
+        """Set exact positions, velocities and accelerations of prescribed components in a balance; their increments are
+        zero. The scheme's own formulas would derive velocities and accelerations from positions and oscillate."""
         supports = self.supports
         forces_hold = sum(weight * time for weight, time in balance.loads)
         v, a = supports.rates(forces_hold, self.stepper.part)
@@ -49,9 +49,9 @@ class PrescribedMotion:
         balance.a_hat[supports.at] = a
 
     def _by_rule(self, balance: Balance, a: np.ndarray) -> State:
-        """What the scheme would make of prescribed components (k, 1) by the acceleration (k,) of their balance.
+        """Return the state of prescribed components (k, 1) if the scheme advanced them with accelerations (k,).
 
-        That is the rule by which forces become impulses.
+        This is the rule by which forces become impulses.
         """
         supports, state = self.supports, self.stepper.state
 
@@ -68,7 +68,7 @@ class PrescribedMotion:
         return ruled
 
     def take_rates(self, time: float) -> None:
-        """Velocity and acceleration of prescribed components at a time, and what the scheme remembers of them."""
+        """Set velocity, acceleration and scheme memory of prescribed components at a time [s]."""
         supports, state = self.supports, self.stepper.state
         state.v[supports.at], state.a[supports.at] = supports.rates(time, self.stepper.part)
         self.stepper.scheme.restart(state, supports.at, self.stepper.part)

@@ -17,11 +17,10 @@ __all__ = ["StepProblem"]
 
 
 class StepProblem:
-    """g(w) of one step, where w is the increment u from the predictor in the coordinates of a transform, u = T w.
+    """Residual g(w) of one step, where w is the increment u from the predictor in transformed coordinates, u = T w.
 
-    Drag by friction is a part of g (see :mod:`pfem_petsc.contact.sliding`), whose derivative is then not symmetric.
-
-    Components that supports prescribe have a zero residual and a unit row: the guess carries their value.
+    Friction is part of g (see :mod:`pfem_petsc.contact.sliding`) and makes its derivative unsymmetric. Prescribed
+    components have a zero residual and a unit row; the guess contains their values.
     """
 
     def __init__(
@@ -44,7 +43,7 @@ class StepProblem:
         self._work = np.zeros((mesh.n_owned, 3))
         self.nodal = balance.alpha * inertia.mass + balance.eta * inertia.damping
         self.scale = float((self.nodal if balance.alpha else model.nodal_stiffness).max(initial=0.0))
-        # what does not change with u: M a_hat + C v_hat + (1 - w) f_n - f_ext
+        # the part independent of u: M a_hat + C v_hat + (1 - w) f_n - f_ext
         known = -external
         if balance.a_hat is not None:
             known = known + inertia.mass_times(balance.a_hat, np.zeros_like(known))
@@ -55,19 +54,19 @@ class StepProblem:
         self.known = known
 
     def increment(self, w: np.ndarray) -> np.ndarray:
-        """u (owned, 3) for w. Collective."""
+        """Return u (owned, 3) for w. Collective."""
         self.u[:] = w
         self.transform.forward(self.u)
         return self.u
 
     def coordinates(self, u: np.ndarray) -> np.ndarray:
-        """w (owned, 3) for u. Collective."""
+        """Return w (owned, 3) for u. Collective."""
         w = u.copy()
         self.transform.inverse(w)
         return w
 
     def imbalance(self, u: np.ndarray, g: np.ndarray) -> None:
-        """g = M a + C v + f_int - f_ext at u, in x, without regard to supports and walls [N]. Collective."""
+        """Write g = M a + C v + f_int - f_ext at u, in x, without supports and walls [N]. Collective."""
         mesh, inertia, balance = self.model.mesh, self.model.inertia, self.balance
         owned = mesh.n_owned
         if inertia.consistent:
@@ -96,14 +95,14 @@ class StepProblem:
             g[self.model.supports.fixed] = 0.0
 
     def hessian(self, w: np.ndarray, matrix: HessianMatrix, values: np.ndarray) -> None:
-        """Add dg/dw to the values of an assembled matrix, in which links have no coordinates yet. Collective."""
+        """Add dg/dw, without the coordinates of links, to the values of an assembled matrix. Collective."""
         self.place(self.increment(w))
         self.hessian_here(matrix, values)
 
     def hessian_here(self, matrix: HessianMatrix, values: np.ndarray, stored: np.ndarray | None = None) -> None:
         """As :meth:`hessian`, at the positions :attr:`x`, ghosts included. Collective.
 
-        With ``stored`` (b, 5) the stiffness of the bars is that of its numbers, see ``Bars.linearise``.
+        With ``stored`` (b, 5) the stiffness of the bars is computed from these data, see ``Bars.linearise``.
         """
         inertia, balance = self.model.inertia, self.balance
         if not inertia.consistent:
@@ -125,6 +124,6 @@ class StepProblem:
         matrix.constrain(self.scale, values)
 
     def place(self, u: np.ndarray) -> None:
-        """Put the positions of all local nodes at the predictor plus u. Collective."""
+        """Set the positions of all local nodes to the predictor plus u. Collective."""
         np.add(self.balance.predictor, u, out=self.x[: self.model.mesh.n_owned])
         self.model.mesh.update_ghosts(self.x)

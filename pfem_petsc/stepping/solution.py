@@ -15,15 +15,15 @@ __all__ = ["Solution"]
 
 @dataclass
 class Solution:
-    """The solve of one balance.
+    """Result of solving one balance.
 
     Attributes
     ----------
     u : (owned, 3) increment from the predictor [m]
     internal : (local, 3) internal force in the balance [N]
     walls : forces per wall, this rank's share
-    newton, linear : iterations
-    contacts : this rank's nodes held by walls
+    newton, linear : numbers of iterations
+    contacts : number of this rank's nodes in contact with walls
     """
 
     u: np.ndarray

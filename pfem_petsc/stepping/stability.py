@@ -11,13 +11,13 @@ if TYPE_CHECKING:
 
 __all__ = ["Frequency", "highest_frequency"]
 
-_LARGEST = 1e150  # squares of frequencies [rad2/s2] whose own squares are still numbers
+_LARGEST = 1e150  # squared frequencies [rad2/s2] whose squares do not overflow
 
 
 class Frequency(NamedTuple):
-    """Bounds on the highest angular frequency [rad/s]: ``lower`` is certain, ``upper`` holds to Lanczos' residual.
+    """Bounds on the highest angular frequency [rad/s]: ``lower`` is rigorous, ``upper`` is based on Lanczos' residual.
 
-    Infinite where stiffness over mass cannot be computed with.
+    Infinite if stiffness over mass overflows double precision.
     """
 
     lower: float
@@ -26,26 +26,26 @@ class Frequency(NamedTuple):
 
 @np.errstate(over="ignore", invalid="ignore")
 def highest_frequency(model: Model, x: np.ndarray, steps: int = 60, accuracy: float = 1e-4) -> Frequency:
-    """Highest natural frequency at positions ``x`` by Lanczos' method on M^-1/2 K_t M^-1/2 (lumped mass). Collective.
+    """Compute the highest natural frequency at positions ``x`` by Lanczos' method on M^-1/2 K_t M^-1/2. Collective.
 
-    The bar's own limit l/c is a safe bound on the critical step for unstressed bars only and often too small; the
-    largest Ritz value is a lower bound of the square of the frequency, and its residual bounds the distance to an
-    eigenvalue. With consistent mass each bar's share of it is at least a third of its lumped mass, so the square of the
-    frequency is at most three times as high; it is at least the Rayleigh quotient of the Ritz vector.
+    M is the lumped mass. The limit l/c of a single bar is a safe bound on the critical step for unstressed bars only,
+    and often too small. The largest Ritz value is a lower bound of the squared frequency, and its residual bounds the
+    distance to an eigenvalue. With consistent mass the element matrix of a bar is at least a third of its lumped one,
+    so the squared frequency is at most three times as high; it is at least the Rayleigh quotient of the Ritz vector.
 
     Parameters
     ----------
     model : Model
     x : (local, 3) positions with ghosts [m]
-    steps : most Lanczos steps
-    accuracy : relative; the iteration stops when the residual is below it
+    steps : maximum number of Lanczos steps
+    accuracy : relative residual at which the iteration stops
     """
     mesh, comm = model.mesh, model.comm
     owned = mesh.n_owned
     free = ~model.supports.fixed
     with np.errstate(divide="ignore"):
         scale = np.where(free, 1.0 / np.sqrt(model.inertia.mass)[:, None], 0.0)
-    # a start vector that is the same for any number of ranks and has all wave lengths: a hash of node and component
+    # the start vector is a hash of node and component: independent of the number of ranks, with all wave lengths
     ids = mesh.node_ids[:owned, None].astype(np.uint64) * np.uint64(3) + np.arange(3, dtype=np.uint64)
     hashed = (ids + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
     hashed ^= hashed >> np.uint64(29)

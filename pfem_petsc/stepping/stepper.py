@@ -1,4 +1,4 @@
-"""One step of a scheme: the solve for the position increment, with walls, and what it leaves in the state."""
+"""One step of a scheme: the solve for the position increment, with contact, and the update of the state."""
 
 from __future__ import annotations
 
@@ -34,18 +34,18 @@ class Stepper(ABC):
     energy : StrainEnergy of this rank's bars at the state's positions
     solution : of the last balance
     balance : the last balance
-    fault : a failure that only this rank has met yet; raised on all when ranks next meet
-    h : the case's time step [s]; ``part`` the part of it being made, ``smallest`` the smallest part of the last step
+    fault : a failure that only this rank knows; raised on all ranks at the next synchronisation
+    h : the case's time step [s]; ``part`` the size of the current part, ``smallest`` the smallest part of the last step
     treatment : of impact, None for the scheme's own formulas
     booking : called after each part of a step
     before : (local, 3) positions at the start of the last part, with ghosts [m]
-    massless : MasslessNodes where contact nodes have no mass along their walls' normals, else None
-    closed : (owned, walls) bool, nodes that have met a wall and not left it since
+    massless : MasslessNodes if contact nodes are massless along their walls' normals, else None
+    closed : (owned, walls) bool, nodes that have touched a wall and not left it since
     prescribed : PrescribedMotion of supports
-    step_changed : whether the scheme was told to forget what holds for another step, since the last booking
+    step_changed : whether the scheme was notified of another step size since the last booking
     totals_at_start, totals_solved : (3, 3) this rank's sums of support, external and damping force [N] at the start,
-        and of the balance that was solved there by a scheme that leads; None after a restart
-    velocity_solved : (owned, 3) of that balance, in which its damping force acts [m/s]
+        and of the balance solved there by a scheme that solves for the next position; None after a restart
+    velocity_solved : (owned, 3) velocity of that balance, on which its damping force depends [m/s]
     walls_at_start, links_at_start : (walls, 3), (tables of links, 3) forces at the start [N]
     renews_forces : each evaluation of the state fills another array ``state.f``, so that the last one is kept
     steady : the loop over many steps (``stepping/fused_loop.py``) makes the same steps, where all else allows it
@@ -74,7 +74,7 @@ class Stepper(ABC):
         self.energy = StrainEnergy()
         self.fault: SimulationFailure | None = None
         self.balance: Balance | None = None
-        self.zero = np.zeros((owned, 3))  # stands for forces that do not act: never written
+        self.zero = np.zeros((owned, 3))  # read-only placeholder for absent forces
         self.state = State(
             x=mesh.points.copy(),
             v=self.zero,
@@ -100,7 +100,7 @@ class Stepper(ABC):
         self.solution = Solution(self.zero, self.state.f, model.contact.nothing)
 
     def start(self) -> None:
-        """Complete the state at the start: velocity, internal force, acceleration. Collective."""
+        """Initialise velocity, internal force and acceleration of the state. Collective."""
         state, model = self.state, self.model
         state.v = model.initial_velocity()
         supports = model.supports
@@ -141,15 +141,15 @@ class Stepper(ABC):
             self._solve_and_finish()
             self.totals_solved = self._totals()
             self.velocity_solved = state.v
-            # what is on a wall has not lost its velocity yet; the scheme goes on from its own memory
+            # nodes on a wall have not lost their velocity yet; the scheme continues from its own memory
             state.v = v
             motion.set_speeds(speeds)
 
     def acceleration(self) -> np.ndarray:
-        """Acceleration (owned, 3) to record [m/s2]; collective where the mass is consistent.
+        """Acceleration (owned, 3) to record [m/s2]; collective with consistent mass.
 
-        Where the balance holds at the ends of steps it is the scheme's. For the others that is of first order, or holds
-        at another time: nodes that nothing holds have the one of the forces at the end of the step.
+        If the balance holds at the ends of steps, it is that of the scheme. For other schemes that is of first order or
+        holds at another time, so free nodes get the acceleration by the forces at the end of the step.
         """
         state, model, scheme = self.state, self.model, self.scheme
         if scheme.balance_at_endpoints or state.step == 0:
@@ -182,12 +182,12 @@ class Stepper(ABC):
         return self.state.time
 
     def step(self) -> None:
-        """Advance from t_n to t_{n+1}; the state is complete at both. Collective where the solve is."""
+        """Advance from t_n to t_{n+1}; the state is complete at both. Collective if the solve is."""
         self._make_part((self.state.step + 1) * self.h)
         self.state.step += 1
 
     def _make_part(self, end: float) -> None:
-        """Advance by ``part``, to the time ``end``."""
+        """Advance by ``part`` to the time ``end`` [s]."""
         state, carried = self.state, self._carried
         if self.model.temperatures.varying:
             self.model.bars.heat_at_start[:] = self.model.bars.heat
@@ -241,7 +241,7 @@ class Stepper(ABC):
             self.model.contact.calm(fresh, state.v, self.balance.time, self.part)
 
     def _acceleration(self, load: np.ndarray) -> np.ndarray:
-        """Acceleration (owned, 3) with M a = load [N] on free components, on others as prescribed. Collective."""
+        """Return the acceleration (owned, 3) with M a = load [N], prescribed values included. Collective."""
         supports = self.model.supports
         if not supports.moving:
             return self.accelerate(load)
@@ -261,17 +261,17 @@ class Stepper(ABC):
         return total
 
     def destroy(self) -> None:  # noqa: B027 - most steppers have nothing to free
-        """Free PETSc objects: the stepper makes no further step. Collective; may be called again."""
+        """Free PETSc objects; the stepper cannot make further steps. Collective; may be called again."""
 
     def when(self, balance: Balance) -> str:
-        """The step that a balance is for, and the time that it holds at, for messages."""
+        """Return the step of a balance and the time at which it holds, for messages."""
         step = self.state.step + 1
         if self.scheme.solves_next_position and self.state.time > 0.0:
-            step += 1  # the position solved for is that of the step after
+            step += 1  # the position solved for belongs to the next step
         return f"step {step}, t = {balance.time:.6g} s"
 
     def evaluate(self, commit: bool) -> None:
-        """Internal force and energies at the state's positions; a collapsed bar becomes a fault."""
+        """Evaluate internal force and energies at the state's positions; a collapsed bar becomes a fault."""
         state, mesh = self.state, self.model.mesh
         mesh.update_ghosts(state.x)
         self.energy = self.model.bars.forces(state.x, state.f, commit)
@@ -282,13 +282,13 @@ class Stepper(ABC):
             self.fault = SimulationFailure(self.collapse(failed))
 
     def collapse(self, bar: int) -> str:
-        """What to tell about a bar (local index) that failed in the step being made."""
+        """Return the message about a bar (local index) that failed in the current step."""
         return tell_collapse(self, bar)
 
     @abstractmethod
     def accelerate(self, load: np.ndarray) -> np.ndarray:
-        """Acceleration (owned, 3) with M a = load [N] on free components, zero on prescribed ones. Collective."""
+        """Return the acceleration (owned, 3) with M a = load [N], zero on prescribed components. Collective."""
 
     @abstractmethod
     def solve(self, balance: Balance) -> Solution:
-        """Solve a balance, and leave contact and support forces in the state."""
+        """Solve a balance, and set contact and support forces in the state."""

@@ -1,6 +1,7 @@
-"""What a step adds to the sums of a history row: the same compiled formulas for single steps and for many in one call.
+"""Contributions of a step to the sums of a history row: compiled formulas that single steps and the fused loop share.
 
-Places of the sums are those of :mod:`~pfem_petsc.output.sums`: integers at module level, constants of the machine code.
+The positions of the sums are those of :mod:`~pfem_petsc.output.sums`, integers at module level that are constants of
+the machine code.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ def add_works(sums, works, stored, heating, impact, friction, work, given, weigh
     sums : (HEAD.width,) in the layout of :data:`~pfem_petsc.output.sums.HEAD`
     works : (5,) see :data:`~pfem_petsc.stepping.node_loops.WORKS`
     stored : change of the energies of nodes and bars; heating : work of changing temperatures
-    impact, friction : what they take
+    impact, friction : dissipations
     work, given, weight, lost : of walls: work on the truss of those that move as prescribed and of those with mass, of
         the weight of these, and their numerical dissipation
     jumped : energy that a treatment of impact gave to nodes
@@ -44,14 +45,14 @@ def add_works(sums, works, stored, heating, impact, friction, work, given, weigh
     sums[_THERMAL] += heating
     sums[_FRICTION] += friction
     sums[_IMPACT] += impact
-    # what contact did to nodes beyond the work of walls and the losses of friction and impact
+    # the work of contact on nodes in excess of the work of walls and the losses by friction and impact
     left = works[_BY_CONTACT] + jumped - work - given + friction
     sums[_NUMERICAL] += works[_BY_INERTIA] + works[_BY_BARS] + heating - stored - left - impact + lost
 
 
 @kernel
 def add_totals(sums, totals) -> None:
-    """Momenta, mass times position and forces of supports of the present (6, 3), see ``TOTALS`` of ``node_loops``."""
+    """Write the present totals (6, 3), see ``TOTALS`` of ``node_loops``."""
     for k in range(4):
         for c in range(3):
             sums[_TOTALS + 3 * k + c] = totals[k, c]
@@ -59,14 +60,14 @@ def add_totals(sums, totals) -> None:
 
 @kernel
 def fill_bars(row, energies) -> None:
-    """Energies of the bars, in the order of ``BAR_ENERGIES``."""
+    """Write the energies of the bars, in the order of ``BAR_ENERGIES``."""
     for k in range(len(energies)):
         row[_BARS[k]] = energies[k]
 
 
 @kernel
 def fill_walls(row, at, force, moment, v, contacts, releases) -> int:
-    """Sums of walls, from place ``at`` of a row; gives the place after them. ``v`` of the particles of all impulses."""
+    """Write sums of walls from index ``at`` of a row; return the next index. ``v``: of the particles of impulses."""
     for k in range(len(force)):
         row[at + _FORCE : at + _FORCE + 3] = force[k]
         row[at + _MOMENT : at + _MOMENT + 3] = moment[k]
@@ -78,9 +79,9 @@ def fill_walls(row, at, force, moment, v, contacts, releases) -> int:
 
 @kernel
 def fill_probes(row, at, nodes, starts, x, v, a, contact, support) -> None:
-    """Positions, velocities, accelerations and reactions of probed nodes, from place ``at`` of a row.
+    """Write positions, velocities, accelerations and reactions of probed nodes, from index ``at`` of a row.
 
-    ``nodes`` (m,) of all probes, which start at ``starts`` (probes + 1,); ``support`` (0, 3) for no supports.
+    ``nodes`` (m,) of all probes, which start at ``starts`` (probes + 1,); ``support`` (0, 3) if there are no supports.
     """
     supported = len(support) > 0
     for p in range(len(starts) - 1):

@@ -1,4 +1,4 @@
-"""Motion over time, step by step: the analysis of a case with a table ``[time]``."""
+"""Time stepping: the analysis of a case with a table ``[time]``."""
 
 from __future__ import annotations
 

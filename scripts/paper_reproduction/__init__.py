@@ -1,1 +1,1 @@
-"""The paper's three impact examples, run, measured, drawn and judged."""
+"""The three impact examples of the paper: runs, measurements, figures and verdicts."""

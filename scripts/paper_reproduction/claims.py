@@ -1,4 +1,4 @@
-"""What a statement of the paper is, and the measurements that statements are judged by."""
+"""Statements of the paper, and the measurements by which they are judged."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ __all__ = [
 ]
 
 REPRODUCED, PARTLY, NOT, OPEN = "reproduced", "partly", "not reproduced", "not checkable"
-FITTED = "fitted"  # what a missing datum was chosen for cannot count as reproduced
+FITTED = "fitted"  # a result used to choose missing data cannot count as reproduced
 SHORT = {
     "central_differences": "CD",
     "newmark": "Newmark",
@@ -59,8 +59,8 @@ SHORT = {
     "wilson": "Wilson",
 }
 EXPLICIT = ("central_differences", "chung_lee", "souza_moura")  # of the paper
-SMOOTH = ("central_differences", "newmark", "chung_lee")  # that the paper recommends, less the one we do not know
-ROUGH = ("houbolt", "wilson")  # that it finds unsatisfactory
+SMOOTH = ("central_differences", "newmark", "chung_lee")  # recommended by the paper, except the unavailable one
+ROUGH = ("houbolt", "wilson")  # unsatisfactory according to the paper
 
 
 class Claim(NamedTuple):
@@ -76,12 +76,12 @@ class Claim(NamedTuple):
 class Measures:
     """All runs under a reading, and their measures.
 
-    Rods by scheme, bars by (scheme, step, plastic), rings by (scheme, step); of the study of phases a list over the
+    Rods by scheme, bars by (scheme, step, plastic), rings by (scheme, step); for the study of phases a list over the
     phases by scheme, None for a run that did not reach its end.
 
     Attributes
     ----------
-    chaotic : schemes whose ring at the large step parts from one with a speed that differs in the tenth digit
+    chaotic : schemes whose ring at the large step diverges from one with a speed that differs in the tenth digit
     """
 
     runs: dict[str, Run]
@@ -132,17 +132,17 @@ def _phase(runs: dict[str, Run], scheme: str, reading: Reading, phase: int) -> R
 
 
 def _parts(run: Run, twin: Run) -> bool:
-    """Whether node 1 of two rings is ever more than a millimetre apart."""
+    """Return whether node 1 of two rings is ever more than a millimetre apart."""
     first, second = (part.history["probe/impact/position"][:, 0, 0] for part in (run, twin))
     rows = min(len(first), len(second))
     return bool(np.abs(first[:rows] - second[:rows]).max() > 1e-3)
 
 
 def listed(values: dict[str, float], form: str = ".2f", unit: str = "") -> str:
-    """Numbers by scheme as text."""
+    """Return numbers by scheme as text."""
     return ", ".join(f"{SHORT[scheme]} {value:{form}}{unit}" for scheme, value in values.items())
 
 
 def pick(measures: dict, schemes: Iterable[str], name: str) -> dict[str, float]:
-    """One measure of some schemes."""
+    """Return one measure of some schemes."""
     return {scheme: getattr(measures[scheme], name) for scheme in schemes}

@@ -1,4 +1,4 @@
-"""Write docs/paper.md: the template, with tables of measured numbers and judged statements."""
+"""Writes docs/paper.md from its template, with tables of measured numbers and judged statements."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Numbers of a run that the paper's statements are about."""
+"""Quantities of a run to which the paper's statements refer."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ __all__ = [
 ]
 
 ENERGIES = ("kinetic_energy", "elastic_energy", "plastic_dissipation")
-WINDOW = 20  # steps after the first contact in which the jump of velocity is judged
-PAUSE = 2.5e-3  # a release of the ring shorter than this is a part of the same contact [s]
-REST = 0.01  # of the speed of arrival: a tip slower than this is at rest
+WINDOW = 20  # steps after the first contact in which the velocity jump is evaluated
+PAUSE = 2.5e-3  # a release of the ring shorter than this belongs to the same contact [s]
+REST = 0.01  # relative to the impact speed: a slower tip counts as at rest
 
 
 def contact_episodes(time: np.ndarray, contacts: np.ndarray) -> list[tuple[float, float]]:
@@ -55,9 +55,9 @@ def _episodes(run: Run) -> list[tuple[float, float]]:
 
 @dataclass
 class RodImpact:
-    """A rod against a wall. Speeds are relative to that of arrival, forces to the exact one, energies to the first.
+    """A rod against a wall. Speeds are relative to the impact speed, forces to the exact one, energies to the initial.
 
-    What a run that ended early has not reached is not a number.
+    Quantities that a run did not reach are NaN.
 
     Attributes
     ----------
@@ -107,7 +107,7 @@ def measure_rod(run: Run, exact: Rod) -> RodImpact:
     moving = np.flatnonzero(np.abs(early) > REST)
     inside = (time > t0 + 2.0 * run.h) & (time < t0 + 0.9 * duration)
     middle = (time > t0 + 0.3 * duration) & (time < t0 + 0.9 * duration)
-    # the same stretch of time for all schemes, clear of when each leaves the wall
+    # the same time interval for all schemes, before any of them leaves the wall
     free = time > max(episodes[-1][1], exact.release) + 0.1 * duration
     kinetic = history["kinetic_energy"][0]
     after = velocity[free]

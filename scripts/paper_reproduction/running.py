@@ -1,4 +1,4 @@
-"""Run the studies in worker processes, keep their results, and read them back."""
+"""Runs the studies in worker processes, stores their results, and reads them back."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from .studies import Study
 
 __all__ = ["Run", "read", "run_all", "run_study"]
 
-# What decides the numbers: results of older versions of these are not used again.
+# Files that determine the numbers: results of older versions of these are not reused.
 SOURCES = ("contact", "integrators", "mechanics", "mesh/generators", "solvers", "stepping", "simulation.py")
 
 
@@ -69,7 +69,7 @@ def _digest(study: Study) -> str:
 
 
 def run_study(study: Study, folder: Path) -> tuple[str, str, float]:
-    """Run one study into its folder: its key, why it failed (or nothing), and seconds."""
+    """Run one study into its folder; return its key, the reason of a failure (or nothing), and seconds."""
     digest, started = _digest(study), time.perf_counter()
     if folder.exists():
         shutil.rmtree(folder)
@@ -91,12 +91,12 @@ def _is_current(study: Study, folder: Path) -> bool:
 
 
 def run_all(studies: Iterable[Study], root: Path, workers: int) -> None:
-    """Run what has no current result under ``root``, in processes of their own; tells each on stdout."""
+    """Run the studies without a current result under ``root`` in separate processes; report each on stdout."""
     missing = [study for study in studies if not _is_current(study, root / study.key)]
     if not missing:
         print("all results are there")
         return
-    # MPI does not survive a fork: each worker is a process of its own from the start
+    # MPI does not survive a fork, so workers are spawned
     with ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn")) as pool:
         runs = [pool.submit(run_study, study, root / study.key) for study in missing]
         for number, run in enumerate(as_completed(runs), 1):
@@ -110,7 +110,7 @@ def read(key: str, root: Path) -> Run:
     Raises
     ------
     FileNotFoundError
-        When it has not been run.
+        If it has not been run.
     """
     folder = root / key
     outcome = json.loads((folder / "outcome.json").read_text())

@@ -1,4 +1,4 @@
-"""The integrators of the comparison: how they are called, set and drawn, and the readings of what the paper omits."""
+"""The integrators of the comparison: names, settings and line styles, and the readings of data missing in the paper."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ EXPLICIT = ("central_differences", "chung_lee", "souza_moura", "chung_lee_1", "h
 
 
 class Reading(NamedTuple):
-    """What is taken for the mass matrix, which the paper does not state for each scheme.
+    """An assumption about the mass matrix, which the paper does not state for each scheme.
 
     Attributes
     ----------

@@ -39,7 +39,7 @@ BAR_ELEMENTS = (20, 80, 320)  # of each of the two bars
 PHASES = 14  # impacts spread evenly over a time step
 PHASE_SPEED = 0.1  # of the rods of that study: no bar comes near inversion [m/s]
 QUIET = "output.fields_every=0"
-TWIN = 1e-9  # change of the ring's speed, relative, by which chaotic runs are told
+TWIN = 1e-9  # relative change of the ring's speed that identifies chaotic runs
 # Further rings whose first contact ends near 35 ms and that hit again near 120 ms: outer and inner radius [m], bays,
 # bracing, orientation.
 OTHER_RINGS = {

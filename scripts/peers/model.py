@@ -1,4 +1,4 @@
-"""The lattice that all codes are timed on; needs NumPy alone, so that every environment can import it.
+"""The lattice on which all codes are timed; needs NumPy only, so that every environment can import it.
 
 Cubic cells of edge PITCH with both diagonals on every face, thrown at the plane z = 0 where its foot starts. SI units.
 """

@@ -1,4 +1,4 @@
-"""The bare loop: what a page of Numba does for the explicit impact, and nothing else (no history, no checks).
+"""The bare loop: a minimal Numba program for the explicit impact, without history and checks.
 
 usage: run_bare_loop.py CELLS explicit|explicit_contact STEPS. Bars in the order of their ends, forces scattered.
 """

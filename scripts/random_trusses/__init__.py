@@ -1,1 +1,1 @@
-"""Random valid cases, and what must hold of their results: see ``scripts/random_cases.py``."""
+"""Random valid cases, and properties that their results must have; see ``scripts/random_cases.py``."""

@@ -1,4 +1,4 @@
-"""Results of two runs of a case: equal bit for bit, or how far they are apart."""
+"""Comparison of two results of a case: bitwise, and by relative differences."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["bitwise", "distance", "paths_distance"]
 
 
 def bitwise(one: Path, other: Path) -> dict[str, float]:
-    """Datasets of two folders' results that are not equal bit for bit, with the largest difference over the largest
+    """Return the datasets of two results that are not bitwise identical, with the largest difference over the largest
     value (inf: of another shape)."""
     found: dict[str, float] = {}
     with (
@@ -36,10 +36,10 @@ def bitwise(one: Path, other: Path) -> dict[str, float]:
 
 
 def distance(one: Path, other: Path) -> tuple[float, str]:
-    """How far two results are apart: the largest relative difference, and where it is.
+    """Return the largest relative difference of two results, and where it is.
 
-    Positions are over the truss's size, energies over the largest energy, momenta over the largest momentum (or that of
-    the centre's way, where they cancel), forces of walls over the largest force.
+    Positions are relative to the size of the truss, energies to the largest energy, momenta to the largest momentum (or
+    that of the displacement of the centre, if they cancel), forces of walls to the largest force.
     """
     a, b = Loaded(one), Loaded(other)
     worst = paths_distance(a, b)

@@ -1,7 +1,7 @@
-"""Draw a valid case by its number, over the documented keys and their combinations.
+"""Draws a valid case by its number, over the documented keys and their combinations.
 
-Bodies are aimed at walls so that they meet within the run. What the documentation excludes is left out, but for a few
-cases in a hundred, which must be refused with a message.
+Bodies are aimed at walls so that they hit them within the run. Combinations that the documentation excludes are not
+drawn, except in a few percent of the cases, which must be refused with a message.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from .walls import draw_walls
 __all__ = ["Motion", "draw_case"]
 
 EXPLICIT = {"central_differences": 2.0, "chung_lee": 1.85, "hulbert_chung": 1.5, "souza_moura": 1.7}
-"""Explicit integrators, with a limit of Omega that all their parameters keep, damping aside."""
+"""Explicit integrators, with a limit of Omega that is safe for all their parameters without damping."""
 IMPLICIT = ("newmark", "houbolt", "wilson", "generalized_alpha", "energy_momentum")
 CONSERVING = ("newmark", "houbolt", "energy_momentum")
 POINT = ("displacement", "velocity", "acceleration", "contact_force")
 CELL = ("strain", "stress", "axial_force", "plastic_strain")
 ODD = 0.03
-"""Part of the cases in which a rule of combination is broken on purpose."""
+"""Fraction of the cases in which a rule of combination is violated on purpose."""
 
 
 @dataclass
 class Motion:
-    """What the body does: direction (3,), speed [m/s], steps, step and duration [s]."""
+    """Motion of the body: direction (3,), speed [m/s], steps, step and duration [s]."""
 
     way: np.ndarray
     speed: float
@@ -39,7 +39,7 @@ class Motion:
 
 
 def draw_case(seed: int) -> dict[str, Any]:
-    """The case of a number: nested tables with the keys of a case file, plain numbers only."""
+    """Return the case of a number as nested tables with the keys of a case file and plain numbers only."""
     chance = random.Random(f"truss {seed}")
     body = draw_body(chance)
     time = _time(chance, body)

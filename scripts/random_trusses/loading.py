@@ -1,4 +1,4 @@
-"""A small result in memory, read in one go."""
+"""A small result, read into memory at once."""
 
 from __future__ import annotations
 

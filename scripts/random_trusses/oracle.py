@@ -1,16 +1,16 @@
-"""What must hold of the results of any valid case that ended with status 0.
+"""Properties that the results of any valid case with status 0 must have.
 
-Each check gives faults, (cause, detail). Tolerances:
+Each check returns faults, (cause, detail). Tolerances:
 
-- positions against walls: 1e-9 of the truss's size (1e-6 with float32); `wilson` keeps walls at t + theta h and not at
-  the end of the step, so that a node may be as far beyond as it moves in (theta - 1) h, twice at most
-- balance of energy: 1e-7 of the largest energy; above 1e-9 it is counted apart
-- gain of energy from contact and the scheme without a warning, in the mean over the last quarter of the run: 0.05 of
-  what was put in (energy at the start, works of loads and temperature; with walls that move, the largest energy).
-  Central differences conserve T + U - h^2/8 a.Ma with velocities in the middle of two half steps: the last term, at
-  most (h w/2)^2 U with the highest frequency w, comes and goes, and is no gain
+- positions relative to walls: 1e-9 of the truss's size (1e-6 with float32); `wilson` satisfies walls at t + theta h and
+  not at the end of the step, so a node may be beyond a wall by at most twice its displacement in (theta - 1) h
+- energy balance: 1e-7 of the largest energy; above 1e-9 it is counted separately
+- energy gain by contact and the scheme without a warning, averaged over the last quarter of the run: 0.05 of the energy
+  input (initial energy, works of loads and temperature; with moving walls the largest energy). Central differences
+  conserve T + U - h^2/8 a.Ma with velocities in the middle of two half steps: the last term, at most (h w/2)^2 U with
+  the highest frequency w, oscillates and is not a gain
 - dissipations: 1e-9 of the largest energy below zero
-- contact work at walls at rest: with `stick` 1e-3 of what was put in, else 0.05 of it in the last quarter
+- contact work at walls at rest: with `stick` 1e-3 of the energy input, else 0.05 of it in the last quarter
 - momentum: 1e-9 of the largest momentum or impulse, or four times the solver's tolerance
 """
 
@@ -36,7 +36,7 @@ LOSSES = ("numerical_dissipation", "impact_dissipation", "friction_dissipation")
 
 
 def check_result(folder: Path, warned: list[str]) -> Faults:
-    """All checks of a result that is complete."""
+    """Run all checks of a complete result."""
     result = Loaded(folder)
     case, history = result.case, result.history
     faults = _finite(result)
@@ -49,7 +49,7 @@ def check_result(folder: Path, warned: list[str]) -> Faults:
 
 
 def energy_scale(history: dict[str, np.ndarray]) -> float:
-    """The largest of all energies, works and dissipations of a run [J]."""
+    """Return the largest of all energies, works and dissipations of a run [J]."""
     return max(float(np.abs(column).max()) for name, column in history.items() if name.endswith(_ENDS))
 
 
@@ -61,7 +61,7 @@ def _finite(result: Loaded) -> Faults:
 
 
 def _walls(result: Loaded, case: Case, history: dict[str, np.ndarray]) -> Faults:
-    """No node is beyond a wall in a snapshot."""
+    """Check that no node is beyond a wall in a snapshot."""
     faults: Faults = []
     if not len(result.steps) or not case.wall:
         return faults
@@ -220,7 +220,7 @@ def _gains(case: Case, history: dict[str, np.ndarray], warned: list[str], scale:
 
 
 def _momentum(case: Case, history: dict[str, np.ndarray]) -> Faults:
-    """Momentum is that at the start and all recorded impulses, where the history has them."""
+    """Check that momentum is the initial momentum plus all recorded impulses, if the history has them."""
     if "external_impulse" not in history:
         return []
     parts = {"external": history["external_impulse"], "supports": history["support_impulse"]}

@@ -1,4 +1,4 @@
-"""Run cases in this process, one after the other, on the ranks of a communicator."""
+"""Runs cases in this process, one after the other, on the ranks of a communicator."""
 
 from __future__ import annotations
 
@@ -26,25 +26,25 @@ from pfem_petsc.errors import EarlyStop, InputError, SimulationFailure
 __all__ = ["Outcome", "case_text", "run_case", "run_in_two_parts"]
 
 COLLECT = 20
-"""Cases between collections of garbage, which take as long as a case."""
+"""Number of cases between garbage collections, which take as long as a case."""
 _cleared = 0
 GRACE = 20.0
-"""Seconds in which all ranks must come to the end of a case."""
+"""Seconds in which all ranks must reach the end of a case."""
 STATUS = {InputError: 2, SimulationFailure: 3}
 _PLACE = re.compile(r"\bstep \d|\bt = ")
 
 
 @dataclass
 class Outcome:
-    """How a run ended.
+    """Outcome of a run.
 
     Attributes
     ----------
-    status : as of the command line; 1 for an exception that is no message
+    status : as of the command line; 1 for an unexpected exception
     message : of the failure
-    warnings : that the run gave
-    faults : what is wrong with the way in which it ended: (cause, detail)
-    stopped : step at which it was asked to stop, -1 where it was not
+    warnings : of the run
+    faults : of its termination: (cause, detail)
+    stopped : step at which a stop was requested, -1 for none
     """
 
     status: int = 0
@@ -118,7 +118,7 @@ def run_case(
 
 
 def run_in_two_parts(text: str, comm: MPI.Comm, folder: Path, middle: int, source: str = "random.toml") -> Outcome:
-    """Run to a step, stop there on a signal, and go on from the checkpoint. Collective.
+    """Run to a step, stop there on a signal, and continue from the checkpoint. Collective.
 
     The outcome is that of the second part, with the step at which the first one ended.
     """
@@ -147,7 +147,7 @@ def _run_to(simulation: Simulation, comm: MPI.Comm, last: int) -> int:
 
 
 def _jiggle(simulation: Simulation, number: int) -> None:
-    """Move the nodes by 1e-13 of the truss's size; bars keep the lengths at which they are free of stress."""
+    """Move the nodes by 1e-13 of the truss's size without changing the stress-free lengths of bars."""
     state = simulation.stepper.state
     size = float(np.ptp(state.x, axis=0).max())
     change = 1e-13 * size * np.random.default_rng(number).uniform(-1.0, 1.0, state.x.shape)
@@ -163,7 +163,7 @@ def _kind(error: Exception) -> type:
 
 
 def _unclear(outcome: Outcome, source: str) -> list[tuple[str, str]]:
-    """A refusal names the file, a failure the step or the time."""
+    """Check that a refusal names the file, and a failure the step or the time."""
     if outcome.status == 2 and source not in outcome.message:
         return [("refusal does not name the file", outcome.message[:200])]
     if outcome.status == 3 and not _PLACE.search(outcome.message):
@@ -172,7 +172,7 @@ def _unclear(outcome: Outcome, source: str) -> list[tuple[str, str]]:
 
 
 def _meet(comm: MPI.Comm, outcome: Outcome) -> None:
-    """All ranks come here with the same status, or the process ends: the case is then at fault."""
+    """Check that all ranks arrive with the same status; otherwise end the process and blame the case."""
     if comm.size == 1:
         return
     request = comm.Ibarrier()
@@ -188,7 +188,7 @@ def _meet(comm: MPI.Comm, outcome: Outcome) -> None:
 
 
 def clear(comm: MPI.Comm, *folders: Path) -> None:
-    """Remove folders, and what PETSc and Python hold of earlier cases. Collective."""
+    """Remove folders, and PETSc and Python objects of earlier cases. Collective."""
     global _cleared
     _cleared += 1
     if _cleared % COLLECT == 0:

@@ -1,10 +1,10 @@
-"""Explicit and implicit schemes at small steps: both tend to the same motion, so that they differ by their errors.
+"""Comparison of explicit and implicit schemes at small steps, which must converge to the same motion.
 
-A case is run with an explicit scheme and an implicit one, at steps h and h/2. What halving the step changes in each is
-the error of the better half, to first order (impacts leave no more); where both converge to the same motion, their
-distance is at most the sum of these errors. The bound is :data:`MARGIN` times that, and so shrinks with h. It is
-calibrated by each case itself: motions that are chaotic, or that yield within few steps, have large errors and are
-not judged.
+A case is run with an explicit and an implicit scheme at steps h and h/2. For each scheme the change between the two
+steps is the error of the smaller step, to first order (impacts allow no more). If both converge to the same motion,
+their distance is at most the sum of these errors. The bound is :data:`MARGIN` times that, so it decreases with h and is
+calibrated by each case itself: motions that are chaotic, or that yield within few steps, have large errors and are not
+judged.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ __all__ = ["judge_schemes", "pair_of"]
 
 MARGIN = 4.0
 EXACT = 1e-6
-"""Part of the size and of the largest energy that counts as equal."""
+"""Differences below this fraction of the size, or of the largest energy, count as equal."""
 VAGUE = 0.05
-"""Errors of this part of the motion, or of the energy, say nothing."""
+"""Errors above this fraction of the motion, or of the energy, are inconclusive."""
 FIRST = 0.25
-"""The larger step over the limit of central differences."""
+"""The larger step relative to the limit of central differences."""
 STEPS = 160
-"""Most of them."""
+"""Maximum number of steps."""
 EXPLICIT = ("central_differences", {}), ("hulbert_chung", {"rho_b": 0.8}), ("chung_lee", {})
 IMPLICIT = (
     ("newmark", {"beta": 0.25, "gamma": 0.5}),

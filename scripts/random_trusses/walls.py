@@ -1,4 +1,4 @@
-"""Walls of a random case, put where the body meets them."""
+"""Walls of a random case, placed where the body hits them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def draw_walls(
     time: dict[str, Any],
     pair: dict[str, Any] | None,
 ) -> list[dict[str, Any]]:
-    """Tables of no wall to three; the first ones stand in the body's way."""
+    """Return tables of zero to three walls; the first ones are in the path of the body."""
     count = chance.choices((0, 1, 2, 3), (5, 55, 28, 12) if pair is None else (40, 45, 15, 0))[0]
     if treatment == "mass_redistribution":
         count = min(count, 1) or 1

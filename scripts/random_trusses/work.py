@@ -1,4 +1,4 @@
-"""What a worker does with each case: run it, check it, stop and continue it; one line of JSON a case on stdout."""
+"""Worker of random cases: runs, checks, stops and continues each case; one line of JSON per case on stdout."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from .schemes import judge_schemes
 __all__ = ["check_case", "amplification", "judge_ranks", "work"]
 
 CHAOS = 100.0
-"""Runs on different ranks may differ by so many times what a change of the positions by 1e-13 makes of a run."""
+"""Allowed difference between ranks, relative to the effect of a change of the positions by 1e-13."""
 AGREE = 1e-9
 LOOSE = 1e-6
 """The same for implicit runs whose solver stops at its default tolerance of 1e-9."""
 
 
 def check_case(text: str, comm: MPI.Comm, folder: Path, source: str, restart: bool) -> dict:
-    """Run a case, check its results and, where asked, that stopping and continuing changes nothing. Collective.
+    """Run a case, check its results and, if requested, that stopping and continuing changes nothing. Collective.
 
-    The result stays in ``folder``/whole.
+    The result is kept in ``folder``/whole.
     """
     outcome = run_case(text, comm, folder / "whole", source=source)
     told = asdict(outcome) | {"touched": False, "parts": False}
@@ -52,8 +52,8 @@ def check_case(text: str, comm: MPI.Comm, folder: Path, source: str, restart: bo
 
 
 def judge_ranks(text: str, table: dict, one: Path, other: Path, folder: Path, source: str) -> list[tuple[str, str]]:
-    """Whether results of one rank and of several agree; chaotic runs are those that a change of the positions by 1e-13
-    of the size parts as far."""
+    """Check that results of one rank and of several agree; a run is chaotic if a change of the positions by 1e-13 of
+    the size has the same effect."""
     apart, where = distance(one, other)
     explicit = "solver" not in table and table["time"].get("mass") != "consistent"
     tight = explicit or table.get("solver", {}).get("rtol", 1.0) < 1e-10
@@ -66,7 +66,7 @@ def judge_ranks(text: str, table: dict, one: Path, other: Path, folder: Path, so
 
 
 def amplification(text: str, whole: Path, folder: Path, source: str) -> float:
-    """The largest distance of three runs with changed positions from the run itself, on one rank."""
+    """Return the largest distance of three runs with changed positions from the run itself, on one rank."""
     worst = 0.0
     for number in (1, 2, 3):
         outcome = run_case(text, MPI.COMM_SELF, folder / f"jiggle{number}", source=source, jiggle=number)
@@ -79,10 +79,10 @@ def amplification(text: str, whole: Path, folder: Path, source: str) -> float:
 
 
 def work(mode: str, seeds: Iterable[int], folder: Path, every_restart: int, sources: dict[int, str]) -> None:
-    """The cases of a worker process. Collective.
+    """Process the cases of a worker. Collective.
 
-    ``mode``: "check" runs and checks, "run" only runs, "judge" compares the results of both and takes them away,
-    "schemes" compares explicit and implicit schemes.
+    ``mode``: "check" runs and checks, "run" only runs, "judge" compares the results of both and removes them, "schemes"
+    compares explicit and implicit schemes.
     """
     comm = MPI.COMM_WORLD
     from .draw import draw_case

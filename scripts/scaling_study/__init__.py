@@ -1,1 +1,1 @@
-"""Strong and weak scaling studies: what to run, tables, plots, and a model of larger machines."""
+"""Strong and weak scaling studies: points, tables, plots, and a model of larger machines."""

@@ -1,14 +1,14 @@
-"""A step on many ranks, from parts that were measured on few: loops, halo messages, sums over ranks, Python.
+"""Performance model of a step on many ranks, from measurements on few: loops, halo messages, reductions, Python.
 
 Assumptions
 -----------
-* Explicit steps with a row of history each. A rank's part is a cube; its loops take the measured time a bar of a run in
-  which all cores of a machine were busy, whatever the part's size (parts that fit in a cache are faster).
-* Bars that cross from one rank to another are evaluated on both. A cubic lattice has 5 of them a node of a face, half
-  of which are a rank's own.
-* One exchange a step of 24 B a ghost with at most 26 neighbours, not overlapped with the loops; every message pays the
-  latency, all share a rank's part of the network.
-* One sum over all ranks a row of history, log2(ranks) stages of one latency each, at least what was measured.
+* Explicit steps with a row of history each. The part of a rank is a cube; its loops take the time per bar measured with
+  all cores of a machine busy, independent of the size of the part (parts that fit in a cache are faster).
+* Bars between two ranks are evaluated on both. A cubic lattice has 5 of them per node of a face, half of which belong
+  to a rank itself.
+* One exchange per step of 24 B per ghost with at most 26 neighbours, not overlapped with the loops; every message costs
+  the latency, and all share a rank's part of the network.
+* One reduction over all ranks per row of history, log2(ranks) stages of one latency each, at least as measured.
 * Python and library calls take the measured time of a step of a tiny model on one rank.
 * No noise of the operating system and no imbalance beyond one layer of nodes.
 """
@@ -25,7 +25,7 @@ import numpy as np
 from matplotlib import pyplot as plt
 
 NEIGHBOURS = 26
-CROSSING = 5.0  # bars a node of a face between two parts of a cubic lattice
+CROSSING = 5.0  # bars per node of a face between two parts of a cubic lattice
 
 
 @dataclass(frozen=True)

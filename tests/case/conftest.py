@@ -1,4 +1,4 @@
-"""A small case that the tests of this folder break in one place each."""
+"""A small case in which each test of this folder introduces one error."""
 
 import pytest
 

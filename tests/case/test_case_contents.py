@@ -1,4 +1,4 @@
-"""A case as read: values, defaults, overrides, and the text that reads back equal."""
+"""A case as read: values, defaults, overrides, and the text from which an equal case is read."""
 
 import pickle
 import tomllib

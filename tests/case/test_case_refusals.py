@@ -1,4 +1,4 @@
-"""Every wrong key or value is refused with the file, the key path, the value and what is expected."""
+"""Every invalid key or value is refused with the file, the key path, the value and what is expected."""
 
 import pytest
 

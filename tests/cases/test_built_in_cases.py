@@ -1,4 +1,4 @@
-"""Every built-in case runs, and gives the number that its comments promise."""
+"""Every built-in case runs and reproduces the number in its comments."""
 
 import numpy as np
 import pytest

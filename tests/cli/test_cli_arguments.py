@@ -1,4 +1,4 @@
-"""Words of the command line, in this process: help, refusals, status; what is imported for them."""
+"""Arguments of the command line, in this process: help, refusals, status, and imported modules."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""What ``info`` says about a result."""
+"""Output of ``info`` about a result."""
 
 from pathlib import Path
 from types import SimpleNamespace

@@ -1,4 +1,4 @@
-"""From a case to results, and from results to what is said and drawn about them, by the command line."""
+"""From a case to results, and from results to summaries and pictures, by the command line."""
 
 import re
 

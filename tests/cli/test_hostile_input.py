@@ -1,4 +1,4 @@
-"""Input that nobody means, each with one message and status 2, and no traceback."""
+"""Hostile input: each is refused with one message and status 2, without a traceback."""
 
 import os
 import subprocess

@@ -1,4 +1,4 @@
-"""The alarm of contact: a node beyond a wall ends the run, and what schemes legitimately leave does not."""
+"""Check of positions: a node beyond a wall ends the run, except by the margin that a scheme legitimately leaves."""
 
 import re
 
@@ -67,7 +67,7 @@ def test_supports_that_carry_a_node_through_a_wall_are_told(mass, tied, comm, sh
     keys = [f'support=[{{node_set="tip", fix="x", {motion}}}]', f"wall.0.tied={tied}", f'time.mass="{mass}"']
     with pytest.raises(SimulationFailure) as failure:
         run(comm, shared_tmp_path, "output.fields_every=10", *keys)
-    message = r"node 20 is 0.0\d+ m beyond wall 'wall' \(1 node in all\), where its supports take it"
+    message = r"node 20 is 0.0\d+ m beyond wall 'wall' \(1 node in all\), moved there by its supports"
     assert all(re.search(message, text) for text in comm.allgather(str(failure.value)))
 
 
@@ -90,5 +90,5 @@ def test_supports_that_carry_a_node_through_a_rectangle_are_told(scheme, beside,
         return
     with pytest.raises(SimulationFailure) as failure:
         run(comm, shared_tmp_path, *keys)
-    message = r"node 20 is 0.0\d+ m beyond wall 'plate' \(1 node in all\), where its supports take it"
+    message = r"node 20 is 0.0\d+ m beyond wall 'plate' \(1 node in all\), moved there by its supports"
     assert all(re.search(message, text) for text in comm.allgather(str(failure.value)))

@@ -1,4 +1,4 @@
-"""Every kind of wall can be drawn: its surface lies on the wall."""
+"""Every wall type can be drawn, with its surface on the wall."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Oblique nodal coordinates: planes become bounds, rows stay independent, axes stay where they can."""
+"""Oblique nodal coordinates: planes become bounds, rows are independent, and axes are kept if possible."""
 
 import numpy as np
 import pytest

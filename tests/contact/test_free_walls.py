@@ -169,7 +169,7 @@ def test_parallel_walls_that_carry_a_node_together_are_told(comm, shared_tmp_pat
     """Which of them carries it is not determined: the run ends, instead of going on with either."""
     with pytest.raises(SimulationFailure) as failure:
         _rammed([-1.0, 0.0, 0.0], "central_differences", comm, shared_tmp_path)
-    assert all("walls with mass ('ram') found no place" in text for text in comm.allgather(str(failure.value)))
+    assert all("walls with mass ('ram') have no position" in text for text in comm.allgather(str(failure.value)))
 
 
 def _rammed(normal, integrator, comm, folder):

@@ -1,4 +1,4 @@
-"""A truss that lies on a wall stays there: at rest from the first row on, with its weight as the wall's force."""
+"""A truss that lies on a wall stays at rest from the first row, with its weight as the wall's force."""
 
 import h5py
 import numpy as np

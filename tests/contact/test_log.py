@@ -1,4 +1,4 @@
-"""Contact times between rows of the history that are far apart: bounded memory, the same sums."""
+"""Contact times with few rows of the history: bounded memory and equal sums."""
 
 from types import SimpleNamespace
 

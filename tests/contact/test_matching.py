@@ -1,4 +1,4 @@
-"""Nearest neighbours across a direction: the same as by looking at all, ties included, and fast."""
+"""Nearest neighbours in a plane: equal to an exhaustive search, including ties, and fast."""
 
 import time
 

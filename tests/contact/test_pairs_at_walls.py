@@ -1,4 +1,4 @@
-"""Contact pairs whose nodes walls stop as well."""
+"""Contact pairs whose nodes walls stop too."""
 
 import numpy as np
 import pytest

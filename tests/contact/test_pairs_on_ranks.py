@@ -1,4 +1,4 @@
-"""Pairs live where their nodes do: nothing of the size of all pairs on a rank, and the results of one rank."""
+"""Pairs are distributed with their nodes: no array of the size of all pairs, and the results of one rank."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""Bars that walls pass through between their nodes are told: before the run, at snapshots, at its end."""
+"""Bars that walls pass through between their nodes are reported before the run, at snapshots, and at its end."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Models that run after one another in a process do not see each other."""
+"""Models that run one after the other in a process do not affect each other."""
 
 import gc
 from pathlib import Path

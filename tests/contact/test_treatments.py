@@ -1,4 +1,4 @@
-"""Treatments of impact: what each keeps, on the rod whose exact force is constant and which loses no energy."""
+"""Treatments of impact: what each conserves, for the rod whose exact force is constant and which loses no energy."""
 
 import numpy as np
 import pytest

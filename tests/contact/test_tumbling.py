@@ -1,4 +1,4 @@
-"""A truss that tumbles in a closed box: nobody gets out, and energy does not grow where that is promised."""
+"""A truss that tumbles in a closed box: no node gets out, and energy does not grow with schemes that guarantee this."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Walls turned with everything else change nothing but the frame."""
+"""Rotating walls and truss together changes only the frame."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Kinds of walls: where they are, whom they stop, how they move, where nodes may start."""
+"""Wall types: position, nodes that they stop, motion, and initial positions of nodes."""
 
 import numpy as np
 import pytest

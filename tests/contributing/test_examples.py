@@ -1,4 +1,4 @@
-"""The examples of CONTRIBUTING.md: each is put into the package as one file, found by its name, and run."""
+"""The examples of CONTRIBUTING.md: each is added to the package as one file, found by its name, and run."""
 
 from __future__ import annotations
 

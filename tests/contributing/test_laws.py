@@ -140,8 +140,8 @@ def test_law_without_mean_stress_is_refused_by_the_energy_momentum_scheme(exampl
     path.write_text(one_bar("energy_momentum", 2e-3, 10).to_toml())
     assert main(["run", str(path), "-o", str(tmp_path / "out")]) == 2
     said = capsys.readouterr().err
-    assert 'material.it.law = "viscoplastic" does not go with time.integrator = "energy_momentum"' in said
-    assert "mean_stress" in said and "take another integrator or law" in said
+    assert 'material.it.law = "viscoplastic" is not compatible with time.integrator = "energy_momentum"' in said
+    assert "mean_stress" in said and "use another integrator or law" in said
 
 
 def test_unknown_law_and_keys_of_another_are_refused(examples):

@@ -1,4 +1,4 @@
-"""Failures provoked on the way, on two ranks: all end, with status 3, one message, readable results."""
+"""Failures provoked during runs on two ranks: both end with status 3, one message and readable results."""
 
 import subprocess
 import sys

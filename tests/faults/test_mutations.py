@@ -1,4 +1,4 @@
-"""Three hundred case and mesh files with mistakes; thousands by scripts/fuzz.py."""
+"""Three hundred case and mesh files with random mistakes; scripts/fuzz.py tries thousands."""
 
 import subprocess
 import sys

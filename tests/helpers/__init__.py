@@ -1,1 +1,1 @@
-"""What several tests share: cases, bodies, meshes, runs of the program and their comparison."""
+"""Helpers shared by several tests: cases, bodies, meshes, runs of the program and their comparison."""

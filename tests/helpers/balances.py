@@ -1,4 +1,4 @@
-"""Rods for tests of energies and impulses, and what these leave over."""
+"""Rods for tests of energies and impulses, and their imbalances."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MIDDLE = [[0.2, -1.0, -1.0], [0.3, 1.0, 1.0]]
 
 
 def case(integrator, *, step, steps, treatment="scheme", mass="lumped", mesh=None, walls=(), **more) -> Case:
-    """A rod, or what is asked for, of 1 kg/m."""
+    """Return the case of a rod, or of another mesh, with 1 kg/m."""
     return Case.from_dict(
         {
             "mesh": mesh or {"generator": "rod", "length": 1.0, "elements": 1},
@@ -37,7 +37,7 @@ def case(integrator, *, step, steps, treatment="scheme", mass="lumped", mesh=Non
 
 
 def unexplained(history) -> float:
-    """Momentum that no impulse explains, relative to the largest impulse."""
+    """Return the momentum not accounted for by impulses, relative to the largest impulse."""
     momentum = history["momentum"] - history["momentum"][0]
     names = [name for name in history if name.endswith(("_impulse", "/impulse"))]
     names = [name for name in names if not name.startswith("pair/")]  # they cancel

@@ -1,4 +1,4 @@
-"""Two lattices that fly at each other, with pairs between their faces, as a mesh file in any frame."""
+"""Two lattices that collide, with contact pairs between their faces, as a mesh file in any frame."""
 
 import numpy as np
 import pyvista as pv

@@ -1,4 +1,4 @@
-"""Whole meshes put together from the ranks' parts, to check them against."""
+"""Whole meshes assembled from the parts of all ranks, as a reference."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pfem_petsc.mesh.slab import MeshSlab, slab_range
 
 
 def whole(slab: MeshSlab, comm: MPI.Comm) -> MeshSlab:
-    """The mesh of all slabs, on every rank."""
+    """Return the mesh of all slabs on every rank."""
 
     def joined(parts: np.ndarray) -> np.ndarray:
         return np.concatenate(comm.allgather(parts))
@@ -36,7 +36,7 @@ def slab_from(
     node_groups: dict[str, list[int]] | None = None,
     bar_groups: dict[str, list[int]] | None = None,
 ) -> MeshSlab:
-    """This rank's slab of a small mesh that every rank has whole."""
+    """Return this rank's slab of a small mesh that every rank has."""
     points, bars = np.asarray(points, dtype=float).reshape(-1, 3), np.asarray(bars, dtype=np.int64).reshape(-1, 2)
     nodes = slab_range(len(points), comm.rank, comm.size)
     edges = slab_range(len(bars), comm.rank, comm.size)
@@ -59,7 +59,7 @@ def slab_from(
 
 
 def stiffness_modes(points: np.ndarray, bars: np.ndarray) -> int:
-    """Motions of the nodes that stretch no bar: 6 for a braced space truss that floats."""
+    """Return the number of motions that stretch no bar: 6 for a braced, unsupported space truss."""
     direction = points[bars[:, 1]] - points[bars[:, 0]]
     direction /= np.linalg.norm(direction, axis=1)[:, None]
     stretch = np.zeros((len(bars), len(points), 3))

@@ -1,4 +1,4 @@
-"""Result files of a truss of the tests, and what readers find in them."""
+"""Result files of a test truss, and checks of their content by readers."""
 
 import numpy as np
 import pyvista
@@ -20,7 +20,7 @@ def write_all(path, comm=COMM, **changes):
 
 
 def read_with_vtk(path, step):
-    """Grid of a step by VTK's own reader, and how many steps there are."""
+    """Return the grid of a step, and the number of steps, by the reader of VTK."""
     reader = vtkHDFReader()
     reader.SetFileName(str(path))
     reader.UpdateInformation()

@@ -1,4 +1,4 @@
-"""Runs that are killed at any moment and restarted until they are done, and what must then be equal."""
+"""Runs that are killed at any time and restarted until they are done, and comparison of their results."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ PATIENCE = 600.0  # seconds that any single run may take, on a machine with othe
 
 
 class Kind(NamedTuple):
-    """A case, with what is set in it."""
+    """A case with its overrides."""
 
     case: str
     overrides: tuple[str, ...]
@@ -79,7 +79,7 @@ def processes_of(process: subprocess.Popen, ranks: int) -> list[int]:
 
 
 LEFT_OVER = ", and the launcher did not notice"
-"""mpirun of Open MPI 4 was seen, once in a hundred, not to reap the rank that was killed; it is killed then too."""
+"""In one of a hundred kills mpirun of Open MPI 4 does not notice that a rank was killed; it is then killed too."""
 
 
 def killed(
@@ -92,7 +92,7 @@ def killed(
     *more: str,
     python: str = sys.executable,
 ) -> str:
-    """Start a run and kill all its ranks, or one of them, at a random moment; says when, or that it was done before."""
+    """Start a run and kill all its ranks, or one of them, at a random time; return when, or that it had finished."""
     process = subprocess.Popen(
         command(ranks, *words(kind, folder, every, *more), python=python),
         env=environment(),
@@ -154,7 +154,7 @@ for line in sys.stdin:
 
 
 class VtkReader:
-    """VTK's own reader in a process of its own, which a file that it cannot read may end."""
+    """The reader of VTK in a separate process, because an unreadable file may crash it."""
 
     def __enter__(self) -> VtkReader:
         self.process = subprocess.Popen(
@@ -168,7 +168,7 @@ class VtkReader:
         self.process.stdout.close()
 
     def steps(self, path: Path) -> int:
-        """How many time steps VTK sees; it has read the first, one between and the last. -1 if it could not."""
+        """Return the number of time steps in VTK, after reading the first, a middle and the last; -1 on errors."""
         self.process.stdin.write(f"{path}\n")
         self.process.stdin.flush()
         answer = self.process.stdout.readline()
@@ -177,7 +177,7 @@ class VtkReader:
 
 
 def assert_readable(path: Path, vtk: VtkReader) -> int:
-    """Open what a kill has left, by VTK and by the package; gives its snapshots."""
+    """Open the file of a killed run with VTK and with the package; return the number of snapshots."""
     with open_result(path) as result:
         n = len(result.times)
         assert list(result.times) == sorted(set(result.times)), f"times {result.times}"
@@ -194,7 +194,7 @@ def assert_readable(path: Path, vtk: VtkReader) -> int:
 
 
 def differences(one: Path, other: Path) -> dict[str, float]:
-    """Datasets of two results that are not equal bit for bit, with the largest difference over the largest value."""
+    """Return the datasets of two results that are not bitwise identical, with the largest relative difference."""
     found = {}
     with h5py.File(one, "r", locking=False) as a, h5py.File(other, "r", locking=False) as b:
         names = [_datasets(file) for file in (a, b)]

@@ -10,11 +10,11 @@ OF_A_LAUNCH = (
     *("PMIX_", "PMI_", "OPAL_", "ORTE_", "OMPI_COMM_", "OMPI_APP_", "OMPI_UNIVERSE_"),
     *("OMPI_MCA_orte_", "OMPI_MCA_ess", "OMPI_MCA_pmix"),
 )
-"""What MPI leaves in the environment of a process that has started it, and that would confuse another launch."""
+"""Variables that MPI sets in the environment of a process and that would confuse another launch."""
 
 
 def environment() -> dict[str, str]:
-    """That of a process which no launcher has started."""
+    """Return the environment of a process without a launcher."""
     variables = {
         name: value for name, value in os.environ.items() if not name.startswith((*OF_A_LAUNCH, "PYTEST_XDIST_"))
     }

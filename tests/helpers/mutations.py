@@ -1,4 +1,4 @@
-"""Case and mesh files with mistakes put in by chance, and what ``check`` makes of them."""
+"""Case and mesh files with random mistakes, and the response of ``check`` to them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pfem_petsc.cli.main import main
 
 from .samples import GMSH, write_hdf5, write_vtk
 
-# What a refusal names besides the file: of a case a key or a line, of a mesh a section, line, dataset, node or bar.
+# A refusal must name, besides the file, a key or line of a case, or a section, line, dataset, node or bar of a mesh.
 OF_A_CASE = re.compile(
     r"line \d+|end of document|^(no |the table )?\[|^[\w.\[\]\"'\\-]+( = | \(|: )|^\.\.\. and|^wall '"
 )
@@ -77,7 +77,7 @@ end = 1e-3
 
 
 def mutated_bytes(raw: bytes, chance: random.Random) -> bytes:
-    """One to four changes of bytes: flipped, removed, repeated, moved, cut off, put in."""
+    """Apply one to four changes of bytes: flip, remove, repeat, move, truncate, insert."""
     raw = bytearray(raw)
     for _ in range(chance.choice([1, 1, 2, 4])):
         n = max(len(raw), 1)
@@ -104,7 +104,7 @@ def mutated_bytes(raw: bytes, chance: random.Random) -> bytes:
 
 
 def mutated_text(text: str, chance: random.Random) -> str:
-    """One to three changes of what a user types: values, keys, lines."""
+    """Apply one to three changes of user input: values, keys, lines."""
     for _ in range(chance.choice([1, 1, 1, 2, 3])):
         lines = text.split("\n")
         at = chance.randrange(len(lines))
@@ -134,14 +134,14 @@ def mutated_text(text: str, chance: random.Random) -> str:
 
 
 def small_cases() -> list[str]:
-    """Texts of the built-in cases, with meshes that are made at once."""
+    """Return the texts of the built-in cases with small meshes."""
     folder = Path(pfem_petsc.__file__).parent / "cases"
     texts = [(folder / f"{name}.toml").read_text() for name in built_in_cases()]
     return [re.sub(r"cells = \[[^\]]*\]", "cells = [2, 2, 2]", text) for text in texts]
 
 
 def sound_meshes(folder: Path) -> list[Path]:
-    """Small mesh files of every kind that is read."""
+    """Write small mesh files of every supported format."""
     folder.mkdir(parents=True, exist_ok=True)
     found = []
     for name, raw in GMSH.items():
@@ -154,7 +154,7 @@ def sound_meshes(folder: Path) -> list[Path]:
 
 
 class TooSlow(BaseException):
-    """The check did not end in time; no Exception, so that nothing catches it."""
+    """The check did not end in time; not an Exception, so that nothing catches it."""
 
 
 def _ring(*_: object) -> None:

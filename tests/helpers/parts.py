@@ -1,4 +1,4 @@
-"""A run on all ranks, the same in two parts, and the same on one rank."""
+"""A run on all ranks, the same run in two parts, and the same run on one rank."""
 
 from __future__ import annotations
 

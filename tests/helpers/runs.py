@@ -1,4 +1,4 @@
-"""Runs of cases and what is read off their histories."""
+"""Runs of cases and quantities from their histories."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One small truss in every file format that is read, made by other writers where there are some."""
+"""One small truss in every supported file format, written by other programs if possible."""
 
 from __future__ import annotations
 

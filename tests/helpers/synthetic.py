@@ -86,7 +86,7 @@ class SyntheticResult:
         self.history["probe/tip/position"] = np.cumsum(self.history["probe/tip/velocity"], axis=0) * fine[1]
 
     def _push(self, time):
-        """How far (0 .. ) the nearest node would be beyond the wall."""
+        """Return the depth (0 .. ) of the nearest node beyond the wall."""
         return np.clip(1.35 * self._away.min() * np.sin(np.pi * time / self._end) - self._away.min(), 0, None)
 
     def positions(self, index):
@@ -108,7 +108,7 @@ class SyntheticResult:
 
 
 def write_result(folder: Path, snapshots: int = 5) -> Path:
-    """A real result file of the case ``rod_impact`` with the motion made up; gives its path."""
+    """Write a real result file of the case ``rod_impact`` with synthetic motion; return its path."""
     from mpi4py import MPI
 
     from pfem_petsc.case.schema import Case

@@ -1,4 +1,4 @@
-"""Several runs that are started into one folder at once: one works, the others say why, and nothing is lost."""
+"""Several runs started into one folder at once: one works, the others are refused, and nothing is lost."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SHARED = ("mesh.elements=8", "time.step=0.02", "output.fields_every=100", "outpu
 FIRST, LATER = 1000, 1500  # steps of the runs, and of those that continue them
 LONGEST = 0.4  # seconds between the first start and the last
 REFUSED = "another run is writing into this folder"
-CHANGED = "another run has written this checkpoint anew"
+CHANGED = "another run has overwritten this checkpoint"
 
 
 def words(folder: Path, steps: int, *more: str) -> list[str]:
@@ -31,9 +31,9 @@ def words(folder: Path, steps: int, *more: str) -> list[str]:
 
 
 def start_together(lines: list[list[str]], chance: random.Random) -> Counter:
-    """Start all at nearly the same time, wait for all; how many worked, were refused, and did something else.
+    """Start all at nearly the same time and wait; return how many worked, were refused, and had another outcome.
 
-    They are forks of this process, on one rank each: what takes seconds to import is there already.
+    They are forks of this process, on one rank each, so that imports are already done.
     """
     found = Counter()
     with tempfile.TemporaryDirectory() as folder:
@@ -50,7 +50,7 @@ def start_together(lines: list[list[str]], chance: random.Random) -> Counter:
 
 
 def _fork(function: Callable[[], int], told: Path) -> int:
-    """Call a function in a process of its own, whose status is what it gives; stderr goes to a file."""
+    """Call a function in a forked process, whose status is its result; stderr goes to a file."""
     pid = os.fork()
     if pid:
         return pid
@@ -63,12 +63,12 @@ def _fork(function: Callable[[], int], told: Path) -> int:
 
 
 def play(folder: Path, reference: Path, chance: random.Random) -> tuple[Counter, Counter]:
-    """One round in a new folder: three starts, then two restarts; what became of them.
+    """Run one round in a new folder, three starts and then two restarts; return the outcomes.
 
     Raises
     ------
     AssertionError
-        Something was lost, or differs from ``reference``, the result of a run that nobody disturbed.
+        If data were lost, or differ from ``reference``, the result of a single run.
     """
     out = folder / "out"
     starts = start_together([words(out, FIRST) for _ in range(3)], chance)

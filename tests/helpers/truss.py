@@ -1,4 +1,4 @@
-"""A small distributed truss with the attributes of a DistributedMesh, and results for it that are known everywhere."""
+"""A small distributed truss with the attributes of a DistributedMesh, and results that all ranks know."""
 
 from types import SimpleNamespace
 
@@ -58,7 +58,7 @@ class Truss:
         return self.reference + wave, point_data, cell_data
 
     def snapshot(self, step):
-        """What this rank gives to ``write_snapshot``: bars not counted here are spoilt."""
+        """Return this rank's arguments of ``write_snapshot``; values of bars not counted here are invalid."""
         points, point_data, cell_data = self.whole(step)
         cells = {name: values[self.local_bars].copy() for name, values in cell_data.items()}
         for block in self.mesh.blocks:

@@ -1,4 +1,4 @@
-"""The same problem in another frame: mesh, velocities and walls turned together."""
+"""The same problem in a rotated frame: mesh, velocities and walls are rotated together."""
 
 import copy
 
@@ -11,7 +11,7 @@ from pfem_petsc.mesh import load_slab
 
 
 def with_mesh_file(case, file, turn=None, shake=0.0):
-    """The case with its generated mesh in a file, nodes shaken by so much [m] and turned, and all the rest."""
+    """Return the case with its mesh in a file, nodes perturbed by ``shake`` [m], and everything rotated by ``turn``."""
     turn = np.eye(3) if turn is None else turn
     slab = load_slab(Case.from_dict(case).mesh, MPI.COMM_SELF)
     points = slab.points + shake * np.random.default_rng(1).uniform(-1.0, 1.0, slab.points.shape)

@@ -1,4 +1,4 @@
-"""Velocity and acceleration of a node that is stopped and held: the recursion that makes contact smooth or chatter."""
+"""Velocity and acceleration of a node that is stopped and fixed: the recursion that determines chatter."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Loops that are compiled by a process are noticed, those that are loaded are not, and a run says so."""
+"""Loops that a process compiles are reported by the run; loops loaded from the cache are not."""
 
 import importlib
 import os

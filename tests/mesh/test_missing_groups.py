@@ -1,4 +1,4 @@
-"""A group that a mesh lacks is refused with the way to make one."""
+"""A group that a mesh does not have is refused with instructions to create one."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Whatever a mesh file holds, it is read or refused with a message that names it."""
+"""Any mesh file is read, or refused with a message that names the file."""
 
 import numpy as np
 import pytest
@@ -36,7 +36,7 @@ def refusal(path):
         ("2.2", "$Nodes\n4", "$Nodes\n999999999999", "its counts declare 3999999999996 numbers where 16 are left"),
         ("2.2", "$Nodes\n4", "$Nodes\n-4", "section $Nodes: -4 ... -4 are not counts"),
         ("2.2", "7 1.0 0.0 0.0", "7 1.0 zero 0.0", "section $Nodes, line 3: 'zero' is not a number"),
-        ("2.2", "7 1.0 0.0 0.0", "10 1.0 0.0 0.0", "section $Nodes: node 10 is there more than once"),
+        ("2.2", "7 1.0 0.0 0.0", "10 1.0 0.0 0.0", "section $Nodes: node 10 is listed more than once"),
         ("2.2", "7 1.0 0.0 0.0", "7.5 1.0 0.0 0.0", "7.5 is not a count or a tag"),
         ("2.2", "7 1.0 0.0 0.0", "7 1.0 inf 0.0", "1 nodes have coordinates that are not numbers"),
         ("2.2", "2 1 2 0 1 10 7", "2 1 2 0 1 10 8", "section $Elements: node 8 is not in $Nodes"),

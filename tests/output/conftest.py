@@ -1,4 +1,4 @@
-"""A disk that is soon full."""
+"""A disk that runs full after a few writes."""
 
 import subprocess
 from collections.abc import Iterator

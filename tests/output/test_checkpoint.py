@@ -1,4 +1,4 @@
-"""Checkpoints: bit for bit on any number of ranks, never half a file, and damage is refused with the reason."""
+"""Checkpoints: bitwise on any number of ranks, never incomplete, and damage is refused with the reason."""
 
 import os
 import subprocess

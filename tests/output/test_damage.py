@@ -1,4 +1,4 @@
-"""Results whose bits, bytes or pages have changed: found before they go into anything, and no reason to crash."""
+"""Results with changed bits, bytes or pages: the damage is detected before it is used, and nothing crashes."""
 
 import random
 import shutil

@@ -1,4 +1,4 @@
-"""A result file as a kill leaves it before any single write, at the snapshots where an index of chunks grows."""
+"""A result file after a kill before any single write, at the snapshots at which an index of chunks grows."""
 
 import io
 import subprocess

@@ -1,4 +1,4 @@
-"""What is left of a result file when the writer is killed or the disk runs full."""
+"""The result file after its writer was killed or the disk ran full."""
 
 import os
 import subprocess

@@ -1,4 +1,4 @@
-"""The lock of an output folder: one owner, left behind by kills, and recognised as that."""
+"""The lock of an output folder: one owner, and locks left behind by kills are recognised."""
 
 import json
 import os
@@ -82,7 +82,7 @@ def test_another_machine(folder, change):
     """Nothing is known of its processes: the file is renewed, or not."""
     path = owner(folder, pid=1, start="1", **change)
     os.utime(path, (time.time() - 300,) * 2)
-    with pytest.raises(InputError, match=rf"shown itself 5:0\d ago: if it is dead, remove {path}"):
+    with pytest.raises(InputError, match=rf"renewed its lock 5:0\d ago: if it is dead, remove {path}"):
         FolderLock(folder).take()
     os.utime(path, (time.time() - 2 * module.ABANDONED,) * 2)
     FolderLock(folder).take()

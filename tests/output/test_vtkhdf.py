@@ -1,4 +1,4 @@
-"""The result file: values, structure, and that VTK and ``open_result`` read it, in the same way from any rank count."""
+"""The result file: values, structure, and reading by VTK and ``open_result``, the same for any number of ranks."""
 
 import h5py
 import numpy as np
@@ -162,7 +162,7 @@ def test_going_on_with_another_case_is_refused(shared_tmp_path):
     truss = write_all(path)
     columns = {name: shape for name, shape in options()["columns"].items() if name != "momentum"}
     for changes, message in (
-        ({"cell_fields": ["strain"]}, "has the fields section, stress .CellData., the case asks for strain"),
+        ({"cell_fields": ["strain"]}, "has the fields section, stress .CellData., the case requests strain"),
         ({"columns": {**columns, "momentum": (4,)}}, r"history/momentum: the run records rows of shape \(4,\)"),
         (
             {"columns": {**options()["columns"], "wall/roof/force": (3,)}},

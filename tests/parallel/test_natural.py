@@ -1,4 +1,4 @@
-"""Transfers between owned rows and slabs: every value arrives, bit for bit, for any type, shape and ownership."""
+"""Transfers between owned rows and slabs: every value arrives unchanged, for any type, shape and ownership."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The energy-momentum scheme keeps energy and both momenta of a tumbling elastic truss."""
+"""The energy-momentum scheme conserves energy and both momenta of a tumbling elastic truss."""
 
 import numpy as np
 import pytest

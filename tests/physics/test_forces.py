@@ -1,4 +1,4 @@
-"""Loads over time, moved supports, damping and the halving of steps, against closed forms."""
+"""Loads over time, moving supports, damping and bisection of steps, against closed forms."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""An irregular truss in free flight: what schemes keep, over a thousand steps, on any number of ranks."""
+"""An irregular truss in free flight: conserved quantities over a thousand steps on any number of ranks."""
 
 from pathlib import Path
 

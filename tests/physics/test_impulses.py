@@ -1,4 +1,4 @@
-"""Momentum is the sum of impulses: of contact and its jumps, of damping, and of supports that move."""
+"""Momentum is the sum of impulses: of contact and its jumps, damping, and moving supports."""
 
 from __future__ import annotations
 

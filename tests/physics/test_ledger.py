@@ -1,4 +1,4 @@
-"""What contact does to energy: impact, friction, walls that move or have a mass."""
+"""The effect of contact on energy: impact, friction, walls that move or have mass."""
 
 from __future__ import annotations
 

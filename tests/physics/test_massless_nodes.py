@@ -1,4 +1,4 @@
-"""Nodes without mass are in equilibrium at any time, beside supports that move as well."""
+"""Massless nodes are in equilibrium at any time, even next to moving supports."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Supports that move: a ground record against exact integration, no ringing, reactions, restarts."""
+"""Moving supports: a ground record against exact integration, no spurious oscillations, reactions, restarts."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What is found before a run, against counts made by hand (Maxwell's rule) and against what a run then takes."""
+"""Checks before a run against counts by hand (Maxwell's rule), and forecasts against the actual run."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Random valid cases of the generator in scripts/random_cases.py: what must hold of any result holds of theirs.
+"""Random valid cases of scripts/random_cases.py: their results have the properties that any result must have.
 
 A case that fails: ``python scripts/random_cases.py --seeds SEED --keep DIR`` runs it again and keeps its file.
 """

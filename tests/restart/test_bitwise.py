@@ -1,4 +1,4 @@
-"""A run continued from a checkpoint gives what it would have given: bit for bit on as many ranks, nearly on others."""
+"""A run continued from a checkpoint equals an uninterrupted one: bitwise on as many ranks, nearly on other numbers."""
 
 import numpy as np
 import pytest

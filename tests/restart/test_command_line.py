@@ -1,4 +1,4 @@
-"""What --restart does on the command line."""
+"""The option --restart of the command line."""
 
 import json
 import re
@@ -80,7 +80,7 @@ def test_longer_end_goes_on_without_gap_or_duplicate(copy, capsys):
         ("mesh.elements=21", "mesh.elements: 20 -> 21"),
         ("wall.0.point=[1.06,0,0]", "wall[0].point: [1.05, 0.0, 0.0] -> [1.06, 0.0, 0.0]"),
         ("initial.velocity=[0.4,0,0]", "initial.velocity"),
-        ("output.fields=['velocity']", "keep [output] fields as it was"),
+        ("output.fields=['velocity']", "keep [output] fields unchanged"),
     ],
 )
 def test_other_case_is_refused(copy, change, text, capsys):
@@ -220,7 +220,7 @@ def test_checkpoint_written_anew_between_set_up_and_start(copy):
 
     late = Simulation(Case.load("rod_impact", ["time.end=0.9"]), output=copy, restart=True, quiet=True)
     assert main(rod(copy, "--restart", end=0.8)) == 0
-    with pytest.raises(InputError, match="another run has written this checkpoint anew"):
+    with pytest.raises(InputError, match="another run has overwritten this checkpoint"):
         late.run()
     np.testing.assert_array_equal(steps(copy)[0], range(81))
 

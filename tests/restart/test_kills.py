@@ -1,4 +1,4 @@
-"""A dozen kills at random moments; hundreds by scripts/crash_test.py."""
+"""A dozen kills at random times; scripts/crash_test.py makes hundreds."""
 
 import random
 

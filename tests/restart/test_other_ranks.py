@@ -1,4 +1,4 @@
-"""Restarts on another number of ranks, with nodes elsewhere."""
+"""Restarts on another number of ranks, with another distribution of nodes."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Signals from the first moment of the program on, and what becomes of them after a run."""
+"""Signals from the start of the program, and their handlers after a run."""
 
 import gc
 import os

@@ -1,4 +1,4 @@
-"""Operators without a matrix whose preconditioner has one, of an earlier iteration."""
+"""Matrix-free operators with a lagged preconditioner from an assembled matrix."""
 
 import numpy as np
 import pytest

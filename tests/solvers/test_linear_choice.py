@@ -1,4 +1,4 @@
-"""What the case's wishes, the size of the model and the step make of the linear solver; a restart keeps it."""
+"""Choice of the linear solver by case, size of the model and step; a restart keeps it."""
 
 import pytest
 

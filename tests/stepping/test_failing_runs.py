@@ -1,4 +1,4 @@
-"""Runs that fail on their way: one message with step, node and reasons, on all ranks, and what came before is kept."""
+"""Failing runs: one message with step, node and reasons on all ranks, and earlier results are kept."""
 
 import re
 

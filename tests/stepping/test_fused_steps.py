@@ -1,4 +1,4 @@
-"""Steps made together by one compiled call: the same to the last bit as steps made one by one."""
+"""Fused steps: bitwise identical to single steps."""
 
 from __future__ import annotations
 

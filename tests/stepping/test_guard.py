@@ -1,4 +1,4 @@
-"""The guard of implicit steps: solutions that have nothing to do with the state before are refused, motions are not."""
+"""The guard of implicit steps: solutions unrelated to the previous state are rejected, and motions are not."""
 
 import h5py
 import numpy as np

@@ -1,4 +1,4 @@
-"""What only the model can find wrong: refused before the first step, in the same words on all ranks, with status 2."""
+"""Errors that only the model can detect: refused before the first step, with one message and status 2 on all ranks."""
 
 import pytest
 

@@ -1,1 +1,1 @@
-"""Treatments of impact, one a module; the module's name is the ``treatment`` that case files use."""
+"""Treatments of impact, one per module; the module's name is the ``treatment`` that case files use."""

@@ -1,6 +1,6 @@
-"""What treatments of impact share: a hook after each part of a step, and how a jump of velocities is booked.
+"""Base class of treatments of impact: a hook after each part of a step, and the record of velocity jumps.
 
-The treatment ``scheme`` is none at all: velocity and acceleration of held nodes follow the integrator's own formulas.
+The treatment ``scheme`` changes nothing: velocity and acceleration of nodes in contact follow from the integrator.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ class Jump:
     ----------
     nodes : (m,) owned local indices
     v, a : (m, 3) before the jump [m/s], [m/s2]
-    energy : kinetic energy that this rank's nodes gained [J]
-    memory : what the scheme remembered of them (m, 3), by name
+    energy : kinetic energy gained by this rank's nodes [J]
+    memory : the scheme's arrays at these nodes before the jump (m, 3), by name
     """
 
     nodes: np.ndarray
@@ -41,13 +41,13 @@ class Jump:
 
 
 class Treatment(ABC):
-    """Changes what the integrator makes of nodes that walls hold.
+    """Changes velocities and accelerations of nodes in contact after the integrator has set them.
 
     Attributes
     ----------
-    jump : of the part of a step just made, None where nothing jumped
-    elastic : whether impact loses nothing
-    serves : keys of walls that it goes with, of ``tied``, ``friction`` and ``restitution``
+    jump : of the part of a step just completed, None if no velocity jumped
+    elastic : whether impact conserves energy
+    serves : compatible keys of walls among ``tied``, ``friction`` and ``restitution``
     """
 
     elastic = False
@@ -55,7 +55,7 @@ class Treatment(ABC):
 
     @classmethod
     def refuses(cls, scheme: Scheme) -> str | None:
-        """Why a scheme cannot have the treatment, None where it can."""
+        """Return why the treatment is not compatible with a scheme, None if it is."""
         return None
 
     @classmethod
@@ -65,7 +65,7 @@ class Treatment(ABC):
         Raises
         ------
         InputError
-            On all ranks, for models that cannot have the treatment.
+            On all ranks, for models that are not compatible with the treatment.
         """
 
     def __init__(self, stepper: Stepper) -> None:
@@ -77,16 +77,17 @@ class Treatment(ABC):
 
     @abstractmethod
     def after(self) -> None:
-        """Called after each part of a step, before it is booked: changes v, a and memory of the state."""
+        """Called after each part of a step, before the ledger: changes v, a and memory of the state."""
 
     def held(self, applicable: np.ndarray | bool = True) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Nodes that walls hold (m,), projections (m, 3, 3) on their normals, velocities (m, 3) to have there [m/s].
+        """Return nodes in contact with walls (m,), projections (m, 3, 3) on their normals, and velocities (m, 3) [m/s].
 
-        These are the walls' own, and :meth:`leaving` away from them. Of nodes that walls hold for good or by friction
-        the projection is on all directions. ``applicable`` (walls,) bool: of which walls; default: all.
+        The velocities are those required along the projections: the walls' own, plus :meth:`leaving` away from them.
+        For nodes that are tied or stick by friction the projection is the identity. ``applicable`` (walls,) bool: walls
+        to include; default: all.
 
-        Components that supports prescribe are not changed: projections P are along the others, P v = F^+ N v with the
-        normals N and their free parts F, so that v - P v has no part along the normals.
+        Prescribed components are not changed: projections P act on the others, P v = F^+ N v with the normals N and
+        their free parts F, so that v - P v has no component along the normals.
         """
         stepper = self.stepper
         contact, walls = stepper.model.contact, stepper.solution.walls
@@ -96,7 +97,7 @@ class Treatment(ABC):
         displacements = contact.motion.displacements(stepper.state.time)
         normals, _ = contact.planes(touching, stepper.state.position[nodes], displacements)
         normals = np.where(touching[:, :, None], normals, 0.0)
-        # the normals' pseudo-inverse serves any number of walls at a node, parallel ones too
+        # the pseudo-inverse of the normals handles any number of walls at a node, parallel ones too
         free = np.where(stepper.model.supports.fixed[nodes][:, None, :], 0.0, normals)
         free[(free * free).sum(axis=2) <= FREE_PART] = 0.0
         inverse = np.linalg.pinv(free, rcond=RANK) if len(nodes) else np.zeros((0, 3, normals.shape[1]))
@@ -116,15 +117,15 @@ class Treatment(ABC):
         return nodes, normal, speeds
 
     def leaving(self, nodes: np.ndarray, touching: np.ndarray, normals: np.ndarray, rates: np.ndarray) -> np.ndarray:
-        """Velocities (m, w) at which nodes (m,) leave walls that they touch (m, w), along normals (m, w, 3) [m/s]."""
+        """Return velocities (m, w) [m/s] at which nodes (m,) leave walls that they touch (m, w), along the normals."""
         return np.zeros(touching.shape)
 
     def sticking(self, nodes: np.ndarray, touching: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        """(m, w) bool: walls whose friction keeps nodes (m,) that touch them (m, w) from slipping."""
+        """Return (m, w) bool: walls to which nodes (m,) that touch them (m, w) stick by friction."""
         return np.zeros(touching.shape, dtype=bool)
 
     def set(self, nodes: np.ndarray, v: np.ndarray, a: np.ndarray) -> None:
-        """Give nodes new velocities and accelerations (m, 3), and keep what they were for the ledger."""
+        """Set velocities and accelerations (m, 3) of nodes, and record the previous ones for the ledger."""
         stepper, state = self.stepper, self.stepper.state
         inertia = stepper.model.inertia
         fixed = stepper.model.supports.fixed[nodes]
@@ -142,12 +143,12 @@ class Treatment(ABC):
         stepper.scheme.restart(state, nodes, stepper.part)
 
     def remembered(self, nodes: np.ndarray) -> dict[str, np.ndarray]:
-        """What the scheme remembers of nodes (m,): name to (m, 3)."""
+        """Return the scheme's arrays at nodes (m,): name to (m, 3)."""
         memory = self.stepper.state.memory
         return {name: memory[name][nodes] for name in self.stepper.scheme.remembers if name in memory}
 
     def clear(self) -> None:
-        """Forget the last jump."""
+        """Discard the last jump."""
         self.jump = None
         change = self.stepper.state.memory.get("contact_change")
         if change is not None:

@@ -1,10 +1,10 @@
 """The velocity update of Laursen and Love (2002): contact does no work, step by step.
 
-The normal velocity of a held node takes back the work W that contact did on it: m (v+^2 - v^2)/2 = -W, away from the
-wall. Its acceleration is the one without contact, so that the next step knows nothing of this contact force. Where W is
-positive and more than the node's energy, what is left is taken back in the steps to come. Of a contact pair the same
-holds for the velocity of its nodes relative to each other and their reduced mass; what is left is kept with its second
-node. For schemes whose balance holds at x_{n+1}.
+The normal velocity of a node in contact is changed such that it cancels the work W of contact: m (v+^2 - v^2)/2 = -W,
+away from the wall. Its acceleration is the one without contact, so that this contact force does not affect the next
+step. If W is positive and exceeds the energy of the node, the remainder is cancelled in later steps. For a contact pair
+the same holds with the relative velocity and reduced mass of its nodes; the remainder is stored at its second node. For
+schemes whose balance holds at x_{n+1}.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ INTEGRATORS = "pfem_petsc.integrators"
 
 
 class Treatment(Base):
-    """Velocity of held nodes such that contact does no work."""
+    """Sets the velocity of nodes in contact such that contact does no work."""
 
     elastic = True
 
@@ -34,7 +34,7 @@ class Treatment(Base):
         return f"goes with the integrators {', '.join(name for name, one in schemes.items() if one.force_acts_once)}"
 
     def before(self) -> None:
-        """Keep where nodes start, and the forces there."""
+        """Record the initial positions of nodes and the forces there."""
         state = self.stepper.state
         self._start = state.position.copy()
         change = state.memory.get("contact_change")
@@ -53,7 +53,7 @@ class Treatment(Base):
             self.set(nodes, v, a)
 
     def _work(self, nodes: np.ndarray) -> np.ndarray:
-        """Work (m,) [J] of contact on nodes (m,) in this part of the step."""
+        """Return the work (m,) [J] of contact on nodes (m,) in this part of the step."""
         state = self.stepper.state
         force = state.contact[nodes]
         if self.stepper.scheme.balance_at_endpoints:
@@ -61,7 +61,7 @@ class Treatment(Base):
         return np.einsum("mi,mi->m", force, state.position[nodes] - self._start[nodes])
 
     def _accelerations(self, nodes: np.ndarray, normal: np.ndarray) -> np.ndarray:
-        """Accelerations (m, 3), without contact along what projections (m, 3, 3) keep."""
+        """Return accelerations (m, 3), without contact along the range of projections (m, 3, 3)."""
         state = self.stepper.state
         force = (state.external - state.f[: len(state.a)])[nodes]
         free = force / self.stepper.model.inertia.mass[nodes, None]
@@ -69,11 +69,11 @@ class Treatment(Base):
         return state.a[nodes] + np.einsum("mij,mj->mi", normal, free - state.a[nodes])
 
     def _off_walls(self, debt: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Nodes that walls hold (m,), their velocities and accelerations (m, 3)."""
+        """Return nodes in contact with walls (m,), their velocities and accelerations (m, 3)."""
         stepper, state = self.stepper, self.stepper.state
         nodes, normal, speed = self.held()
         mass = stepper.model.inertia.mass[nodes]
-        # work on a wall that moves is work done, not lost
+        # work on a moving wall is transferred, not lost
         moved = np.einsum("mi,mi->m", state.contact[nodes], speed) * stepper.part
         work = self._work(nodes) - moved + debt[nodes, 0]
         push = np.einsum("mij,mj->mi", normal, state.contact[nodes])
@@ -87,7 +87,7 @@ class Treatment(Base):
         return nodes, v, self._accelerations(nodes, normal)
 
     def _apart(self, debt: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Nodes that pairs hold (m,), their velocities and accelerations (m, 3). Collective."""
+        """Return nodes in contact through pairs (m,), their velocities and accelerations (m, 3). Collective."""
         state, pairs, mass = self.stepper.state, self.stepper.model.pairs, self.stepper.model.inertia.mass
         nodes, normals = pairs.pressed()
         work = np.zeros(len(state.v))

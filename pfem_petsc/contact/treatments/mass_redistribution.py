@@ -1,13 +1,13 @@
 """No mass on contact nodes along the walls' normals, after Khenous, Laborde and Renard (2008).
 
-The mass m of a contact node moves, for motions along its wall's normal n, to the neighbours that its bars lead to away
-from the wall: the mass of a node becomes a matrix, m I - m n n^T at the contact node and m_j I + w m n n^T at its
-neighbours, with the total kept. A contact node then follows its neighbours by equilibrium along n: its force is
-continuous in time, no spike grows as 1/h, and impact loses no energy. Needs plane walls
-with a node set, each node in one wall only.
+For motions along the normal n of its wall, the mass m of a contact node is moved to the neighbours that its bars
+connect it to away from the wall. The mass of a node becomes a matrix, m I - m n n^T at the contact node and
+m_j I + w m n n^T at its neighbours; the total is conserved. A contact node then follows its neighbours by equilibrium
+along n: its force is continuous in time, no spike grows as 1/h, and impact loses no energy. This requires plane walls
+with a node set, and each node in one wall only.
 
-Supports decide over walls: where they prescribe components of a contact node, n is the free part of the wall's normal,
-scaled to a unit vector, and the wall is no concern of a node that it cannot move.
+Supports override walls: if they prescribe components of a contact node, n is the free part of the wall's normal, scaled
+to a unit vector, and the wall does not apply to a node that it cannot move.
 """
 
 from __future__ import annotations
@@ -31,16 +31,17 @@ __all__ = ["Redistribution", "Treatment", "redistribute"]
 
 
 class Redistribution:
-    """The masses moved, on this rank.
+    """The redistributed masses of this rank.
 
     Attributes
     ----------
     nodes : (m,) owned contact nodes that can move along their walls' normals
     walls : (m,) wall of each
     normals : (m, 3) unit vectors along the free parts of these walls' normals
-    across : (m,) size of these parts: a node that moves by d along its vector moves by ``across`` d off the wall
+    across : (m,) lengths of these parts: a node that moves by d along its vector moves away from the wall by
+        ``across`` d
     touched : (k,) owned nodes whose mass is a matrix, ascending
-    tensors : (k, 3, 3) what the matrix is beyond mass times identity [kg]
+    tensors : (k, 3, 3) the matrix minus mass times identity [kg]
     """
 
     def __init__(
@@ -60,9 +61,10 @@ class Redistribution:
         self.tensors = tensors
 
     def inverse(self, mass: np.ndarray, fixed: np.ndarray) -> np.ndarray:
-        """Inverse (k, 3, 3) of the mass matrices of the touched nodes on their free components, zero elsewhere [1/kg].
+        """Return the inverses (k, 3, 3) of the mass matrices of the touched nodes on their free components [1/kg].
 
-        ``mass`` (owned,) [kg], ``fixed`` (owned, 3) bool. Directions without mass have none.
+        ``mass`` (owned,) [kg], ``fixed`` (owned, 3) bool. The inverse is zero on other components and along directions
+        without mass.
         """
         free = ~fixed[self.touched]
         matrices = mass[self.touched, None, None] * np.eye(3) + self.tensors
@@ -71,12 +73,13 @@ class Redistribution:
 
 
 def redistribute(model: Model) -> Redistribution:
-    """Work out the masses to move. Collective.
+    """Compute the redistributed masses. Collective.
 
     Raises
     ------
     InputError
-        On all ranks: walls that are no planes or name no node set, nodes of several walls, nodes without neighbours.
+        On all ranks, for walls that are not planes or name no node set, nodes with several walls, and nodes without
+        neighbours.
     """
     contact, mesh, inertia = model.contact, model.mesh, model.inertia
     source = model.case.source
@@ -114,8 +117,8 @@ def redistribute(model: Model) -> Redistribution:
         lone = nodes[info[nodes, 4] <= 1e-6]
         if len(lone):
             raise InputError(
-                f"{key}: node {mesh.node_ids[lone[0]]} has no bar that leads away from its wall, so its mass has "
-                "nowhere to go; leave it out of the wall's node_set"
+                f"{key}: node {mesh.node_ids[lone[0]]} has no bar that leads away from its wall, so its mass "
+                "cannot be redistributed; leave it out of the wall's node_set"
             )
     tensors = np.zeros((owned, 3, 3))
     normals = info[:, :3]
@@ -130,12 +133,12 @@ def redistribute(model: Model) -> Redistribution:
 
 
 def _movable(contact: Contact) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Owned wall nodes (m,) that can move off their walls (m,), along which unit vectors (m, 3), how far (m,)."""
+    """Return owned nodes (m,) that can move off their walls (m,), the unit vectors (m, 3), and ``across`` (m,)."""
     nodes = np.flatnonzero(contact.members.any(axis=1))
     walls = contact.members[nodes].argmax(axis=1)
     normals = contact.normals[walls]
     free = np.where(contact.fixed[nodes], 0.0, normals)
-    # the whole normal as it is: its last digits decide nothing, but results stay what they were
+    # a fully free normal is not rescaled, which would change its last digits
     free = np.where(contact.fixed[nodes].any(axis=1)[:, None], free, normals)
     across = np.sqrt((free * free).sum(axis=1))
     can = across**2 > FREE_PART
@@ -143,7 +146,7 @@ def _movable(contact: Contact) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.n
 
 
 class Treatment(Base):
-    """No mass on contact nodes along the walls' normals."""
+    """Removes the mass of contact nodes along the walls' normals."""
 
     elastic = True
 
@@ -156,7 +159,7 @@ class Treatment(Base):
 
     @classmethod
     def prepare(cls, model: Model) -> None:
-        """Take the mass from the nodes. Collective."""
+        """Redistribute the mass of the contact nodes. Collective."""
         if model.links:
             raise InputError(
                 f'{model.case.source}: contact.treatment = "mass_redistribution": only walls can take mass from nodes; '
@@ -165,17 +168,17 @@ class Treatment(Base):
         model.inertia.redistribution = redistribute(model)
 
     def before(self) -> None:
-        """Keep where nodes start."""
+        """Record the initial positions of nodes."""
         self._start = self.stepper.state.position.copy()
 
     def after(self) -> None:
-        """What has no mass has no velocity and acceleration of its own: the secant's, so that nothing grows unseen."""
+        """Set velocities and accelerations without inertia to those of the secant, which prevents unseen growth."""
         stepper, state = self.stepper, self.stepper.state
         if stepper.scheme.explicit:
             return
         moved = stepper.model.inertia.redistribution
         nodes, n = moved.nodes, moved.normals
-        # no momentum jumps along the normals, but the scheme's memory is made anew
+        # no momentum jumps along the normals, but the scheme's memory must be set again
         self.jump = Jump(nodes, state.v[nodes], state.a[nodes], 0.0, self.remembered(nodes))
         secant = (state.position[nodes] - self._start[nodes]) / stepper.part
         state.v, state.a = state.v.copy(), state.a.copy()

@@ -1,12 +1,11 @@
-"""Held nodes move with the wall: their normal velocity is the wall's, and they are not accelerated.
+"""Nodes in contact move with the wall: their normal velocity is the wall's, and their normal acceleration is zero.
 
-Where friction keeps them from slipping, or a tied wall, that holds in all directions.
+For nodes that stick by friction, and for tied nodes, this holds in all directions. The nodes of a contact pair in
+contact move together, with the normal velocity that conserves their momentum.
 
-The nodes of a pressed contact pair move on together: their normal velocity is the one that keeps their momentum.
-
-On closure a node loses the kinetic energy of its approach, m v_n^2/2, an O(element length) part of the whole; on
+On closure a node loses the kinetic energy of its approach, m v_n^2/2, an O(element length) part of the total. On
 release it starts from rest, and the wall does no work on it. At a wall with restitution e a node that closes leaves
-with e times the velocity of its approach, and loses (1 - e^2) of that energy: see
+with e times the velocity of its approach and loses (1 - e^2) of that energy; see
 :mod:`~pfem_petsc.contact.restitution`.
 """
 
@@ -21,20 +20,20 @@ __all__ = ["Treatment"]
 
 
 class Treatment(Restitution):
-    """Velocity and acceleration of held nodes as those of the wall."""
+    """Sets velocity and acceleration of nodes in contact to those of the wall."""
 
     everywhere = True
     serves = ("tied", "friction", "restitution")
 
     def before(self) -> None:
-        """Keep how pressed pairs stand and what presses them, as well."""
+        """Also record the positions and forces of pairs in contact."""
         super().before()
         state, pairs = self.stepper.state, self.stepper.model.pairs
         self._pressed = None
         if self._frees and pairs is not None and pairs.any_pressed():
             change = state.memory.get("contact_change", 0.0)
             ends = pairs.gather(np.concatenate([state.contact + change, state.position], axis=1))
-            force = 0.5 * pairs.distances(ends[:, :, :3])  # half of what the ends bear against each other
+            force = 0.5 * pairs.distances(ends[:, :, :3])  # half the relative force between the ends
             self._pressed = pairs.force > 0.0, force, pairs.distances(ends[:, :, 3:])
 
     def after(self) -> None:
@@ -54,7 +53,7 @@ class Treatment(Restitution):
         self.put(nodes, v, a)
 
     def _pairs_let_go(self) -> tuple[np.ndarray, np.ndarray]:
-        """Ends (m,) of pairs that came free in this step, and their velocities (m, 3): see :meth:`_let_go`.
+        """Return ends (m,) of pairs that opened in this step, and their velocities (m, 3); see :meth:`_let_go`.
 
         Collective.
         """

@@ -1,1 +1,1 @@
-"""Kinds of wall, one a module; the module's name is the ``type`` that case files use."""
+"""Wall types, one per module; the module's name is the ``type`` that case files use."""

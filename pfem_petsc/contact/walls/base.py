@@ -1,4 +1,4 @@
-"""What every kind of wall shares: keys, surface at rest, and motion."""
+"""Base classes of wall types: keys, surface at rest, and motion."""
 
 from __future__ import annotations
 
@@ -16,31 +16,31 @@ Row4 = Annotated[tuple[Finite, Finite, Finite, Finite], listed]
 
 
 class WallKeys(WallParameters):
-    """Keys of every wall beside its shape."""
+    """Keys that all wall types share."""
 
     velocity: Vector3 | None = None
-    """velocity of the wall [m/s]: constant, or that at the start for a wall with mass"""
+    """velocity of the wall [m/s]: constant, or the initial one of a wall with mass"""
     mass: PositiveFloat | None = None
-    """mass [kg] of a wall that the forces of contact push about; it does not turn"""
+    """mass [kg] of a wall that moves under the contact forces; it does not rotate"""
     gravity: bool = False
-    """true: gravity acts on a wall with mass as it does on the truss"""
+    """true: gravity acts on a wall with mass, as on the truss"""
     motion: Annotated[tuple[Row4, ...], listed] | None = None
     """rows [t, dx, dy, dz]: displacement of the wall [s, m], at rest before the first and after the last"""
     interpolation: Literal["smooth", "linear"] = "smooth"
-    """of ``motion`` between its rows: a cubic spline, or straight lines, whose velocity jumps at rows"""
+    """interpolation of ``motion`` between its rows: a cubic spline, or straight lines with velocity jumps at rows"""
     adjust: bool = False
     """true: nodes that start beyond the wall are moved onto it, unstressed bars included"""
 
     friction: NonNegativeFloat = 0.0
     """coefficient of Coulomb friction"""
     static_friction: NonNegativeFloat | None = None
-    """coefficient below which a node sticks; default: as friction, and no less"""
+    """coefficient of static friction; default, and minimum: friction"""
 
     restitution: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
-    """part of the normal velocity with which a node leaves that hits the wall"""
+    """coefficient of restitution: fraction of the normal velocity at which a node leaves the wall after impact"""
 
     tied: bool = False
-    """true: a node that touches the wall is held where it is on it from then on, in all directions"""
+    """true: a node that touches the wall is fixed to it from then on, in all directions"""
 
     @field_validator("motion")
     @classmethod
@@ -70,13 +70,13 @@ class WallKeys(WallParameters):
 
 
 class BaseWall(ABC):
-    """The surface of a wall where it is at rest.
+    """The surface of a wall at rest.
 
     Attributes
     ----------
     flat : whether the tangent plane is the same everywhere; then ``normal`` (3,) and ``offset`` [m] are that plane
-    partial : whether nodes can pass beside it, so that where a node comes from matters (:meth:`stops`)
-    centre : (3,) [m], the point whose position is recorded when the wall moves
+    partial : whether nodes can pass beside it, so that their previous positions matter (:meth:`stops`)
+    centre : (3,) [m], the point whose position is recorded if the wall moves
     """
 
     flat = False
@@ -85,18 +85,18 @@ class BaseWall(ABC):
 
     @abstractmethod
     def planes(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Tangent planes nearest to positions (m, 3) [m]: unit normals (m, 3) and offsets (m,) [m].
+        """Return the tangent planes nearest to positions (m, 3) [m]: unit normals (m, 3) and offsets (m,) [m].
 
-        Allowed is n . x >= d; n . x - d is the distance of x from the surface, negative beyond it.
+        The allowed region is n . x >= d; n . x - d is the distance of x from the surface, negative beyond it.
         """
 
     def stops(self, before: np.ndarray, x: np.ndarray, tolerance: float) -> np.ndarray:
-        """(m,) bool: nodes for which the wall is in the way from (m, 3) to (m, 3); for partial walls."""
+        """Return (m,) bool: nodes that the wall stops between ``before`` (m, 3) and ``x`` (m, 3); for partial walls."""
         return np.ones(len(x), dtype=bool)
 
 
 def direction(value: tuple[float, float, float], what: str) -> tuple[float, float, float]:
-    """A vector of any length but zero."""
+    """Check that a vector has nonzero length; return it."""
     largest = max(map(abs, value))
     if not largest > 0.0:
         raise ValueError(f"has zero length; give {what}")

@@ -1,4 +1,4 @@
-"""An infinite circular cylinder; nodes stay outside of it, or inside."""
+"""An infinite circular cylinder; nodes stay outside or inside."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Parameters(WallKeys):
     point: Vector3
     """Any point of the axis [m]."""
     axis: Vector3
-    """Direction of the axis; of any length but zero."""
+    """Direction of the axis, of any nonzero length."""
     radius: PositiveFloat
     """Radius [m]."""
     side: Literal["outside", "inside"] = "outside"
@@ -56,7 +56,7 @@ def _across(axis: np.ndarray) -> np.ndarray:
 
 
 def surface(parameters: Parameters, bounds: np.ndarray) -> Surface:
-    """The cylinder as it is drawn: as long as the structure's shadow on its axis and a margin."""
+    """Return the cylinder for pictures, as long as the projection of the structure on its axis plus a margin."""
     wall = Wall(parameters)
     corners = np.array([[bounds[i, 0], bounds[j, 1], bounds[k, 2]] for i in (0, 1) for j in (0, 1) for k in (0, 1)])
     along = (corners - wall.centre) @ wall.axis

@@ -17,7 +17,7 @@ class Parameters(WallKeys):
     point: Vector3
     """Any point of the plane [m]."""
     normal: Vector3
-    """Points to the allowed side; of any length but zero."""
+    """Points to the allowed side, of any nonzero length."""
 
     @field_validator("normal")
     @classmethod

@@ -1,4 +1,4 @@
-"""A finite rectangle; it stops nodes that come from the side its normal points to, and nodes pass beside it."""
+"""A finite rectangle; it stops nodes that come from the side its normal points to, and nodes can pass beside it."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ class Parameters(WallKeys):
     point: Vector3
     """Centre of the rectangle [m]."""
     normal: Vector3
-    """Points to the side that nodes come from; of any length but zero."""
+    """Points to the side that nodes come from, of any nonzero length."""
     along: Vector3
-    """Direction of the first edges; its part along the normal is left out."""
+    """Direction of the first edges; its component along the normal is ignored."""
     size: Annotated[tuple[PositiveFloat, PositiveFloat], listed]
     """Lengths of the edges along ``along`` and across it [m]."""
 
@@ -53,7 +53,7 @@ class Wall(Plane):
     def stops(self, before: np.ndarray, x: np.ndarray, tolerance: float) -> np.ndarray:
         start = before @ self.normal - self.offset
         end = x @ self.normal - self.offset
-        # where the way crosses the plane; the foot of x where it does not
+        # the point where the path crosses the plane; the foot of x if it does not
         crossing = end < 0.0
         part = np.where(crossing, np.clip(start, 0.0, None) / np.maximum(start - end, 1e-300), 1.0)
         point = before + np.minimum(part, 1.0)[:, None] * (x - before) - self.centre
@@ -62,7 +62,7 @@ class Wall(Plane):
 
 
 def surface(parameters: Parameters, bounds: np.ndarray) -> Surface:
-    """The rectangle as it is drawn."""
+    """Return the rectangle for pictures."""
     wall = Wall(parameters)
     a, b = wall.half[0] * wall.first, wall.half[1] * wall.second
     face = np.array([wall.centre - a - b, wall.centre + a - b, wall.centre + a + b, wall.centre - a + b])

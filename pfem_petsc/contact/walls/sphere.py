@@ -1,4 +1,4 @@
-"""A sphere; nodes stay outside of it, or inside."""
+"""A sphere; nodes stay outside or inside."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ class Parameters(WallKeys):
 def radial_planes(
     arm: np.ndarray, centres: np.ndarray, radius: float, sign: float, helper: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Tangent planes at the feet of points whose arms (m, 3) from their centres (m, 3) are given.
+    """Return the tangent planes at the feet of points with arms (m, 3) from their centres (m, 3).
 
-    ``sign`` +1 for outside, -1 for inside; ``helper`` (3,) is the normal of a point in the centre itself.
+    ``sign`` +1 for outside, -1 for inside; ``helper`` (3,) is the normal for a point at the centre itself.
     """
     length = np.linalg.norm(arm, axis=1)
     normals = np.where(length[:, None] > 1e-12 * radius, arm / np.maximum(length, 1e-300)[:, None], helper)
@@ -51,7 +51,7 @@ class Wall(BaseWall):
 
 
 def surface(parameters: Parameters, bounds: np.ndarray) -> Surface:
-    """The sphere as it is drawn."""
+    """Return the sphere for pictures."""
     angles = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 17)
     profile = parameters.radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
     return revolved(parameters.name, profile, np.array(parameters.point), np.array([0.0, 0.0, 1.0]))

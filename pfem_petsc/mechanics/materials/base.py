@@ -1,8 +1,8 @@
-"""What every material law is made of: the keys of its table, and a :class:`Law` for the loops over bars.
+"""Base of material laws: the keys of their tables, and a :class:`Law` for the loops over bars.
 
-A module of this package is a law. It has ``Parameters``, a :class:`MaterialKeys` whose :meth:`~MaterialKeys.pack` gives
-the numbers that the law reads, and ``LAW``, a :class:`Law`. The compiled loops of explicit steps, alone and fused, of
-implicit steps, assembled and matrix-free, and of the energy-momentum scheme are made from it.
+A module of this package is a law. It has ``Parameters``, a :class:`MaterialKeys` whose :meth:`~MaterialKeys.pack`
+returns the numbers that the law reads, and ``LAW``, a :class:`Law`. The compiled loops of explicit steps (single and
+fused), of implicit steps (assembled and matrix-free), and of the energy-momentum scheme are made from it.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ __all__ = ["Law", "MaterialKeys"]
 
 
 class MaterialKeys(StrictModel):
-    """Keys of every material, whatever its law."""
+    """Keys that all materials share."""
 
     law: str | None = None
     """name of a material law; default: "elastoplastic" with a yield_stress, else "elastic\""""
@@ -36,20 +36,20 @@ class MaterialKeys(StrictModel):
     """strain measure"""
 
     def pack(self) -> tuple[float, ...]:
-        """The numbers that the law's response reads as ``p``; at least one."""
+        """Return the numbers that the response of the law reads as ``p``; at least one."""
         return (float(self.young_modulus),)
 
     def largest_modulus(self) -> float:
-        """Largest tangent modulus that a bar can have [Pa]: of wave speeds and of the rounding of forces."""
+        """Largest tangent modulus of a bar [Pa], for wave speeds and the rounding of forces."""
         return float(self.young_modulus)
 
     def suspicions(self, key: str, hint: str) -> list[str]:
-        """Texts about values that look wrong, for the check before a run.
+        """Return messages about suspicious values, for the check before a run.
 
         Parameters
         ----------
         key : of the table, ``material.NAME``
-        hint : what to say of a value that may be in a wrong unit
+        hint : text for a value that may be in a wrong unit
         """
         return []
 
@@ -60,23 +60,23 @@ class Law:
 
     Attributes
     ----------
-    response : compiled (``register_jitable``) function of (strain, rate, step, temperature, p, q): strain less the
+    response : compiled (``register_jitable``) function of (strain, rate, step, temperature, p, q): strain minus the
         thermal strain; its rate over the step [1/s]; the step [s], 0 at the start of a run; temperature above reference
-        [K]; the packed parameters; and the internal variables at the start of the step, a tuple. It gives (stress [Pa],
-        tangent [Pa], internal variables at the end of the step, energy densities [J/m3]). The tangent is the whole
-        derivative of the stress by the strain at the end, that of the rate (1/step) included
-    internal : name and unit of each internal variable of a bar, zero at the start; a unit of ``""`` is a pure number.
-        They are fields of the snapshots where a case asks for them, and arrays of the checkpoints
+        [K]; the packed parameters; and the internal variables at the start of the step, a tuple. It returns (stress
+        [Pa], tangent [Pa], internal variables at the end of the step, energy densities [J/m3]). The tangent is the
+        total derivative of the stress with respect to the strain at the end, including that of the rate (1/step)
+    internal : name and unit of each internal variable of a bar, zero at the start; the unit ``""`` is a pure number.
+        They are fields of the snapshots if a case selects them, and arrays of the checkpoints
     energies : names of the energy densities, of :data:`~pfem_petsc.energies.BAR_ENERGIES`: functions of strain and
-        internal variables. A law whose dissipation is not one keeps it as another internal variable
-    rate : whether the law depends on the rate or on the step: strain and stress at the end of the last step are then
-        kept as well. Without it, rate and step are zero
-    smooth : whether the tangent is constant, so that Newton's method has nothing to follow
-    mean_stress : compiled function of (stress0, strain0, strain, rate, step, temperature, p, q): mean stress [Pa] over
-        the step from stress0 and strain0 to strain, whose work is the change of energies, and its derivative by strain.
-        The energy-momentum scheme needs it; None: it is refused
-    mean_correction : what ``mean_stress`` has beyond the mean of both ends [Pa], from p, the change of stress and the
-        internal variables before and after, (variables, bars), for the work of changing temperatures; None for nothing
+        internal variables. If the dissipation is no such function, the law keeps it as another internal variable
+    rate : whether the law depends on the rate or on the step; strain and stress at the end of the last step are then
+        kept as well. Otherwise rate and step are zero
+    smooth : whether the tangent is constant
+    mean_stress : compiled function of (stress0, strain0, strain, rate, step, temperature, p, q): returns the mean
+        stress [Pa] over the step from stress0 and strain0 to strain, whose work is the change of energies, and its
+        derivative with respect to strain. The energy-momentum scheme requires it; None: the law is refused there
+    mean_correction : ``mean_stress`` minus the mean of both ends [Pa], as a function of p, the change of stress and the
+        internal variables before and after, (variables, bars), for the work of changing temperatures; None for zero
     """
 
     response: Callable[..., Any]
@@ -94,11 +94,11 @@ class Law:
 
     @property
     def rows(self) -> tuple[tuple[str, str], ...]:
-        """Name and unit of all that is kept of a bar from step to step: internal variables first."""
+        """Name and unit of all data kept from step to step, internal variables first."""
         return (*self.internal, ("last_strain", ""), ("last_stress", "Pa")) if self.rate else self.internal
 
     def refuses(self, scheme: Any) -> str | None:
-        """Why a :class:`~pfem_petsc.integrators.base.Scheme` cannot have the law, None where it can."""
+        """Return why a :class:`~pfem_petsc.integrators.base.Scheme` cannot use the law, None if it can."""
         if scheme.discrete_gradient and self.mean_stress is None:
             return "it has no mean stress over a step (mean_stress), which this scheme needs"
         return None

@@ -1,16 +1,17 @@
 """Elastoplastic bar with mixed linear hardening, isotropic (K) and kinematic (H).
 
-Yield function f = |s - H e_p| - (s_Y + K a) with the accumulated plastic strain a. The return mapping of a linear law
-is closed: da = f_trial / (E + H + K). On the yield surface s = sign (s_Y + K a) + H e_p, so the plastic work is the
-function of state s_Y a + K a^2/2 + H e_p^2/2: its first term is heat, the rest is stored by the hardening.
+The yield function is f = |s - H e_p| - (s_Y + K a) with the accumulated plastic strain a. The return mapping of a
+linear law has a closed form: da = f_trial / (E + H + K). On the yield surface s = sign (s_Y + K a) + H e_p, so the
+plastic work is the function of state s_Y a + K a^2/2 + H e_p^2/2; its first term is heat, the rest is stored by
+hardening.
 
-In a step that yields at the part q of the strain's change before its end, the stress follows the line of modulus E to
-the yield stress and that of modulus Et from there. With the plastic strain de_p of the step its mean is
+In a step that yields during the last fraction q of the strain increment, the stress follows the line of modulus E up to
+the yield stress and the line of modulus Et from there. With the plastic strain de_p of the step its mean is
 
     S = (s0 + s1)/2 + E de_p (1 - q)/2,   q = E de_p/((E - Et)(e1 - e0)),   dS/de1 = (Et + (E - Et)(1 - q)^2)/2.
 
-The energies are functions of state on that path, so that the work S (e1 - e0) is the change of elastic energy and the
-plastic dissipation, which is not negative. (s0 + s1)/2 would work less than is dissipated.
+The energies are functions of state on that path, so the work S (e1 - e0) is the change of elastic energy plus the
+plastic dissipation, which is nonnegative. The work of (s0 + s1)/2 would be less than the dissipation.
 """
 
 from __future__ import annotations
@@ -35,13 +36,13 @@ class Parameters(MaterialKeys):
     """kinematic hardening modulus H [Pa]"""
 
     def pack(self) -> tuple[float, ...]:
-        """(E, s_Y, K, H) [Pa] and 1/(E + H + K) [1/Pa]."""
+        """Return (E, s_Y, K, H) [Pa] and 1/(E + H + K) [1/Pa]."""
         young, isotropic, kinematic = self.young_modulus, self.isotropic_hardening, self.kinematic_hardening
         inverse = 1.0 / (young + kinematic + isotropic)
         return float(young), float(self.yield_stress), float(isotropic), float(kinematic), float(inverse)
 
     def suspicions(self, key: str, hint: str) -> list[str]:
-        """Strains at yield that no material has, and yielding without hardening."""
+        """Return messages about unrealistic strains at yield, and about yielding without hardening."""
         texts = []
         if self.yield_stress > 0.2 * self.young_modulus:
             texts.append(
@@ -50,8 +51,8 @@ class Parameters(MaterialKeys):
             )
         if self.isotropic_hardening + self.kinematic_hardening == 0.0:
             texts.append(
-                f"{key} yields without hardening: one bar of a row takes all plastic strain, the more the shorter it "
-                "is, so results depend on the mesh; give isotropic_hardening or kinematic_hardening"
+                f"{key} yields without hardening: plastic strain localises in one bar of a row, "
+                "so results depend on the mesh; give isotropic_hardening or kinematic_hardening"
             )
         return texts
 
@@ -80,21 +81,21 @@ def response(strain, rate, step, temperature, p, q):
 
 @register_jitable
 def mean_stress(stress0, strain0, strain, rate, step, temperature, p, q):
-    """Mean stress of the step and its derivative, see the module."""
+    """Return the mean stress of the step and its derivative; see the module."""
     stress, modulus, (flowed, _), _ = response(strain, rate, step, temperature, p, q)
     mean = 0.5 * (stress0 + stress)
     if flowed != q[0]:
         young, change = p[0], strain - strain0
         lost = young - modulus
         part = young * (flowed - q[0]) / (lost * change) if change != 0.0 else 1.0
-        part = min(max(part, 0.0), 1.0)  # beyond by rounding only: the start is not outside of the yield surface
+        part = min(max(part, 0.0), 1.0)  # clips rounding only: the start is not outside the yield surface
         mean += 0.5 * young * (flowed - q[0]) * (1.0 - part)
         modulus += lost * (1.0 - part) * (1.0 - part)
     return mean, 0.5 * modulus
 
 
 def mean_correction(p: tuple[float, ...], stress: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """What yielding adds to the mean stress (s0 + s1)/2 of a step: E de_p (1 - q)/2 [Pa].
+    """Return the contribution of yielding to the mean stress of a step beyond (s0 + s1)/2: E de_p (1 - q)/2 [Pa].
 
     ``stress`` s1 - s0 [Pa], internal variables (2, bars) ``before`` and ``after`` the step.
     """

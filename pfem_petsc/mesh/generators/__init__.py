@@ -1,1 +1,1 @@
-"""Meshes made by rule: one module each, named as in case files."""
+"""Mesh generators, one per module; the module's name is the one that case files use."""

@@ -13,7 +13,7 @@ from ..slab import MeshSlab, check_length, check_size, index_type, slab_range
 
 __all__ = ["Parameters", "generate"]
 
-# Nodes and bars are made in pieces of this many, to keep temporary arrays small.
+# Number of nodes or bars generated at a time, to keep temporary arrays small.
 _PIECE = 1 << 19
 
 Triple = tuple[int, int, int]
@@ -34,7 +34,7 @@ class Parameters(StrictModel):
 
 @dataclass(frozen=True)
 class _Lattice:
-    """Nodes on a box-shaped grid, numbered from ``base``, z running fastest."""
+    """Nodes on a box-shaped grid, numbered from ``base`` with z varying fastest."""
 
     shape: Triple
     origin: Triple
@@ -66,7 +66,7 @@ class _Family:
 
 
 def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
-    """This rank's part of the lattice, by index arithmetic: no rank holds a list of the whole.
+    """Generate this rank's part of the lattice by index arithmetic; no rank has the whole lattice.
 
     Node groups: ``bottom`` and ``top`` (z faces), ``left`` and ``right`` (x faces), ``front`` and ``back`` (y faces).
     """
@@ -92,7 +92,7 @@ def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
 
 
 def _pieces(counts: list[int], first: int, last: int) -> Iterator[tuple[int, np.ndarray]]:
-    """Cut the range [first, last) of things numbered through several boxes: (box, places within that box)."""
+    """Divide the range [first, last) of items numbered across several boxes into (box, indices within that box)."""
     base = 0
     for box, count in enumerate(counts):
         for start in range(max(first - base, 0), min(last - base, count), _PIECE):
@@ -110,7 +110,7 @@ def _nodes(
         at = places[0] + lattice.base - first
         for axis, index in enumerate(np.unravel_index(places, lattice.shape)):
             half = 2 * index + lattice.origin[axis]
-            # An even number of half pitches is a whole number of pitches: the same rounding as index * pitch.
+            # An even number of half pitches is a whole number of pitches, with the same rounding as index * pitch.
             points[at : at + len(places), axis] = 0.5 * half * parameters.pitch
             low, high = (("left", "right"), ("front", "back"), ("bottom", "top"))[axis]
             found[low].append(places[half == 0] + lattice.base)
@@ -131,7 +131,7 @@ def _bars(families: list[_Family], first: int, last: int, dtype: type[np.signedi
 
 
 def _cubic(cells: Triple) -> tuple[list[_Lattice], list[_Family]]:
-    """Edges along x, y, z, then the two diagonals of the faces normal to z, to y and to x."""
+    """Return edges along x, y, z, then the two diagonals of the faces normal to z, to y and to x."""
     corners = _corners(cells)
     families = _edges(cells, corners)
     for first, second in ((0, 1), (0, 2), (1, 2)):
@@ -143,7 +143,7 @@ def _cubic(cells: Triple) -> tuple[list[_Lattice], list[_Family]]:
 
 
 def _octet(cells: Triple) -> tuple[list[_Lattice], list[_Family]]:
-    """Corner to face centre in every face, then face centre to face centre around every cell."""
+    """Return bars from corners to face centres, then bars between the face centres of every cell."""
     corners = _corners(cells)
     lattices, families = [corners], []
     for axis in range(3):
@@ -161,7 +161,7 @@ def _octet(cells: Triple) -> tuple[list[_Lattice], list[_Family]]:
 
 
 def _bcc(cells: Triple) -> tuple[list[_Lattice], list[_Family]]:
-    """Cube edges along x, y, z, then the eight half diagonals of every cell."""
+    """Return cube edges along x, y, z, then the eight half diagonals of every cell."""
     corners = _corners(cells)
     centres = _Lattice(cells, (1, 1, 1), corners.count)
     families = _edges(cells, corners)

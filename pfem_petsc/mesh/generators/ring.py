@@ -31,7 +31,7 @@ class Parameters(StrictModel):
     @classmethod
     def _enough_bays(cls, bays: int) -> int:
         if bays < 3:
-            raise ValueError("a ring has 3 bays or more")
+            raise ValueError("a ring needs at least 3 bays")
         return bays
 
     @field_validator("inner_radius")
@@ -44,7 +44,7 @@ class Parameters(StrictModel):
 
 
 def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
-    """This rank's part of the ring.
+    """Generate this rank's part of the ring.
 
     Nodes: the outer polygon, anticlockwise, then the inner one. Bars: outer chords, inner chords, radial struts,
     diagonals from outer node i to inner node i + 1 and, with ``bracing = "x"``, from inner node i to outer node i + 1.
@@ -97,7 +97,7 @@ def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
 
 def _points(parameters: Parameters, node: np.ndarray) -> np.ndarray:
     n = parameters.bays
-    # Half bays from the +x axis, brought to (-n, n] so that the ring is symmetric about it to the last digit.
+    # Half bays from the +x axis, mapped to (-n, n] so that the ring is symmetric about it to the last digit.
     half_bays = 2 * (node % n) + (parameters.orientation == "flat")
     half_bays = np.where(half_bays > n, half_bays - 2 * n, half_bays)
     angle = np.pi / n * half_bays
@@ -108,7 +108,7 @@ def _points(parameters: Parameters, node: np.ndarray) -> np.ndarray:
 
 
 def _extremes(parameters: Parameters) -> dict[str, list[int]]:
-    """Outer nodes farthest towards +x and -x, counted, not measured."""
+    """Return the outer nodes farthest towards +x and -x, from their numbers and not from coordinates."""
     n = parameters.bays
     if parameters.orientation == "vertex":
         return {"impact": [0], "opposite": [n // 2] if n % 2 == 0 else [n // 2, n // 2 + 1]}

@@ -20,7 +20,7 @@ class Parameters(StrictModel):
 
 
 def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
-    """This rank's part of the rod: node i at x = i length / elements, bar i from node i to node i + 1.
+    """Generate this rank's part of the rod: node i at x = i length / elements, bar i from node i to node i + 1.
 
     Node groups ``start`` and ``end``; bar group ``rod`` (all).
     """

@@ -22,7 +22,7 @@ class Parameters(StrictModel):
 
 
 def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
-    """This rank's part: the first rod from x = 0 to length, the second from length + gap to 2 length + gap.
+    """Generate this rank's part: the first rod from x = 0 to length, the second from length + gap to 2 length + gap.
 
     Node groups ``start``, ``first_end``, ``second_start``, ``end``; bar groups ``first`` and ``second``.
     """

@@ -27,12 +27,12 @@ _CONVERT = {
 
 
 def read_slab(path: Path, comm: MPI.Comm) -> MeshSlab:
-    """This rank's part of the mesh in a file. Collective.
+    """Read this rank's part of the mesh in a file. Collective.
 
     Raises
     ------
     InputError
-        On all ranks, when there is no such file, no reader for its suffix, or its content is not a mesh of bars.
+        On all ranks, if there is no such file, no reader for its suffix, or its content is not a mesh of bars.
     """
     from ...errors import InputError
     from ...parallel.agreement import on_root
@@ -58,7 +58,7 @@ def _check_file(path: Path) -> None:
 
 
 def _near(path: Path) -> str:
-    """A hint at the mesh file that may be meant."""
+    """Return a hint at a mesh file with a similar name."""
     folder = path.parent
     try:
         there = sorted(entry.name for entry in folder.iterdir() if entry.suffix.lower() in SUFFIXES)

@@ -1,7 +1,7 @@
 """Gmsh .msh files, versions 2.2 and 4.1, ASCII and binary: lines are bars, physical groups are groups.
 
-Two-node lines (element type 1) are the bars, in the file's order; points (type 15) with a physical group make node
-groups; surfaces and volumes are left out, which a warning says. Nodes are numbered from 0 in the file's order.
+Two-node lines (element type 1) are the bars, in file order; points (type 15) with a physical group define node groups;
+surfaces and volumes are ignored with a warning. Nodes are numbered from 0 in file order.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ __all__ = ["read"]
 
 _POINT, _LINE = 15, 1
 
-# Nodes of each type of element in Gmsh's documentation; curved lines are refused, the others passed over.
+# Nodes of each type of element in Gmsh's documentation; curved lines are refused, the others skipped.
 _NODES = {1: 2, 2: 3, 3: 4, 4: 4, 5: 8, 6: 6, 7: 5, 8: 3, 9: 6, 10: 9, 11: 10, 12: 27, 13: 18, 14: 14, 15: 1, 16: 8}
 _NODES |= {17: 20, 18: 15, 19: 13, 20: 9, 21: 10, 22: 12, 23: 15, 24: 15, 25: 21, 26: 4, 27: 5, 28: 6, 29: 20, 30: 35}
 _NODES |= {31: 56, 92: 64, 93: 125}
@@ -32,7 +32,7 @@ Elements = list[tuple[int, np.ndarray, np.ndarray]]
 
 
 def read(path: Path, comm: MPI.Comm) -> MeshSlab:
-    """Each rank's slab of the mesh in a Gmsh file, which rank 0 reads. Collective.
+    """Return this rank's slab of the mesh in a Gmsh file, which rank 0 reads. Collective.
 
     Raises
     ------
@@ -43,7 +43,7 @@ def read(path: Path, comm: MPI.Comm) -> MeshSlab:
 
 
 def _read(path: Path) -> WholeMesh:
-    # editors of Windows put a mark in front
+    # editors on Windows insert a byte order mark
     content = path.read_bytes().removeprefix(codecs.BOM_UTF8)
     if not content.lstrip().startswith(b"$MeshFormat"):
         raise InputError(f"{path}: does not start with $MeshFormat: not a Gmsh mesh of version 2.2 or 4.1")
@@ -71,7 +71,7 @@ def _read(path: Path) -> WholeMesh:
 
 
 def _physical_names(path: Path, payload: bytes) -> dict[tuple[int, int], str]:
-    """Names by dimension and tag; this section is text also in binary files."""
+    """Return names by dimension and tag; this section is text even in binary files."""
     lines = payload.decode("utf-8", "replace").splitlines() or [""]
     names = {}
     for number, line in enumerate(lines[1:], 2):
@@ -115,7 +115,7 @@ def _nodes_4(path: Path, numbers: Numbers) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _entities_4(numbers: Numbers) -> dict[tuple[int, int], np.ndarray]:
-    """Tags of physical groups of every point and curve."""
+    """Return the tags of physical groups of every point and curve."""
     groups = {}
     counts = numbers.sizes(4)
     for dimension in (0, 1):
@@ -125,7 +125,7 @@ def _entities_4(numbers: Numbers) -> dict[tuple[int, int], np.ndarray]:
             groups[dimension, tag] = numbers.ints(int(numbers.sizes(1)[0]))
             if dimension == 1:
                 numbers.ints(int(numbers.sizes(1)[0]))
-    # Surfaces and volumes follow, which no bar belongs to.
+    # Surfaces and volumes follow, which have no bars.
     return groups
 
 
@@ -146,7 +146,7 @@ def _elements_2(path: Path, numbers: Numbers, binary: bool) -> Elements:
         if binary:
             rows = numbers.ints(n * (1 + n_tags + nodes)).reshape(n, 1 + n_tags + nodes)[:, 1:]
         else:
-            # As many alike as follow each other, looked for ever farther as long as there are.
+            # Find the run of consecutive elements of the same type, searching ever farther.
             width = 3 + n_tags + nodes
             ahead = numbers.peek(min(run, declared - done) * width)
             ahead = ahead[: len(ahead) // width * width].reshape(-1, width)
@@ -195,7 +195,7 @@ def _assemble(
     in_order = tags[order]
     twice = np.flatnonzero(in_order[1:] == in_order[:-1])
     if len(twice):
-        raise InputError(f"{path}: section $Nodes: node {in_order[twice[0]]} is there more than once")
+        raise InputError(f"{path}: section $Nodes: node {in_order[twice[0]]} is listed more than once")
 
     def numbered(wanted: np.ndarray) -> np.ndarray:
         place = np.minimum(np.searchsorted(in_order, wanted), max(len(in_order) - 1, 0))
@@ -228,7 +228,7 @@ def _assemble(
 
 
 def _collect(parts: dict[int, list[np.ndarray]], members: np.ndarray, physical: np.ndarray) -> None:
-    # A negative tag is the same group, run through backwards.
+    # A negative tag denotes the same group with reversed orientation.
     for column in np.abs(physical).T:
         for tag in np.unique(column[column != 0]):
             parts.setdefault(int(tag), []).append(members[column == tag])

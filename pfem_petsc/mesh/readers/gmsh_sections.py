@@ -13,7 +13,7 @@ __all__ = ["Format", "Numbers", "sections"]
 
 
 class Format:
-    """What the $MeshFormat section says.
+    """Content of the $MeshFormat section.
 
     Attributes
     ----------
@@ -23,7 +23,7 @@ class Format:
     order : str
         Byte order of binary numbers, ``"<"`` or ``">"``.
     size_type : str
-        numpy's name for C's size_t in a binary file: ``"u4"`` or ``"u8"``.
+        NumPy type of C's size_t in a binary file: ``"u4"`` or ``"u8"``.
     """
 
     def __init__(self, path: Path, payload: bytes) -> None:
@@ -48,7 +48,7 @@ class Format:
 
 
 class Numbers:
-    """Numbers of one section, taken from front to back.
+    """Numbers of one section, read sequentially.
 
     Parameters
     ----------
@@ -57,12 +57,12 @@ class Numbers:
     payload : bytes
     layout : Format
     count_line : bool
-        The section starts with a count in ASCII, also in a binary file (version 2.2).
+        Whether the section starts with a count in ASCII, even in a binary file (version 2.2).
 
     Raises
     ------
     InputError
-        From every method, when the section ends early or holds something else than asked for.
+        From every method, if the section ends early or has other content than requested.
     """
 
     def __init__(self, where: str, payload: bytes, layout: Format, count_line: bool) -> None:
@@ -82,28 +82,28 @@ class Numbers:
             self._bytes = payload
 
     def count(self) -> int:
-        """The count that a section of version 2.2 starts with."""
+        """Return the count at the start of a section of version 2.2."""
         if self._binary:
             return int(self._whole(self._count)[0])
         return int(self.sizes(1)[0])
 
     def ints(self, n: int) -> np.ndarray:
-        """The next ``n`` integers (C's int)."""
+        """Return the next ``n`` integers (C's int)."""
         return self._take(n, "i4").astype(np.int64) if self._binary else self._whole(self._take(n))
 
     def sizes(self, n: int) -> np.ndarray:
-        """The next ``n`` counts or tags (C's size_t), as int64."""
+        """Return the next ``n`` counts or tags (C's size_t), as int64."""
         values = self._take(n, self._size_type) if self._binary else self._whole(self._take(n))
         if n and (values.min() < 0 or values.max() > np.iinfo(np.int64).max):
             raise InputError(f"{self._where}: {values.min()} ... {values.max()} are not counts or tags")
         return values.astype(np.int64)
 
     def reals(self, n: int) -> np.ndarray:
-        """The next ``n`` floating-point numbers."""
+        """Return the next ``n`` floating-point numbers."""
         return self._take(n, "f8").astype(np.float64) if self._binary else self._take(n)
 
     def rows(self, n: int, n_ints: int, n_reals: int) -> tuple[np.ndarray, np.ndarray]:
-        """The next ``n`` rows of some integers and then some floating-point numbers."""
+        """Return the next ``n`` rows of ``n_ints`` integers and ``n_reals`` floating-point numbers."""
         if self._binary:
             row = np.dtype([("i", self._order + "i4", (n_ints,)), ("r", self._order + "f8", (n_reals,))])
             rows = self._cut(n, row)
@@ -112,11 +112,11 @@ class Numbers:
         return self._whole(rows[:, :n_ints]), rows[:, n_ints:]
 
     def peek(self, n: int) -> np.ndarray:
-        """At most the next ``n`` numbers of an ASCII section, without taking them."""
+        """Return at most the next ``n`` numbers of an ASCII section without consuming them."""
         return self._values[self._at : self._at + n]
 
     def end(self) -> None:
-        """Refuse numbers that are left over."""
+        """Refuse surplus numbers."""
         left = len(self._bytes[self._at :].strip()) if self._binary else len(self._values) - self._at
         if left:
             what = "bytes" if self._binary else "numbers"
@@ -149,7 +149,7 @@ class Numbers:
 
 
 def sections(path: Path, content: bytes) -> dict[str, bytes]:
-    """Payloads of the sections of a file, by name; of several with one name the first."""
+    """Return the payloads of the sections of a file by name; of several with the same name the first."""
     found: dict[str, bytes] = {}
     at = 0
     while True:
@@ -169,10 +169,10 @@ def sections(path: Path, content: bytes) -> dict[str, bytes]:
 
 
 def _parse(where: str, text: bytes) -> np.ndarray:
-    """All numbers of a text as float64, which holds tags up to 2^53 exactly."""
+    """Return all numbers of a text as float64, exact for tags up to 2^53."""
     try:
         with warnings.catch_warnings():
-            # Text that is no number ends the parsing, with a warning in older numpy and an error in newer.
+            # Text other than numbers ends the parsing, with a warning in older NumPy and an error in newer versions.
             warnings.simplefilter("error")
             return np.fromstring(text, dtype=np.float64, sep=" ") if text.strip() else np.empty(0)
     except (DeprecationWarning, ValueError):
@@ -182,7 +182,7 @@ def _parse(where: str, text: bytes) -> np.ndarray:
                     float(word)
                 except ValueError:
                     raise InputError(f"{where}, line {number}: {_shown(word)!r} is not a number") from None
-        raise InputError(f"{where}: holds something else than numbers") from None
+        raise InputError(f"{where}: contains text other than numbers") from None
 
 
 def _shown(text: bytes) -> str:

@@ -1,4 +1,4 @@
-"""The package's own mesh file: HDF5, read and written by all ranks, each its slab.
+"""The mesh file format of this package: HDF5, read and written by all ranks, each its slab.
 
 ``/points`` (n_nodes, 3) float [m], ``/bars`` (n_bars, 2) integers from 0, ``/node_groups/<name>`` and
 ``/bar_groups/<name>`` with the numbers of members, in any order.
@@ -19,26 +19,26 @@ from ..slab import MeshSlab, check_size, slab_range
 
 __all__ = ["read", "write_hdf5"]
 
-# Members of groups are read and written in pieces of this many.
+# Number of group members read or written at a time.
 _PIECE = 1 << 20
 
-# No filter of HDF5 compresses real meshes by more: a dataset that claims it was never written.
+# HDF5 filters compress real meshes by less than this; a dataset beyond it was never written.
 _COMPRESSION = 1100
 
 
 def read(path: Path, comm: MPI.Comm) -> MeshSlab:
-    """Each rank's slab of the mesh in an HDF5 file. Collective; no rank reads more than its part at a time.
+    """Return this rank's slab of the mesh in an HDF5 file. Collective; no rank reads more than its part at a time.
 
     Raises
     ------
     InputError
-        On all ranks, naming the dataset, when the file is not HDF5 or its datasets are not those of a mesh.
+        On all ranks, naming the dataset, if the file is not HDF5 or its datasets are not those of a mesh.
     """
     n_nodes, n_bars, node_names, bar_names = on_root(comm, _describe, path)
     check_size(n_nodes, str(path))
     first_node, last_node = slab_range(n_nodes, comm.rank, comm.size)
     first_bar, last_bar = slab_range(n_bars, comm.rank, comm.size)
-    # Every rank opens the file for itself, read-only: this needs no MPI driver, which a serial h5py lacks.
+    # Every rank opens the file read-only: this needs no MPI driver, which a serial h5py lacks.
     with agreed(comm), _opened(path) as file:
         try:
             return MeshSlab(
@@ -59,7 +59,7 @@ def read(path: Path, comm: MPI.Comm) -> MeshSlab:
 
 
 def write_hdf5(path: Path, slab: MeshSlab, comm: MPI.Comm) -> None:
-    """Write a mesh, each rank its slab. Collective: ranks write one after the other, which needs no MPI driver."""
+    """Write a mesh, each rank its slab. Collective; ranks write one after the other, which needs no MPI driver."""
     import h5py
 
     for rank in range(comm.size):
@@ -92,7 +92,7 @@ def _opened(path: Path) -> Any:
 
 
 def _describe(path: Path) -> tuple[int, int, list[str], list[str]]:
-    """Sizes and names of groups, after looking at every dataset's shape and type."""
+    """Check shape and type of every dataset; return sizes and names of groups."""
     import h5py
 
     with _opened(path) as file:
@@ -107,7 +107,7 @@ def _describe(path: Path) -> tuple[int, int, list[str], list[str]]:
                         f"{path}: /{name} has shape {dataset.shape} and type {dataset.dtype}; "
                         f"expected (n, {width}) {what}"
                     )
-                # Space never written takes no room in the file, so a small file can declare any size.
+                # Unwritten datasets need no space in the file, so a small file can declare any size.
                 stored, declared = dataset.id.get_storage_size(), prod(dataset.shape) * dataset.dtype.itemsize
                 if declared > stored * (_COMPRESSION if dataset.chunks else 1):
                     raise InputError(f"{path}: /{name} declares {dataset.shape} values but holds {stored} bytes")

@@ -1,4 +1,4 @@
-"""A mesh that one rank has read whole, dealt out to all ranks as slabs."""
+"""Distributes a mesh that one rank has read to all ranks as slabs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["WholeMesh", "read_and_scatter"]
 
 @dataclass
 class WholeMesh:
-    """A mesh as read from a file by one rank; numbers from 0."""
+    """A mesh read from a file by one rank; numbers from 0."""
 
     points: np.ndarray
     """(n_nodes, 3) float64 [m]."""
@@ -30,12 +30,12 @@ class WholeMesh:
 
 
 def read_and_scatter(read: Callable[[Path], WholeMesh], path: Path, comm: MPI.Comm) -> MeshSlab:
-    """Read a file on rank 0 and give every rank its slab. Collective.
+    """Read a file on rank 0 and send every rank its slab. Collective.
 
     Raises
     ------
     InputError
-        On all ranks, as raised by ``read`` on rank 0, and when the file's mesh does not fit in memory.
+        On all ranks, as raised by ``read`` on rank 0, and if the mesh does not fit in memory.
     """
     whole: WholeMesh | None = None
     with agreed(comm):
@@ -66,7 +66,7 @@ def read_and_scatter(read: Callable[[Path], WholeMesh], path: Path, comm: MPI.Co
 
 
 def _scatter(comm: MPI.Comm, rows: np.ndarray, n: int) -> np.ndarray:
-    """Deal out the rows that rank 0 has in the ranges of slab_range."""
+    """Scatter the rows of rank 0 in the ranges of slab_range."""
     if comm.size == 1:
         return rows
     ranges = [slab_range(n, rank, comm.size) for rank in range(comm.size)]
@@ -81,7 +81,7 @@ def _scatter(comm: MPI.Comm, rows: np.ndarray, n: int) -> np.ndarray:
 
 
 def _members(comm: MPI.Comm, members: np.ndarray | None, n: int) -> np.ndarray:
-    """The members of a group that rank 0 has which fall in this rank's range of ``n``; ascending, each once."""
+    """Return the members of rank 0's group within this rank's range of ``n``, ascending and unique."""
     parts = None
     if members is not None:
         members = np.unique(members).astype(np.int64)

@@ -1,8 +1,8 @@
 """VTK files of lines (.vtu, .vtkhdf): cells are bars, integer cell arrays are groups.
 
-A cell array of integers called ``group`` or ``section`` puts every bar with value i in the bar group ``group_i`` or
-``section_i``; a field array of strings called ``group_names`` or ``section_names`` replaces these by its i-th entry.
-Point arrays of the same names make node groups (a value below 0: in none).
+A cell array of integers named ``group`` or ``section`` assigns every bar with value i to the bar group ``group_i`` or
+``section_i``; a field array of strings named ``group_names`` or ``section_names`` replaces these names by its i-th
+entry. Point arrays of the same names define node groups (a negative value: no group).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ __all__ = ["read"]
 
 
 def read(path: Path, comm: MPI.Comm) -> MeshSlab:
-    """Each rank's slab of the mesh in a VTK file, which rank 0 reads. Collective.
+    """Return this rank's slab of the mesh in a VTK file, which rank 0 reads. Collective.
 
     Raises
     ------
@@ -39,7 +39,7 @@ def read(path: Path, comm: MPI.Comm) -> MeshSlab:
 def _read(path: Path) -> WholeMesh:
     with tempfile.TemporaryDirectory() as folder:
         result = Path(folder, "mesh.npz")
-        # -P: without the program's own folder in the path, where this module would stand in for the package vtk.
+        # -P removes the program's folder from the path, where this module would shadow the package vtk.
         command = [sys.executable, "-P", vtk_extract.__file__, str(path.resolve()), str(result)]
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
         done = subprocess.run(command, env=environment, capture_output=True, text=True, errors="replace", check=False)

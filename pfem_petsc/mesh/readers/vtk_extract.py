@@ -1,7 +1,7 @@
-"""Take a mesh of lines out of a VTK file: run as a program, ``vtk_extract.py FILE RESULT.npz``.
+"""Extracts a mesh of lines from a VTK file; run as a program, ``vtk_extract.py FILE RESULT.npz``.
 
-A process of its own, because VTK aborts the process on some damaged files. Imports neither MPI nor this package.
-A file that is no mesh of bars: status 3 and the reason on stdout.
+It is a separate process because VTK aborts the process on some damaged files. Imports neither MPI nor this package. For
+a file without a mesh of bars the status is 3 and the reason is printed on stdout.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ def main(path: str, result: str) -> int:
     """Read ``path``, write ``points``, ``bars`` and ``node_groups/<name>``, ``bar_groups/<name>`` to ``result``."""
     from vtkmodules.vtkCommonCore import vtkOutputWindow, vtkStringOutputWindow
 
-    # a damaged file can ask for any memory, and filling that takes a machine's time: compressed files need 200 times
-    # their size at most, arrays and copies included
+    # a damaged file can request any amount of memory, which takes time to fill: compressed files need at most 200 times
+    # their size, including arrays and copies
     _, most = resource.getrlimit(resource.RLIMIT_AS)
     enough = (4 << 30) + 200 * Path(path).stat().st_size
     resource.setrlimit(resource.RLIMIT_AS, (enough if most == resource.RLIM_INFINITY else min(enough, most), most))

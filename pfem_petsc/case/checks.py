@@ -47,6 +47,7 @@ def check_names(case: Mapping[str, Any], data: Mapping[str, Any], problems: Prob
             _node_sets((table, i), entry, node_sets, problems)
         _distinct((table,), case[table], what, problems)
 
+    _node_sets(("static",), getattr(case["static"], "parameters", None), node_sets, problems)
     output = case["output"]
     if output is not None:
         for i, probe in enumerate(output.probe):
@@ -71,8 +72,8 @@ def _node_set(path: tuple[str | int, ...], entry: Any, known: list[str], problem
 
 
 def _node_sets(path: tuple[str | int, ...], entry: Any, known: list[str], problems: Problems) -> None:
-    """Check names of node sets in the keys of type ``NodeSetName``."""
-    for key, field in type(entry).model_fields.items():
+    """Names of node sets in the keys of type ``NodeSetName``; None has none."""
+    for key, field in getattr(type(entry), "model_fields", {}).items():
         if (field.json_schema_extra or {}).get("refers_to") == "node_set" and getattr(entry, key) is not None:
             problems.refer((*path, key), getattr(entry, key), known, "node set")
 

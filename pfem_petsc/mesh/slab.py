@@ -8,7 +8,7 @@ import numpy as np
 
 from ..errors import InputError
 
-__all__ = ["MeshSlab", "check_length", "check_size", "index_type", "slab_of", "slab_range"]
+__all__ = ["MeshSlab", "check_length", "check_size", "index_type", "slab_of", "slab_of_whole", "slab_range"]
 
 
 @dataclass
@@ -90,3 +90,34 @@ def check_length(value: float, where: str) -> None:
         raise InputError(
             f"{where}: length {value:g} m overflows double precision when squared; choose one between 1e-150 and 1e150"
         )
+
+
+def slab_of_whole(
+    points: np.ndarray,
+    bars: np.ndarray,
+    node_groups: dict[str, np.ndarray],
+    bar_groups: dict[str, np.ndarray],
+    source: str,
+    rank: int,
+    size: int,
+) -> MeshSlab:
+    """A rank's part of a small mesh that every rank has made: points (nodes, 3) [m], bars (bars, 2), members."""
+    first_node, last_node = slab_range(len(points), rank, size)
+    first_bar, last_bar = slab_range(len(bars), rank, size)
+
+    def within(groups: dict[str, np.ndarray], first: int, last: int) -> dict[str, np.ndarray]:
+        found = {name: np.asarray(members, dtype=np.int64) for name, members in groups.items()}
+        return {name: members[(members >= first) & (members < last)] for name, members in found.items()}
+
+    return MeshSlab(
+        n_nodes=len(points),
+        n_bars=len(bars),
+        first_node=first_node,
+        points=np.array(points[first_node:last_node], dtype=np.float64).reshape(-1, 3),
+        first_bar=first_bar,
+        bars=np.asarray(bars, dtype=index_type(len(points)))[first_bar:last_bar].reshape(-1, 2),
+        node_groups=within(node_groups, first_node, last_node),
+        bar_groups=within(bar_groups, first_bar, last_bar),
+        source=source,
+        structured=True,
+    )

@@ -86,7 +86,8 @@ def damages(file: h5py.File, deep: bool = True) -> Iterator[str]:
 
     ``deep``: whether to read the values of all snapshots; else only those of mesh, steps, times and history.
     """
-    # imported here: the layout imports the writer of rows, which imports this module
+    # the layout needs what writes rows, which needs this module
+    from .history import EVENT
     from .layout import PER_STEP, complete_rows, complete_snapshots, field_datasets
     from .modes import mode_damages
 
@@ -112,7 +113,9 @@ def damages(file: h5py.File, deep: bool = True) -> Iterator[str]:
                 for i in range(n):
                     if _seeded(name, _stored_sum(dataset, i * size, size)) != int(digests[i, 1 + k]):
                         yield f"{name} of snapshot {i} (t = {times[i]:.6g} s) does not match its checksum"
-    yield from _history_damages(file["history"], checks["history"], complete_rows(file))
+    for table in ("history", EVENT):
+        if table in file:
+            yield from _history_damages(file[table], checks[table], complete_rows(file, table))
     yield from mode_damages(file, deep)
     if zlib.crc32(file["case/text"][()]) != int(file["case/text"].attrs["checksum"]):
         yield "the text of the case does not match its checksum"
@@ -139,7 +142,7 @@ def _history_damages(history: h5py.Group, digests: h5py.Dataset, n_rows: int) ->
         wrong = row_digests({name: history[name][rows] for name in names}, first) != digests[rows]
         if wrong.any():
             at = first + np.nonzero(wrong)[0]
-            yield f"history: {len(at)} rows do not match their checksums, the first is row {at[0]}"
+            yield f"{history.name[1:]}: {len(at)} rows do not match their checksums, the first is row {at[0]}"
 
 
 def _stored_sum(dataset: h5py.Dataset, first: int, count: int) -> int:

@@ -16,7 +16,10 @@ from .hdf5 import create_growing, dataset_names, grow, set_unit, write_rows, wri
 from .row import RowLayout
 from .units import unit_of
 
-__all__ = ["HistoryWriter", "check_columns", "create_history"]
+__all__ = ["EVENT", "HistoryWriter", "RowTables", "check_columns", "create_history"]
+
+EVENT = "event"
+"""The table of events: what happened between recorded steps, one row each."""
 
 # Rows per chunk: few, so that a short run has a small file (the first row allocates a whole chunk).
 ROWS_PER_CHUNK = 512
@@ -26,15 +29,20 @@ BUFFER_ROWS = 1024
 BUFFER_BYTES = 1 << 24
 
 
-def create_history(file: h5py.File, columns: Mapping[str, tuple[int, ...]], types: Mapping[str, Any]) -> None:
-    """Create ``/history`` with an empty dataset per column and the attribute ``rows``, the number of complete rows."""
-    group = file.create_group("history")
+def create_history(
+    file: h5py.File, columns: Mapping[str, tuple[int, ...]], types: Mapping[str, Any], name: str = "history"
+) -> None:
+    """Make a table of rows: an empty dataset a column and the attribute ``rows``: how many rows are complete.
+
+    ``name``: ``history``, or ``event``, of what happened between steps.
+    """
+    group = file.create_group(name)
     group.attrs["rows"] = np.int64(0)
-    for name, shape in columns.items():
-        dtype = np.dtype(types.get(name, np.float64))
+    for column, shape in columns.items():
+        dtype = np.dtype(types.get(column, np.float64))
         per_chunk = CHUNK_BYTES // max(1, dtype.itemsize * int(np.prod(shape, dtype=np.int64)))
-        made = create_growing(group, name, tuple(shape), dtype, max(1, min(ROWS_PER_CHUNK, per_chunk)))
-        set_unit(made, unit_of(name))
+        made = create_growing(group, column, tuple(shape), dtype, max(1, min(ROWS_PER_CHUNK, per_chunk)))
+        set_unit(made, unit_of(column))
 
 
 def check_columns(file: h5py.File, path: Path, columns: Mapping[str, tuple[int, ...]]) -> None:
@@ -62,7 +70,7 @@ def check_columns(file: h5py.File, path: Path, columns: Mapping[str, tuple[int, 
 
 
 class HistoryWriter:
-    """Appends rows to ``/history``.
+    """Appends rows to ``/history``, or to another table.
 
     Rank 0 has the values and writes them; the file grows on all ranks together. The attribute ``rows`` is updated after
     a flush of the data, so that neither a reader nor a kill ever leaves an incomplete row counted.
@@ -75,13 +83,16 @@ class HistoryWriter:
     path : Path
         For messages.
     columns : collection of column names
+    table : the group, ``history`` or ``event``
     """
 
-    def __init__(self, file: h5py.File, comm: MPI.Comm, path: Path, columns: Collection[str]) -> None:
+    def __init__(
+        self, file: h5py.File, comm: MPI.Comm, path: Path, columns: Collection[str], table: str = "history"
+    ) -> None:
         self._comm, self._path = comm, path
-        group = file["history"]
+        group = file[table]
         self._datasets = {name: group[name] for name in columns}
-        self._digests = file[CHECKS]["history"]
+        self._digests = file[CHECKS][table]
         self._rows_attribute = h5py.h5a.open(group.id, b"rows")
         self.n_rows = int(group.attrs["rows"])
         row_bytes = sum(d.dtype.itemsize * int(np.prod(d.shape[1:], dtype=np.int64)) for d in self._datasets.values())
@@ -128,3 +139,48 @@ class HistoryWriter:
         """Count the written rows as complete; flush the file afterwards. Collective."""
         with writing(self._comm, self._path):
             self._rows_attribute.write(np.array(self.n_rows, dtype=np.int64))
+
+
+class RowTables:
+    """The tables of a result file that grow by rows: the history, and the events of analyses that have some.
+
+    Attributes
+    ----------
+    history, event : HistoryWriter; ``event`` is None without events
+    reserve_bytes : what a write of all may take on disk
+
+    Raises
+    ------
+    InputError
+        Where the run has events, and the file was made without.
+    """
+
+    def __init__(
+        self,
+        file: h5py.File,
+        comm: MPI.Comm,
+        path: Path,
+        columns: Collection[str],
+        events: Collection[str] | None,
+    ) -> None:
+        if events and EVENT not in file:
+            raise InputError(f"{path}: has no events, which the run records: write elsewhere (-o)")
+        self.history = HistoryWriter(file, comm, path, columns)
+        self.event = HistoryWriter(file, comm, path, events, EVENT) if events else None
+        self._all = [self.history] if self.event is None else [self.history, self.event]
+        self.reserve_bytes = sum(table.reserve_bytes for table in self._all)
+
+    @property
+    def buffered(self) -> bool:
+        """Whether any has rows to write."""
+        return any(table.n_buffered for table in self._all)
+
+    def write(self) -> None:
+        """Write the buffered rows of all. Collective."""
+        for table in self._all:
+            table.write()
+
+    def commit(self) -> None:
+        """Count them as complete. Collective."""
+        for table in self._all:
+            table.commit()

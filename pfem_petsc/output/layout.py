@@ -10,7 +10,7 @@ import numpy as np
 
 from .digests import CHECKS
 from .hdf5 import chunk_rows, create_growing, dataset_names, set_unit
-from .history import ROWS_PER_CHUNK, create_history
+from .history import EVENT, ROWS_PER_CHUNK, create_history
 from .modes import create_modes
 from .provenance import write_case
 from .units import field_unit
@@ -40,8 +40,11 @@ def create_result(
     case_text: str,
     attributes: Mapping[str, Any],
     modes: str | None = None,
+    events: Mapping[str, Any] | None = None,
 ) -> None:
     """Create the structure of a result file without fields: VTKHDF 2.0 without steps, history, case.
+
+    ``events``: columns of the table of events with their types, empty for none.
 
     The mesh is one part, whatever the number of ranks, and all steps use the same connectivity (offset 0).
     ``modes`` is the kind of those that there will be.
@@ -78,6 +81,9 @@ def create_result(
     checks.create_dataset("mesh", data=np.zeros(1, dtype=np.uint64))
     create_growing(checks, "history", (), np.uint64, ROWS_PER_CHUNK)
     create_history(file, columns, column_types)
+    if events:
+        create_growing(checks, EVENT, (), np.uint64, ROWS_PER_CHUNK)
+        create_history(file, dict.fromkeys(events, ()), events, EVENT)
     write_case(file, case_text, attributes)
     if modes is not None:
         create_modes(file, modes, n_nodes)
@@ -131,13 +137,15 @@ def complete_snapshots(file: h5py.File) -> int:
     return min(lengths)
 
 
-def complete_rows(file: h5py.File) -> int:
-    """Return the number of complete rows of the history."""
-    history = file["history"]
+def complete_rows(file: h5py.File, table: str = "history") -> int:
+    """How many rows of the history, or of another table, are complete; zero where the file has no such table."""
+    if table not in file:
+        return 0
+    rows = file[table]
     return min(
         [
-            int(history.attrs["rows"]),
-            len(file[CHECKS]["history"]),
-            *(len(history[name]) for name in dataset_names(history)),
+            int(rows.attrs["rows"]),
+            len(file[CHECKS][table]),
+            *(len(rows[name]) for name in dataset_names(rows)),
         ]
     )

@@ -16,7 +16,7 @@ from ..errors import InputError
 from .digests import CHECKS
 from .disk import fsync_all
 from .hdf5 import create_checked, dataset_names, grow, write_rows
-from .history import check_columns
+from .history import EVENT, check_columns
 from .layout import (
     PER_STEP,
     complete_rows,
@@ -38,14 +38,16 @@ PIECE = 1 << 24
 """Number of bytes that are read and written at once."""
 
 
-def repair(path: Path | str, last: tuple[int, int] | None = None) -> tuple[int, int]:
-    """Remove incomplete data of a killed run, and everything after the ``last`` steps. Not collective.
+def repair(path: Path | str, last: tuple[int, int] | None = None, after_step: int | None = None) -> tuple[int, int]:
+    """Cut off what a killed run left incomplete, and everything after the ``last`` steps. One process.
 
     Parameters
     ----------
     path : Path or str
     last : (int, int), optional
         Steps of the last snapshot and of the last history row that are kept.
+    after_step : int, optional
+        Step of the last event that is kept.
 
     Returns
     -------
@@ -88,6 +90,11 @@ def repair(path: Path | str, last: tuple[int, int] | None = None) -> tuple[int, 
         for name in dataset_names(history):
             grow(history[name], n_rows)
         grow(file[CHECKS]["history"], n_rows)
+        if EVENT in file:
+            n_events = _kept_events(file, after_step)
+            file[EVENT].attrs.modify("rows", np.int64(n_events))
+            for dataset in (*file[EVENT].values(), file[CHECKS][EVENT]):
+                grow(dataset, n_events)
         if n_snapshots:
             grow(file[CHECKS]["snapshots"], n_snapshots)
     fsync_all(path)
@@ -133,9 +140,10 @@ def reopen(
             earlier = list(read_attributes(file["case"]).get("restarts_after_step", []))
             described = {**attributes, "restarts_after_step": [*earlier, after_step]}
             if target != path:
-                create_checked(target, _rebuild, file, n_snapshots, n_rows, case_text, described)
+                kept = n_snapshots, n_rows, _kept_events(file, after_step)
+                create_checked(target, _rebuild, file, kept, case_text, described)
                 return
-        repair(target, last)
+        repair(target, last, after_step)
         with h5py.File(target, "r+", locking=False) as file:
             write_case(file, case_text, described)
 
@@ -179,21 +187,26 @@ def _check_same(
 def _rebuild(
     target: h5py.File,
     source: h5py.File,
-    n_snapshots: int,
-    n_rows: int,
+    kept: tuple[int, int, int],
     case_text: str,
     attributes: Mapping[str, Any],
 ) -> None:
-    """Copy the kept data of a file to a new one, without remains of a kill or damage."""
+    """Fill a new file with what is kept of another: nothing that a kill or damage has left in that one comes along.
+
+    ``kept``: snapshots, history rows and events
+    """
+    n_snapshots, n_rows, n_events = kept
     vtk, history = source["VTKHDF"], source["history"]
     n_nodes, n_bars = int(vtk["NumberOfPoints"][0]), int(vtk["NumberOfCells"][0])
     columns = {name: history[name].shape[1:] for name in dataset_names(history)}
     types = {name: history[name].dtype for name in columns}
-    create_result(target, n_nodes, n_bars, columns, types, case_text, attributes)
+    events = {name: dataset.dtype for name, dataset in source[EVENT].items()} if EVENT in source else {}
+    create_result(target, n_nodes, n_bars, columns, types, case_text, attributes, events=events)
     rows: dict[str, int] = {"VTKHDF/Connectivity": 2 * n_bars, "VTKHDF/Offsets": n_bars + 1, f"{CHECKS}/mesh": 1}
     rows |= {f"VTKHDF/Steps/{name}": n_snapshots for name in (*PER_STEP, "Values")}
     rows |= {f"snapshots/{name}": n_snapshots for name in ("step", "time")}
     rows |= {f"history/{name}": n_rows for name in columns} | {f"{CHECKS}/history": n_rows}
+    rows |= {f"{EVENT}/{name}": n_events for name in events} | ({f"{CHECKS}/{EVENT}": n_events} if events else {})
     if n_snapshots:
         for name, dataset in field_datasets(vtk).items():
             kind, _, field = name.partition("/")
@@ -211,6 +224,8 @@ def _rebuild(
             write_rows(new, first, old[first : min(first + piece, n)])
     target["VTKHDF/Steps"].attrs.modify("NSteps", np.int64(n_snapshots))
     target["history"].attrs.modify("rows", np.int64(n_rows))
+    if events:
+        target[EVENT].attrs.modify("rows", np.int64(n_events))
 
 
 def _kept(file: h5py.File, last: tuple[int, int] | None) -> tuple[int, int]:
@@ -220,6 +235,14 @@ def _kept(file: h5py.File, last: tuple[int, int] | None) -> tuple[int, int]:
         n_snapshots = int(np.searchsorted(file["snapshots/step"][:n_snapshots], last[0], side="right"))
         n_rows = int(np.searchsorted(file["history/step"][:n_rows], last[1], side="right"))
     return n_snapshots, n_rows
+
+
+def _kept_events(file: h5py.File, after_step: int | None) -> int:
+    """Complete events, up to the step that the run goes on from."""
+    n_events = complete_rows(file, EVENT)
+    if after_step is not None and n_events:
+        n_events = int(np.searchsorted(file[EVENT]["step"][:n_events], after_step, side="right"))
+    return n_events
 
 
 @contextmanager

@@ -14,6 +14,7 @@ import numpy as np
 from ..errors import InputError
 from ..registry import nearest
 from .hdf5 import HDF5_ERRORS, dataset_names
+from .history import EVENT
 from .layout import complete_rows, complete_snapshots
 from .modes import MODES, NAMES, complete_modes
 from .provenance import read_attributes
@@ -107,6 +108,9 @@ class Result:
         self.attributes: dict[str, Any] = read_attributes(file["case"])
         self._n_rows = complete_rows(file)
         self._columns = dataset_names(file["history"])
+        self._n_events = complete_rows(file, EVENT)
+        if EVENT in file:
+            self._columns += [f"{EVENT}/{name}" for name in dataset_names(file[EVENT])]
         self.n_modes = complete_modes(file)
         self._names = sorted(file[MODES]) if self.n_modes else []
 
@@ -117,7 +121,10 @@ class Result:
 
     @property
     def history(self) -> History:
-        """The columns of the history: ``result.history["wall/floor/force"]``, (rows, 3)."""
+        """The history's columns: ``result.history["wall/floor/force"]``, (rows, 3).
+
+        Those of events, ``event/...``, have a row for each event instead.
+        """
         return History(self, self._columns, self._n_rows)
 
     @property
@@ -188,6 +195,17 @@ class Result:
         """Return rows of a dataset, named by its path in the file."""
         return self._patiently(lambda file: file[name][rows])
 
+    def column(self, name: str, n_rows: int) -> np.ndarray:
+        """A column of the history, or of the events; names where numbers stand for them."""
+        if not name.startswith(f"{EVENT}/"):
+            return self.read(f"history/{name}", slice(0, n_rows))
+        values = self.read(name, slice(0, self._n_events))
+        names = h5py.check_enum_dtype(values.dtype)
+        if names is None:
+            return values
+        words = {number: word for word, number in names.items()}
+        return np.array([words[int(value)] for value in values], dtype=np.str_)
+
     def _patiently(self, look: Callable[[h5py.File], T]) -> T:
         with readable(self.path):
             for left in reversed(range(ATTEMPTS)):
@@ -227,7 +245,7 @@ class History(Mapping[str, np.ndarray]):
 
     def __getitem__(self, name: str) -> Any:
         if name in self._names:
-            return self._result.read(f"history/{self._prefix}{name}", slice(0, self.n_rows))
+            return self._result.column(self._prefix + name, self.n_rows)
         if any(known.startswith(f"{name}/") for known in self._names):
             return History(self._result, self._columns, self.n_rows, f"{self._prefix}{name}/")
         raise KeyError(f"{self._result.path}: history has no {self._prefix}{name}{nearest(name, self._names)}")

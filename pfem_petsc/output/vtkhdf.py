@@ -26,7 +26,7 @@ from .hdf5 import (
     write_rows,
     writing,
 )
-from .history import HistoryWriter
+from .history import RowTables
 from .layout import create_field, create_result, field_datasets
 from .modes import prepare_modes, write_modes
 from .provenance import describe_run
@@ -43,12 +43,12 @@ __all__ = ["ResultWriter"]
 class ResultWriter:
     """Writes snapshots and history of a run to one file, the same for any number of ranks.
 
-    ``/VTKHDF`` is a temporal UnstructuredGrid of lines in mesh numbering: the connectivity once, and points (the
-    current positions) and fields for each snapshot. A kill may occur at any time, even within a flush, whose order of
-    writes is undefined. Therefore the data and offsets of a snapshot are flushed before it is counted, and its count is
-    flushed before its time is written: VTK cannot read a step without data, and crashes on more times than steps.
-    ``/history`` has one row per recorded step, ``/case`` the data needed to run the case again, ``/snapshots`` step and
-    time of each snapshot.
+    ``/VTKHDF`` is a temporal UnstructuredGrid of lines in the mesh's own numbering: connectivity once, points (the
+    current positions) and fields a snapshot. A kill may come at any moment, also within a flush, which writes in an
+    order of its own. So a snapshot's data and offsets are flushed before it is counted, and its count is flushed before
+    its time is written: VTK cannot read a step without data, and crashes on more times than steps.
+    ``/history`` has a row a recorded step, ``/event`` one for each event of analyses that have some, ``/case`` what is
+    needed to run the case again, ``/snapshots`` step and time of each snapshot.
 
     All methods are collective. After a :class:`SimulationFailure` they raise it again, and the writer can only be
     closed.
@@ -75,6 +75,8 @@ class ResultWriter:
         Steps of the last snapshot and of the last history row that are kept then, where not all up to that step are.
     modes : "vibration" or "buckling", optional
         Kind of the modes that :meth:`write_modes` will write.
+    events : mapping, optional
+        Columns of the table ``/event`` to their types, one of them ``step``; without it there is no such table.
 
     Raises
     ------
@@ -99,6 +101,7 @@ class ResultWriter:
         append_after_step: int | None = None,
         last: tuple[int, int] | None = None,
         modes: str | None = None,
+        events: Mapping[str, Any] | None = None,
     ) -> None:
         require_parallel_hdf5(comm)
         self.path, self.comm = Path(path), comm
@@ -118,7 +121,7 @@ class ResultWriter:
         described = describe_run(comm, attributes)
         sizes = (self.n_nodes, self.n_bars)
         if append_after_step is None:
-            structure = (*sizes, columns, column_types, case_text, described, modes)
+            structure = (*sizes, columns, column_types, case_text, described, modes, events)
             self._unpublished = create_new(self.path, comm, create_result, *structure, checked=True)
         else:
             last = last or (append_after_step, append_after_step)
@@ -133,7 +136,7 @@ class ResultWriter:
         # Points and fields, created with the first snapshot, which defines the shapes.
         self._data = field_datasets(vtk) if self.n_snapshots else {}
         self._index = SnapshotIndex(self._file, comm, self.path, mesh)
-        self._history = HistoryWriter(self._file, comm, self.path, columns)
+        self._rows = RowTables(self._file, comm, self.path, columns, events)
         if append_after_step is None:
             with self._whole_or_failed():
                 write_connectivity(self._file, comm, self.path, mesh)
@@ -190,10 +193,10 @@ class ResultWriter:
                     first = n * order.n_global + order.first
                     write_rows(self._data[name], first, slab, collective=self.comm.size > 1)
             self._index.append(n, step, time, digests)
-            self._history.write()
+            self._rows.write()
             with writing(self.comm, self.path):
                 file.flush()
-            self._history.commit()
+            self._rows.commit()
             self._index.publish(n, time)
             self._publish()
         self.n_snapshots = n + 1
@@ -203,21 +206,27 @@ class ResultWriter:
 
         Rows are buffered until a snapshot, :meth:`flush_history`, :meth:`close`, or a thousand rows.
         """
-        if self._history.full:
+        if self._rows.history.full:
             self.flush_history()
-        self._history.append(row)
+        self._rows.history.append(row)
+
+    def append_event(self, row: Mapping[str, Any] | None) -> None:
+        """Add an event: rank 0 passes a value for each column, the other ranks None. Collective."""
+        if self._rows.event.full:
+            self.flush_history()
+        self._rows.event.append(row)
 
     def flush_history(self) -> None:
-        """Write the buffered rows. Collective."""
+        """Write the rows and events kept in memory. Collective."""
         file = self._ready()
-        if self._history.n_buffered == 0:
+        if not self._rows.buffered:
             return
         self._require_room(0)
         with self._whole_or_failed():
-            self._history.write()
+            self._rows.write()
             with writing(self.comm, self.path):
                 file.flush()
-            self._history.commit()
+            self._rows.commit()
             with writing(self.comm, self.path):
                 file.flush()
             self._publish()
@@ -287,7 +296,12 @@ class ResultWriter:
 
     def _require_room(self, n_bytes: int) -> None:
         try:
-            require_room(self.comm, self.path, n_bytes + self._history.reserve_bytes, target=self._unpublished)
+            require_room(
+                self.comm,
+                self.path,
+                n_bytes + self._rows.reserve_bytes,
+                target=self._unpublished,
+            )
         except SimulationFailure as error:
             self._failure = error
             raise

@@ -69,6 +69,7 @@ def open_result_file(
         append_after_step=step if continues else None,
         last=restart.last if continues else None,
         modes=case.modes.kind if case.modes is not None else None,
+        events=recorder.stepper.event_columns,
     )
 
 

@@ -10,6 +10,7 @@ from ..errors import EarlyStop, SimulationFailure
 from ..output.progress import Progress
 from ..output.vtkhdf import ResultWriter
 from ..recording.checkpointing import Checkpointing
+from ..recording.events import Events
 from ..recording.fields import Fields
 from ..recording.history import History
 from ..recording.observer import Callback, Observer
@@ -41,7 +42,7 @@ class Outputs:
     Attributes
     ----------
     fields : of the snapshots
-    progress, history, snapshots, checkpointing : None before :meth:`open`
+    progress, history, events, snapshots, checkpointing : None before :meth:`open`
     """
 
     def __init__(
@@ -59,6 +60,7 @@ class Outputs:
         self.history: History | None = None
         self.snapshots: Snapshots | None = None
         self.checkpointing: Checkpointing | None = None
+        self.events: Events | None = None
         self._report: ProgressReport | None = None
         self._callbacks: list[Callback] = []
         self._writer: ResultWriter | None = None
@@ -71,7 +73,7 @@ class Outputs:
 
     @property
     def _recording(self) -> tuple[Observer, ...]:
-        return self.history, self.snapshots, self.checkpointing
+        return self.history, self.events, self.snapshots, self.checkpointing
 
     @property
     def _observers(self) -> tuple[Observer, ...]:
@@ -107,6 +109,7 @@ class Outputs:
         self.history = history = History(stepper, self._synchroniser, warn)
         if hasattr(stepper, "message"):
             stepper.message = warn
+        self.events = Events(stepper, self.progress.message)
         self.snapshots = Snapshots(analysis, self.fields, warn)
         self.checkpointing = Checkpointing(checkpoints, history, self.snapshots, self._synchroniser)
         self._report = ProgressReport(self.progress, analysis, history)
@@ -122,7 +125,7 @@ class Outputs:
         if restart is not None:
             remove_modes(folder, model.comm)
         self._writer = open_result_file(model, plan, history.recorder, self.fields, folder, restart, start[0])
-        history.writer = self.snapshots.writer = self._writer
+        history.writer = self.events.writer = self.snapshots.writer = self._writer
 
     def record_start(self) -> None:
         """Record the first row and snapshot, unless the continued results contain them. Collective."""

@@ -12,11 +12,10 @@ from ..analysis import Analysis, Step
 from ..case.materials import law_name, law_of
 from ..errors import InputError, PfemError
 from ..integrators.base import Scheme, State
-from ..output.units import LOAD_FACTOR, Axis
+from ..output.units import LOAD_FACTOR, POINT, Axis
 from ..registry import lookup
 from ..solvers.linear import LinearChoice, choose_linear
 from ..tolerances import TIME
-from .scheme import Equilibrium
 
 if TYPE_CHECKING:
     from ..case.schema import Case
@@ -38,9 +37,9 @@ class StaticPlan:
     ----------
     scheme : the balance without inertia
     step : first increment of the load factor
-    end : last load factor; None where the path ends by other limits
+    end : last load factor, or largest number of points
     linear : linear solver
-    steps : number of steps, which is not known before
+    steps : largest number of steps, None where it is not known before
     axis : of the times in the results
     """
 
@@ -86,9 +85,12 @@ class StaticAnalysis(Analysis):
         self.model = model
         parameters = case.static.parameters
         choice = _linear(model)
-        self.plan = StaticPlan(Equilibrium(), parameters.step, getattr(parameters, "end", None), choice)
         self.step_size = parameters.step
         self.stepper = lookup(METHODS, case.static.method, "static.method").make_stepper(model, parameters, choice)
+        scheme, end = self.stepper.scheme, self.stepper.end
+        points = getattr(parameters, "max_points", None)
+        axis = LOAD_FACTOR if points is None else POINT
+        self.plan = StaticPlan(scheme, parameters.step, end, choice, points, axis)
 
     @property
     def last_step(self) -> int:

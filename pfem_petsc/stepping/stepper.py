@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -53,6 +53,8 @@ class Stepper(ABC):
         arrays with a row for each owned node, and for each local bar
     columns : names of attributes, numbers, that are columns of the history
     remedy : what the user can do against steps that are too large
+    event_columns : columns of events and their types; empty for steppers without events
+    events : found with the last step and not recorded yet, the same on all ranks; each has ``row()`` and a text
     """
 
     kept_numbers: tuple[str, ...] = ("part", "smallest")
@@ -60,6 +62,8 @@ class Stepper(ABC):
     kept_bars: tuple[str, ...] = ()
     columns: tuple[str, ...] = ()
     remedy = "reduce time.step"
+    event_columns: Mapping[str, Any] = {}
+    events: Sequence[Any] = ()
     renews_forces = False
     steady = False
 
@@ -259,6 +263,10 @@ class Stepper(ABC):
         for weight, time in balance.loads:
             total += weight * self.model.external.at(time, part)
         return total
+
+    def remarks(self) -> list[str]:
+        """What users should know at the end of a run."""
+        return []
 
     def destroy(self) -> None:  # noqa: B027 - most steppers have nothing to free
         """Free PETSc objects; the stepper cannot make further steps. Collective; may be called again."""

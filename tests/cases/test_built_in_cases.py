@@ -157,6 +157,31 @@ def tensegrity_prism(run):
     assert history["elastic_energy"][-1] == pytest.approx(6.0589, rel=1e-3)
 
 
+def limits(history):
+    return [factor for kind, factor in zip(history["event/kind"], history["event/load_factor"]) if kind == "limit"]
+
+
+@number
+def von_mises(run):
+    """Limit points at +-2 E A (1 - (b/L0)^(2/3))^(3/2) (formulas: 3.3)."""
+    exact = 2e5 * (1.0 - 1.01 ** (-1 / 3)) ** 1.5
+    assert 100.0 * np.array(limits(run("von_mises"))) == pytest.approx([exact, -exact], rel=1e-9)
+
+
+@number
+def star_dome(run):
+    """Limit points at P/(E A) = 3.1565e-4 and at -265 N (formulas: 4)."""
+    up, down = limits(run("star_dome"))
+    assert 1000.0 * up / (3.03e9 * 3.17e-4) == pytest.approx(3.1565e-4, abs=5e-9)
+    assert 1000.0 * down == pytest.approx(-265.0, abs=0.5)
+
+
+@number
+def dome_16(run):
+    """Limit points of the path up to the second bifurcation."""
+    assert limits(run("dome_16", "static.max_points=40")) == pytest.approx([0.09566, -0.09612, 0.3209], abs=1.1e-4)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", built_in_cases())
 def test_promised_numbers(name, run):

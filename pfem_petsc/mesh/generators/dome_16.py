@@ -1,0 +1,50 @@
+"""The shallow dome of 16 bars: an apex, a square around it, and four feet on the axes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ...case.base import PositiveFloat, StrictModel
+from ..slab import MeshSlab, check_length, slab_of_whole
+
+__all__ = ["Parameters", "generate"]
+
+
+class Parameters(StrictModel):
+    """Keys of ``[mesh]`` with ``generator = "dome_16"``; the defaults are the dome of Hrinda 2010."""
+
+    apex_height: PositiveFloat = 0.1016
+    """Height of the apex over the feet [m]."""
+    ring_height: PositiveFloat = 0.0508
+    """Height of the square over the feet [m]."""
+    half_side: PositiveFloat = 0.127
+    """Half a side of the square [m]."""
+    base_radius: PositiveFloat = 0.254
+    """Distance of the feet from the axis [m]."""
+
+
+def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
+    """This rank's part: node 0 is the apex, 1 to 4 the corners of the square, 5 to 8 the feet, from the x axis on.
+
+    Bars: apex to corners, the square, corners to the two feet next to each. Node groups ``apex``, ``ring``, ``feet``;
+    bar groups ``spokes``, ``ring``, ``legs``.
+
+    Source of geometry: Hrinda, Snap-through instability patterns in truss structures, AIAA 2010-2611.
+    """
+    for name in ("apex_height", "ring_height", "half_side", "base_radius"):
+        check_length(getattr(parameters, name), f"mesh.{name}")
+    a, z, base = parameters.half_side, parameters.ring_height, parameters.base_radius
+    points = [[0.0, 0.0, parameters.apex_height], [a, a, z], [-a, a, z], [-a, -a, z], [a, -a, z]]
+    points += [[base, 0.0, 0.0], [0.0, base, 0.0], [-base, 0.0, 0.0], [0.0, -base, 0.0]]
+    k = np.arange(4)
+    after = (k + 1) % 4
+    bars = [(np.zeros(4), 1 + k), (1 + k, 1 + after), (1 + k, 5 + k), (1 + k, 5 + after)]
+    return slab_of_whole(
+        np.array(points),
+        np.vstack([np.column_stack(pair) for pair in bars]).astype(np.int64),
+        {"apex": np.zeros(1), "ring": 1 + k, "feet": 5 + k},
+        {"spokes": k, "ring": 4 + k, "legs": np.arange(8, 16)},
+        "generator dome_16",
+        rank,
+        size,
+    )

@@ -1,0 +1,47 @@
+"""Equal bars from feet on a circle to an apex above its centre: the two-bar truss of von Mises, or a pyramid."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field
+
+from ...case.base import PositiveFloat, StrictModel
+from ..slab import MeshSlab, check_length, slab_of_whole
+
+__all__ = ["Parameters", "generate"]
+
+
+class Parameters(StrictModel):
+    """Keys of ``[mesh]`` with ``generator = "von_mises"``."""
+
+    half_span: PositiveFloat
+    """Radius of the circle of feet [m]."""
+    rise: PositiveFloat
+    """Height of the apex over the feet [m]."""
+    legs: Annotated[int, Field(ge=2, le=10_000)] = 2
+    """Number of bars, at equal angles from the x axis."""
+
+
+def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
+    """This rank's part: node 0 is the apex, node 1 + i the foot of bar i, in the plane z = 0.
+
+    Node groups ``apex`` and ``feet``; bar group ``legs`` (all).
+    """
+    n = parameters.legs
+    check_length(parameters.half_span, "mesh.half_span")
+    check_length(parameters.rise, "mesh.rise")
+    angles = 2.0 * np.pi * np.arange(n) / n
+    feet = parameters.half_span * np.column_stack([np.cos(angles), np.sin(angles), np.zeros(n)])
+    feet[np.abs(feet) < 1e-15 * parameters.half_span] = 0.0
+    numbers = np.arange(1, n + 1)
+    return slab_of_whole(
+        np.vstack([[0.0, 0.0, parameters.rise], feet]),
+        np.column_stack([np.zeros(n, dtype=np.int64), numbers]),
+        {"apex": np.zeros(1), "feet": numbers},
+        {"legs": np.arange(n)},
+        f"generator von_mises ({n} legs)",
+        rank,
+        size,
+    )

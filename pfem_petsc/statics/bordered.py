@@ -1,0 +1,202 @@
+"""Equilibrium and its derivatives as functions of displacements and load factor, and the linear solves of a path.
+
+Along a path displacement u and load factor are unknowns of f_int(u) - f_ext(load factor) = 0 and one further equation.
+Newton's method eliminates it: with the tangent stiffness K it takes two solves, K r = -g for the residual g and
+K v = -dg/d(load factor) for the response to the load, and the further equation gives the change of the load factor
+(Batoz and Dhatt 1979; Riks 1979). K alone is factorised, which is singular at critical points only, so that any linear
+solver serves.
+"""
+
+from __future__ import annotations
+
+import weakref
+from typing import TYPE_CHECKING
+
+import numpy as np
+from mpi4py import MPI
+from petsc4py import PETSc
+
+from ..contact.transform import Transform
+from ..errors import NotConverged
+from ..solvers.lagged import LaggedPreconditioner
+from ..solvers.linear import DIRECT, LinearChoice, configure
+from ..solvers.reasons import linear_reason
+from ..stepping.problem import StepProblem
+
+if TYPE_CHECKING:
+    from ..integrators.base import State
+    from ..solvers.matrix import HessianMatrix
+    from ..solvers.matrix_free import MatrixFreeHessian
+    from ..stepping.model import Model
+    from .path_scheme import PathEquilibrium
+
+__all__ = ["BorderedSystem"]
+
+_PREFIX = "pfem_path_"
+_RTOL = 1e-8  # of iterative solves: tangents, which tell where the load factor turns, have no further correction
+_SHARE = 1e-5  # of the load factor, for differences in it: those of loads that are linear in it are exact
+
+
+class BorderedSystem:
+    """Residual, response to the load, and solves with the tangent stiffness. Made once for a run.
+
+    Options: prefix ``pfem_path_``.
+
+    Parameters
+    ----------
+    model : Model
+    hessian : of the stepper, assembled or matrix-free
+    choice : of the linear solver
+    lagged : preconditioner that is kept over steps, None where PETSc makes one from the matrix
+    scheme : gives the balance
+    unit : a load factor that is not small, for differences
+
+    Attributes
+    ----------
+    problem : StepProblem at the start of the present step
+    linear : iterations of the linear solver so far
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        hessian: HessianMatrix | MatrixFreeHessian,
+        choice: LinearChoice,
+        lagged: LaggedPreconditioner | None,
+        scheme: PathEquilibrium,
+        unit: float,
+    ) -> None:
+        self.model, self.hessian, self.lagged, self.scheme = model, hessian, lagged, scheme
+        self._unit = unit
+        self._transform = Transform(model)
+        self.direct = choice.krylov == "preonly"
+        self.linear = 0
+        mesh = model.mesh
+        self._b = PETSc.Vec().createMPI((3 * mesh.n_owned, 3 * mesh.n_nodes), bsize=3, comm=mesh.comm)
+        self._x = self._b.duplicate()
+        self._ksp = PETSc.KSP().create(mesh.comm)
+        self._ksp.setOptionsPrefix(_PREFIX)
+        # beyond a critical point the stiffness is indefinite
+        own = (
+            choice
+            if self.direct or choice.preconditioner in DIRECT
+            else LinearChoice("gmres", choice.preconditioner, "")
+        )
+        ours = None if lagged is None else _Preconditioning(self)
+        configure(self._ksp, own, False, ours)
+        if not self.direct:
+            self._ksp.setTolerances(rtol=_RTOL, max_it=2000)
+        self._ksp.setOperators(hessian.mat, hessian.mat)
+        self._ksp.setFromOptions()
+        self.problem: StepProblem | None = None
+
+    def begin(self, state: State) -> None:
+        """Take displacements from the positions of a state on. Collective."""
+        balance = self.scheme.balance(state, 0.0)
+        self.problem = StepProblem(self.model, state, balance, state.external, self._transform)
+
+    def external(self, load_factor: float) -> np.ndarray:
+        """External forces (owned, 3) [N]."""
+        out = np.zeros_like(self.problem.u)
+        return self.model.external.at(load_factor, out) if self.model.external.active else out
+
+    def prescribe(self, u: np.ndarray, load_factor: float) -> None:
+        """Put prescribed components of displacements (owned, 3) in place."""
+        supports = self.model.supports
+        if supports.any:
+            u[supports.at] = supports.positions(load_factor) - self.problem.balance.predictor[supports.at]
+
+    def imbalance(self, u: np.ndarray, load_factor: float, g: np.ndarray) -> None:
+        """g = f_int - f_ext (owned, 3) [N], reactions of supports included. Collective."""
+        if self.model.temperatures.varying:
+            self.model.temperatures.apply(load_factor)
+        self.problem.known = -self.external(load_factor)
+        self.problem.imbalance(u, g)
+
+    def residual(self, u: np.ndarray, load_factor: float, g: np.ndarray) -> None:
+        """As :meth:`imbalance`, zero where supports prescribe the position. Collective."""
+        self.imbalance(u, load_factor, g)
+        if self.model.supports.any:
+            g[self.model.supports.fixed] = 0.0
+
+    def rate(self, u: np.ndarray, load_factor: float) -> np.ndarray:
+        """-dg/d(load factor) (owned, 3) [N] at free components, by central differences. Collective."""
+        h = _SHARE * max(abs(load_factor), self._unit)
+        model = self.model
+        if not (model.temperatures.varying or model.supports.moving):
+            q = (self.external(load_factor + h) - self.external(load_factor - h)) / (2.0 * h)
+            q[model.supports.fixed] = 0.0
+            return q
+        ends = []
+        for end in (load_factor + h, load_factor - h):
+            there, g = u.copy(), np.empty_like(u)
+            self.prescribe(there, end)
+            self.residual(there, end, g)
+            ends.append(g)
+        if model.temperatures.varying:
+            model.temperatures.apply(load_factor)
+        return (ends[1] - ends[0]) / (2.0 * h)
+
+    def linearise(self, u: np.ndarray) -> None:
+        """Take the tangent stiffness at a displacement. Collective."""
+        self.hessian.update(self.problem, u)
+        self._ksp.setOperators(self.hessian.mat, self.hessian.mat)
+
+    def solve(self, b: np.ndarray) -> np.ndarray:
+        """K^-1 b (owned, 3), zero at prescribed components. Collective.
+
+        Raises
+        ------
+        NotConverged
+            On all ranks: K is singular, or the linear solver does not converge.
+        """
+        self._b.array[:] = b.ravel()
+        if self.model.supports.any:
+            self._b.array[self.model.supports.fixed.ravel()] = 0.0
+        reason = self._attempt()
+        if reason < 0 and self.lagged is not None and self.lagged.carried:
+            self.lagged.drop()
+            self._ksp.setOperators(self.hessian.mat, self.hessian.mat)
+            reason = self._attempt()
+        x = self._x.array.reshape(b.shape).copy()
+        finite = self.model.comm.allreduce(int(np.isfinite(x).all()), op=MPI.MIN)
+        if reason < 0 or not finite:
+            why = linear_reason(reason) if reason < 0 else "the solution is not finite"
+            raise NotConverged(f"the linear system of the tangent stiffness cannot be solved ({why})")
+        return x
+
+    def response(self, u: np.ndarray, load_factor: float) -> np.ndarray:
+        """Displacement per load factor v (owned, 3) of the stiffness last taken, supports included. Collective."""
+        v = self.solve(self.rate(u, load_factor))
+        supports = self.model.supports
+        if supports.moving:
+            h = _SHARE * max(abs(load_factor), self._unit)
+            v[supports.at] = (supports.positions(load_factor + h) - supports.positions(load_factor - h)) / (2.0 * h)
+        return v
+
+    def _attempt(self) -> int:
+        self._ksp.solve(self._b, self._x)
+        self.linear += self._ksp.getIterationNumber()
+        return self._ksp.getConvergedReason()
+
+    def destroy(self) -> None:
+        """Free the PETSc objects."""
+        for thing in (self._ksp, self._b, self._x):
+            thing.destroy()
+
+
+class _Preconditioning:
+    """What PETSc calls of the preconditioner that is kept over steps."""
+
+    def __init__(self, system: BorderedSystem) -> None:
+        self._system = weakref.ref(system)
+
+    def setUp(self, pc: PETSc.PC) -> None:  # noqa: N802 - PETSc's name
+        """The stiffness has changed; called by PETSc."""
+        system = self._system()
+        if system.problem is not None:
+            system.lagged.renew(system.problem, None)
+
+    def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """Y = P x; called by PETSc."""
+        self._system().lagged.apply(x, y)

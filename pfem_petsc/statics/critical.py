@@ -1,0 +1,248 @@
+"""Critical points between two points of a path: limit points of the load factor, and bifurcations.
+
+A limit point is where the slope of the load factor changes sign. The number of negative eigenvalues of the tangent
+stiffness changes by one there; where it changes otherwise, paths cross. Both are located by regula falsi with
+bisection on the length from the last point, each trial being a point of the path of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import h5py
+import numpy as np
+
+from ..errors import NotConverged
+
+if TYPE_CHECKING:
+    from .path_stepper import PathStepper
+    from .points import Point
+
+__all__ = ["EVENTS", "KINDS", "Event", "find_critical"]
+
+KINDS = {"limit": 0, "bifurcation": 1}
+EVENTS: dict[str, Any] = {
+    "kind": h5py.enum_dtype(KINDS, basetype="i8"),
+    "load_factor": np.float64,
+    "step": np.int64,
+    "displacement": np.float64,
+    "multiplicity": np.int64,
+}
+"""Columns of events, and their types."""
+
+_TRIALS = 60
+_LOCATED = 1e-8  # last change of the length, over the step
+_FLAT = 1e-9  # slope of the load factor at a limit point, over that of the first response
+_BESIDE = 4e-3  # length beside a bifurcation, over the step, at which the path is well determined
+_DEPTH = 8  # bisections to tell critical points of a step apart
+
+
+@dataclass(frozen=True)
+class Event:
+    """A critical point.
+
+    Attributes
+    ----------
+    kind : ``limit`` or ``bifurcation``
+    load_factor : there
+    step : number of the first point at it or beyond
+    displacement : along ``static.direction`` [m]; NaN without
+    multiplicity : eigenvalues that pass zero there
+    """
+
+    kind: str
+    load_factor: float
+    step: int
+    displacement: float
+    multiplicity: int
+
+    def row(self) -> dict[str, Any]:
+        """Values by column."""
+        return {**self.__dict__, "kind": KINDS[self.kind]}
+
+    def __str__(self) -> str:
+        what = {"limit": "limit point", "bifurcation": "bifurcation"}[self.kind]
+        what += f" of {self.multiplicity} modes" if self.multiplicity > 1 else ""
+        where = "" if np.isnan(self.displacement) else f", displacement {self.displacement:.6g} m"
+        return f"{what} at load factor {self.load_factor:.9g}{where}, before point {self.step}"
+
+
+class _End(NamedTuple):
+    """One end of an interval: length, slope and negative eigenvalues there."""
+
+    size: float
+    slope: float
+    negatives: int
+
+
+class _Interval(NamedTuple):
+    first: _End
+    second: _End
+
+    @property
+    def turned(self) -> bool:
+        """Whether the slope of the load factor changes sign."""
+        return self.first.slope * self.second.slope < 0.0
+
+    @property
+    def change(self) -> int:
+        """Of the number of negative eigenvalues."""
+        known = self.first.negatives >= 0 and self.second.negatives >= 0
+        return self.second.negatives - self.first.negatives if known else 0
+
+
+def find_critical(stepper: PathStepper, last: Point) -> tuple[list[Event], Point | None]:
+    """Critical points up to a point, in their order, and the one at which the path is to turn. Collective."""
+    return _Search(stepper, last).run()
+
+
+class _Search:
+    """The search between the state and a point."""
+
+    def __init__(self, stepper: PathStepper, last: Point) -> None:
+        self.stepper, self.last = stepper, last
+        self.size = stepper.measure(last)
+        tangent, slope = stepper.state.memory["tangent"], stepper.slope
+        here = stepper.state.time
+        self._start = replace(last, u=np.zeros_like(last.u), load_factor=here, tangent=tangent, slope=slope)
+        self.events: list[Event] = []
+        self.turn: Point | None = None
+
+    def run(self) -> tuple[list[Event], Point | None]:
+        """See :func:`find_critical`."""
+        stepper, last = self.stepper, self.last
+        start = _End(0.0, stepper.slope, stepper.negatives)
+        try:
+            self._look(_Interval(start, _End(self.size, last.slope, last.negatives)), 0)
+        except NotConverged as failure:
+            stepper.message(f"a critical point could not be located: {failure}")
+        return self.events, self.turn
+
+    def _look(self, interval: _Interval, depth: int) -> None:
+        """Find what lies in an interval, from its first end on."""
+        if self.turn is not None or not (interval.turned or interval.change):
+            return
+        first, second = interval
+        limit = abs(interval.change) == 1 or first.negatives < 0
+        if interval.turned and (limit or depth == _DEPTH):
+            # where the load factor of a branch turns and no other eigenvalue passes zero, another path is left or met
+            point = self._locate(interval, lambda point: point.slope, _FLAT)
+            self._note("limit" if limit else "bifurcation", point, max(abs(interval.change), 1))
+            return
+        if interval.turned:
+            middle = self._end(self._at(0.5 * (first.size + second.size)))
+            self._look(_Interval(first, middle), depth + 1)
+            self._look(_Interval(middle, second), depth + 1)
+            return
+        before = first.negatives
+
+        def distance(point: Point) -> float:
+            return point.nearest if point.negatives == before else -point.nearest
+
+        size = self.stepper.measure(self._locate(interval, distance, 0.0))
+        beyond = self._at(size + _BESIDE * self.size)
+        many = abs(beyond.negatives - before) or 1
+        self._note("bifurcation", self._crossing(size, beyond), many)
+        end = self._end(beyond)._replace(negatives=before + (many if second.negatives > before else -many))
+        if end.size < second.size:
+            self._look(_Interval(end, second), depth + 1)
+
+    def _crossing(self, size: float, beyond: Point) -> Point:
+        """The point at a bifurcation, between points on both sides of it.
+
+        At the point itself equilibrium hardly tells how far it is off along the mode, nor the response to the load how
+        the path goes on.
+        """
+        low = size - _BESIDE * self.size
+        before = self._at(low) if low > _BESIDE * self.size else self._start
+        low = max(low, 0.0) if before is not self._start else 0.0
+        u, load_factor, tangent, slope = self._cubic(before, low, beyond, self.stepper.measure(beyond), size)
+        length = self.stepper.metric.length(tangent, slope)
+        return replace(beyond, u=u, load_factor=load_factor, tangent=tangent / length, slope=slope / length)
+
+    def _note(self, kind: str, point: Point, multiplicity: int) -> None:
+        stepper = self.stepper
+        displacement = np.nan
+        if stepper.direction is not None:
+            displacement = stepper.direction.at(stepper.state.position + point.u)
+        self.events.append(
+            Event(kind, float(point.load_factor), stepper.state.step + 1, float(displacement), multiplicity)
+        )
+        if kind == "bifurcation":
+            number = stepper.bifurcations + sum(event.kind == kind for event in self.events)
+            if stepper.turns_at(number, point, multiplicity):
+                self.turn = point
+
+    def _end(self, point: Point) -> _End:
+        return _End(self.stepper.measure(point), point.slope, point.negatives)
+
+    def _at(self, size: float) -> Point:
+        """The point at a length, guessed by the cubic through both ends with their tangents."""
+        stepper = self.stepper
+        u, load_factor, _, _ = self._cubic(self._start, 0.0, self.last, self.size, size)
+        return stepper.points.find(stepper.constraint(size), u, load_factor)
+
+    def _cubic(
+        self, first: Point, low: float, second: Point, high: float, size: float
+    ) -> tuple[np.ndarray, float, np.ndarray, float]:
+        """Displacement, load factor and their derivatives at a length, by the cubic through two points and tangents."""
+        h = high - low
+        t = (size - low) / h
+        values = (
+            (1.0 + 2.0 * t) * (1.0 - t) ** 2,
+            t * t * (3.0 - 2.0 * t),
+            t * (1.0 - t) ** 2 * h,
+            t * t * (t - 1.0) * h,
+        )
+        rates = 6.0 * t * (t - 1.0) / h, 6.0 * t * (1.0 - t) / h, (1.0 - t) * (1.0 - 3.0 * t), t * (3.0 * t - 2.0)
+        # lengths are not those along the path: that of an arc is a chord
+        speeds = [self.stepper.rate(point) for point in (first, second)]
+        u = np.stack([first.u, second.u, first.tangent / speeds[0], second.tangent / speeds[1]])
+        slopes = [first.slope / speeds[0], second.slope / speeds[1]]
+        loads = np.array([first.load_factor, second.load_factor, *slopes])
+        at, along = np.tensordot(values, u, 1), np.tensordot(rates, u, 1)
+        return at, float(np.dot(values, loads)), along, float(np.dot(rates, loads))
+
+    def _locate(self, interval: _Interval, value: Callable[[Point], float], zero: float) -> Point:
+        """Where a value changes sign: regula falsi (Illinois), with bisection where that is slow."""
+        a, b = interval.first.size, interval.second.size
+        fa = fb = None
+        size, side, point, previous = 0.5 * (a + b), 0, None, None
+        for trial in range(_TRIALS):
+            point = self._tried(size, a, b)
+            f = value(point)
+            size = self.stepper.measure(point)
+            if abs(f) <= zero or (previous is not None and abs(size - previous) <= _LOCATED * self.size):
+                break
+            previous = size
+            below = self._on_first_side(interval, point, f)
+            width = b - a
+            if below:
+                a, fa = size, f
+                fb = 0.5 * fb if side == -1 and fb is not None else fb
+                side = -1
+            else:
+                b, fb = size, f
+                fa = 0.5 * fa if side == 1 and fa is not None else fa
+                side = 1
+            slow = trial % 4 == 3 and b - a > 0.5 * width
+            size = 0.5 * (a + b)
+            if fa is not None and fb is not None and not slow:
+                size = (a * fb - b * fa) / (fb - fa)
+        return point
+
+    @staticmethod
+    def _on_first_side(interval: _Interval, point: Point, f: float) -> bool:
+        """Whether a trial lies before what is located."""
+        if interval.turned:
+            return f * interval.first.slope > 0.0
+        return f > 0.0
+
+    def _tried(self, size: float, a: float, b: float) -> Point:
+        """The point at a length, or close by where the stiffness is singular to the last digit."""
+        try:
+            return self._at(size)
+        except NotConverged:
+            return self._at(size + 1e-3 * (b - a))

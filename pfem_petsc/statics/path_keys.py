@@ -1,0 +1,80 @@
+"""Keys that methods which follow paths have in common."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from ..case.base import PositiveFloat, PositiveInt, StrictModel, Vector3, listed
+from ..errors import InputError
+
+__all__ = ["PathKeys"]
+
+_SMALLEST, _LARGEST = 2.0**-10, 4.0  # of the first length
+
+
+class PathKeys(StrictModel):
+    """Lengths from point to point, limits of the path, and what is looked for on the way.
+
+    Lengths are in units of the load factor: the first response of the truss to a unit of load has length one.
+    """
+
+    step: PositiveFloat = 0.1
+    """first increment of the load factor, and so the first length from point to point"""
+    min_step: PositiveFloat | None = None
+    """smallest length; default: a 1024th of ``step``"""
+    max_step: PositiveFloat | None = None
+    """largest length; default: four times ``step``"""
+    iterations: PositiveInt = 4
+    """Newton iterations of a point that lengths aim at"""
+    end: PositiveFloat | None = None
+    """load factor at which the path ends"""
+    max_points: PositiveInt = 1000
+    """number of points after which it ends"""
+    node_set: Annotated[str | None, Field(json_schema_extra={"refers_to": "node_set"})] = None
+    """nodes whose mean displacement along ``direction`` is followed"""
+    direction: Vector3 | None = None
+    """direction of that displacement"""
+    displacement: PositiveFloat | None = None
+    """displacement along ``direction`` at which the path ends [m]"""
+    critical_points: bool = True
+    """whether limit points and bifurcations are located and recorded"""
+    branch_at: Annotated[tuple[int, ...], listed] = ()
+    """numbers, from 1, of bifurcations at which the path leaves along the critical mode; negative: against it"""
+    branch_mode: PositiveInt = 1
+    """which of the critical modes, where a bifurcation has several: 1, 2, ..., n, then sums and differences of pairs"""
+
+    @property
+    def spherical(self) -> bool:
+        """Whether the load factor counts in lengths."""
+        return False
+
+    @property
+    def smallest(self) -> float:
+        """The smallest length."""
+        return _SMALLEST * self.step if self.min_step is None else self.min_step
+
+    @property
+    def largest(self) -> float:
+        """The largest length."""
+        return _LARGEST * self.step if self.max_step is None else self.max_step
+
+    @model_validator(mode="after")
+    def _consistent(self) -> PathKeys:
+        if self.smallest > self.step:
+            raise InputError(f"min_step = {self.min_step!r} is larger than step = {self.step!r}")
+        if self.largest < self.step:
+            raise InputError(f"max_step = {self.max_step!r} is smaller than step = {self.step!r}")
+        if (self.node_set is None) != (self.direction is None):
+            raise InputError("node_set and direction belong together; give both or none")
+        if self.direction is not None and not np.any(self.direction):
+            raise InputError("direction = [0, 0, 0] is none; give a vector")
+        if self.displacement is not None and self.node_set is None:
+            raise InputError("displacement needs node_set and direction")
+        if 0 in self.branch_at:
+            raise InputError("branch_at counts bifurcations from 1")
+        if self.branch_at and not self.critical_points:
+            raise InputError("branch_at needs critical_points = true")
+        return self

@@ -1,0 +1,39 @@
+"""Equilibrium as a balance whose load factor is an unknown of the step."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ..integrators.base import Balance, State
+from .scheme import Equilibrium
+
+__all__ = ["PathEquilibrium"]
+
+
+class PathEquilibrium(Equilibrium):
+    """As :class:`~.scheme.Equilibrium`; displacement and load factor of a step were found before it is made.
+
+    ``reached`` is the load factor of the point that the next step goes to.
+    The state's memory holds ``tangent``: the displacement part of the path's unit tangent at the state.
+    """
+
+    remembers = ("tangent",)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.reached = 0.0
+
+    def balance(self, state: State, h: float) -> Balance:
+        """The balance at the load factor reached; ``h`` is a length, not an increment of it."""
+        return replace(super().balance(state, 0.0), time=self.reached, loads=((1.0, self.reached),))
+
+    def start(self, state: State, h: float) -> None:
+        state.memory["tangent"] = np.zeros_like(state.v)
+
+    def expected_move(self, state: State, h: float) -> np.ndarray:
+        return h * state.memory["tangent"]
+
+    def finish(self, state: State, balance: Balance, u: np.ndarray, h: float) -> None:
+        state.position[:] = balance.predictor + u

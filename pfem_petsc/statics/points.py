@@ -1,0 +1,179 @@
+"""Points of a path: Newton's method with a constraint, and the tangent and stiffness there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..errors import NotConverged
+from ..solvers.matrix import HessianMatrix
+from .path_constraints import dot
+from .stability import Stability
+
+if TYPE_CHECKING:
+    from ..integrators.base import State
+    from ..stepping.model import Model
+    from .bordered import BorderedSystem
+    from .path_constraints import Constraint, Metric
+
+__all__ = ["Point", "PointSolver"]
+
+_MOST = 20  # Newton iterations of a point: more are no sign of a path
+_CLOSE = 1e-10  # value of the constraint, over the length of the step
+_NEAR = 1e-6  # the same, where it no longer falls
+_STAGNATION = 100.0  # as in the other solves: a residual within this many rounding floors that no longer falls
+
+
+@dataclass
+class Point:
+    """A point of the path, from the last one.
+
+    Attributes
+    ----------
+    u : (owned, 3) displacement from the last point [m]
+    load_factor : there
+    tangent, slope : the path's tangent of unit length there: displacement part (owned, 3) [m] and change of the load
+        factor
+    negatives : number of negative eigenvalues of the stiffness, -1 where it is not looked for
+    nearest : magnitude of the eigenvalue nearest to zero [N/m]
+    newton : iterations
+    """
+
+    u: np.ndarray
+    load_factor: float
+    tangent: np.ndarray
+    slope: float
+    negatives: int
+    nearest: float
+    newton: int
+
+
+class PointSolver:
+    """Finds points from the present state on. Methods are collective.
+
+    Parameters
+    ----------
+    model : Model
+    state : State
+    system : BorderedSystem, begun at the state
+    metric : Metric
+    looks : whether critical points are looked for
+
+    Attributes
+    ----------
+    stability : Stability, None where critical points are not looked for
+    """
+
+    def __init__(self, model: Model, state: State, system: BorderedSystem, metric: Metric, looks: bool) -> None:
+        self.model, self.state, self.system, self.metric = model, state, system, metric
+        self.stability: Stability | None = None
+        self._own: HessianMatrix | None = None
+        if looks:
+            if not isinstance(system.hessian, HessianMatrix):
+                self._own = HessianMatrix(model.mesh, model.supports.fixed, model.supports.any)
+            self.stability = Stability(model, self._own or system.hessian)
+
+    @property
+    def place(self) -> str:
+        """Where points are looked for, for messages."""
+        return f"point {self.state.step + 1}, beyond load factor {self.state.time:.6g}"
+
+    def destroy(self) -> None:
+        """Free the PETSc objects."""
+        for thing in (self.stability, self._own):
+            if thing is not None:
+                thing.destroy()
+
+    def find(self, constraint: Constraint, u: np.ndarray, load_factor: float) -> Point:
+        """The point with a constraint, from a guess, with its tangent. Collective.
+
+        Raises
+        ------
+        NotConverged
+            On all ranks.
+        """
+        start = self.state.time
+        u, load_factor, newton = self.newton(constraint, u.copy(), load_factor)
+        tangent, slope = self.tangent(u, load_factor)
+        if self.metric.product(u, load_factor - start, tangent, slope) < 0.0:
+            tangent, slope = -tangent, -slope
+        negatives, nearest = self.spectrum(u)
+        return Point(u, load_factor, tangent, slope, negatives, nearest, newton)
+
+    def newton(self, constraint: Constraint, u: np.ndarray, load_factor: float) -> tuple[np.ndarray, float, int]:
+        system, start = self.system, self.state.time
+        most = min(self.model.case.solver.max_newton, _MOST)
+        comm, floor = self.model.comm, self.model.rounding
+        system.prescribe(u, load_factor)
+        g, previous, before = np.empty_like(u), np.inf, np.inf
+        tolerance = self.tolerance(u, load_factor, constraint.size)
+        for iteration in range(most + 1):
+            system.residual(u, load_factor, g)
+            norm = float(np.sqrt(dot(comm, g, g)))
+            terms = constraint.terms(u, load_factor - start)
+            if not np.isfinite(norm + terms.value):
+                raise NotConverged(f"{self.place}: Newton's method diverged: the residual is not finite")
+            stagnant = iteration >= 1 and norm > 0.5 * previous and norm <= _STAGNATION * floor
+            off = abs(terms.value) / constraint.size
+            # beside a bifurcation rounding moves iterates along its modes, and no iteration brings them closer
+            near = off <= _CLOSE or (iteration >= 2 and off <= _NEAR and off > 0.5 * before)
+            if (norm <= tolerance or stagnant) and near:
+                return u, load_factor, iteration
+            previous, before = norm, off
+            if iteration == most:
+                break
+            system.linearise(u)
+            r, v = system.solve(-g), system.response(u, load_factor)
+            along = comm.allreduce(np.array([(terms.by_u * r).sum(), (terms.by_u * v).sum()]))
+            change = -(terms.value + along[0]) / (along[1] + terms.by_load)
+            u += r + change * v
+            load_factor += float(change)
+            system.prescribe(u, load_factor)
+        raise NotConverged(
+            f"{self.place}: no convergence after {most} Newton iterations: residual {norm:.3g} N, required "
+            f"{tolerance:.3g} N"
+        )
+
+    def tolerance(self, u: np.ndarray, load_factor: float, size: float) -> float:
+        """Of the residual's 2-norm [N], as elsewhere: ``solver.rtol`` of external and internal forces."""
+        solver, state = self.model.case.solver, self.state
+        external, internal = self.system.external(load_factor), state.f[: len(u)]
+        change = self.system.external(load_factor + size) - external
+        sums = np.array([(array**2).sum() for array in (external, internal, change)])
+        scale = float(np.sqrt(self.model.comm.allreduce(sums).max()))
+        return max(solver.rtol * scale, solver.atol or 0.0, self.model.rounding)
+
+    def tangent(self, u: np.ndarray, load_factor: float) -> tuple[np.ndarray, float]:
+        """Unit tangent at an equilibrium, along which the load factor rises."""
+        self.system.linearise(u)
+        v = self.system.response(u, load_factor)
+        length = self.metric.length(v, 1.0)
+        return v / length, 1.0 / length
+
+    def spectrum(self, u: np.ndarray) -> tuple[int, float]:
+        """Negative eigenvalues of the stiffness last taken, and the one nearest to zero; -1 where not looked for."""
+        if self.stability is None or self.stability.refusal is not None:
+            return -1, np.inf
+        if self._own is not None:
+            self._own.update(self.system.problem, u)
+        return self.stability.look()
+
+    def modes(self, point: Point, count: int) -> list[np.ndarray]:
+        """Critical modes (owned, 3) of unit length at a point, across the path; then sums and differences of pairs.
+
+        Paths of symmetric trusses leave along either. Collective.
+        """
+        (self._own or self.system.hessian).update(self.system.problem, point.u)
+        found = []
+        for mode in self.stability.modes(count):
+            along = self.metric.product(mode, 0.0, point.tangent, 0.0)
+            mode = (
+                mode - along / max(self.metric.product(point.tangent, 0.0, point.tangent, 0.0), 1e-300) * point.tangent
+            )
+            found.append(mode / self.metric.length(mode, 0.0))
+        pairs = [
+            (found[i] + sign * found[j]) for i in range(count) for j in range(i + 1, count) for sign in (1.0, -1.0)
+        ]
+        return found + [pair / self.metric.length(pair, 0.0) for pair in pairs]

@@ -13,7 +13,7 @@ import numpy as np
 from ..mechanics.compiled import kernel
 from ..tolerances import FREE_PART, SINGULAR_ROW
 
-__all__ = ["complementary", "solve_groups"]
+__all__ = ["complementary", "find_multipliers", "solve_groups"]
 
 
 @kernel
@@ -52,7 +52,7 @@ def _active_system(matrix, active, count, system):
 
 
 @kernel
-def _complementary(matrix, values, tolerance, z):
+def find_multipliers(matrix, values, tolerance, z):
     """See :func:`complementary`; False where there is no solution."""
     n = len(values)
     active = np.empty(n, dtype=np.int64)
@@ -127,7 +127,7 @@ def complementary(matrix: np.ndarray, values: np.ndarray, tolerance: float) -> n
     broken by no more than the tolerance count as kept; None where there is no solution.
     """
     z = np.zeros(len(values))
-    return z if _complementary(np.ascontiguousarray(matrix), values, tolerance, z) else None
+    return z if find_multipliers(np.ascontiguousarray(matrix), values, tolerance, z) else None
 
 
 @kernel
@@ -250,7 +250,7 @@ def solve_groups(
                                 s += vector[a, d, c] * vector[b, e, c] / hard
                 gram[a, b] = gram[b, a] = s
         z = np.zeros(n)
-        if not _complementary(gram, value[:n], tolerance, z):
+        if not find_multipliers(gram, value[:n], tolerance, z):
             return group
         for a in range(n):
             if pair[a] >= 0:

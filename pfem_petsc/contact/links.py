@@ -7,8 +7,7 @@ and never ask what is in it. Explicit steps call :meth:`Links.explicit`; implici
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from functools import reduce
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -16,6 +15,7 @@ from petsc4py import PETSc
 
 from ..errors import SimulationFailure
 from ..integrators.base import Balance, State
+from ..parallel.natural import NaturalOrder
 from .frames import NodalFrames
 
 if TYPE_CHECKING:
@@ -29,12 +29,10 @@ class Link(Protocol):
 
     Attributes
     ----------
-    key : under which checkpoints hold its forces
     columns : of its tables in the history, like ``pair/NAME``
     numbers : mesh numbers of the nodes of its rows, at least of those whose nodes this rank owns
     """
 
-    key: str
     columns: list[str]
     numbers: np.ndarray
 
@@ -46,8 +44,10 @@ class Link(Protocol):
         stiffness: np.ndarray,
         contact: np.ndarray,
         tolerance: float,
-    ) -> None:
+    ) -> bool:
         """Correct the increments ``u`` (owned, 3) of a step in which each node is solved on its own. Collective.
+
+        Gives whether any row presses on a node of this rank.
 
         ``stiffness`` (owned,) is the force for a displacement of a node [N/m], ``contact`` (owned, 3) takes the forces
         [N], ``tolerance`` [m] is the depth up to which a row counts as kept.
@@ -61,8 +61,8 @@ class Link(Protocol):
     def coordinates(self) -> LinkCoordinates:
         """The coordinates of implicit steps. Collective."""
 
-    def held(self) -> np.ndarray:
-        """Owned nodes (k,) on which rows press."""
+    def mark(self, held: np.ndarray) -> None:
+        """Mark owned nodes (owned,) on which rows press."""
 
     def totals(self) -> np.ndarray:
         """This rank's share of the forces (tables, 3) of the rows on their last nodes [N]."""
@@ -94,16 +94,17 @@ class Link(Protocol):
         """Add its forces to those on the nodes (owned, 3) [N]."""
 
     def save(self) -> Any:
-        """Its forces, for :meth:`restore`: numbers and lists, as a checkpoint takes them. Collective."""
+        """Its forces, for :meth:`restore` of a step that is given up."""
 
     def restore(self, saved: Any) -> None:
         """Take the forces back."""
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        """What a checkpoint keeps of it at nodes: name to rows (owned, ...); the same names on all ranks."""
+    def arrays(self) -> dict[str, tuple[NaturalOrder, np.ndarray]]:
+        """What a checkpoint keeps of it: name to an order of things and the rows that this rank owns; the same names
+        on all ranks."""
 
     def load_state(self, name: str, values: np.ndarray) -> None:
-        """Take such an array (owned, ...) back. Collective."""
+        """Take such rows back. Collective."""
 
 
 class LinkCoordinates(Protocol):
@@ -199,19 +200,25 @@ class Links:
         """See :meth:`Link.explicit`; the forces (owned, 3) [N], ``none`` where there are no links."""
         if not self.members:
             return none
-        contact, failure = np.zeros(u.shape), None
+        contact, failure, pressed = np.zeros(u.shape), None, False
         for link in self.members:
             try:
-                link.explicit(balance, state, u, stiffness, contact, tolerance)
+                pressed |= link.explicit(balance, state, u, stiffness, contact, tolerance)
             except SimulationFailure as met:  # the next link may be collective
                 failure = failure or met
         if failure is not None:
             raise failure
-        return contact if any(len(link.held()) for link in self.members) else none
+        return contact if pressed else none
 
-    def held(self, nodes: np.ndarray) -> np.ndarray:
-        """Nodes (k,) that walls hold, with those that links hold."""
-        return reduce(np.union1d, (link.held() for link in self.members), nodes)
+    def count_held(self, nodes: np.ndarray, owned: int) -> int:
+        """How many of the owned nodes are among those (k,) that walls hold, or held by links."""
+        if not self.members:
+            return len(nodes)
+        held = np.zeros(owned, dtype=bool)
+        held[nodes] = True
+        for link in self.members:
+            link.mark(held)
+        return int(np.count_nonzero(held))
 
     def totals(self) -> np.ndarray:
         """This rank's share of the forces (tables, 3) of all tables on the last nodes of their rows [N]."""
@@ -247,21 +254,21 @@ class Links:
         for link in self.members:
             link.push(contact)
 
-    def save(self) -> dict[str, Any]:
-        """Forces of all links by key. Collective."""
-        return {link.key: link.save() for link in self.members}
+    def save(self) -> list[Any]:
+        """See :meth:`Link.save`."""
+        return [link.save() for link in self.members]
 
-    def arrays(self) -> dict[str, np.ndarray]:
+    def restore(self, saved: list[Any]) -> None:
+        """Take the forces back from what :meth:`save` gave."""
+        for link, own in zip(self.members, saved, strict=True):
+            link.restore(own)
+
+    def arrays(self) -> dict[str, tuple[NaturalOrder, np.ndarray]]:
         """See :meth:`Link.arrays`; those of all links."""
         return {name: array for link in self.members for name, array in link.arrays().items()}
 
-    def load_state(self, name: str, values: np.ndarray) -> None:
-        """See :meth:`Link.load_state`."""
+    def load_state(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Take the arrays of all links back. Collective."""
         for link in self.members:
-            if name in link.arrays():
-                link.load_state(name, values)
-
-    def restore(self, saved: dict[str, Any]) -> None:
-        """Take the forces back from what :meth:`save` gave."""
-        for link in self.members:
-            link.restore(saved[link.key])
+            for name in link.arrays():
+                link.load_state(name, arrays[name])

@@ -90,8 +90,10 @@ class ContactPairs:
         contact: np.ndarray,
         time: float,
         tolerance: float,
-    ) -> None:
+    ) -> bool:
         """Separate the pairs that the free positions, predictor + u, violate; walls follow. Collective.
+
+        Gives whether any pair here has a force.
 
         Parameters
         ----------
@@ -111,6 +113,7 @@ class ContactPairs:
             self._move(u, self.force, stiffness, contact)
         else:
             self.force = self.part(predictor, u, stiffness, contact)
+        return bool(self.force.any())
 
     def pressed(self) -> tuple[np.ndarray, np.ndarray]:
         """Owned nodes (k,) that pairs hold, and the directions (k, 3) of their pairs."""

@@ -17,7 +17,7 @@ from ..registry import lookup
 from ..tolerances import ON_BOUND
 from .constraints.base import Constraint, ConstraintKeys, SetPart
 from .row_coordinates import RowCoordinates
-from .row_loops import free_positions, mark_pressed, push_nodes
+from .row_loops import free_positions, last_forces, mark_pressed, push_nodes
 from .rows import Planes, Rows
 from .search import near_planes
 
@@ -91,7 +91,6 @@ class ConstraintLink:
             start = rows.spread(state.position, far[:, 4:7]) if acts_at_start(balance, state) else None
             return rows.spread(stiffness, far[:, 3]), start, self._planes(near, x, far[:, 7:] > 0.0, displacements)
 
-        self.release()
         self.force, self.jacobian = rows.project(x, tolerance, near, given)
         if not self.force.any():
             return False
@@ -134,8 +133,7 @@ class ConstraintLink:
 
     def totals(self) -> np.ndarray:
         rows, totals = self.rows, np.zeros((len(self.names), 3))
-        at = np.flatnonzero((self.force != 0.0) & rows.counted)
-        np.add.at(totals, rows.source[at], self.force[at, None] * self.jacobian[at, rows.last[at]])
+        last_forces(rows.counted, rows.source, rows.last, self.jacobian, self.force, totals)
         return totals
 
     def tables(self, owned: int) -> np.ndarray:

@@ -18,7 +18,10 @@ __all__ = [
     "advance_groups",
     "broken_groups",
     "free_positions",
+    "gather_rows",
     "group_rows",
+    "last_forces",
+    "linearise",
     "mark_pressed",
     "push_nodes",
     "solve_row_groups",
@@ -61,6 +64,16 @@ def free_positions(where, predictor, u, far, x):
         i = where[k]
         for c in range(3):
             x[k, c] = predictor[i, c] + u[i, c] if i >= 0 else far[-1 - i, c]
+
+
+@kernel
+def gather_rows(at, array, vectors):
+    """Vectors (k, 3, r) of rows with nodes ``at`` (r, k) from those of nodes (n, 3)."""
+    for r in range(len(at)):
+        for k in range(at.shape[1]):
+            i = at[r, k]
+            for c in range(3):
+                vectors[k, c, r] = array[i, c]
 
 
 @kernel
@@ -229,6 +242,29 @@ def advance_groups(groups, node_starts, nodes, x, moves, at, tolerances, settled
                 same = same and abs(place - at[i, c]) <= tolerances[g]
                 at[i, c] = place
         settled[k] = same
+
+
+@kernel
+def linearise(rows, ends, gradients, free, x, at, own, values):
+    """Put ``own`` (m,) of some rows (m,) at positions ``at`` (n, 3), led on to ``x`` (n, 3), into ``values`` (r,)."""
+    for k in range(len(rows)):
+        r = rows[k]
+        total = 0.0
+        for e in range(ends.shape[1]):
+            i = ends[r, e]
+            if i >= 0:
+                for c in range(3):
+                    total += gradients[r, e, c] * free[i, c] * (x[i, c] - at[i, c])
+        values[r] = own[k] + total
+
+
+@kernel
+def last_forces(counted, source, last, gradients, force, totals):
+    """Add the forces of counted rows on their last nodes to the totals (sources, 3)."""
+    for r in range(len(force)):
+        if force[r] != 0.0 and counted[r]:
+            for c in range(3):
+                totals[source[r], c] += force[r] * gradients[r, last[r], c]
 
 
 @kernel

@@ -26,7 +26,7 @@ from ..mesh.exchange import GhostExchange, Router
 from ..parallel.natural import NaturalOrder
 from ..tolerances import FREE_PART
 from .constraints.base import Constraint
-from .row_loops import add_forces, advance_groups, broken_groups, group_rows, solve_row_groups
+from .row_loops import add_forces, advance_groups, broken_groups, gather_rows, group_rows, linearise, solve_row_groups
 from .row_search import owner_starts, petsc_numbers, to_owners, with_groups
 
 if TYPE_CHECKING:
@@ -170,9 +170,11 @@ class Rows:
 
     def spread(self, values: np.ndarray, far: np.ndarray) -> np.ndarray:
         """Values (n, ...) of the nodes from those of owned nodes (owned, ...) and those that partners sent (m, ...)."""
+        if len(self._away) == 0:
+            return values.take(self.where, axis=0)
         every = np.empty((len(self.numbers), *values.shape[1:]))
         every[self.mine] = values[self.here]
-        if len(self._away) and every.size:
+        if every.size:
             every[self._away] = far[self._far]
         return every
 
@@ -194,12 +196,12 @@ class Rows:
                 some = rows[begin:end] - first
                 if end - begin < len(at):
                     source, at = source.of(source.nodes[some], source.data[some]), at[some]
-            found.append(getattr(source, method)(*(array.take(at, axis=0) for array in arrays)))
+            found.append(getattr(source, method)(*(_of_rows(at, array) for array in arrays)))
         return found
 
     def values(self, x: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
         """Rows (r,) [m] at positions (n, 3); of some rows, ascending, if they are given, as below."""
-        return np.concatenate(self._each(rows, "values", x))
+        return _joined(self._each(rows, "values", x))
 
     def gradients(self, x: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
         """Gradients (r, k, 3) at positions (n, 3), zero behind the last node of a row."""
@@ -207,17 +209,16 @@ class Rows:
         for s, part in enumerate(parts):
             if part.shape[1] < width:
                 parts[s] = np.concatenate([part, np.zeros((len(part), width - part.shape[1], 3))], axis=1)
-        return np.concatenate(parts)
+        return _joined(parts)
 
     def drift(self, x: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Second derivatives (r,) by time of rows whose nodes at (n, 3) move straight on with v (n, 3) [m/s2]."""
         return np.concatenate(self._each(None, "drift", x, v))
 
-    def along(self, jacobian: np.ndarray, y: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
+    def along(self, jacobian: np.ndarray, y: np.ndarray) -> np.ndarray:
         """J y (r,) of gradients (r, k, 3) and vectors (n, 3)."""
-        ends = self.ends if rows is None else self.ends[rows]
-        vectors = np.where(ends[:, :, None] < 0, 0.0, y[ends])
-        total = np.zeros(len(ends))
+        vectors = np.where(self.ends[:, :, None] < 0, 0.0, y[self.ends])
+        total = np.zeros(len(vectors))
         for products in np.einsum("rki,rki->kr", jacobian, vectors):
             total += products
         return total
@@ -328,8 +329,7 @@ class Rows:
             if rows is None or start is None:
                 jacobian[fewer] = self.gradients(at if start is None else start, fewer)
             if rows is not None:
-                free = jacobian[fewer] * np.where(self.ends[fewer, :, None] < 0, 0.0, self.free[self.ends[fewer]])
-                values[fewer] = self.values(at, fewer) + self.along(free, x - at, fewer)
+                linearise(fewer, self.ends, jacobian, self.free, x, at, self.values(at, fewer), values)
             rows = fewer
             self._solve(groups, jacobian, values, stiffness, planes, tolerances, force, moves)
             settled = np.empty(len(groups), dtype=bool)
@@ -341,3 +341,15 @@ class Rows:
             f"the positions of nodes {self._shown(int(groups[0]))} on their constraints did not converge in "
             f"{_ITERATIONS} iterations; reduce time.step"
         )
+
+
+def _of_rows(at: np.ndarray, array: np.ndarray) -> np.ndarray:
+    """Vectors (r, k, 3) of rows with nodes ``at`` (r, k), from those of nodes (n, 3); rows are next to each other in
+    memory, so that sums and differences over their nodes and components are as fast as they can be."""
+    vectors = np.empty((at.shape[1], 3, len(at)))
+    gather_rows(at, array, vectors)
+    return vectors.transpose(2, 0, 1)
+
+
+def _joined(parts: list[np.ndarray]) -> np.ndarray:
+    return np.ascontiguousarray(parts[0]) if len(parts) == 1 else np.concatenate(parts)

@@ -17,7 +17,7 @@ from ..registry import lookup
 from ..tolerances import ON_BOUND
 from .constraints.base import Constraint, ConstraintKeys, SetPart
 from .row_coordinates import RowCoordinates
-from .row_loops import free_positions, last_forces, mark_pressed, push_nodes
+from .row_loops import free_positions, last_forces, leaving_nodes, mark_pressed, push_nodes
 from .rows import Planes, Rows
 from .search import near_planes
 
@@ -53,6 +53,8 @@ class ConstraintLink:
         self.rows = Rows([_source(case.source, keys, nodes, mesh) for keys in case.constraint], mesh, fixed)
         self._members = self.rows.gather(contact.members) > 0.0
         self._walled = bool(self._members.any())
+        # walls whose flags travel with the positions
+        self._flags = len(contact.walls) if mesh.comm.allreduce(self._walled, op=MPI.LOR) else 0
         self._x = np.empty((len(self.rows.numbers), 3))
         self.release()
 
@@ -74,16 +76,15 @@ class ConstraintLink:
         contact: np.ndarray,
         tolerance: float,
     ) -> bool:
-        rows, x, walls = self.rows, self._x, len(self.contact.walls)
+        rows, x = self.rows, self._x
         displacements = self.contact.motion.displacements(balance.time)
-        far = np.empty((0, 7 + walls))
+        far = np.empty((0, 7 + self._flags))
         if not rows.partners.alone:
-            at = rows.partners.rows
-            places = balance.predictor[at] + u[at]
-            applicable = self.contact.applicable(at, places, displacements)
-            far = rows.partners.bring(
-                np.column_stack([places, stiffness[at], state.position[at], applicable.reshape(len(at), walls)])
-            )
+            at, leaving = rows.partners.rows, rows.partners.leaving(far.shape[1])
+            leaving_nodes(at, balance.predictor, u, stiffness, state.position, leaving)
+            if self._flags:
+                leaving[:, 7:] = self.contact.applicable(at, leaving[:, :3], displacements)
+            far = rows.partners.bring(leaving)
         free_positions(rows.where, balance.predictor, u, far, x)
         near = self._near(x, balance.time)
 

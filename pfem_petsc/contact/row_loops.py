@@ -21,6 +21,7 @@ __all__ = [
     "gather_rows",
     "group_rows",
     "last_forces",
+    "leaving_nodes",
     "linearise",
     "mark_pressed",
     "push_nodes",
@@ -52,6 +53,17 @@ def group_rows(ends, n, label):
                 label[a] = b
     for i in range(n):
         label[i] = _root(label, i)
+
+
+@kernel
+def leaving_nodes(rows, predictor, u, stiffness, start, leaving):
+    """Put predictor + u, the stiffness and the position at the start of owned nodes (m,) into ``leaving`` (m, 7...)."""
+    for k in range(len(rows)):
+        i = rows[k]
+        for c in range(3):
+            leaving[k, c] = predictor[i, c] + u[i, c]
+            leaving[k, 4 + c] = start[i, c]
+        leaving[k, 3] = stiffness[i]
 
 
 @kernel

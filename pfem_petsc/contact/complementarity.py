@@ -143,7 +143,8 @@ def solve_groups(
     ends, pair_normals, least : (2, p), (p, 3), (p,) nodes, directions and bounds of pairs, -inf where of no concern
     x, stiffness, free : (n, 3), (n,), (n, 3) of nodes; ``free`` is 0.0 where supports hold
     first_plane : (n,) first row of a node among the planes, -1 for nodes of other groups
-    planes : (normals (k, w, 3), offsets (k, w)), -inf where a wall is no concern
+    planes : (normals (k, w, 3), offsets (k, w), stopped (n, w) bool), -inf where a wall is no concern; the last says which
+        walls stop which nodes where several nodes have the same planes, (0, 0) where each has its own
     tolerance : a constraint broken by no more counts as kept
     force : (p,) out; written for these groups
 
@@ -152,8 +153,9 @@ def solve_groups(
     int
         First of the groups whose constraints contradict each other, else -1.
     """
-    normals, offsets = planes
+    normals, offsets, stopped = planes
     walls = offsets.shape[1]
+    shared = len(stopped) > 0
     for group in groups:
         begin, end = starts[group], starts[group + 1]
         if end - begin == 1:  # mostly a pair is alone, and its own solution breaks no wall
@@ -176,7 +178,7 @@ def solve_groups(
                 at = first_plane[node_here]
                 sign = -1.0 if e == 0 else 1.0
                 for k in range(walls):
-                    if not settled or offsets[at, k] == -math.inf:
+                    if not settled or offsets[at, k] == -math.inf or (shared and not stopped[node_here, k]):
                         continue
                     gap, along, wall_square = -offsets[at, k], 0.0, 0.0
                     for c in range(3):
@@ -225,7 +227,7 @@ def solve_groups(
                     continue
                 for k in range(walls):
                     at = first_plane[i]
-                    if offsets[at, k] == -math.inf:
+                    if offsets[at, k] == -math.inf or (shared and not stopped[i, k]):
                         continue
                     square, distance = 0.0, 0.0
                     for c in range(3):

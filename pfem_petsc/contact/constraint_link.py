@@ -17,7 +17,7 @@ from ..registry import lookup
 from ..tolerances import ON_BOUND
 from .constraints.base import Constraint, ConstraintKeys, SetPart
 from .row_coordinates import RowCoordinates
-from .row_loops import free_positions, last_forces, leaving_nodes, mark_pressed, push_nodes
+from .row_loops import free_positions, free_stiffness, last_forces, leaving_nodes, mark_pressed, push_nodes
 from .rows import Planes, Rows
 from .search import near_planes
 
@@ -55,7 +55,7 @@ class ConstraintLink:
         self._walled = bool(self._members.any())
         # walls whose flags travel with the positions
         self._flags = len(contact.walls) if mesh.comm.allreduce(self._walled, op=MPI.LOR) else 0
-        self._x = np.empty((len(self.rows.numbers), 3))
+        self._x, self._hard = np.empty((len(self.rows.numbers), 3)), np.empty(len(self.rows.numbers))
         self.release()
 
     @property
@@ -90,7 +90,8 @@ class ConstraintLink:
 
         def given() -> tuple[np.ndarray, np.ndarray | None, Planes]:
             start = rows.spread(state.position, far[:, 4:7]) if acts_at_start(balance, state) else None
-            return rows.spread(stiffness, far[:, 3]), start, self._planes(near, x, far[:, 7:] > 0.0, displacements)
+            free_stiffness(rows.where, stiffness, far, self._hard)
+            return self._hard, start, self._planes(near, x, far[:, 7:] > 0.0, displacements)
 
         self.force, self.jacobian = rows.project(x, tolerance, near, given)
         if not self.force.any():

@@ -18,6 +18,7 @@ __all__ = [
     "advance_groups",
     "broken_groups",
     "free_positions",
+    "free_stiffness",
     "gather_rows",
     "group_rows",
     "last_forces",
@@ -57,12 +58,15 @@ def group_rows(ends, n, label):
 
 @kernel
 def leaving_nodes(rows, predictor, u, stiffness, start, leaving):
-    """Put predictor + u, the stiffness and the position at the start of owned nodes (m,) into ``leaving`` (m, 7...)."""
+    """Put predictor + u and stiffness of owned nodes (m,) into ``leaving`` (m, 4...), and positions at the start, unless
+    these are (0, 3)."""
+    started = len(start) > 0
     for k in range(len(rows)):
         i = rows[k]
         for c in range(3):
             leaving[k, c] = predictor[i, c] + u[i, c]
-            leaving[k, 4 + c] = start[i, c]
+            if started:
+                leaving[k, 4 + c] = start[i, c]
         leaving[k, 3] = stiffness[i]
 
 
@@ -76,6 +80,13 @@ def free_positions(where, predictor, u, far, x):
         i = where[k]
         for c in range(3):
             x[k, c] = predictor[i, c] + u[i, c] if i >= 0 else far[-1 - i, c]
+
+
+@kernel
+def free_stiffness(where, stiffness, far, hard):
+    """The stiffness (n,) of the same nodes, from that of owned nodes (owned,) and ``far`` (m, 4 or more)."""
+    for k in range(len(where)):
+        hard[k] = stiffness[where[k]] if where[k] >= 0 else far[-1 - where[k], 3]
 
 
 @kernel

@@ -143,8 +143,8 @@ def solve_groups(
     ends, pair_normals, least : (2, p), (p, 3), (p,) nodes, directions and bounds of pairs, -inf where of no concern
     x, stiffness, free : (n, 3), (n,), (n, 3) of nodes; ``free`` is 0.0 where supports hold
     first_plane : (n,) first row of a node among the planes, -1 for nodes of other groups
-    planes : (normals (k, w, 3), offsets (k, w), stopped (n, w) bool), -inf where a wall is no concern; the last says which
-        walls stop which nodes where several nodes have the same planes, (0, 0) where each has its own
+    planes : (normals (k, w, 3), offsets (k, w), stopped (n, w) bool), -inf where a wall is no concern; the last says
+        which walls stop which nodes where several nodes have the same planes, (0, 0) where each has its own
     tolerance : a constraint broken by no more counts as kept
     force : (p,) out; written for these groups
 

@@ -40,8 +40,8 @@ class ConstraintLink:
     Attributes
     ----------
     rows : Rows
-    force : (r,) of the rows here in the last step [N]; jacobian : (r, k, 3) gradients along which these act; the same on
-        all ranks that have a row
+    force : (r,) of the rows here in the last step [N]; jacobian : (r, k, 3) gradients along which these act; the same
+        on all ranks that have a row
     """
 
     def __init__(
@@ -168,8 +168,8 @@ class ConstraintLink:
         deepest = min(comm.allgather(deepest))
         if len(deepest) > 1:
             raise InputError(
-                f"{key} {self.names[deepest[1]]!r}: nodes {deepest[3]} start {-deepest[0]:.6g} m beyond it; correct its "
-                "keys, or move the mesh"
+                f"{key} {self.names[deepest[1]]!r}: nodes {deepest[3]} start {-deepest[0]:.6g} m beyond it; correct "
+                "its keys, or move the mesh"
             )
 
     def resting(self, x: np.ndarray, v: np.ndarray, slack: float, still: float) -> np.ndarray:

@@ -8,8 +8,8 @@ complete pivoting; with s the size of a row's gradient and N all other component
 
 so that the row is a lower bound on w_P. The gradient follows: g_N <- g_N - J_N^T q, g_P <- s q with q = J_P^-T g_P, and
 q are the rows' forces then. What supports prescribe is no part of J: it moves the bound. Rows that are not linear are
-taken again at the solution, until it keeps them and their gradients are those of the solve. Groups of the same shape are
-worked on together, and all ranks that have a group do the same.
+taken again at the solution, until it keeps them and their gradients are those of the solve. Groups of the same
+shape are worked on together, and all ranks that have a group do the same.
 """
 
 from __future__ import annotations
@@ -121,7 +121,7 @@ class RowCoordinates:
     def _transform(
         self, rows: np.ndarray, unknowns: np.ndarray, dense: np.ndarray, row: np.ndarray, column: np.ndarray
     ) -> None:
-        """T of groups (g,) alike: their rows (g, p), unknowns (g, u), gradients (g, p, u), and pivots (g, k), (g, k)."""
+        """T of groups (g,) alike: rows (g, p), unknowns (g, u), gradients (g, p, u), and pivots (g, k), (g, k)."""
         every = np.arange(len(rows))[:, None]
         own = dense[every, row]
         pivots = np.take_along_axis(own, np.repeat(column[:, None, :], own.shape[1], axis=1), axis=2)
@@ -181,7 +181,8 @@ class RowCoordinates:
 
     def matrix(self) -> PETSc.Mat:
         rows, mesh = self.rows, self.rows.mesh
-        numbers = rows.gather(np.arange(mesh.first_node, mesh.first_node + mesh.n_owned).astype(float)).astype(np.int64)
+        own = np.arange(mesh.first_node, mesh.first_node + mesh.n_owned)
+        numbers = rows.gather(own).astype(np.int64)
         local = np.repeat(np.where(rows.mine, 3 * rows.where, -1), 3) + np.tile([0, 1, 2], len(rows.numbers))
         local[np.repeat(~rows.mine, 3)] = -1
         counts = np.ones(3 * mesh.n_owned, dtype=np.int64)

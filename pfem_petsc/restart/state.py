@@ -10,12 +10,12 @@ Where what decides is kept: positions, velocities, accelerations, forces and the
 treatment of impact changed are part of it): arrays of the state. Who touches walls, nodes held in the last step, place
 of the kept preconditioner: arrays of the stepper. Level of halving, part and smallest part of the step, counts of the
 kept preconditioner: its numbers. What laws keep, thermal strains, history of the kept preconditioner: arrays of the
-bars. Walls with mass: ``free_walls``, their last increment included. Forces of constraints: arrays of their
-rows. Forces of pairs, and which of them have met: arrays of their second nodes. Works and energies: ``ranks``. Energy at the start, the
-largest energy, iterations since the last row: the recorder's. Rows seen, strange ones and energy put in: ``blow_up``.
-Contact times and impulses: the contact log's. Time step and linear solver: the plan in the attributes. Newton's method,
-Krylov methods, candidates for contact and friction begin anew each step. What goes with the clock (meetings, progress,
-wall time) begins anew with each run, and decides nothing of the results.
+bars. Walls with mass: ``free_walls``, their last increment included. Forces of constraints: arrays of their rows.
+Forces of pairs, and which of them have met: arrays of their second nodes. Works and energies: ``ranks``. Energy at the
+start, the largest energy, iterations since the last row: the recorder's. Rows seen, strange ones and energy put in:
+``blow_up``. Contact times and impulses: the contact log's. Time step and linear solver: the plan in the attributes.
+Newton's method, Krylov methods, candidates for contact and friction begin anew each step. What goes with the clock
+(meetings, progress, wall time) begins anew with each run, and decides nothing of the results.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Rows over several nodes live where their nodes do: nothing of the size of all rows on a rank, and one rank's results."""
+"""Rows over several nodes live where their nodes do: nothing of the size of all rows, and the results of one rank."""
 
 from __future__ import annotations
 

@@ -39,10 +39,10 @@ NodesOf = Callable[[str], SetPart]
 class Constraint(ABC):
     """The rows of one table.
 
-    A constructor makes rows of this rank's parts of node sets; it does not communicate, and what it refuses on one rank
-    is refused on all. The rows of all ranks together, in the order of the ranks, must not depend on how many ranks there
-    are. Rows are then sent to where their nodes are: :attr:`nodes` and :attr:`data` are of other rows from then on, and
-    ``values``, ``gradients`` and ``drift`` may be asked of any of them, see :meth:`of`.
+    A constructor makes rows of this rank's parts of node sets. It does not communicate, and what it refuses on one rank
+    is refused on all. The rows of all ranks together, in the order of the ranks, must not depend on how many ranks
+    there are. Rows are then sent to where their nodes are: from then on :attr:`nodes` and :attr:`data` are of other
+    rows, and ``values``, ``gradients`` and ``drift`` may be asked of any of them, see :meth:`of`.
 
     Attributes
     ----------

@@ -13,7 +13,7 @@ import numpy as np
 from ..mechanics.compiled import kernel
 from ..tolerances import FREE_PART, SINGULAR_ROW
 
-__all__ = ["complementary", "solve_groups"]
+__all__ = ["complementary", "find_multipliers", "solve_groups"]
 
 
 @kernel
@@ -52,8 +52,8 @@ def _active_system(matrix, active, count, system):
 
 
 @kernel
-def _complementary(matrix, values, tolerance, z):
-    """See :func:`complementary`; return False if there is no solution."""
+def find_multipliers(matrix, values, tolerance, z):
+    """See :func:`complementary`; False where there is no solution."""
     n = len(values)
     active = np.empty(n, dtype=np.int64)
     held = np.zeros(n, dtype=np.bool_)
@@ -127,7 +127,7 @@ def complementary(matrix: np.ndarray, values: np.ndarray, tolerance: float) -> n
     violated by at most the tolerance count as satisfied. Returns None if there is no solution.
     """
     z = np.zeros(len(values))
-    return z if _complementary(np.ascontiguousarray(matrix), values, tolerance, z) else None
+    return z if find_multipliers(np.ascontiguousarray(matrix), values, tolerance, z) else None
 
 
 @kernel
@@ -144,17 +144,19 @@ def solve_groups(
         apply
     x, stiffness, free : (n, 3), (n,), (n, 3) of nodes; ``free`` is 0.0 where supports prescribe
     first_plane : (n,) first row of a node among the planes, -1 for nodes of other groups
-    planes : (normals (k, w, 3), offsets (k, w)), -inf where a wall does not apply
-    tolerance : a constraint violated by at most this counts as satisfied
-    force : (p,) output; written for these groups only
+    planes : (normals (k, w, 3), offsets (k, w), stopped (n, w) bool), -inf where a wall is no concern; the last says
+        which walls stop which nodes where several nodes have the same planes, (0, 0) where each has its own
+    tolerance : a constraint broken by no more counts as kept
+    force : (p,) out; written for these groups
 
     Returns
     -------
     int
         First of the groups with infeasible constraints, else -1.
     """
-    normals, offsets = planes
+    normals, offsets, stopped = planes
     walls = offsets.shape[1]
+    shared = len(stopped) > 0
     for group in groups:
         begin, end = starts[group], starts[group + 1]
         if end - begin == 1:  # the common case: a single pair whose own solution violates no wall
@@ -177,7 +179,7 @@ def solve_groups(
                 at = first_plane[node_here]
                 sign = -1.0 if e == 0 else 1.0
                 for k in range(walls):
-                    if not settled or offsets[at, k] == -math.inf:
+                    if not settled or offsets[at, k] == -math.inf or (shared and not stopped[node_here, k]):
                         continue
                     gap, along, wall_square = -offsets[at, k], 0.0, 0.0
                     for c in range(3):
@@ -226,7 +228,7 @@ def solve_groups(
                     continue
                 for k in range(walls):
                     at = first_plane[i]
-                    if offsets[at, k] == -math.inf:
+                    if offsets[at, k] == -math.inf or (shared and not stopped[i, k]):
                         continue
                     square, distance = 0.0, 0.0
                     for c in range(3):
@@ -251,7 +253,7 @@ def solve_groups(
                                 s += vector[a, d, c] * vector[b, e, c] / hard
                 gram[a, b] = gram[b, a] = s
         z = np.zeros(n)
-        if not _complementary(gram, value[:n], tolerance, z):
+        if not find_multipliers(gram, value[:n], tolerance, z):
             return group
         for a in range(n):
             if pair[a] >= 0:

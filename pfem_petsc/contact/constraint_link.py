@@ -1,20 +1,25 @@
-"""The constraints of a case as a link: the interface of rows of any kind to the steps.
-
-All ranks know all rows and solve the same small problems; each rank applies the result to its own nodes.
-"""
+"""The constraints of a case as a link: what steps ask of rows, whatever kind they are of."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from mpi4py import MPI
 
 from ..errors import InputError
 from ..integrators.base import Balance, State
+from ..mesh.exchange import Router
+from ..mesh.slab import slab_of
+from ..parallel.agreement import agreed
+from ..parallel.natural import NaturalOrder
 from ..registry import lookup
 from ..tolerances import ON_BOUND
+from .constraints.base import Constraint, ConstraintKeys, SetPart
 from .row_coordinates import RowCoordinates
-from .rows import Rows
+from .row_loops import free_positions, free_stiffness, last_forces, leaving_nodes, mark_pressed, push_nodes
+from .rows import Planes, Rows
+from .search import near_planes
 
 if TYPE_CHECKING:
     from ..case.schema import Case
@@ -25,6 +30,8 @@ if TYPE_CHECKING:
 __all__ = ["ConstraintLink"]
 
 PACKAGE = "pfem_petsc.contact.constraints"
+_ZERO = np.zeros(1)
+_NOWHERE = np.empty(0, dtype=bool)
 
 
 class ConstraintLink:
@@ -33,10 +40,9 @@ class ConstraintLink:
     Attributes
     ----------
     rows : Rows
-    force : (r,) of the last step [N]; jacobian : (e, 3) gradients along which they act; the same on all ranks
+    force : (r,) of the rows here in the last step [N]; jacobian : (r, k, 3) gradients along which these act; the same
+        on all ranks that have a row
     """
-
-    key = "constraints"
 
     def __init__(
         self, case: Case, nodes: dict[str, np.ndarray], mesh: DistributedMesh, fixed: np.ndarray, contact: Contact
@@ -44,27 +50,12 @@ class ConstraintLink:
         self.source, self.contact = case.source, contact
         self.names = [parameters.name for parameters in case.constraint]
         self.columns = [f"constraint/{name}" for name in self.names]
-
-        def nodes_of(name: str) -> tuple[np.ndarray, np.ndarray]:
-            local = nodes[name]
-            parts = mesh.comm.allgather((mesh.node_ids[local], mesh.points[local]))
-            numbers, points = (np.concatenate([part[k] for part in parts]) for k in (0, 1))
-            order = np.argsort(numbers)
-            return numbers[order].astype(np.int64), points[order]
-
-        sources = []
-        for parameters in case.constraint:
-            key = f"{case.source}: constraint {parameters.name!r}"
-            try:
-                source = lookup(PACKAGE, parameters.kind, f"{key}: kind").Constraint(parameters, nodes_of)
-            except InputError as error:  # a kind knows its keys, but not the file that contains them
-                raise InputError(f"{key}: {error}") from error
-            same = np.sort(source.nodes, axis=1)
-            if (same[:, 1:] == same[:, :-1]).any():
-                node = same[:, 1:][same[:, 1:] == same[:, :-1]][0]
-                raise InputError(f"{key}: node {node} is constrained with itself; name different nodes")
-            sources.append(source)
-        self.rows = Rows(sources, mesh, fixed)
+        self.rows = Rows([_source(case.source, keys, nodes, mesh) for keys in case.constraint], mesh, fixed)
+        self._members = self.rows.gather(contact.members) > 0.0
+        self._walled = bool(self._members.any())
+        # walls whose flags travel with the positions
+        self._flags = len(contact.walls) if mesh.comm.allreduce(self._walled, op=MPI.LOR) else 0
+        self._x, self._hard = np.empty((len(self.rows.numbers), 3)), np.empty(len(self.rows.numbers))
         self.release()
 
     @property
@@ -74,7 +65,7 @@ class ConstraintLink:
     def release(self) -> None:
         """Set all forces to zero."""
         self.force = np.zeros(len(self.rows.source))
-        self.jacobian = np.zeros((len(self.rows.entry_row), 3))
+        self.jacobian = np.zeros((*self.rows.ends.shape, 3))
 
     def explicit(
         self,
@@ -84,74 +75,101 @@ class ConstraintLink:
         stiffness: np.ndarray,
         contact: np.ndarray,
         tolerance: float,
-    ) -> None:
-        rows, here = self.rows, self.rows.here
-        x = balance.predictor + u
-        start = rows.gather(state.position) if acts_at_start(balance, state) else None
-        planes = self._planes(x[here], balance.time)
-        self.force, self.jacobian = rows.project(rows.gather(x), rows.gather(stiffness), start, planes, tolerance)
-        forces = rows.forces(self.jacobian, self.force)[rows.mine]
-        u[here] += forces * rows.free[rows.mine] / stiffness[here, None]
-        contact[here] += forces
+    ) -> bool:
+        rows, x = self.rows, self._x
+        displacements = self.contact.motion.displacements(balance.time)
+        far = np.empty((0, 7 + self._flags))
+        if not rows.partners.alone:
+            at, leaving = rows.partners.rows, rows.partners.leaving(far.shape[1])
+            leaving_nodes(at, balance.predictor, u, stiffness, state.position, leaving)
+            if self._flags:
+                leaving[:, 7:] = self.contact.applicable(at, leaving[:, :3], displacements)
+            far = rows.partners.bring(leaving)
+        free_positions(rows.where, balance.predictor, u, far, x)
+        near = self._near(x, balance.time)
 
-    def _planes(self, x: np.ndarray, time: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return planes (n, w, 3), (n, w) of walls at all nodes, from positions (m, 3) of owned nodes. Collective."""
-        contact, here = self.contact, self.rows.here
-        walls = len(contact.walls)
-        displacements = contact.motion.displacements(time)
-        normals, offsets = contact.planes(contact.applicable(here, x, displacements), x, displacements)
-        # a sum over ranks must not contain infinities
-        data = np.zeros((len(contact.members), 4 * walls))
-        data[here] = np.hstack([normals.reshape(len(here), 3 * walls), np.maximum(offsets, -1e300)])
-        data = self.rows.gather(data) if walls else np.zeros((len(self.rows.numbers), 0))
-        offsets = data[:, 3 * walls :]
-        return data[:, : 3 * walls].reshape(len(data), walls, 3), np.where(offsets <= -1e300, -np.inf, offsets)
+        def given() -> tuple[np.ndarray, np.ndarray | None, Planes]:
+            start = rows.spread(state.position, far[:, 4:7]) if acts_at_start(balance, state) else None
+            free_stiffness(rows.where, stiffness, far, self._hard)
+            return self._hard, start, self._planes(near, x, far[:, 7:] > 0.0, displacements)
+
+        self.force, self.jacobian = rows.project(x, tolerance, near, given)
+        if not self.force.any():
+            return False
+        load = rows.forces(self.jacobian, self.force)
+        push_nodes(rows.where, load, rows.free, stiffness, u, contact)
+        return bool(load[rows.mine].any())
+
+    def _near(self, x: np.ndarray, time: float) -> np.ndarray:
+        """(n,) bool: nodes at positions (n, 3) beyond a wall."""
+        if not self._walled:
+            return _NOWHERE
+        near, flat = np.zeros(len(x), dtype=bool), self.contact.flat
+        members = np.ascontiguousarray(self._members[:, flat])
+        offsets = self.contact.plane_offsets(time)[flat]
+        near_planes(x, self.contact.normals[flat], offsets, np.zeros(len(offsets), bool), members, _ZERO, near)
+        return near
+
+    def _planes(self, near: np.ndarray, x: np.ndarray, away: np.ndarray, displacements: np.ndarray) -> Planes:
+        """Planes of the groups that have a node near a wall or any row, at positions x (n, 3); ``away`` (m, w): walls
+        that concern nodes that others own."""
+        rows, contact = self.rows, self.contact
+        place = np.full(len(x), -1)
+        if not self._walled:
+            return place, np.empty((0, 0, 3)), np.empty((0, 0))
+        nodes = np.flatnonzero(self._members.any(axis=1))
+        place[nodes] = np.arange(len(nodes))
+        where = rows.where[nodes]
+        own = where >= 0
+        applicable = np.empty((len(nodes), len(contact.walls)), dtype=bool)
+        applicable[own] = contact.applicable(where[own], x[nodes[own]], displacements)
+        applicable[~own] = away[-1 - where[~own]]
+        normals, offsets = contact.planes(applicable, x[nodes], displacements)
+        return place, normals, np.einsum("nwi,ni->nw", normals, x[nodes]) - offsets
 
     def coordinates(self) -> RowCoordinates:
         return RowCoordinates(self)
 
-    def held(self) -> np.ndarray:
-        pressed = np.zeros(len(self.rows.numbers), dtype=bool)
-        pressed[self.rows.entry_node[self.force[self.rows.entry_row] > 0.0]] = True
-        return np.sort(self.rows.here[pressed[self.rows.mine]])
+    def mark(self, held: np.ndarray) -> None:
+        mark_pressed(self.rows.ends, self.rows.where, self.force, held)
 
     def totals(self) -> np.ndarray:
-        totals = np.zeros((len(self.names), 3))
-        if self.rows.mesh.comm.rank == 0:  # all ranks know the forces
-            np.add.at(totals, self.rows.source, self.force[:, None] * self.jacobian[self.rows.last])
+        rows, totals = self.rows, np.zeros((len(self.names), 3))
+        last_forces(rows.counted, rows.source, rows.last, self.jacobian, self.force, totals)
         return totals
 
     def tables(self, owned: int) -> np.ndarray:
         rows, tables = self.rows, np.full(owned, -1)
-        of_nodes = np.full(len(rows.numbers), -1)
-        pressed = self.force > 0.0
-        of_nodes[rows.entry_node[rows.last[pressed]]] = rows.source[pressed]
-        tables[rows.here] = of_nodes[rows.mine]
+        at = np.flatnonzero((self.force > 0.0) & rows.counted)
+        tables[rows.where[rows.ends[at, rows.last[at]]]] = rows.source[at]
         return tables
 
     def check(self, model: Model, on_its_own: bool) -> None:
-        key, rows, walls = f"{self.source}: constraint", self.rows, self.contact
+        key, rows, walls, comm = f"{self.source}: constraint", self.rows, self.contact, model.mesh.comm
         if model.case.contact.treatment != "scheme":
             raise InputError(f'{key}: constraints need contact.treatment = "scheme"')
         others = [link.numbers for link in model.links if link is not self]
         both = sum(np.isin(rows.numbers, numbers).sum() for numbers in others)
-        if model.mesh.comm.allreduce(int(both)):
+        if comm.allreduce(int(both)):
             raise InputError(f"{key}: a node is in a contact_pair as well as in a constraint; use one of them")
-        met = rows.mesh.comm.allreduce(walls.members[rows.here].sum(axis=0)) > 0
+        met = comm.allreduce(walls.members[rows.here].sum(axis=0)) > 0
         special = walls.special & met
         if special.any():
             raise InputError(
                 f"{key}: wall {walls.names[int(special.argmax())]!r} stops constrained nodes: such a wall must be "
                 "flat, without mass, friction and restitution, and not tied; or give it a node_set without them"
             )
-        points = rows.gather(model.mesh.points[: model.mesh.n_owned])
-        values = rows.values(points)
+        values = rows.values(rows.gather(model.mesh.points[: model.mesh.n_owned]))
+        deepest = (np.inf,)
         if len(values) and not values.min() >= -ON_BOUND * model.length:
             row = int(np.argmin(values))
-            at = ", ".join(str(n) for n in rows.numbers[rows.entry_node[rows.entry_row == row]])
+            at = ", ".join(str(n) for n in rows.numbers[rows.ends[row][rows.ends[row] >= 0]])
+            deepest = (float(values[row]), int(rows.source[row]), int(rows.ids[row]), at)
+        deepest = min(comm.allgather(deepest))
+        if len(deepest) > 1:
             raise InputError(
-                f"{key} {self.names[rows.source[row]]!r}: nodes {at} start {-values[row]:.6g} m beyond it; correct its "
-                "keys, or move the mesh"
+                f"{key} {self.names[deepest[1]]!r}: nodes {deepest[3]} start {-deepest[0]:.6g} m beyond it; correct "
+                "its keys, or move the mesh"
             )
 
     def resting(self, x: np.ndarray, v: np.ndarray, slack: float, still: float) -> np.ndarray:
@@ -163,35 +181,77 @@ class ConstraintLink:
         return np.where(closed, self.rows.drift(x, v), np.inf)
 
     def rest(self, a: np.ndarray, mass: np.ndarray, closed: Any, on_walls: np.ndarray) -> np.ndarray:
-        rows, here = self.rows, self.rows.here
-        state, change = self.contact.state, np.zeros_like(a)
-        normals, offsets = self._planes(state.position[here], state.time)
-        rests = rows.gather(on_walls.astype(float)) > 0.0
-        every = rows.gather(a)
+        rows, contact = self.rows, self.contact
+        state, change = contact.state, np.zeros_like(a)
+        rests = rows.gather(on_walls) > 0.0
+        every, hard = rows.gather(a), rows.gather(mass)
+        normals, _ = contact.planes(rests, rows.gather(state.position), contact.motion.displacements(state.time))
         gaps = np.where(rests, np.einsum("nwi,ni->nw", normals, every), np.inf)
         values = rows.along(self.jacobian, every) + closed
-        tolerance = 1e-13 * float(np.abs(every).max(initial=0.0))
-        self.force, _ = rows.solve(self.jacobian, values, rows.gather(mass), (normals, gaps), tolerance)
-        change[here] = (rows.forces(self.jacobian, self.force) * rows.free)[rows.mine]
+        largest = rows.mesh.comm.allreduce(float(np.abs(every).max(initial=0.0)), op=MPI.MAX)
+        place = np.where(rests.any(axis=1), np.arange(len(every)), -1)
+        with agreed(rows.mesh.comm):
+            self.force = rows.solve(self.jacobian, values, hard, (place, normals, gaps), 1e-13 * largest)
+        change[rows.here] = (rows.forces(self.jacobian, self.force) * rows.free)[rows.mine]
         return change
 
     def push(self, contact: np.ndarray, factor: float = 1.0) -> None:
         contact[self.rows.here] += factor * self.rows.forces(self.jacobian, self.force)[self.rows.mine]
 
-    def save(self) -> dict[str, list]:
-        return {"force": self.force.tolist(), "jacobian": self.jacobian.tolist()}
+    def save(self) -> tuple[np.ndarray, np.ndarray]:
+        return self.force, self.jacobian
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        return {}
+    def restore(self, saved: tuple[np.ndarray, np.ndarray]) -> None:
+        self.force, self.jacobian = saved
+
+    def arrays(self) -> dict[str, tuple[NaturalOrder, np.ndarray]]:
+        rows = self.rows
+        kept = {"constraints.force": self.force, "constraints.gradients": self.jacobian}
+        return {name: (rows.order, values[rows.counted]) for name, values in kept.items() if rows.order.n_global}
 
     def load_state(self, name: str, values: np.ndarray) -> None:
-        """Do nothing: constraints keep no arrays."""
-
-    def restore(self, saved: dict[str, list]) -> None:
-        self.force = np.array(saved["force"], dtype=float)
-        self.jacobian = np.array(saved["jacobian"], dtype=float).reshape(-1, 3)
+        every = self.rows.of_counted(values)
+        if name == "constraints.force":
+            self.force = every
+        else:
+            self.jacobian = every
 
 
 def acts_at_start(balance: Balance, state: State) -> bool:
     """Return whether the forces of a balance act at the state's positions, not at the positions solved for."""
     return all(time == state.time for _, time in balance.loads)
+
+
+def _source(file: str, parameters: ConstraintKeys, nodes: dict[str, np.ndarray], mesh: DistributedMesh) -> Constraint:
+    """The rows that a table makes of this rank's parts of its node sets. Collective."""
+    key = f"{file}: constraint {parameters.name!r}"
+    named = [
+        getattr(parameters, name)
+        for name, field in type(parameters).model_fields.items()
+        if (field.json_schema_extra or {}).get("refers_to") == "node_set"
+    ]
+    parts = {name: _part(mesh, nodes[name]) for name in named if name is not None}
+    with agreed(mesh.comm):
+        try:
+            source = lookup(PACKAGE, parameters.kind, f"{key}: kind").Constraint(parameters, parts.__getitem__)
+        except InputError as error:  # a kind knows its keys, but not the file that they are in
+            raise InputError(f"{key}: {error}") from error
+        if not hasattr(source, "data"):
+            source.data = np.empty((len(source.nodes), 0))
+        same = np.sort(source.nodes, axis=1)
+        if (same[:, 1:] == same[:, :-1]).any():
+            node = same[:, 1:][same[:, 1:] == same[:, :-1]][0]
+            raise InputError(f"{key}: node {node} is constrained with itself; name different nodes")
+    return source
+
+
+def _part(mesh: DistributedMesh, local: np.ndarray) -> SetPart:
+    """This rank's part of a node set, of which it owns nodes (k,). Collective."""
+    comm = mesh.comm
+    to_slab = Router(comm, slab_of(mesh.node_ids[local], mesh.n_nodes, comm.size))
+    numbers, places = to_slab.send(mesh.node_ids[local]), to_slab.send(mesh.points[local])
+    order = np.argsort(numbers)
+    counts = np.array(comm.allgather(len(numbers)))
+    count, first = int(counts.sum()), int(counts[: comm.rank].sum())
+    evenly = Router(comm, slab_of(first + np.arange(len(numbers)), count, comm.size))
+    return SetPart(count, evenly.send(numbers[order]).astype(np.int64), evenly.send(places[order]))

@@ -23,6 +23,7 @@ from ..errors import SimulationFailure
 from .complementarity import complementary, solve_groups
 from .pair_loops import broken_pairs
 from .projection import project
+from .row_loops import free_positions, free_stiffness, leaving_nodes
 from .search import near_planes
 
 if TYPE_CHECKING:
@@ -59,6 +60,8 @@ class CoupledPairs:
         self._away = np.flatnonzero(self._where < 0)
         self._here, self._far = self._where[self._owned], -1 - self._where[self._away]
         self._free = pairs.free.reshape(-1, 3)[first]
+        self._x, self._hard, self._nowhere = np.empty((n, 3)), np.empty(n), np.empty((0, 3))
+        self._zero = np.zeros(n, dtype=np.int64)
         self._members = self._every(contact.members.astype(float)) > 0.0
         walled = self._members.any(axis=1)
         self.shared = np.bincount(self._of.ravel(), minlength=n) > 1
@@ -104,23 +107,25 @@ class CoupledPairs:
         """Return forces of the pairs (p,) [N] in a step; see :meth:`ContactPairs.explicit`. Collective."""
         contact, partners = self.contact, self.pairs.partners
         displacements = contact.motion.displacements(time)
-        rows, walls = partners.rows, len(contact.walls)
-        leaving = np.empty((len(rows), 4 + walls))
+        rows, walls = partners.rows, len(contact.walls) if contact.partial else 0
+        far = np.empty((0, 4 + walls))
         if not partners.alone:
-            leaving[:, :3] = predictor[rows] + u[rows]
-            leaving[:, 3] = stiffness[rows]
-            leaving[:, 4:] = contact.applicable(rows, leaving[:, :3], displacements)
-        far = partners.bring(leaving)
-        here = self._here
-        x = self._spread(predictor[here] + u[here], far[:, :3])
-        hard = self._spread(stiffness[here][:, None], far[:, 3:4])[:, 0]
+            leaving = partners.leaving(4 + walls)
+            leaving_nodes(rows, predictor, u, stiffness, self._nowhere, leaving)
+            if walls:
+                leaving[:, 4:] = contact.applicable(rows, leaving[:, :3], displacements)
+            far = partners.bring(leaving)
+        x, hard = self._x, self._hard
+        free_positions(self._where, predictor, u, far, x)
+        free_stiffness(self._where, stiffness, far, hard)
 
-        def planes(nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            where = self._where[nodes]
-            own = where >= 0
-            applicable = np.empty((len(nodes), walls), dtype=bool)
-            applicable[own] = contact.applicable(where[own], x[nodes[own]], displacements)
-            applicable[~own] = far[-1 - where[~own], 4:] > 0.0
+        def own_planes(nodes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            applicable = self._members[nodes]
+            if contact.partial:
+                where = self._where[nodes]
+                own = where >= 0
+                applicable[own] = contact.applicable(where[own], x[nodes[own]], displacements)
+                applicable[~own] = far[-1 - where[~own], 4:] > 0.0
             return contact.planes(applicable, x[nodes], displacements)
 
         near = np.zeros(len(x), dtype=bool)
@@ -129,7 +134,11 @@ class CoupledPairs:
             offsets = contact.plane_offsets(time)[flat]
             members = np.ascontiguousarray(self._members[:, flat])
             near_planes(x, contact.normals[flat], offsets, np.zeros(len(offsets), bool), members, _ZERO, near)
-        return self._forces(x, hard, self.pairs.gaps, planes, np.flatnonzero(near), tolerance)
+        shared = None
+        if contact.flat.all() and not contact.partial:
+            every = np.ones((1, len(contact.walls)), dtype=bool)
+            shared = *contact.planes(every, np.zeros((1, 3)), displacements), self._members
+        return self._forces(x, hard, self.pairs.gaps, own_planes, np.flatnonzero(near), tolerance, shared)
 
     def rest(
         self, a: np.ndarray, mass: np.ndarray, least: np.ndarray, resting: np.ndarray, tolerance: float
@@ -166,10 +175,12 @@ class CoupledPairs:
         planes: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]],
         near: np.ndarray,
         tolerance: float,
+        shared: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None,
     ) -> np.ndarray:
         """Return forces of the pairs (p,) for nodes at x (n, 3), of which ``near`` (m,) may lie beyond walls.
 
-        ``planes(nodes)`` returns normals (m, w, 3) and offsets (m, w) of nodes (m,), -inf where a wall does not apply.
+        ``planes(nodes)`` gives the normals (m, w, 3) and offsets (m, w) of nodes (m,), -inf where a wall is no concern;
+        ``shared``: normals (1, w, 3), offsets (1, w) and nodes (n, w) bool where they are the same for all nodes.
         """
         pairs, free = self.pairs, self._free
         force, broken = np.zeros(len(least)), np.empty(len(least), dtype=bool)
@@ -181,13 +192,17 @@ class CoupledPairs:
             pushed[near] = moved
         if not broken_pairs(self._of, pushed, least, pairs.normals, tolerance, broken):
             return force
-        groups = np.unique(self._group[broken])
         chosen = np.zeros(len(self._starts) - 1, dtype=bool)
-        chosen[groups] = True
-        nodes = np.unique(self._of[:, chosen[self._group]])
-        plane = np.full(len(x), -1)
-        plane[nodes] = np.arange(len(nodes))
-        arguments = self._of, pairs.normals, least, x, stiffness, free, plane, planes(nodes), tolerance, force
+        chosen[self._group[broken]] = True
+        groups = np.flatnonzero(chosen)
+        if shared is not None:
+            plane, given = self._zero, shared
+        else:
+            nodes = np.unique(self._of[:, chosen[self._group]])
+            plane = np.full(len(x), -1)
+            plane[nodes] = np.arange(len(nodes))
+            given = *planes(nodes), np.empty((0, 0), dtype=bool)
+        arguments = self._of, pairs.normals, least, x, stiffness, free, plane, given, tolerance, force
         infeasible = solve_groups(groups, self._starts, self._pairs, *arguments)
         if infeasible >= 0:
             some = np.unique(self._of[:, self._group == infeasible])

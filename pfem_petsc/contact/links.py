@@ -7,8 +7,7 @@ list without distinguishing its entries. Explicit steps call :meth:`Links.explic
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from functools import reduce
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
@@ -16,6 +15,7 @@ from petsc4py import PETSc
 
 from ..errors import SimulationFailure
 from ..integrators.base import Balance, State
+from ..parallel.natural import NaturalOrder
 from .frames import NodalFrames
 
 if TYPE_CHECKING:
@@ -29,12 +29,10 @@ class Link(Protocol):
 
     Attributes
     ----------
-    key : under which checkpoints store its forces
-    columns : of its tables in the history, such as ``pair/NAME``
-    numbers : mesh numbers of the nodes of its rows, at least of rows with nodes that this rank owns
+    columns : of its tables in the history, like ``pair/NAME``
+    numbers : mesh numbers of the nodes of its rows, at least of those whose nodes this rank owns
     """
 
-    key: str
     columns: list[str]
     numbers: np.ndarray
 
@@ -46,11 +44,13 @@ class Link(Protocol):
         stiffness: np.ndarray,
         contact: np.ndarray,
         tolerance: float,
-    ) -> None:
-        """Correct the increments ``u`` (owned, 3) of a step in which nodes are solved independently. Collective.
+    ) -> bool:
+        """Correct the increments ``u`` (owned, 3) of a step in which each node is solved on its own. Collective.
 
-        ``stiffness`` (owned,) is the force for a displacement of a node [N/m]; the forces [N] are added to ``contact``
-        (owned, 3); a row violated by at most ``tolerance`` [m] counts as satisfied.
+        Gives whether any row presses on a node of this rank.
+
+        ``stiffness`` (owned,) is the force for a displacement of a node [N/m], ``contact`` (owned, 3) takes the forces
+        [N], ``tolerance`` [m] is the depth up to which a row counts as kept.
 
         Raises
         ------
@@ -61,8 +61,8 @@ class Link(Protocol):
     def coordinates(self) -> LinkCoordinates:
         """Return the coordinates for implicit steps. Collective."""
 
-    def held(self) -> np.ndarray:
-        """Owned nodes (k,) with active rows."""
+    def mark(self, held: np.ndarray) -> None:
+        """Mark owned nodes (owned,) on which rows press."""
 
     def totals(self) -> np.ndarray:
         """This rank's share of the forces (tables, 3) of the rows on their last nodes [N]."""
@@ -94,16 +94,17 @@ class Link(Protocol):
         """Add its forces to those on the nodes (owned, 3) [N]."""
 
     def save(self) -> Any:
-        """Its forces, for :meth:`restore`: numbers and lists, as a checkpoint takes them. Collective."""
+        """Its forces, for :meth:`restore` of a step that is given up."""
 
     def restore(self, saved: Any) -> None:
         """Restore the forces."""
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        """Return nodal arrays for a checkpoint: name to values (owned, ...); the same names on all ranks."""
+    def arrays(self) -> dict[str, tuple[NaturalOrder, np.ndarray]]:
+        """What a checkpoint keeps of it: name to an order of things and the rows that this rank owns; the same names
+        on all ranks."""
 
     def load_state(self, name: str, values: np.ndarray) -> None:
-        """Restore such an array (owned, ...). Collective."""
+        """Take such rows back. Collective."""
 
 
 class LinkCoordinates(Protocol):
@@ -202,19 +203,25 @@ class Links:
         """See :meth:`Link.explicit`; return the forces (owned, 3) [N], ``none`` if there are no links."""
         if not self.members:
             return none
-        contact, failure = np.zeros(u.shape), None
+        contact, failure, pressed = np.zeros(u.shape), None, False
         for link in self.members:
             try:
-                link.explicit(balance, state, u, stiffness, contact, tolerance)
+                pressed |= link.explicit(balance, state, u, stiffness, contact, tolerance)
             except SimulationFailure as met:  # the next link may be collective
                 failure = failure or met
         if failure is not None:
             raise failure
-        return contact if any(len(link.held()) for link in self.members) else none
+        return contact if pressed else none
 
-    def held(self, nodes: np.ndarray) -> np.ndarray:
-        """Return the nodes in contact with walls, ``nodes`` (k,), together with those in contact through links."""
-        return reduce(np.union1d, (link.held() for link in self.members), nodes)
+    def count_held(self, nodes: np.ndarray, owned: int) -> int:
+        """How many of the owned nodes are among those (k,) that walls hold, or held by links."""
+        if not self.members:
+            return len(nodes)
+        held = np.zeros(owned, dtype=bool)
+        held[nodes] = True
+        for link in self.members:
+            link.mark(held)
+        return int(np.count_nonzero(held))
 
     def totals(self) -> np.ndarray:
         """This rank's share of the forces (tables, 3) of all links on the last nodes of their rows [N]."""
@@ -250,21 +257,21 @@ class Links:
         for link in self.members:
             link.push(contact)
 
-    def save(self) -> dict[str, Any]:
-        """Return the forces of all links by key. Collective."""
-        return {link.key: link.save() for link in self.members}
+    def save(self) -> list[Any]:
+        """See :meth:`Link.save`."""
+        return [link.save() for link in self.members]
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        """See :meth:`Link.arrays`; return those of all links."""
+    def restore(self, saved: list[Any]) -> None:
+        """Take the forces back from what :meth:`save` gave."""
+        for link, own in zip(self.members, saved, strict=True):
+            link.restore(own)
+
+    def arrays(self) -> dict[str, tuple[NaturalOrder, np.ndarray]]:
+        """See :meth:`Link.arrays`; those of all links."""
         return {name: array for link in self.members for name, array in link.arrays().items()}
 
-    def load_state(self, name: str, values: np.ndarray) -> None:
-        """See :meth:`Link.load_state`."""
+    def load_state(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Take the arrays of all links back. Collective."""
         for link in self.members:
-            if name in link.arrays():
-                link.load_state(name, values)
-
-    def restore(self, saved: dict[str, Any]) -> None:
-        """Restore the forces from the result of :meth:`save`."""
-        for link in self.members:
-            link.restore(saved[link.key])
+            for name in link.arrays():
+                link.load_state(name, arrays[name])

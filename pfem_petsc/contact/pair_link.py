@@ -9,10 +9,12 @@ from petsc4py import PETSc
 
 from ..errors import NotConverged
 from ..integrators.base import Balance, State
+from ..parallel.natural import NaturalOrder
 from .frames import NodalFrames
 from .links import BlocksOf
 from .pair_checks import check_scheme, check_start
 from .pair_coordinates import PairCoordinates
+from .pair_loops import mark_nodes
 from .pairs import ContactPairs
 
 if TYPE_CHECKING:
@@ -23,8 +25,6 @@ __all__ = ["PairLink", "PairLinkCoordinates"]
 
 class PairLink:
     """The pairs of a case; see :class:`~pfem_petsc.contact.links.Link`."""
-
-    key = "pairs"
 
     def __init__(self, pairs: ContactPairs) -> None:
         self.pairs = pairs
@@ -43,15 +43,15 @@ class PairLink:
         stiffness: np.ndarray,
         contact: np.ndarray,
         tolerance: float,
-    ) -> None:
+    ) -> bool:
         """See :class:`~pfem_petsc.contact.links.Link`, here and below."""
-        self.pairs.explicit(balance.predictor, u, stiffness, contact, balance.time, tolerance)
+        return self.pairs.explicit(balance.predictor, u, stiffness, contact, balance.time, tolerance)
 
     def coordinates(self) -> PairLinkCoordinates:
         return PairLinkCoordinates(self.pairs)
 
-    def held(self) -> np.ndarray:
-        return self.pairs.pressed()[0]
+    def mark(self, held: np.ndarray) -> None:
+        mark_nodes(self.pairs.where, self.pairs.force, held)
 
     def totals(self) -> np.ndarray:
         return np.array(list(self.pairs.totals().values()))
@@ -80,10 +80,10 @@ class PairLink:
         return None
 
     def restore(self, saved: None) -> None:
-        """Do nothing: the forces are in the arrays."""
+        """They are found again."""
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        return self.pairs.kept()
+    def arrays(self) -> dict[str, tuple[NaturalOrder, np.ndarray]]:
+        return {name: (self.pairs.mesh.node_order, values) for name, values in self.pairs.kept().items()}
 
     def load_state(self, name: str, values: np.ndarray) -> None:
         self.pairs.load_state(name, values)

@@ -15,6 +15,7 @@ from ..mechanics.compiled import kernel
 __all__ = [
     "broken_pairs",
     "leaving_rows",
+    "mark_nodes",
     "move_nodes",
     "needed_forces",
     "part_nodes",
@@ -162,6 +163,15 @@ def pressed_nodes(where, force, normals, nodes, directions):
                     directions[count, c] = normals[p, c]
                 count += 1
     return count
+
+
+@kernel
+def mark_nodes(where, force, held):
+    """Mark owned nodes (owned,) that pairs press."""
+    for end in range(2):
+        for p in range(len(force)):
+            if where[end, p] >= 0 and force[p] > 0.0:
+                held[where[end, p]] = True
 
 
 @kernel

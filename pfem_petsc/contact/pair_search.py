@@ -1,8 +1,7 @@
 """Distribution of contact pairs over ranks: a rank has the pairs of its own nodes, and those connected with them.
 
-The tables of a case are matched among the ranks (:mod:`~pfem_petsc.contact.matching`): the owner of each second node
-finds the first node and notifies its owner. If a node is in several pairs, all ranks that own a node of such a group
-have the whole group.
+The tables of a case are matched among the ranks (:mod:`~pfem_petsc.contact.matching`), so that the owner of a second
+node learns of its first one. Who has which pair then is as for all rows: :mod:`~pfem_petsc.contact.row_search`.
 """
 
 from __future__ import annotations
@@ -17,6 +16,7 @@ from ..errors import InputError
 from ..mesh.exchange import GhostExchange, Router
 from ..mesh.slab import slab_of
 from .matching import nearest_among_ranks
+from .row_search import owner_starts, to_owners, with_groups
 
 if TYPE_CHECKING:
     from ..case.schema import Case
@@ -57,14 +57,12 @@ def find_pairs(case: Case, nodes: dict[str, np.ndarray], mesh: DistributedMesh) 
         On all ranks, for sets of unequal size, a node paired with itself, or two nodes paired with the same node.
     """
     comm = mesh.comm
-    starts = np.concatenate([[0], np.cumsum(comm.allgather(mesh.n_owned))]).astype(np.int64)
+    starts = owner_starts(mesh)
     found = np.concatenate([_match(case, k, nodes, mesh) for k in range(len(case.contact_pair))])
     _refuse_itself(found, case.source, comm)
-    # notify the owner of each pair's first node; rows that both owners have are equal
-    owner = np.searchsorted(starts, found[:, _FIRST_AT], side="right") - 1
-    away = owner != comm.rank
-    pairs = _sorted(np.concatenate([found, Router(comm, owner[away]).send(found[away])]))
-    pairs = _with_groups(pairs, starts, comm)
+    # a second node is in one pair of a table: table and second node tell pairs apart
+    ends = [_FIRST_AT, _SECOND_AT]
+    pairs = with_groups(to_owners(found, ends, starts, comm), ends, starts, comm)
     first, last = starts[comm.rank], starts[comm.rank + 1]
     at = pairs[:, [_FIRST_AT, _SECOND_AT]].T
     mine = (at >= first) & (at < last)
@@ -101,34 +99,3 @@ def _refuse_itself(pairs: np.ndarray, source: str, comm: MPI.Comm) -> None:
     lowest = min(comm.allgather(tuple(same[:, [_TABLE, _FIRST]].min(axis=0).tolist()) if len(same) else (np.inf,)))
     if len(lowest) > 1:
         raise InputError(f"{source}: contact_pair: node {lowest[1]} is paired with itself")
-
-
-def _sorted(pairs: np.ndarray) -> np.ndarray:
-    """Return the pairs sorted and without duplicates."""
-    return np.unique(pairs, axis=0)
-
-
-def _with_groups(pairs: np.ndarray, starts: np.ndarray, comm: MPI.Comm) -> np.ndarray:
-    """Add the pairs connected with those of this rank through shared nodes, repeated until complete. Collective."""
-    own = pairs
-    order = [np.argsort(own[:, at], kind="stable") for at in (_FIRST_AT, _SECOND_AT)]
-    first, last = starts[comm.rank], starts[comm.rank + 1]
-    known = np.empty(0, dtype=np.int64)
-    while True:
-        ends = np.unique(pairs[:, [_FIRST_AT, _SECOND_AT]])
-        asked = np.setdiff1d(ends[(ends < first) | (ends >= last)], known)
-        if comm.allreduce(len(asked), op=MPI.MAX) == 0:
-            return pairs
-        known = np.union1d(known, asked)
-        asking = Router(comm, np.searchsorted(starts, asked, side="right") - 1)
-        wanted = asking.send(np.column_stack([asked, np.full(len(asked), comm.rank)]))
-        answers, ranks = [], []
-        for column, rows in zip((_FIRST_AT, _SECOND_AT), order, strict=True):
-            keys = own[rows, column]
-            begin = np.searchsorted(keys, wanted[:, 0])
-            count = np.searchsorted(keys, wanted[:, 0], side="right") - begin
-            place = np.arange(count.sum()) + np.repeat(begin - np.cumsum(count) + count, count)
-            answers.append(own[rows[place]])
-            ranks.append(np.repeat(wanted[:, 1], count))
-        answer = Router(comm, np.concatenate(ranks)).send(np.concatenate(answers))
-        pairs = _sorted(np.concatenate([pairs, answer]))

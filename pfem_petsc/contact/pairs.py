@@ -89,8 +89,10 @@ class ContactPairs:
         contact: np.ndarray,
         time: float,
         tolerance: float,
-    ) -> None:
-        """Separate the pairs that the free positions, predictor + u, violate; called before the walls. Collective.
+    ) -> bool:
+        """Separate the pairs that the free positions, predictor + u, violate; walls follow. Collective.
+
+        Gives whether any pair here has a force.
 
         Parameters
         ----------
@@ -110,6 +112,7 @@ class ContactPairs:
             self._move(u, self.force, stiffness, contact)
         else:
             self.force = self.part(predictor, u, stiffness, contact)
+        return bool(self.force.any())
 
     def pressed(self) -> tuple[np.ndarray, np.ndarray]:
         """Return owned nodes (k,) of pairs in contact, and the directions (k, 3) of their pairs."""

@@ -6,20 +6,24 @@ pivoting. With s the size of a row's gradient and N all other components,
 
     w_P = J y / s,   w_N = y_N,   and back   y_P = J_P^-1 (s w_P - J_N w_N),
 
-so that the row is a lower bound on w_P. The gradient transforms accordingly, g_N <- g_N - J_N^T q, g_P <- s q with
-q = J_P^-T g_P, and q are the forces of the rows. Prescribed components do not enter J; they move the bound. Nonlinear
-rows are linearised again at the solution until it satisfies them and their gradients no longer change.
+so that the row is a lower bound on w_P. The gradient follows: g_N <- g_N - J_N^T q, g_P <- s q with q = J_P^-T g_P, and
+q are the rows' forces then. What supports prescribe is no part of J: it moves the bound. Rows that are not linear are
+taken again at the solution, until it keeps them and their gradients are those of the solve. Groups of the same
+shape are worked on together, and all ranks that have a group do the same.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
+from mpi4py import MPI
 from petsc4py import PETSc
 
 from ..errors import NotConverged
 from ..integrators.base import Balance, State
+from ..parallel.agreement import agreed
 from ..tolerances import PROJECTED
 from .frames import NodalFrames
 from .links import BlocksOf
@@ -30,7 +34,8 @@ if TYPE_CHECKING:
 __all__ = ["RowCoordinates"]
 
 _LEAST = 0.05  # of a pivot below which a row is deferred
-_TURN = 1e-10  # change of a gradient that counts as zero
+_TURN = 1e-10  # of a gradient that counts as none
+_NOWHERE = np.empty(0, dtype=bool)
 
 
 class RowCoordinates:
@@ -44,20 +49,22 @@ class RowCoordinates:
     varies = True
 
     def __init__(self, link: ConstraintLink) -> None:
-        self.link, self.rows = link, link.rows
+        self.link, self.rows, self.comm = link, link.rows, link.rows.mesh.comm
         n = len(self.rows.numbers)
         self._start: np.ndarray | None = None
-        self._place(self.rows.gradients(self._points()), np.tile(np.eye(3), (n, 1, 1)), np.ones((n, 3), dtype=bool))
+        points = self.rows.gather(self.rows.mesh.points[: self.rows.mesh.n_owned])
+        self._place(self.rows.gradients(points), np.tile(np.eye(3), (n, 1, 1)), np.ones((n, 3), dtype=bool))
 
-    def _points(self) -> np.ndarray:
-        return self.rows.gather(self.rows.mesh.points[: self.rows.mesh.n_owned])
+    def _any(self, flag: bool) -> bool:
+        """Whether a flag is set on any rank. Collective."""
+        return bool(self.comm.allreduce(bool(flag), op=MPI.LOR))
 
     def reached(self, state: State, move: np.ndarray, slack: float) -> bool:
         rows = self.rows
         data = rows.gather(np.concatenate([state.position + move, move], axis=1))
-        way = np.linalg.norm(data[:, 3:], axis=1)
-        reach = 0.5 * np.bincount(rows.entry_row, way[rows.entry_node], minlength=len(rows.source)) + slack
-        return bool(((rows.values(data[:, :3]) < reach) | (self.link.force > 0.0)).any())
+        way = np.append(np.linalg.norm(data[:, 3:], axis=1), 0.0)  # the last one: of no node
+        reach = 0.5 * way[rows.ends].sum(axis=1) + slack
+        return self._any(((rows.values(data[:, :3]) < reach) | (self.link.force > 0.0)).any())
 
     def place(self, frames: NodalFrames | None, balance: Balance, state: State, x: np.ndarray) -> None:
         rows, owned = self.rows, self.rows.mesh.n_owned
@@ -73,58 +80,61 @@ class RowCoordinates:
         self._place(jacobian, data[:, :9].reshape(-1, 3, 3), data[:, 9:] == 0.0)
 
     def _place(self, jacobian: np.ndarray, inverse: np.ndarray, room: np.ndarray) -> None:
-        """Choose the pivots.
-
-        ``jacobian`` (e, 3) with respect to x; ``inverse`` (n, 3, 3) of the bases of the nodes' frames; ``room`` (n, 3)
-        bool, coordinates that no wall bounds.
-        """
+        """Choose the pivots. ``jacobian`` (r, k, 3) by x; of the nodes: ``inverse`` (n, 3, 3) of their frames' bases,
+        and ``room`` (n, 3) bool: coordinates that no wall bounds."""
         rows = self.rows
         self.jacobian = jacobian
-        turned = np.einsum("eji,ej->ei", inverse[rows.entry_node], jacobian) * rows.free[rows.entry_node]
-        n, count = 3 * len(rows.numbers), len(rows.source)
-        self._pivot = np.full(count, -1)  # unknown of each row among those of all nodes
-        self._scale = np.ones(count)
+        some = (rows.ends >= 0)[:, :, None]
+        turned = np.einsum("rkji,rkj->rki", inverse[rows.ends], jacobian)
+        self._turned = np.where(some, turned * rows.free[rows.ends], 0.0)
+        n = 3 * len(rows.numbers)
+        self._pivot = np.full(len(rows.source), -1)  # unknown of each row among those of all nodes
+        self._scale = np.ones(len(rows.source))
         room = (room & (rows.free > 0.0)).ravel()
-        self._blocks: list[tuple[np.ndarray, np.ndarray]] = []  # unknowns of a group and its part of T
-        self._inverse_rows, inverses = [], []
-        for group in rows.groups:
-            unknowns = (3 * group.nodes[:, None] + np.arange(3)).ravel()
-            dense = group.dense(turned).reshape(len(group.rows), -1)
-            row, column = _pivots(np.where(room[unknowns], dense, 0.0))
-            pivots, every = dense[np.ix_(row, column)], np.eye(len(unknowns))
-            scale = np.linalg.norm(dense[row], axis=1)
-            others = dense[row].copy()
-            others[:, column] = 0.0
-            transform = every.copy()
-            solved = np.linalg.inv(pivots) if len(row) else pivots
-            transform[column] = -solved @ others
-            transform[np.ix_(column, column)] = solved * scale
-            self._blocks.append((unknowns, transform))
-            self._pivot[group.rows[row]] = unknowns[column]
-            self._scale[group.rows[row]] = scale
-            inverses.append((group.rows[row], np.linalg.inv(pivots) if len(row) else pivots))
-        self._solved = inverses
-        self._turned = turned
+        self._blocks: list[tuple[np.ndarray, np.ndarray]] = []  # of groups alike: unknowns (g, u), T (g, u, u)
+        self._solved: list[tuple[np.ndarray, np.ndarray]] = []  # rows (g, p) with pivots, and J_P^-1 (g, p, p)
+        for groups in rows.alike:
+            unknowns = (3 * groups.nodes[:, :, None] + np.arange(3)).reshape(len(groups.nodes), -1)
+            dense = groups.dense(self._turned[groups.rows])
+            row, column, count = _pivots(np.where(room[unknowns][:, None, :], dense, 0.0))
+            for k in np.unique(count):
+                part = np.flatnonzero(count == k)
+                self._transform(groups.rows[part], unknowns[part], dense[part], row[part, :k], column[part, :k])
         self._placed = np.flatnonzero(self._pivot >= 0)
         self._deferred = np.flatnonzero((self._pivot < 0) & rows.usable(jacobian))
-        # entries of T in the rows of pivots
+        self._owner = np.zeros(n, dtype=bool)
+        self._owner[self._pivot[self._placed]] = True
+        # T on the pivots' rows, as entries
         parts = []
         for unknowns, transform in self._blocks:
-            pivot = np.isin(unknowns, self._pivot[self._placed])
-            at, column = np.nonzero((transform != 0.0) & pivot[:, None])
-            parts.append((unknowns[at], unknowns[column], transform[at, column]))
+            group, at, column = np.nonzero((transform != 0.0) & self._owner[unknowns][:, :, None])
+            parts.append((unknowns[group, at], unknowns[group, column], transform[group, at, column]))
         self._to, self._from, self._values = (
             np.concatenate([np.empty(0, dtype=kind), *(part[k] for part in parts)])
             for k, kind in ((0, np.int64), (1, np.int64), (2, np.float64))
         )
-        self._owner = np.zeros(n, dtype=bool)
-        self._owner[self._pivot[self._placed]] = True
-        # pivots at this rank's nodes: local node, component, row
-        place = np.full(len(rows.numbers), -1)
-        place[rows.mine] = rows.here
-        local = place[self._pivot[self._placed] // 3]
+        # pivots of this rank's nodes: local node, component, row
+        local = rows.where[self._pivot[self._placed] // 3]
         here = local >= 0
         self._here = local[here], self._pivot[self._placed][here] % 3, self._placed[here]
+
+    def _transform(
+        self, rows: np.ndarray, unknowns: np.ndarray, dense: np.ndarray, row: np.ndarray, column: np.ndarray
+    ) -> None:
+        """T of groups (g,) alike: rows (g, p), unknowns (g, u), gradients (g, p, u), and pivots (g, k), (g, k)."""
+        every = np.arange(len(rows))[:, None]
+        own = dense[every, row]
+        pivots = np.take_along_axis(own, np.repeat(column[:, None, :], own.shape[1], axis=1), axis=2)
+        scale = np.linalg.norm(own, axis=2)
+        solved = np.linalg.inv(pivots)
+        np.put_along_axis(own, np.repeat(column[:, None, :], own.shape[1], axis=1), 0.0, axis=2)
+        transform = np.tile(np.eye(unknowns.shape[1]), (len(rows), 1, 1))
+        transform[every, column] = -solved @ own
+        transform[every[:, :, None], column[:, :, None], column[:, None, :]] = solved * scale[:, None, :]
+        self._blocks.append((unknowns, transform))
+        self._solved.append((rows[every, row], solved))
+        self._pivot[rows[every, row]] = unknowns[every, column]
+        self._scale[rows[every, row]] = scale
 
     def _all(self, array: np.ndarray) -> np.ndarray:
         """Return the unknowns (3 n,) of all nodes from an array whose first rows are owned nodes. Collective."""
@@ -132,10 +142,11 @@ class RowCoordinates:
 
     def feasible(self, predictor: np.ndarray, u: np.ndarray, stiffness: np.ndarray) -> None:
         rows, here = self.rows, self.rows.here
-        planes = np.zeros((len(rows.numbers), 0, 3)), np.zeros((len(rows.numbers), 0))
-        k = rows.gather(stiffness)
+        nowhere = np.full(len(rows.numbers), -1), np.empty((0, 0, 3)), np.empty((0, 0))
+        k, x = rows.gather(stiffness), rows.gather(predictor + u)
         tolerance = PROJECTED * self.link.contact.length
-        force, jacobian = rows.project(rows.gather(predictor + u), k, self._start, planes, tolerance)
+        with agreed(self.comm):
+            force, jacobian = rows.project(x, tolerance, _NOWHERE, lambda: (k, self._start, nowhere))
         u[here] += (rows.forces(jacobian, force) * rows.free / k[:, None])[rows.mine]
 
     def forward(self, w: np.ndarray) -> None:
@@ -162,43 +173,52 @@ class RowCoordinates:
         full = np.zeros((rows.mesh.n_owned, 3, 3))
         full[rows.here] = blocks(rows.here)
         full, every = rows.gather(full), np.zeros(3 * len(rows.numbers))
-        for group, (unknowns, transform) in zip(rows.groups, self._blocks, strict=True):
-            parts = transform.reshape(-1, 3, len(unknowns))
-            every[unknowns] = np.einsum("nij,nik,nkj->j", parts, full[group.nodes], parts)
+        for unknowns, transform in self._blocks:
+            parts = transform.reshape(len(unknowns), -1, 3, unknowns.shape[1])
+            at = full[unknowns[:, ::3] // 3]
+            every[unknowns] = np.einsum("gnij,gnij->gj", parts, np.einsum("gnik,gnkj->gnij", at, parts))
         self._write(diagonal, every)
 
     def matrix(self) -> PETSc.Mat:
         rows, mesh = self.rows, self.rows.mesh
-        numbers = rows.gather(np.arange(mesh.first_node, mesh.first_node + mesh.n_owned).astype(float))
-        columns: list[np.ndarray] = [np.array([3 * mesh.first_node + k]) for k in range(3 * mesh.n_owned)]
-        self._places = []  # for each group: local rows, and the order of its unknowns in PETSc numbering
-        local = np.full(len(rows.numbers), -1)
-        local[rows.mine] = rows.here
-        for group, (unknowns, _) in zip(rows.groups, self._blocks, strict=True):
-            wide = (3 * numbers[group.nodes].astype(np.int64)[:, None] + np.arange(3)).ravel()
-            order = np.argsort(wide)
-            mine = np.flatnonzero(local[unknowns // 3] >= 0)
-            at = 3 * local[unknowns[mine] // 3] + unknowns[mine] % 3
-            for row in at:
-                columns[row] = wide[order]
-            self._places.append((mine, at, order))
-        pointers = np.append(0, np.cumsum([len(some) for some in columns])).astype(PETSc.IntType)
-        indices = np.concatenate([np.empty(0), *columns]).astype(PETSc.IntType)
-        self._pattern = pointers, indices
+        own = np.arange(mesh.first_node, mesh.first_node + mesh.n_owned)
+        numbers = rows.gather(own).astype(np.int64)
+        local = np.repeat(np.where(rows.mine, 3 * rows.where, -1), 3) + np.tile([0, 1, 2], len(rows.numbers))
+        local[np.repeat(~rows.mine, 3)] = -1
+        counts = np.ones(3 * mesh.n_owned, dtype=np.int64)
+        size = np.zeros(len(local), dtype=np.int64)
+        for unknowns, _ in self._blocks:
+            size[unknowns] = unknowns.shape[1]
+        counts[local[local >= 0]] = size[local >= 0]
+        pointers = np.append(0, np.cumsum(counts))
+        indices = 3 * mesh.first_node + np.repeat(np.arange(3 * mesh.n_owned), counts)
+        self._local, self._wide = local, 3 * np.repeat(numbers, 3) + np.tile([0, 1, 2], len(numbers))
+        for at, columns, _ in self._entries(pointers):
+            indices[at] = columns
+        self._pattern = pointers.astype(PETSc.IntType), indices.astype(PETSc.IntType)
         matrix = PETSc.Mat().create(comm=mesh.comm)
         size = 3 * mesh.n_owned, 3 * mesh.n_nodes
         matrix.setSizes((size, size), bsize=3)
         matrix.setType(PETSc.Mat.Type.AIJ)
-        matrix.setPreallocationCSR((pointers, indices))
+        matrix.setPreallocationCSR(self._pattern)
         self.refresh(matrix)
         return matrix
+
+    def _entries(self, pointers: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """Of groups alike, and of T's rows (m,) here: places (m, u) of entries, columns, and values."""
+        for unknowns, transform in self._blocks:
+            wide = self._wide[unknowns]
+            order = np.argsort(wide, axis=1)
+            group, row = np.nonzero(self._local[unknowns] >= 0)
+            at = pointers[self._local[unknowns[group, row]]][:, None] + np.arange(unknowns.shape[1])
+            columns = np.take_along_axis(wide, order, axis=1)[group]
+            yield at, columns, np.take_along_axis(transform[group, row], order[group], axis=1)
 
     def refresh(self, matrix: PETSc.Mat) -> None:
         pointers, indices = self._pattern
         values = np.ones(len(indices))
-        for (mine, at, order), (_, transform) in zip(self._places, self._blocks, strict=True):
-            for row, k in zip(at, mine, strict=True):
-                values[pointers[row] : pointers[row + 1]] = transform[k][order]
+        for at, _, entries in self._entries(pointers):
+            values[at] = entries
         matrix.setValuesCSR(pointers, indices, values)
         matrix.assemble()
 
@@ -216,7 +236,7 @@ class RowCoordinates:
         self.link.release()
         self.link.jacobian = self.jacobian
         for rows, solved in self._solved:
-            force = solved.T @ every[self._pivot[rows]]
+            force = np.einsum("gji,gj->gi", solved, every[self._pivot[rows]])
             pressed = (on[self._pivot[rows]] > 0.0) & (force > noise)
             self.link.force[rows] = np.where(pressed, force, 0.0)
 
@@ -227,36 +247,46 @@ class RowCoordinates:
         rows, every = self.rows, self.rows.gather(x)
         values, pressed = rows.values(every), self.link.force > 0.0
         blocked = self._deferred[values[self._deferred] < -slack]
-        if len(blocked):
-            nodes = rows.numbers[rows.entry_node[rows.entry_row == blocked[0]]]
-            raise NotConverged(
-                f"walls and other constraints take all directions in which nodes {', '.join(map(str, nodes))} can keep "
-                f"constraint {self.link.names[rows.source[blocked[0]]]!r}; use an explicit integrator"
-            )
-        if (values[self._placed] < -slack).any() or (np.abs(values[pressed]) > slack).any():
-            return False
-        if self._start is not None:
-            return True
-        turn = np.abs(rows.gradients(every) - self.jacobian).max(axis=1, initial=0.0)
-        return not (turn[pressed[rows.entry_row]] > _TURN).any()
+        with agreed(self.comm):
+            if len(blocked):
+                ends = rows.ends[blocked[0]]
+                nodes = ", ".join(map(str, rows.numbers[ends[ends >= 0]]))
+                raise NotConverged(
+                    f"walls and other constraints take all directions in which nodes {nodes} can keep constraint "
+                    f"{self.link.names[rows.source[blocked[0]]]!r}; use an explicit integrator"
+                )
+        lost = (values[self._placed] < -slack).any() or (np.abs(values[pressed]) > slack).any()
+        if self._start is None:
+            turn = np.abs(rows.gradients(every) - self.jacobian).max(axis=(1, 2), initial=0.0)
+            lost = lost or (turn[pressed] > _TURN).any()
+        return not self._any(lost)
 
     def broken(self, x: np.ndarray, slack: float) -> bool:
         usable = self.rows.usable(self.jacobian)
-        return bool((self.rows.values(self.rows.gather(x))[usable] < -slack).any())
+        return self._any((self.rows.values(self.rows.gather(x))[usable] < -slack).any())
 
     def release(self) -> None:
         self.link.release()
 
 
-def _pivots(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the rows and columns (k,) of the pivots of a matrix (p, q) under complete pivoting, largest first."""
-    left, rows, columns = matrix.copy(), [], []
-    for _ in range(len(left)):
-        at, column = np.unravel_index(np.abs(left).argmax(), left.shape)
-        if not abs(left[at, column]) > _LEAST:
+def _pivots(matrices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows and columns (g, p) of matrices (g, p, q) that elimination with complete pivoting takes, largest first, and
+    how many (g,) are."""
+    left, every = matrices.copy(), np.arange(len(matrices))
+    rows, columns = np.zeros((2, *matrices.shape[:2]), dtype=np.int64)
+    count, going = np.zeros(len(matrices), dtype=np.int64), np.ones(len(matrices), dtype=bool)
+    for k in range(matrices.shape[1]):
+        at, column = np.divmod(np.abs(left).reshape(len(left), -1).argmax(axis=1), matrices.shape[2])
+        largest = left[every, at, column]
+        going &= np.abs(largest) > _LEAST
+        if not going.any():
             break
-        rows.append(at)
-        columns.append(column)
-        left -= np.outer(left[:, column] / left[at, column], left[at])
-        left[at], left[:, column] = 0.0, 0.0
-    return np.array(rows, dtype=np.int64), np.array(columns, dtype=np.int64)
+        some = np.flatnonzero(going)
+        at, column, largest = at[some], column[some], largest[some]
+        rows[some, k], columns[some, k] = at, column
+        count[some] += 1
+        factors = left[some, :, column] / largest[:, None]
+        left[some] -= factors[:, :, None] * left[some, at][:, None, :]
+        left[some, at] = 0.0
+        left[some, :, column] = 0.0
+    return rows, columns, count

@@ -5,140 +5,76 @@ x are x_f + K^-1 J^T f, where
 
     0 <= f   complementary to   r(x) + J (x_f + K^-1 J^T f - x) >= 0.
 
-This is repeated until x is the solution, which then satisfies the nonlinear rows. The gradients of the forces are taken
-at the solution, or at the positions where the forces of the balance act if these differ. Rows that share nodes form one
-problem; planes of walls that stop the same nodes are further rows of it.
+Repeated until x is the solution, this keeps the rows themselves. Gradients are those of the solution, or those of the
+places where the forces of the balance act, which may be other ones. Rows that share nodes make one problem, a *group*;
+planes of walls that stop the same nodes are rows of it. Each group is repeated on its own account, so that it does not
+matter which other groups a rank has. All ranks that own a node of a group have it, and solve the same problem.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 import numpy as np
-from mpi4py import MPI
 
 from ..errors import SimulationFailure
 from ..tolerances import FREE_PART
-from .constraints.base import Constraint
-from .coupled import complementary
+from .row_layout import RowLayout
+from .row_loops import add_forces, advance_groups, broken_groups, gather_rows, linearise
+from .row_solution import solve_row_groups
 
-if TYPE_CHECKING:
-    from ..mesh.distribution import DistributedMesh
-
-__all__ = ["Group", "Rows"]
+__all__ = ["Planes", "Rows"]
 
 _ITERATIONS = 100  # linearisations of a problem
 
-
-class Group:
-    """Rows connected by shared nodes.
-
-    Attributes
-    ----------
-    rows, nodes : (p,), (q,) indices among all rows and nodes
-    entries : (e,) indices among all entries of the Jacobian
-    """
-
-    def __init__(self, rows: np.ndarray, nodes: np.ndarray, entries: np.ndarray, every: Rows) -> None:
-        self.rows, self.nodes, self.entries = rows, nodes, entries
-        self._row = np.searchsorted(rows, every.entry_row[entries])
-        self._node = np.searchsorted(nodes, every.entry_node[entries])
-
-    def dense(self, jacobian: np.ndarray) -> np.ndarray:
-        """Return the gradients (p, q, 3) of the group from the entries (e, 3) of the Jacobian."""
-        dense = np.zeros((len(self.rows), len(self.nodes), 3))
-        np.add.at(dense, (self._row, self._node), jacobian[self.entries])
-        return dense
+Planes = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Walls at nodes: place of each node among the planes (n,), -1 for none; normals (m, w, 3), and distances (m, w) [m] at
+the free positions, infinite for no concern."""
 
 
-class Rows:
-    """The rows of all sources. All ranks know all rows and their nodes. Construction is collective.
+class Rows(RowLayout):
+    """The rows of all sources that this rank has, and what they are at positions of their nodes."""
 
-    Attributes
-    ----------
-    source : (r,) index of the source of each row
-    numbers : (n,) mesh numbers of the nodes
-    mine, here : (n,) bool, nodes that this rank owns; (m,) their owned local indices
-    free : (n, 3) 1.0 where a component may move, 0.0 where a support prescribes it
-    entry_row, entry_node : (e,) row and node of each entry of the Jacobian; last : (r,) the last entry of each row
-    groups : rows that share nodes
-    """
-
-    def __init__(self, sources: Sequence[Constraint], mesh: DistributedMesh, fixed: np.ndarray) -> None:
-        self.sources, self.mesh = list(sources), mesh
-        counts = [len(source.nodes) for source in self.sources]
-        self.source = np.repeat(np.arange(len(counts)), counts)
-        every = np.concatenate([np.empty(0, dtype=np.int64), *(source.nodes.ravel() for source in self.sources)])
-        self.numbers, places = np.unique(every, return_inverse=True)
-        self.entry_node = places.ravel()
-        widths = np.repeat([source.nodes.shape[1] for source in self.sources], counts)
-        self.entry_row = np.repeat(np.arange(len(self.source)), widths)
-        self.last = np.cumsum(widths) - 1
-        ids = mesh.node_ids[: mesh.n_owned]
-        order = np.argsort(ids)
-        place = np.searchsorted(ids[order], self.numbers)
-        self.mine = np.zeros(len(self.numbers), dtype=bool)
-        inside = place < len(ids)
-        self.mine[inside] = ids[order][place[inside]] == self.numbers[inside]
-        self.here = order[place[self.mine]]
-        self.free = self.gather(np.where(fixed, 0.0, 1.0))
-        self.groups = self._grouped()
-
-    def _grouped(self) -> list[Group]:
-        label = np.arange(len(self.numbers))
-        while True:  # propagate the smallest node number through rows until nothing changes
-            least = np.full(len(self.source), len(self.numbers))
-            np.minimum.at(least, self.entry_row, label[self.entry_node])
-            before = label.copy()
-            np.minimum.at(label, self.entry_node, least[self.entry_row])
-            if (label == before).all():
-                break
-        of_row = label[self.entry_node[self.last]]
-        groups = []
-        for number in np.unique(of_row):
-            entries = np.flatnonzero(of_row[self.entry_row] == number)
-            groups.append(Group(np.flatnonzero(of_row == number), np.flatnonzero(label == number), entries, self))
-        return groups
-
-    def gather(self, values: np.ndarray) -> np.ndarray:
-        """Return values (n, ...) at the nodes from those at owned nodes (owned, ...), on all ranks. Collective."""
-        data = np.zeros((len(self.numbers), *values.shape[1:]))
-        data[self.mine] = values[self.here]
-        if self.mesh.comm.size > 1:
-            self.mesh.comm.Allreduce(MPI.IN_PLACE, data)
-        return data
-
-    def _each(self, method: str, *arrays: np.ndarray) -> list[np.ndarray]:
-        """Return the results of a method of each source for arrays (n, 3)."""
-        found, first = [], 0
-        for source in self.sources:
-            at = self.entry_node[first : first + source.nodes.size].reshape(source.nodes.shape)
-            found.append(getattr(source, method)(*(array[at] for array in arrays)))
-            first += source.nodes.size
+    def _each(self, rows: np.ndarray | None, method: str, *arrays: np.ndarray) -> list[np.ndarray]:
+        """What a method of each source makes of arrays (n, 3), for some rows, ascending, or all."""
+        found = []
+        for source, at, first in zip(self.sources, self._at, self._first, strict=False):
+            if rows is not None:
+                begin, end = np.searchsorted(rows, (first, first + len(at)))
+                some = rows[begin:end] - first
+                if end - begin < len(at):
+                    source, at = source.of(source.nodes[some], source.data[some]), at[some]
+            found.append(getattr(source, method)(*(_of_rows(at, array) for array in arrays)))
         return found
 
-    def values(self, x: np.ndarray) -> np.ndarray:
-        """Return rows (r,) [m] at positions (n, 3)."""
-        return np.concatenate(self._each("values", x))
+    def values(self, x: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
+        """Rows (r,) [m] at positions (n, 3); of some rows, ascending, if they are given, as below."""
+        return _joined(self._each(rows, "values", x))
 
-    def gradients(self, x: np.ndarray) -> np.ndarray:
-        """Return entries (e, 3) of the Jacobian at positions (n, 3)."""
-        return np.concatenate([part.reshape(-1, 3) for part in self._each("gradients", x)])
+    def gradients(self, x: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
+        """Gradients (r, k, 3) at positions (n, 3), zero behind the last node of a row."""
+        width, parts = self.ends.shape[1], self._each(rows, "gradients", x)
+        for s, part in enumerate(parts):
+            if part.shape[1] < width:
+                parts[s] = np.concatenate([part, np.zeros((len(part), width - part.shape[1], 3))], axis=1)
+        return _joined(parts)
 
     def drift(self, x: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Return second time derivatives (r,) of rows [m/s2] for nodes at (n, 3) with constant velocities v (n, 3)."""
-        return np.concatenate(self._each("drift", x, v))
+        """Second derivatives (r,) by time of rows whose nodes at (n, 3) move straight on with v (n, 3) [m/s2]."""
+        return np.concatenate(self._each(None, "drift", x, v))
 
     def along(self, jacobian: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Return J y (r,) for vectors (n, 3)."""
-        products = np.einsum("ei,ei->e", jacobian, y[self.entry_node])
-        return np.bincount(self.entry_row, products, minlength=len(self.source))
+        """J y (r,) of gradients (r, k, 3) and vectors (n, 3)."""
+        vectors = np.where(self.ends[:, :, None] < 0, 0.0, y[self.ends])
+        total = np.zeros(len(vectors))
+        for products in np.einsum("rki,rki->kr", jacobian, vectors):
+            total += products
+        return total
 
     def forces(self, jacobian: np.ndarray, force: np.ndarray) -> np.ndarray:
         """Return J^T f (n, 3) [N] for the forces (r,) of the rows [N]."""
         total = np.zeros((len(self.numbers), 3))
-        np.add.at(total, self.entry_node, force[self.entry_row, None] * jacobian)
+        add_forces(self.ends, jacobian, force, total)
         return total
 
     def usable(self, jacobian: np.ndarray) -> np.ndarray:
@@ -146,91 +82,122 @@ class Rows:
         return self.along(jacobian**2, self.free) > FREE_PART
 
     def solve(
+        self, jacobian: np.ndarray, values: np.ndarray, stiffness: np.ndarray, planes: Planes, tolerance: float
+    ) -> np.ndarray:
+        """Forces (r,) [N] of the rows.
+
+        Parameters
+        ----------
+        jacobian, values : (r, k, 3) gradients, (r,) rows at the free positions; infinite for rows that are no concern
+        stiffness : (n,) force for a displacement of a node [N/m]
+        planes : see :data:`Planes`
+        tolerance : rows broken by no more count as kept [m]
+
+        Raises
+        ------
+        SimulationFailure
+            On ranks that have such rows: nothing keeps all of them.
+        """
+        place, _, gaps = planes
+        near = place >= 0
+        near[near] = (gaps[place[near]] < -tolerance).any(axis=1)
+        nowhere, force = np.zeros((len(self.numbers), 3)), np.zeros(len(values))
+        groups, tolerances = self._broken(values, nowhere, near, tolerance)
+        self._solve(groups, jacobian, values, stiffness, planes, tolerances, force, np.empty_like(nowhere))
+        return force
+
+    def _broken(
+        self, values: np.ndarray, x: np.ndarray, near: np.ndarray, tolerance: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        groups = len(self.starts) - 1
+        chosen, tolerances = np.empty(groups, dtype=bool), np.empty(groups)
+        arrays = self.starts, self.members, self.node_starts, self.nodes
+        if not broken_groups(*arrays, values, x, near, tolerance, chosen, tolerances):
+            return np.empty(0, dtype=np.int64), tolerances
+        return np.flatnonzero(chosen), tolerances
+
+    def _solve(
         self,
+        groups: np.ndarray,
         jacobian: np.ndarray,
         values: np.ndarray,
         stiffness: np.ndarray,
-        planes: tuple[np.ndarray, np.ndarray],
-        tolerance: float,
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return forces (r,) [N] of the rows, and displacements (n, 3) [m] of the nodes by rows and planes.
+        planes: Planes,
+        tolerances: np.ndarray,
+        force: np.ndarray,
+        moves: np.ndarray,
+    ) -> None:
+        arrays = self.starts, self.members, self.node_starts, self.nodes, self.ends
+        given = jacobian, values, stiffness, self.free, planes, tolerances
+        infeasible = solve_row_groups(groups, *arrays, *given, force, moves)
+        if infeasible >= 0:
+            raise SimulationFailure(
+                f"no positions of nodes {self._shown(infeasible)} satisfy their constraints, walls and supports"
+            )
 
-        Parameters
-        ----------
-        jacobian, values : (e, 3) gradients and (r,) rows at the free positions; infinite for rows that do not apply
-        stiffness : (n,) force for a displacement of a node [N/m]
-        planes : (n, w, 3), (n, w) normals of walls and distances from them at the free positions, infinite where a wall
-            does not apply
-        tolerance : rows violated by at most this count as satisfied [m]
-
-        Raises
-        ------
-        SimulationFailure
-            On all ranks, if the rows are infeasible.
-        """
-        force, moves = np.zeros(len(values)), np.zeros((len(self.numbers), 3))
-        normals, gaps = planes
-        short = values < -tolerance
-        near = (gaps < -tolerance).any(axis=1)
-        for group in self.groups:
-            if not short[group.rows].any() and not near[group.nodes].any():
-                continue
-            node, wall = np.nonzero(gaps[group.nodes] < np.inf)
-            walls = np.zeros((len(wall), len(group.nodes), 3))
-            walls[np.arange(len(wall)), node] = normals[group.nodes[node], wall]
-            kept = values[group.rows] < np.inf
-            rows = np.concatenate([group.dense(jacobian)[kept], walls]) * self.free[group.nodes]
-            at = np.append(values[group.rows[kept]], gaps[group.nodes[node], wall])
-            usable = (rows**2).sum(axis=(1, 2)) > FREE_PART
-            flat = (rows[usable] / np.sqrt(stiffness[group.nodes])[None, :, None]).reshape(int(usable.sum()), -1)
-            found = complementary(flat @ flat.T, at[usable], tolerance)
-            if found is None:
-                shown = ", ".join(str(number) for number in self.numbers[group.nodes][:6])
-                raise SimulationFailure(f"no positions of nodes {shown} satisfy their constraints, walls and supports")
-            multipliers = np.zeros(len(rows))
-            multipliers[usable] = found
-            own = np.zeros(len(group.rows))
-            own[kept] = multipliers[: int(kept.sum())]
-            force[group.rows] = own
-            moves[group.nodes] = np.einsum("r,rni->ni", multipliers, rows) / stiffness[group.nodes, None]
-        return force, moves
+    def _shown(self, group: int) -> str:
+        nodes = self.nodes[self.node_starts[group] : self.node_starts[group + 1]]
+        return ", ".join(str(number) for number in self.numbers[nodes][:6])
 
     def project(
         self,
-        free_x: np.ndarray,
-        stiffness: np.ndarray,
-        start: np.ndarray | None,
-        planes: tuple[np.ndarray, np.ndarray],
+        x: np.ndarray,
         tolerance: float,
+        near: np.ndarray,
+        given: Callable[[], tuple[np.ndarray, np.ndarray | None, Planes]],
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return forces (r,) [N] that satisfy the rows, and the gradients (e, 3) along which they act.
+        """Forces (r,) [N] that keep the rows, and the gradients (r, k, 3) along which they act, where there are forces.
 
         Parameters
         ----------
-        free_x : (n, 3) positions without rows [m]
-        stiffness : (n,) force for a displacement of a node [N/m]
-        start : (n, 3) positions at which the forces act [m]; None: at the solution
-        planes : (n, w, 3), (n, w) planes n . x >= d of walls at the nodes; offset -inf where a wall does not apply
+        x : (n, 3) positions without rows [m]
         tolerance : [m]
+        near : (n,) bool, nodes that may be beyond walls; (0,) for none
+        given : asked where groups are to be solved; gives the stiffness (n,) of the nodes [N/m], places (n, 3) where
+            the forces act, None: at the solution, and planes
 
         Raises
         ------
         SimulationFailure
-            On all ranks.
+            On ranks that have such rows.
         """
-        tolerance = max(tolerance, 16.0 * np.finfo(float).eps * float(np.abs(free_x).max(initial=0.0)))
-        x = free_x
-        normals, offsets = planes
-        gaps = np.einsum("nwi,ni->nw", normals, free_x) - offsets
+        values = self.values(x)
+        force, jacobian = np.zeros(len(values)), np.zeros((*self.ends.shape, 3))
+        groups, tolerances = self._broken(values, x, near, tolerance)
+        if len(groups) == 0:
+            return force, jacobian
+        stiffness, start, planes = given()
+        at, moves = x.copy(), np.empty_like(x)
+        chosen = np.zeros(len(self.starts) - 1, dtype=bool)
+        rows = None
         for _ in range(_ITERATIONS):
-            jacobian = self.gradients(x if start is None else start)
-            values = self.values(x) + self.along(jacobian * self.free[self.entry_node], free_x - x)
-            force, moves = self.solve(jacobian, values, stiffness, (normals, gaps), tolerance)
-            before, x = x, free_x + moves
-            if np.abs(x - before).max(initial=0.0) <= tolerance:
+            chosen[:] = False
+            chosen[groups] = True
+            fewer = np.flatnonzero(chosen[self.group_of_row])
+            if rows is None or start is None:
+                jacobian[fewer] = self.gradients(at if start is None else start, fewer)
+            if rows is not None:
+                linearise(fewer, self.ends, jacobian, self.free, x, at, self.values(at, fewer), values)
+            rows = fewer
+            self._solve(groups, jacobian, values, stiffness, planes, tolerances, force, moves)
+            settled = np.empty(len(groups), dtype=bool)
+            advance_groups(groups, self.node_starts, self.nodes, x, moves, at, tolerances, settled)
+            groups = groups[~settled]
+            if len(groups) == 0:
                 return force, jacobian
-        node = self.numbers[np.abs(x - before).max(axis=1).argmax()]
         raise SimulationFailure(
-            f"the position of node {node} on its constraints did not converge in {_ITERATIONS} iterations; reduce "
-            "time.step"
+            f"the positions of nodes {self._shown(int(groups[0]))} on their constraints did not converge in "
+            f"{_ITERATIONS} iterations; reduce time.step"
         )
+
+
+def _of_rows(at: np.ndarray, array: np.ndarray) -> np.ndarray:
+    """Vectors (r, k, 3) of rows with nodes ``at`` (r, k), from those of nodes (n, 3); rows are next to each other in
+    memory, so that sums and differences over their nodes and components are as fast as they can be."""
+    vectors = np.empty((at.shape[1], 3, len(at)))
+    gather_rows(at, array, vectors)
+    return vectors.transpose(2, 0, 1)
+
+
+def _joined(parts: list[np.ndarray]) -> np.ndarray:
+    return np.ascontiguousarray(parts[0]) if len(parts) == 1 else np.concatenate(parts)

@@ -6,21 +6,16 @@ recomputed, because for a yielding bar a second evaluation may differ in the las
 energies, wall forces) are saved rank by rank and restored on the same number of ranks; on another number, rank 0 gets
 the totals.
 
-Where the data are stored:
-
-- Arrays of the state: positions, velocities, accelerations, forces, and the scheme's memory (including tied nodes and
-  changes by a treatment of impact).
-- Arrays of the stepper: contacts with walls, nodes in contact in the last step, positions of the lagged preconditioner.
-- Numbers of the stepper: level of bisection, part and smallest part of the step, counts of the lagged preconditioner.
-- Arrays of the bars: data of the laws, thermal strains, history of the lagged preconditioner.
-- ``free_walls``: walls with mass, including their last increment. Forces of constraints: under their key. Forces of
-  pairs and which of them are closed: arrays at their second nodes.
-- ``ranks``: works and energies. Recorder: energy at the start, largest energy, iterations since the last row.
-  ``blow_up``: number of rows, suspicious rows, and energy input. Contact log: contact times and impulses.
-- Attributes (plan): time step and linear solver.
-
-Newton's method, Krylov methods, candidates for contact and friction start from scratch in each step. Data that depend
-on wall-clock time (synchronisation, progress, wall time) start from scratch in each run and do not affect the results.
+Where what decides is kept: positions, velocities, accelerations, forces and the scheme's memory (tied nodes and what a
+treatment of impact changed are part of it): arrays of the state. Who touches walls, nodes held in the last step, place
+of the kept preconditioner: arrays of the stepper. Level of halving, part and smallest part of the step, counts of the
+kept preconditioner: its numbers. What laws keep, thermal strains, history of the kept preconditioner: arrays of the
+bars. Walls with mass: ``free_walls``, their last increment included. Forces of constraints: arrays of their rows.
+Forces of pairs, and which of them have met: arrays of their second nodes. Works and energies: ``ranks``. Energy at the
+start, the largest energy, iterations since the last row: the recorder's. Rows seen, strange ones and energy put in:
+``blow_up``. Contact times and impulses: the contact log's. Time step and linear solver: the plan in the attributes.
+Newton's method, Krylov methods, candidates for contact and friction begin anew each step. What goes with the clock
+(meetings, progress, wall time) begins anew with each run, and decides nothing of the results.
 """
 
 from __future__ import annotations
@@ -44,8 +39,8 @@ if TYPE_CHECKING:
 
 __all__ = ["STATE_VERSION", "RunState"]
 
-STATE_VERSION = 4
-"""Incremented whenever the meaning of the saved data changes."""
+STATE_VERSION = 5
+"""Changed with the meaning of what is saved."""
 
 _MEMORY = "memory."
 _KEPT = "stepper."
@@ -85,7 +80,7 @@ class RunState:
             own[name] = np.zeros((self.model.mesh.n_owned, *shape), dtype=kind)
         nodes = {name: (self.node_order, own[name]) for name in sorted(kinds)}
         bars = {name: (self.bar_order, array[self.counted]) for name, array in self._bar_arrays().items()}
-        return {**nodes, **bars}
+        return {**nodes, **bars, **self.model.links.arrays()}
 
     def scalars(
         self, ledger: Ledger, recorder: Recorder, blow_up: BlowUp, row: dict[str, Any], snapshot: int
@@ -108,7 +103,6 @@ class RunState:
             "start_energy": recorder.start_energy,
             "energy_scale": recorder.energy_scale,
             "blow_up": blow_up.kept(),
-            **self.model.links.save(),
             "free_walls": self.model.contact.motion.kept(),
             "contact_times": self.model.contact.log.times(self.comm),
             "row": {name: float(row[name]) for name in ("energy_imbalance", "active_contacts", "step")},
@@ -123,13 +117,13 @@ class RunState:
         """Return the orders of the arrays of a checkpoint with these numbers: nodal rows by owner, bars in slabs."""
         slab = np.arange(self.bar_order.first, self.bar_order.first + self.bar_order.count)
         bars = NaturalOrder(self.comm, slab, self.model.mesh.n_bars)
-        return dict.fromkeys(scalars["node_arrays"], self.node_order) | dict.fromkeys(scalars["bar_arrays"], bars)
+        orders = dict.fromkeys(scalars["node_arrays"], self.node_order) | dict.fromkeys(scalars["bar_arrays"], bars)
+        return orders | {name: order for name, (order, _) in self.model.links.arrays().items()}
 
     def load_state(self, checkpoint: Checkpoint) -> None:
         """Restore the stepper from a checkpoint, instead of its ``start``. Collective."""
         stepper, state, owned = self.stepper, self.stepper.state, self.model.mesh.n_owned
         scalars = checkpoint.scalars
-        links = self.model.links.arrays()
         for name in scalars["node_arrays"]:
             values = checkpoint.arrays[name]
             if name.startswith(_MEMORY):
@@ -137,8 +131,6 @@ class RunState:
             elif name.startswith(_KEPT):
                 name = name.removeprefix(_KEPT)
                 setattr(stepper, name, values.astype(getattr(stepper, name).dtype))
-            elif name in links:
-                self.model.links.load_state(name, values)
             elif name in ("x", "f"):
                 getattr(state, name)[:owned] = values
             else:
@@ -160,7 +152,7 @@ class RunState:
         stepper.solution.walls = dataclasses.replace(walls, **sums)
         stepper.solution.contacts = int(mine["contacts"])
         self.model.contact.motion.load_state(scalars["free_walls"])
-        self.model.links.restore(scalars)
+        self.model.links.load_state(checkpoint.arrays)
         self.model.contact.log.load_state(mine["contact_log"], scalars["contact_times"], stepper.touching)
 
     def load_sums(self, checkpoint: Checkpoint, ledger: Ledger, recorder: Recorder, blow_up: BlowUp) -> dict[str, Any]:
@@ -189,7 +181,6 @@ class RunState:
                 found[item.name] = value[:owned]
         found |= {_MEMORY + name: array for name, array in state.memory.items()}
         found |= {_KEPT + name: _numbers(getattr(self.stepper, name)) for name in self.stepper.kept_arrays}
-        found |= self.model.links.arrays()
         # a case without walls has no columns for them
         return {name: array for name, array in found.items() if 0 not in array.shape[1:]}
 

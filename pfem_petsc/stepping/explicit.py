@@ -91,8 +91,7 @@ class ExplicitStepper(Stepper):
                         state.contact = np.zeros_like(u)
                     state.contact[nodes] += force
                 held = nodes
-        held = model.links.held(held)
         if supports.any:
             state.support = np.zeros_like(u)
             react(supports.nodes, supports.components, load, state.contact, stiffness, u, state.support)
-        return Solution(u, state.f, walls, contacts=len(held))
+        return Solution(u, state.f, walls, contacts=model.links.count_held(held, len(u)))

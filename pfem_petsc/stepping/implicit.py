@@ -250,12 +250,12 @@ class ImplicitStepper(Stepper):
         if not trial.candidates.anywhere and not model.supports.any:
             self._keep_momentum(problem, u, g)
         state.contact, walls, self.held = active_set.forces(outcome, u)
-        held = model.links.held(np.flatnonzero(self.held))
+        held = model.links.count_held(np.flatnonzero(self.held), len(u))
         state.support = np.zeros_like(u)
         fixed = model.supports.fixed
         state.support[fixed] = g[fixed] - state.contact[fixed]
         internal = problem.f if balance.weight else state.f
-        return Solution(u, internal, walls, newton, linear, len(held))
+        return Solution(u, internal, walls, newton, linear, held)
 
     def _keep_momentum(self, problem: StepProblem, u: np.ndarray, g: np.ndarray) -> None:
         """Remove the net residual of a free truss by a translation, which strains no bar.

@@ -125,8 +125,8 @@ class Stepper(ABC):
         if model.can_touch and model.inertia.redistribution is None:
             walls = start_at_rest(model, state, self._acceleration, load)
             if walls is not None:
-                held = model.links.held(walls.nodes[walls.touching.any(axis=1)])
-                self.solution.walls, self.solution.contacts = walls, len(held)
+                held = model.links.count_held(walls.nodes[walls.touching.any(axis=1)], len(state.v))
+                self.solution.walls, self.solution.contacts = walls, held
         if self.massless is not None:
             state.contact, self.solution.walls = self.massless.press(state.position, load, 0.0)
             self.solution.contacts = int(self.solution.walls.touching.sum())

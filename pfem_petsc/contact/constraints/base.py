@@ -6,29 +6,58 @@ and a class ``Constraint``. Explicit and implicit steps, history and checkpoints
 
 from __future__ import annotations
 
+import copy
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from typing import NamedTuple, Self
 
 import numpy as np
 
 from ...case.base import ConstraintKeys, NodeSetName
 
-__all__ = ["Constraint", "ConstraintKeys", "NodeSetName", "NodesOf"]
+__all__ = ["Constraint", "ConstraintKeys", "NodeSetName", "NodesOf", "SetPart"]
 
-NodesOf = Callable[[str], tuple[np.ndarray, np.ndarray]]
-"""Maps the name of a node set to the mesh numbers of its nodes (n,), ascending, and their positions in the mesh (n, 3)
-[m]; the same on all ranks."""
+
+class SetPart(NamedTuple):
+    """This rank's part of a node set in ascending order of mesh numbers: a range of the whole.
+
+    Of sets of the same size all ranks have the same ranges, so that nodes in the same place meet.
+    """
+
+    count: int
+    """Nodes of the set on all ranks."""
+    numbers: np.ndarray
+    """(m,) mesh numbers, ascending."""
+    places: np.ndarray
+    """(m, 3) places in the mesh [m]."""
+
+
+NodesOf = Callable[[str], SetPart]
+"""Name of a node set, from a key of type ``NodeSetName``, to this rank's part of it."""
 
 
 class Constraint(ABC):
     """The rows of one table.
 
+    A constructor makes rows of this rank's parts of node sets. It does not communicate, and what it refuses on one rank
+    is refused on all. The rows of all ranks together, in the order of the ranks, must not depend on how many ranks
+    there are. Rows are then sent to where their nodes are: from then on :attr:`nodes` and :attr:`data` are of other
+    rows, and ``values``, ``gradients`` and ``drift`` may be asked of any of them, see :meth:`of`.
+
     Attributes
     ----------
-    nodes : (r, k) mesh numbers of the nodes of each row; the same on all ranks
+    nodes : (r, k) mesh numbers of the nodes of each row; k on all ranks the same
+    data : (r, m) float64, numbers that belong to each row, as a length; m on all ranks the same, by default none
     """
 
     nodes: np.ndarray
+    data: np.ndarray
+
+    def of(self, nodes: np.ndarray, data: np.ndarray) -> Self:
+        """The same constraint with other rows (r, k), (r, m)."""
+        other = copy.copy(self)
+        other.nodes, other.data = nodes, data
+        return other
 
     @abstractmethod
     def values(self, x: np.ndarray) -> np.ndarray:

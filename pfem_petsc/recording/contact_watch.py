@@ -9,6 +9,7 @@ from ..energies import STORED, SUPPLIED
 
 if TYPE_CHECKING:
     from ..stepping.model import Model
+    from ..stepping.prepare import Plan
 
 __all__ = ["ContactWatch", "NoContactWatch"]
 
@@ -21,8 +22,9 @@ class ContactWatch:
 
     A step may be so large that bars yield, or damping stops nodes, within it: the forces of its balance then work less
     than is dissipated. The energy of an explicit scheme swings near the limit of its steps where nothing is dissipated
-    either: by h^2/8 a.Ma with central differences, which within the limit is no more than the elastic energy (h times a
-    load's acceleration is small). So much of a gain is let pass, and all of it where nothing dissipates.
+    either: by h^2/8 a.Ma with central differences, which is no more than (h w/2)^2 of the elastic energy with the
+    highest frequency w (h times a load's acceleration is small). So much of a gain is let pass, and all of it where
+    nothing dissipates.
 
     What is stored, and dissipated by plasticity and damping, less what was supplied, cannot grow beyond what it was at
     the start: friction, impact and integration only take from it. Its rows are the same on all ranks, so that all tell
@@ -32,13 +34,14 @@ class ContactWatch:
     ----------
     model : Model
     tell : takes the warning
-    explicit : whether the scheme is
+    plan : Plan
     """
 
-    def __init__(self, model: Model, tell: Callable[[str], None], explicit: bool) -> None:
+    def __init__(self, model: Model, tell: Callable[[str], None], plan: Plan) -> None:
         self.tell = tell
         self.told = False
-        self.explicit = explicit
+        self.explicit = plan.scheme.explicit
+        self.swing = min((0.5 * plan.step * plan.frequency.upper) ** 2, 1.0)  # of the elastic energy
         self.rounding = model.rounding * model.length  # of energies [J]: what is at rest has no other
         self.rows = 0
         contact, time = model.case.contact, model.case.time
@@ -79,12 +82,11 @@ class ContactWatch:
                 f"steps are too large for the motion within them{self._causes(row)}; reduce time.step"
             )
 
-    @staticmethod
-    def _swing(row: dict[str, Any]) -> float:
+    def _swing(self, row: dict[str, Any]) -> float:
         """What an explicit scheme's own energy may have gained for a while [J]: all of it where nothing dissipates."""
         if not row["plastic_dissipation"] > 0.0 and not row["damping_dissipation"] > 0.0:
             return float("inf")
-        return row["elastic_energy"]
+        return self.swing * row["elastic_energy"]
 
     @staticmethod
     def _causes(row: dict[str, Any]) -> str:

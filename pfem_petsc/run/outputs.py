@@ -104,7 +104,7 @@ class Outputs:
             analysis.start()
             self._synchroniser.synchronise()
         warn = self.progress.warning
-        self.history = history = History(stepper, self._synchroniser, warn)
+        self.history = history = History(stepper, plan, self._synchroniser, warn)
         if hasattr(stepper, "message"):
             stepper.message = warn
         self.snapshots = Snapshots(analysis, self.fields, warn)

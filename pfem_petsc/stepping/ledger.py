@@ -1,10 +1,11 @@
 """The energy ledger: every term by its own formula, so that their balance is a check and not a definition.
 
 For a scheme whose balance holds at the ends of steps (``balance_at_endpoints``), works follow the trapezoidal rule:
-with dx = x1 - x0, external work = (e0 + e1) dx/2, contact work (r0 + r1) dx/2, damping dissipation (C v0 + C v1) dx/2,
-and the numerical dissipation is what inertia and internal force work beyond the change of their energies:
+with dx = x1 - x0, external work = (e0 + e1) dx/2, contact work (r0 + r1) dx/2, and the numerical dissipation is what
+inertia and internal force work beyond the change of their energies:
 (M a0 + M a1) dx/2 - dT + (f0 + f1) dx/2 - dU - dD + dH, with the work dH of changing temperatures. For the others the
-forces of the one balance work over the whole step, and damping takes C dx . dx/h.
+forces of the one balance work over the whole step. Damping takes C dx . dx/h, which is never negative; with explicit
+schemes whose balance holds at the ends, (C v0 + C v1) dx/2.
 The sum of all changes is then the work of the residual, zero up to the solver's tolerance.
 
 What contact does is told apart by formulas that are the same for all schemes and treatments: ``contact_work`` is the
@@ -100,8 +101,10 @@ class Ledger:
         stored = present.kinetic - jumped - before.kinetic + present.energy.total - before.energy.total
         heating = self._heating.work()
         work, given, weight, lost = self._work_of_walls(before)
-        damping = self._damped() if self.model.inertia.damped and not stepper.scheme.balance_at_endpoints else None
-        if damping is not None:
+        # velocities at the ends of explicit steps are those of the steps beside
+        follows = stepper.scheme.explicit and stepper.scheme.balance_at_endpoints
+        if self.model.inertia.damped and not follows:
+            damping = self._damped()
             of, by = WORKS.index("inertial"), WORKS.index("damping")
             self._works[of] = self._works[of] + self._works[by] - damping
             self._works[by] = damping
@@ -110,8 +113,8 @@ class Ledger:
     def _damped(self) -> float:
         """What damping takes in the step just made, C dx . dx / h [J]: never negative.
 
-        The velocity of a balance within the step, or beyond its end, may point against the way of the step: what the
-        damping force of the balance works otherwise is the scheme's.
+        The velocity of a balance, at the ends of the step, within it or beyond, may point against the way of the step:
+        what the damping force of the balance works otherwise is the scheme's.
         """
         stepper = self.stepper
         way = stepper.state.position - stepper.before[: self.model.mesh.n_owned]

@@ -233,8 +233,8 @@ def _momentum(case: Case, history: dict[str, np.ndarray]) -> Faults:
     open_part = np.abs(change - sum(part - part[0] for part in parts.values())).max()
     mass = _speed_scale(history)
     scale = max(mass, *(float(np.abs(part).max()) for part in parts.values()))
-    # forces of rounding, over a step: all that a truss at rest has
-    rounding = 1e-12 * _strongest(case) * float(history["step_size"].max())
+    # forces of rounding, over all steps: the impulses of walls that touch a truss at rest add up
+    rounding = 1e-12 * _strongest(case) * float(history["time"][-1])
     tolerance = max(1e-9, 4.0 * case.solver.rtol)  # what a solver leaves of a balance is a force without an impulse
     if scale > rounding and open_part > tolerance * scale:
         return [("momentum is not that of the impulses", f"{open_part / scale:.3g} of the largest")]

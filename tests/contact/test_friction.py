@@ -186,6 +186,18 @@ def test_guided_node_is_stopped_by_any_friction(integrator, friction, comm, shar
     assert abs(rows[-1]["energy_imbalance"]) < 1e-12
 
 
+@pytest.mark.parametrize("integrator", ["central_differences", "newmark"])
+def test_guided_node_meets_a_wall_that_is_almost_parallel(integrator, comm, shared_tmp_path):
+    """One that only touches it at the start: the slip of its first step is nothing beside what the drag must stop."""
+    steep = {"normal": [np.sqrt(1.0 - 0.0138**2), 0.0, 0.0138], "point": [0.0, 0.0, -1e-8]}
+    rows = [step.row for step in simulation(guided(integrator, 0.95, steep, -0.1), comm, shared_tmp_path)]
+    x, _, z = next(row["wall/slope/force"] for row in rows if row["wall/slope/force"][2] > 0.0)
+    n = steep["normal"]
+    assert x / z == pytest.approx((n[0] - 0.95 * n[2]) / (n[2] + 0.95 * n[0]), rel=1e-6)
+    assert rows[-1]["friction_dissipation"] > 0.0
+    assert abs(rows[-1]["energy_imbalance"]) < 1e-12
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["central_differences", "newmark"])
 def test_wedge_that_locks_itself(integrator, comm, shared_tmp_path):

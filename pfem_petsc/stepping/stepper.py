@@ -138,7 +138,7 @@ class Stepper(ABC):
         motion.start(self.h)
         if self.scheme.solves_next_position:
             v, speeds = state.v, motion.speeds
-            self._solve_and_finish()
+            self._solve_and_finish(self.state.time)
             self.totals_solved = self._totals()
             self.velocity_solved = state.v
             # what is on a wall has not lost its velocity yet; the scheme goes on from its own memory
@@ -199,9 +199,9 @@ class Stepper(ABC):
             self.scheme.advance(self.state, self.part)
             self.prescribed.place(end)
             self._arrive(end)
-            self._solve_and_finish()
+            self._solve_and_finish(end)
         else:
-            self._solve_and_finish()
+            self._solve_and_finish(end)
             if self.prescribed.moving:
                 self.prescribed.place(end)
                 self.prescribed.take_rates(end)
@@ -221,7 +221,7 @@ class Stepper(ABC):
             self.model.temperatures.apply(end)
         self.evaluate(commit=True)
 
-    def _solve_and_finish(self) -> None:
+    def _solve_and_finish(self, end: float) -> None:
         state = self.state
         self.balance = self.scheme.balance(state, self.part)
         if self.prescribed.moving:
@@ -236,7 +236,7 @@ class Stepper(ABC):
         self.scheme.finish(state, self.balance, self.solution.u, self.part)
         if self.scheme.solves_next_position and self.prescribed.moving:
             self.prescribed.take_rates(state.time)
-        self.model.contact.motion.finish(self.part)
+        self.model.contact.motion.finish(self.part, end)
         if self.scheme.turns_held and self.treatment is None:
             self.model.contact.calm(fresh, state.v, self.balance.time, self.part)
 

@@ -98,6 +98,8 @@ class Ledger:
         self.impulses.fill(self.sums)
         stepper.step_changed = False
         impact, friction = self._dissipated(before)
+        if jump is not None:
+            friction += jump.friction
         stored = present.kinetic - jumped - before.kinetic + present.energy.total - before.energy.total
         heating = self._heating.work()
         work, given, weight, lost = self._work_of_walls(before)

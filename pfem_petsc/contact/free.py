@@ -64,11 +64,11 @@ class FreeWalls:
         self.state.time = time
         self._balance = self.scheme.balance(self.state, h)
 
-    def finish(self, h: float) -> None:
-        """Advance the walls' state with the solution."""
+    def finish(self, h: float, end: float) -> None:
+        """Complete the walls' state with the solution; ``end`` is the time of the truss then, to the last bit."""
         self.scheme.finish(self.state, self._balance, self._u, h)
         if not self.scheme.solves_next_position:
-            self.state.time = self._balance.time if self.scheme.solves_end else self.state.time + h
+            self.state.time = end
 
     @property
     def kinetic(self) -> float:
@@ -199,8 +199,8 @@ class NoFreeWalls:
     def begin(self, time: float, h: float) -> None:
         """Do nothing."""
 
-    def finish(self, h: float) -> None:
-        """Do nothing."""
+    def finish(self, h: float, end: float) -> None:
+        """Nothing moves."""
 
     def step_changed(self, scheme: Scheme) -> None:
         """Do nothing."""

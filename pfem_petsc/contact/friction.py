@@ -1,9 +1,9 @@
 """Coulomb friction of nodes on walls in explicit steps.
 
-Each wall k exerts a normal force lambda_k >= 0 and a friction force tau_k in its plane on a node. The slip s_k of the
-step is the node's displacement relative to the wall in the wall's plane. The node sticks (s_k = 0) if this is possible
-with |tau_k| <= mu_static lambda_k; else it slips and tau_k = -mu lambda_k s_k/|s_k|. One wall at a node is solved
-exactly; several walls are swept until nothing changes.
+Each wall k presses a node with lambda_k >= 0 along its normal and drags it by tau_k in its plane. With the slip s_k of
+the step, which is the node's motion relative to the wall in the wall's plane: the node sticks (s_k = 0) where
+|tau_k| <= mu_static lambda_k does it, else it slips and tau_k = -mu lambda_k s_k/|s_k|. On one wall this is solved
+exactly, also where supports leave the node one component; several walls at a node are swept until nothing changes.
 """
 
 from __future__ import annotations
@@ -12,12 +12,65 @@ import math
 
 import numpy as np
 
-from ..mechanics.compiled import kernel
+from ..mechanics.compiled import inlined, kernel
 
 __all__ = ["add_friction"]
 
 _SWEEPS = 2000
-_OVERSHOOT = 0.9  # ratio of displacements by friction and by the normal force above which sweeps are underrelaxed
+_SLIDES = 1e-13  # of the position: slips beyond are no rounding
+_OVERSHOOT = 0.9  # of the drag over the normal force, from which on sweeps go a part of the way
+
+
+@inlined
+def slides_along_guide(i, x, before, way, fixed, normals, dynamic, normal_forces, drag):
+    """Forces on a node that supports leave one component, pressed by one wall with friction: in closed form.
+
+    Where it is, and so its slip s, is decided by the wall alone. Along the free component f, with lambda_0 the normal
+    force without friction, lambda (n_f - mu s_f/|s|) = lambda_0 n_f: no sweeps are needed, which creep where the wall
+    is almost parallel to the guide.
+
+    Returns
+    -------
+    bool
+        Whether it is such a node, slides, and a normal force does it; otherwise nothing has changed.
+    """
+    free = -1
+    for c in range(3):
+        if not fixed[i, c]:
+            if free >= 0:
+                return False
+            free = c
+    if free < 0:
+        return False
+    wall = -1
+    for k in range(normal_forces.shape[1]):
+        if normal_forces[i, k] > 0.0:
+            if wall >= 0:
+                return False
+            wall = k
+    if wall < 0 or not dynamic[wall] > 0.0:
+        return False
+    n = normals[i, wall]
+    along = 0.0
+    for c in range(3):
+        along += (x[i, c] - before[i, c] - way[wall, c]) * n[c]
+    size, where = 0.0, 0.0
+    for c in range(3):
+        slip = x[i, c] - before[i, c] - way[wall, c] - along * n[c]
+        size += slip * slip
+        where += abs(x[i, c])
+    size = math.sqrt(size)
+    if not size > _SLIDES * where:
+        return False
+    slip = x[i, free] - before[i, free] - way[wall, free] - along * n[free]
+    helped = 1.0 - dynamic[wall] * slip / (size * n[free])
+    if not helped > _SLIDES:
+        return False
+    normal_forces[i, wall] /= helped
+    for c in range(3):
+        slip = x[i, c] - before[i, c] - way[wall, c] - along * n[c]
+        drag[i, wall, c] = -dynamic[wall] * normal_forces[i, wall] * slip / size
+    return True
 
 
 @kernel
@@ -51,7 +104,7 @@ def add_friction(x, before, way, fixed, normals, offsets, dynamic, static, stiff
                 drag[i, k, c] = 0.0
             if normal_forces[i, k] > 0.0:
                 rubbing = rubbing or static[k] > 0.0
-        if not rubbing:
+        if not rubbing or slides_along_guide(i, x, before, way, fixed, normals, dynamic, normal_forces, drag):
             continue
         soft = 1.0 / stiffness[i]
         reach = stiffness[i] * (

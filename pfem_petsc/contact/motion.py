@@ -56,9 +56,9 @@ class WallMotion:
         """Begin a step of ``h`` from ``time`` [s] for walls with mass."""
         self.bodies.begin(time, h)
 
-    def finish(self, h: float) -> None:
-        """Advance the state of walls with mass after a step of ``h`` [s]."""
-        self.bodies.finish(h)
+    def finish(self, h: float, end: float) -> None:
+        """Complete the state of walls with mass after a step of ``h`` to the time ``end`` [s]."""
+        self.bodies.finish(h, end)
 
     def step_changed(self, scheme: Scheme) -> None:
         """Notify the scheme of the walls with mass that the step size has changed."""

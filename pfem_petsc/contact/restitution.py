@@ -19,10 +19,10 @@ import numpy as np
 from .rebound import impact_square, rebound_way
 from .treatments.base import Treatment as Base
 
-__all__ = ["Treatment"]
+__all__ = ["STILL", "Treatment"]
 
-_STILL = 1e-13  # of the model's length: slip below this is rounding
-_NONE = 1e-9  # relative part of a force, and of the tolerance of the solve, that counts as rounding
+STILL = 1e-13  # of the model's length: a slip that is rounding
+_NONE = 1e-9  # of a force: what of it is rounding, and of the tolerance of the solve
 
 
 class Treatment(Base):
@@ -142,7 +142,7 @@ class Treatment(Base):
             return np.zeros(touching.shape, dtype=bool)
         slip = self._moved(nodes)
         slip -= np.einsum("mwi,mwi->mw", slip, normals)[:, :, None] * normals
-        still = np.linalg.norm(slip, axis=2) <= _STILL * model.length
+        still = np.linalg.norm(slip, axis=2) <= STILL * model.length
         return touching & still & (model.contact.static_friction > 0.0)
 
     def _moved(self, nodes: np.ndarray) -> np.ndarray:

@@ -32,7 +32,7 @@ BUFFER_BYTES = 1 << 24
 def create_history(
     file: h5py.File, columns: Mapping[str, tuple[int, ...]], types: Mapping[str, Any], name: str = "history"
 ) -> None:
-    """Make a table of rows: an empty dataset a column and the attribute ``rows``: how many rows are complete.
+    """Create a table with an empty dataset per column and the attribute ``rows``, the number of complete rows.
 
     ``name``: ``history``, or ``event``, of what happened between steps.
     """

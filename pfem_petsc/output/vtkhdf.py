@@ -43,11 +43,11 @@ __all__ = ["ResultWriter"]
 class ResultWriter:
     """Writes snapshots and history of a run to one file, the same for any number of ranks.
 
-    ``/VTKHDF`` is a temporal UnstructuredGrid of lines in the mesh's own numbering: connectivity once, points (the
-    current positions) and fields a snapshot. A kill may come at any moment, also within a flush, which writes in an
-    order of its own. So a snapshot's data and offsets are flushed before it is counted, and its count is flushed before
-    its time is written: VTK cannot read a step without data, and crashes on more times than steps.
-    ``/history`` has a row a recorded step, ``/event`` one for each event of analyses that have some, ``/case`` what is
+    ``/VTKHDF`` is a temporal UnstructuredGrid of lines in mesh numbering: the connectivity once, and points (the
+    current positions) and fields for each snapshot. A kill may occur at any time, even within a flush, whose order of
+    writes is undefined. Therefore the data and offsets of a snapshot are flushed before it is counted, and its count is
+    flushed before its time is written: VTK cannot read a step without data, and crashes on more times than steps.
+    ``/history`` has one row per recorded step, ``/event`` one per event of analyses with events, ``/case`` the data
     needed to run the case again, ``/snapshots`` step and time of each snapshot.
 
     All methods are collective. After a :class:`SimulationFailure` they raise it again, and the writer can only be

@@ -9,6 +9,7 @@ from ..energies import STORED, SUPPLIED
 
 if TYPE_CHECKING:
     from ..stepping.model import Model
+    from ..stepping.prepare import Plan
 
 __all__ = ["ContactWatch", "NoContactWatch"]
 
@@ -22,22 +23,24 @@ class ContactWatch:
     The stored energy plus the energy dissipated by plasticity and damping, minus the energy supplied, cannot exceed its
     initial value: friction, impact and integration only reduce it. In large steps, within which bars yield or damping
     stops nodes, the work of the forces of the balance is less than the dissipation. The energy of an explicit scheme
-    oscillates near its stability limit even without dissipation: by h^2/8 a.Ma with central differences, which within
-    the limit is at most the elastic energy (h times the acceleration by a load is small). A gain up to this amount is
-    accepted, and any gain if nothing dissipates. The rows are the same on all ranks, so all ranks report, or none.
+    oscillates near its stability limit even without dissipation: by h^2/8 a.Ma with central differences, which is at
+    most (h w/2)^2 of the elastic energy with the highest frequency w (h times the acceleration by a load is small). A
+    gain up to this amount is accepted, and any gain if nothing dissipates. The rows are the same on all ranks, so all
+    ranks report, or none.
 
     Parameters
     ----------
     model : Model
-    tell : receives the warning
-    explicit : whether the scheme is explicit
+    tell : takes the warning
+    plan : Plan
     """
 
-    def __init__(self, model: Model, tell: Callable[[str], None], explicit: bool) -> None:
+    def __init__(self, model: Model, tell: Callable[[str], None], plan: Plan) -> None:
         self.tell = tell
         self.told = False
-        self.explicit = explicit
-        self.rounding = model.rounding * model.length  # of energies [J]; the only energy of a model at rest
+        self.explicit = plan.scheme.explicit
+        self.swing = min((0.5 * plan.step * plan.frequency.upper) ** 2, 1.0)  # of the elastic energy
+        self.rounding = model.rounding * model.length  # of energies [J]: what is at rest has no other
         self.rows = 0
         contact, time = model.case.contact, model.case.time
         self.what = f'{time.integrator} with contact.treatment = "{contact.treatment}" and time.mass = "{time.mass}"'
@@ -77,12 +80,11 @@ class ContactWatch:
                 f"steps are too large for the motion within them{self._causes(row)}; reduce time.step"
             )
 
-    @staticmethod
-    def _swing(row: dict[str, Any]) -> float:
-        """Return the possible oscillation of an explicit scheme's energy [J]; unlimited if nothing dissipates."""
+    def _swing(self, row: dict[str, Any]) -> float:
+        """What an explicit scheme's own energy may have gained for a while [J]: all of it where nothing dissipates."""
         if not row["plastic_dissipation"] > 0.0 and not row["damping_dissipation"] > 0.0:
             return float("inf")
-        return row["elastic_energy"]
+        return self.swing * row["elastic_energy"]
 
     @staticmethod
     def _causes(row: dict[str, Any]) -> str:

@@ -18,6 +18,7 @@ from .recorder import Recorder
 
 if TYPE_CHECKING:
     from ..run.synchroniser import Synchroniser
+    from ..stepping.prepare import Plan
     from ..stepping.stepper import Stepper
 
 __all__ = ["History"]
@@ -31,6 +32,7 @@ class History(Observer):
     Parameters
     ----------
     stepper : Stepper
+    plan : Plan
     synchroniser : Synchroniser
     warn : receives a warning
 
@@ -40,15 +42,15 @@ class History(Observer):
     writer : of the result file
     """
 
-    def __init__(self, stepper: Stepper, synchroniser: Synchroniser, warn: Callable[[str], None]) -> None:
+    def __init__(self, stepper: Stepper, plan: Plan, synchroniser: Synchroniser, warn: Callable[[str], None]) -> None:
         model = stepper.model
         self.every = model.case.output.history_every
         self._stepper, self._synchroniser, self._model = stepper, synchroniser, model
         self.ledger = Ledger(stepper)
         self.recorder = Recorder(stepper, self.ledger)
         self.blow_up = BlowUp(model)
-        scheme = stepper.scheme
-        self.contact_watch = ContactWatch(model, warn, scheme.explicit) if scheme.inertial else NoContactWatch()
+        inertial = stepper.scheme.inertial
+        self.contact_watch = ContactWatch(model, warn, plan) if inertial else NoContactWatch()
         self.row: dict[str, Any] | None = None
         self.writer: ResultWriter | None = None
         stepper.booking = self._book

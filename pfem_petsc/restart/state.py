@@ -6,16 +6,21 @@ recomputed, because for a yielding bar a second evaluation may differ in the las
 energies, wall forces) are saved rank by rank and restored on the same number of ranks; on another number, rank 0 gets
 the totals.
 
-Where what decides is kept: positions, velocities, accelerations, forces and the scheme's memory (tied nodes and what a
-treatment of impact changed are part of it): arrays of the state. Who touches walls, nodes held in the last step, place
-of the kept preconditioner: arrays of the stepper. Level of halving, part and smallest part of the step, counts of the
-kept preconditioner: its numbers. What laws keep, thermal strains, history of the kept preconditioner: arrays of the
-bars. Walls with mass: ``free_walls``, their last increment included. Forces of constraints: arrays of their rows.
-Forces of pairs, and which of them have met: arrays of their second nodes. Works and energies: ``ranks``. Energy at the
-start, the largest energy, iterations since the last row: the recorder's. Rows seen, strange ones and energy put in:
-``blow_up``. Contact times and impulses: the contact log's. Time step and linear solver: the plan in the attributes.
-Newton's method, Krylov methods, candidates for contact and friction begin anew each step. What goes with the clock
-(meetings, progress, wall time) begins anew with each run, and decides nothing of the results.
+Where the data are stored:
+
+- Arrays of the state: positions, velocities, accelerations, forces, and the scheme's memory (including tied nodes and
+  changes by a treatment of impact).
+- Arrays of the stepper: contacts with walls, nodes in contact in the last step, positions of the lagged preconditioner.
+- Numbers of the stepper: level of bisection, part and smallest part of the step, counts of the lagged preconditioner.
+- Arrays of the bars: data of the laws, thermal strains, history of the lagged preconditioner.
+- ``free_walls``: walls with mass, including their last increment. Forces of constraints: arrays of their rows. Forces
+  of pairs and which of them are closed: arrays at their second nodes.
+- ``ranks``: works and energies. Recorder: energy at the start, largest energy, iterations since the last row.
+  ``blow_up``: number of rows, suspicious rows, and energy input. Contact log: contact times and impulses.
+- Attributes (plan): time step and linear solver.
+
+Newton's method, Krylov methods, candidates for contact and friction start from scratch in each step. Data that depend
+on wall-clock time (synchronisation, progress, wall time) start from scratch in each run and do not affect the results.
 """
 
 from __future__ import annotations

@@ -106,7 +106,7 @@ class Outputs:
             analysis.start()
             self._synchroniser.synchronise()
         warn = self.progress.warning
-        self.history = history = History(stepper, self._synchroniser, warn)
+        self.history = history = History(stepper, plan, self._synchroniser, warn)
         if hasattr(stepper, "message"):
             stepper.message = warn
         self.events = Events(stepper, self.progress.message)

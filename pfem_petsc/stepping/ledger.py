@@ -1,11 +1,12 @@
 """The energy ledger: every term has its own formula, so that their balance is a check and not a definition.
 
 For a scheme whose balance holds at the ends of steps (``balance_at_endpoints``), works follow the trapezoidal rule.
-With dx = x1 - x0, the external work is (e0 + e1) dx/2, the contact work (r0 + r1) dx/2, and the damping dissipation
-(C v0 + C v1) dx/2. The numerical dissipation is the work of inertia and internal forces in excess of the change of
-their energies: (M a0 + M a1) dx/2 - dT + (f0 + f1) dx/2 - dU - dD + dH, with the work dH of changing temperatures. For
-other schemes the forces of the single balance act over the whole step, and damping dissipates C dx . dx/h. The sum of
-all changes is then the work of the residual, which is zero up to the tolerance of the solver.
+With dx = x1 - x0, the external work is (e0 + e1) dx/2 and the contact work (r0 + r1) dx/2. The numerical dissipation is
+the work of inertia and internal forces in excess of the change of their energies:
+(M a0 + M a1) dx/2 - dT + (f0 + f1) dx/2 - dU - dD + dH, with the work dH of changing temperatures. For other schemes
+the forces of the single balance act over the whole step. Damping dissipates C dx . dx/h, which is never negative, and
+(C v0 + C v1) dx/2 with explicit schemes whose balance holds at the ends. The sum of all changes is then the work of the
+residual, which is zero up to the tolerance of the solver.
 
 The work of contact is split by formulas that are the same for all schemes and treatments. ``contact_work`` is the work
 of moving walls, F . dX by the rule above and J . V for jumps J of momentum. ``friction_dissipation`` is the work of
@@ -97,11 +98,15 @@ class Ledger:
         self.impulses.fill(self.sums)
         stepper.step_changed = False
         impact, friction = self._dissipated(before)
+        if jump is not None:
+            friction += jump.friction
         stored = present.kinetic - jumped - before.kinetic + present.energy.total - before.energy.total
         heating = self._heating.work()
         work, given, weight, lost = self._work_of_walls(before)
-        damping = self._damped() if self.model.inertia.damped and not stepper.scheme.balance_at_endpoints else None
-        if damping is not None:
+        # velocities at the ends of explicit steps are those of the steps beside
+        follows = stepper.scheme.explicit and stepper.scheme.balance_at_endpoints
+        if self.model.inertia.damped and not follows:
+            damping = self._damped()
             of, by = WORKS.index("inertial"), WORKS.index("damping")
             self._works[of] = self._works[of] + self._works[by] - damping
             self._works[by] = damping
@@ -110,8 +115,8 @@ class Ledger:
     def _damped(self) -> float:
         """Return the damping dissipation of the last step, C dx . dx / h [J]; never negative.
 
-        The velocity of a balance within the step, or beyond its end, may be opposite to the displacement of the step;
-        the difference to the work of the damping force is numerical dissipation.
+        The velocity of a balance, at the ends of the step, within it or beyond, may point against the way of the step:
+        what the damping force of the balance works otherwise is the scheme's.
         """
         stepper = self.stepper
         way = stepper.state.position - stepper.before[: self.model.mesh.n_owned]

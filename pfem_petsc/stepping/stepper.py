@@ -142,7 +142,7 @@ class Stepper(ABC):
         motion.start(self.h)
         if self.scheme.solves_next_position:
             v, speeds = state.v, motion.speeds
-            self._solve_and_finish()
+            self._solve_and_finish(self.state.time)
             self.totals_solved = self._totals()
             self.velocity_solved = state.v
             # nodes on a wall have not lost their velocity yet; the scheme continues from its own memory
@@ -203,9 +203,9 @@ class Stepper(ABC):
             self.scheme.advance(self.state, self.part)
             self.prescribed.place(end)
             self._arrive(end)
-            self._solve_and_finish()
+            self._solve_and_finish(end)
         else:
-            self._solve_and_finish()
+            self._solve_and_finish(end)
             if self.prescribed.moving:
                 self.prescribed.place(end)
                 self.prescribed.take_rates(end)
@@ -225,7 +225,7 @@ class Stepper(ABC):
             self.model.temperatures.apply(end)
         self.evaluate(commit=True)
 
-    def _solve_and_finish(self) -> None:
+    def _solve_and_finish(self, end: float) -> None:
         state = self.state
         self.balance = self.scheme.balance(state, self.part)
         if self.prescribed.moving:
@@ -240,7 +240,7 @@ class Stepper(ABC):
         self.scheme.finish(state, self.balance, self.solution.u, self.part)
         if self.scheme.solves_next_position and self.prescribed.moving:
             self.prescribed.take_rates(state.time)
-        self.model.contact.motion.finish(self.part)
+        self.model.contact.motion.finish(self.part, end)
         if self.scheme.turns_held and self.treatment is None:
             self.model.contact.calm(fresh, state.v, self.balance.time, self.part)
 

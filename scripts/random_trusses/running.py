@@ -92,7 +92,7 @@ def run_case(
             if stop_after is None:
                 simulation.run()
             else:
-                outcome.stopped = _run_to(simulation, comm, stop_after)
+                _run_to(simulation, comm, stop_after, outcome)
         except EarlyStop as stop:
             outcome.status, outcome.message = 4, str(stop)
         except (InputError, SimulationFailure) as error:
@@ -131,19 +131,16 @@ def run_in_two_parts(text: str, comm: MPI.Comm, folder: Path, middle: int, sourc
     return second
 
 
-def _run_to(simulation: Simulation, comm: MPI.Comm, last: int) -> int:
-    step = 0
+def _run_to(simulation: Simulation, comm: MPI.Comm, last: int, outcome: Outcome) -> None:
     try:
         for made in simulation:
-            step = made.step
-            if step == last and comm.rank == comm.size - 1:
+            if made.step == last and comm.rank == comm.size - 1:
                 os.kill(os.getpid(), signal.SIGTERM)
     except EarlyStop:
-        step = simulation.state.step
+        outcome.stopped = simulation.state.step
         raise
     finally:
         simulation = None
-    return step
 
 
 def _jiggle(simulation: Simulation, number: int) -> None:

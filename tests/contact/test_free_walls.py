@@ -217,3 +217,22 @@ def test_what_hits_a_truss_at_rest_brings_energy_into_it(integrator, comm, share
     reach = speed * np.sqrt((mass + 0.5 * 7850.0 * area) / (210e9 * area))
     assert 1.0 - min(row["probe/tip/position"][0, 0] for row in rows) == pytest.approx(reach, rel=0.03)
     assert rows[-1]["wall/stop/velocity"][0] == pytest.approx(speed, rel=0.03)
+
+
+@pytest.mark.parametrize("integrator, parameters", [("wilson", {"theta": 1.8}), ("newmark", {})])
+def test_wall_is_where_its_state_says_after_every_step(integrator, parameters, comm, shared_tmp_path):
+    """The sum of steps and the time of a step differ by rounding: the wall is not at t + theta h for that.
+
+    All the energy is the wall's at the start: none is created by an unstable motion.
+    """
+    step = 1e-3 / 3.0
+    walls = planes([[0.0, 0.0, 1.0]], [-0.02], mass=0.05, velocity=[0.0, 0.0, 5.0], name="ram")
+    case = lattice_case(walls, integrator=integrator, step=step, end=30 * step)
+    case["time"] |= parameters
+    run = simulation(case, comm, shared_tmp_path)
+    motion, sums = run.model.contact.motion, 0.0
+    for _ in run:
+        sums += step
+        np.testing.assert_array_equal(motion.displacements(run.state.time)[0], motion.bodies.state.x[0])
+    assert sums != run.state.time
+    assert np.abs(run.row["wall/ram/impulse"]).max() > 0.0

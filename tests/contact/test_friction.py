@@ -186,6 +186,52 @@ def test_guided_node_is_stopped_by_any_friction(integrator, friction, comm, shar
     assert abs(rows[-1]["energy_imbalance"]) < 1e-12
 
 
+@pytest.mark.parametrize("integrator", ["central_differences", "newmark"])
+def test_guided_node_meets_a_wall_that_is_almost_parallel(integrator, comm, shared_tmp_path):
+    """One that only touches it at the start: the slip of its first step is nothing beside what the drag must stop."""
+    steep = {"normal": [np.sqrt(1.0 - 0.0138**2), 0.0, 0.0138], "point": [0.0, 0.0, -1e-8]}
+    rows = [step.row for step in simulation(guided(integrator, 0.95, steep, -0.1), comm, shared_tmp_path)]
+    x, _, z = next(row["wall/slope/force"] for row in rows if row["wall/slope/force"][2] > 0.0)
+    n = steep["normal"]
+    assert x / z == pytest.approx((n[0] - 0.95 * n[2]) / (n[2] + 0.95 * n[0]), rel=1e-6)
+    assert rows[-1]["friction_dissipation"] > 0.0
+    assert abs(rows[-1]["energy_imbalance"]) < 1e-12
+
+
+@pytest.mark.parametrize("phase", [0.05, 0.8])
+@pytest.mark.parametrize(
+    ("integrator", "parameters"),
+    [
+        ("chung_lee", {}),
+        ("hulbert_chung", {}),
+        ("newmark", {"beta": 0.25, "gamma": 0.5}),
+        ("newmark", {}),
+        ("houbolt", {}),
+        ("wilson", {}),
+        ("generalized_alpha", {}),
+        ("energy_momentum", {}),
+    ],
+)
+def test_impact_drags_by_its_momentum(integrator, parameters, phase, comm, shared_tmp_path):
+    """A bar that meets a rough floor loses mu m v along it, wherever in a step that is, and the energy of that."""
+    step, friction = 1e-3, 0.2
+    floor = {"type": "plane", "name": "floor", "normal": [0.0, 0.0, 1.0], "friction": friction}
+    case = {
+        "mesh": {"generator": "rod", "length": 1.0, "elements": 1},
+        "material": {"m": {"young_modulus": 1.0, "density": 1000.0}},
+        "section": {"s": {"area": 1e-3, "material": "m"}},
+        "initial": {"velocity": [1.0, 0.0, -1.0]},
+        "wall": [floor | {"point": [0.0, 0.0, -(5 + phase) * step]}],
+        "contact": {"treatment": "stick"},
+        "time": {"integrator": integrator, "step": step, "end": 12 * step, **parameters},
+    }
+    rows = [step.row for step in simulation(case, comm, shared_tmp_path)]
+    assert rows[-1]["momentum"] == pytest.approx([1.0 - friction, 0.0, 0.0], abs=1e-7)
+    assert rows[-1]["kinetic_energy"] == pytest.approx(0.5 * (1.0 - friction) ** 2, rel=1e-6)
+    assert all(row["friction_dissipation"] >= 0.0 for row in rows)
+    assert abs(rows[-1]["energy_imbalance"]) < 1e-12
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["central_differences", "newmark"])
 def test_wedge_that_locks_itself(integrator, comm, shared_tmp_path):

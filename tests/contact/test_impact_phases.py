@@ -257,6 +257,7 @@ def rod_held_at_one_end(integrator, step, **material):
         ("newmark", 0.5, {"damping": 2e3}, None),
         ("energy_momentum", 4.0, {"yield_stress": 2e4}, None),
         ("central_differences", 0.9, {"yield_stress": 5e4}, "bars yield"),
+        ("central_differences", 0.6, {"yield_stress": 8e4}, "bars yield"),
         ("central_differences", 0.1, {"yield_stress": 5e4}, None),
         ("central_differences", 0.9, {}, None),
         ("chung_lee", 0.8, {"damping": 2e3}, None),

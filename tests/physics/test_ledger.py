@@ -169,3 +169,15 @@ def test_damping_only_takes(integrator, mass, shared_tmp_path):
     assert (np.diff(history["damping_dissipation"]) >= 0.0).all()
     assert history["damping_dissipation"][-1] > 0.05 * start
     assert np.abs(history["energy_imbalance"]).max() < 1e-10 * start
+
+
+def test_damping_of_backward_differences_only_takes(shared_tmp_path):
+    """A wall that turns a bar back within one large step: the velocities at its ends then point against the step."""
+    wall = {"point": [10.2, 0.0, 0.0], "normal": [-1.0, 0.0, 0.0]}
+    material = {"default": {"young_modulus": 100.0, "density": 1.0, "damping": 0.05}}
+    mesh = {"generator": "rod", "length": 10.0, "elements": 1}
+    initial = {"velocity": [0.3, 0.0, 0.0]}
+    table = case("houbolt", step=5.0, steps=20, mesh=mesh, walls=[wall], material=material, initial=initial)
+    history = run(table, shared_tmp_path)
+    assert (np.diff(history["damping_dissipation"]) > 0.0).all()
+    assert np.abs(history["energy_imbalance"]).max() < 1e-10 * history["kinetic_energy"][0]

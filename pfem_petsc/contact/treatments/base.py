@@ -29,8 +29,9 @@ class Jump:
     ----------
     nodes : (m,) owned local indices
     v, a : (m, 3) before the jump [m/s], [m/s2]
-    energy : kinetic energy gained by this rank's nodes [J]
-    memory : the scheme's arrays at these nodes before the jump (m, 3), by name
+    energy : kinetic energy that this rank's nodes gained [J]
+    memory : what the scheme remembered of them (m, 3), by name
+    friction : what the drag that goes with the jump took of it [J]
     """
 
     nodes: np.ndarray
@@ -38,6 +39,7 @@ class Jump:
     a: np.ndarray
     energy: float
     memory: dict[str, np.ndarray] = field(default_factory=dict)
+    friction: float = 0.0
 
 
 class Treatment(ABC):

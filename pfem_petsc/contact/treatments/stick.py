@@ -7,6 +7,11 @@ On closure a node loses the kinetic energy of its approach, m v_n^2/2, an O(elem
 release it starts from rest, and the wall does no work on it. At a wall with restitution e a node that closes leaves
 with e times the velocity of its approach and loses (1 - e^2) of that energy; see
 :mod:`~pfem_petsc.contact.restitution`.
+
+The momentum that stops a node is m v_n in all. What the force of the step falls short of it, or exceeds it by, depends
+on where in the step the impact falls; the jump makes up for it. Friction follows the momentum: a node that slips is
+dragged by mu times the jump as well, no farther than to rest, so that an impact takes mu m v_n along the wall whatever
+the step.
 """
 
 from __future__ import annotations
@@ -14,9 +19,13 @@ from __future__ import annotations
 import numpy as np
 from mpi4py import MPI
 
+from ...tolerances import FREE_PART, RANK
+from ..restitution import STILL
 from ..restitution import Treatment as Restitution
 
 __all__ = ["Treatment"]
+
+_TINY = 1e-200  # divides what is nothing
 
 
 class Treatment(Restitution):
@@ -41,6 +50,7 @@ class Treatment(Restitution):
         self.clear()
         state = self.stepper.state
         nodes, v, a = self.on_walls()
+        v, a, friction = self._dragged(nodes, v, a)
         pairs, mass = self.stepper.model.pairs, self.stepper.model.inertia.mass
         if pairs is not None and pairs.any_pressed():
             ends, _ = pairs.pressed()
@@ -51,6 +61,62 @@ class Treatment(Restitution):
             ends, slower = self._pairs_let_go()
             nodes, v, a = np.append(nodes, ends), np.vstack([v, slower]), np.vstack([a, state.a[ends]])
         self.put(nodes, v, a)
+        if self.jump is not None:
+            self.jump.friction = friction
+
+    def _dragged(self, nodes: np.ndarray, v: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        """Velocities and accelerations (m, 3) of held nodes with the drag that goes with jumps, and what it takes [J].
+
+        With the free parts F of the normals N and the directions s of the slip, the jumps are D lambda, D = F - mu s,
+        as large along the normals as without friction.
+        """
+        stepper, state = self.stepper, self.stepper.state
+        contact = stepper.model.contact
+        if not contact.has_friction or stepper.scheme.solves_next_position or len(nodes) == 0:
+            return v, a, 0.0
+        touching = stepper.touching[nodes]
+        displacements = contact.motion.displacements(state.time)
+        normals, _ = contact.planes(touching, state.position[nodes], displacements)
+        slip = self._moved(nodes)
+        slip -= np.einsum("mwi,mwi->mw", slip, normals)[:, :, None] * normals
+        size = np.linalg.norm(slip, axis=2)
+        slips = touching & (size > STILL * stepper.model.length) & (contact.friction > 0.0)
+        slips[self.sticking(nodes, touching, normals).any(axis=1)] = False
+        at = np.flatnonzero(slips.any(axis=1))
+        if len(at) == 0:
+            return v, a, 0.0
+        held = ~stepper.model.supports.fixed[nodes[at]][:, None, :] & touching[at][:, :, None]
+        free = np.where(held, normals[at], 0.0)
+        free[(free * free).sum(axis=2) <= FREE_PART] = 0.0
+        way = np.where(held & slips[at][:, :, None], slip[at] / np.maximum(size[at], _TINY)[:, :, None], 0.0)
+        old_v, old_a = state.v[nodes[at]], state.a[nodes[at]]
+
+        def jumps(change: np.ndarray, friction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            """Jumps (k, 3), as large along the normals as a change (k, 3), and their lambda (k, walls)."""
+            along = free - friction[:, :, None] * way
+            matrix = np.einsum("kwi,kui->kwu", free, along)
+            push = np.einsum("kwu,kui,ki->kw", np.linalg.pinv(matrix, rcond=RANK), free, change)
+            return np.einsum("kw,kwi->ki", push, along), push
+
+        smooth = np.zeros(size[at].shape)
+        # what the force has dragged beside pressing: less than the law's where the node sticks at t + theta h
+        force = state.contact[nodes[at]]
+        dragged = -np.einsum("kwi,ki->kw", way, force) / np.maximum(np.einsum("kwi,ki->kw", free, force), _TINY)
+        dragged = np.clip(dragged, 0.0, contact.friction)
+        relative = old_v[:, None, :] - contact.motion.rates(state.time)
+        speed = np.maximum(np.einsum("kwi,kwi->kw", way, relative), 0.0)
+        _, push = jumps(v[at] - old_v, smooth)
+        most = np.where(push > 0.0, speed / np.maximum(push, _TINY), dragged)
+        friction = np.minimum(smooth + contact.friction, most)
+        change, push = jumps(v[at] - old_v, friction)
+        mean = np.einsum("kwi,kwi->kw", way, relative + 0.5 * change[:, None, :])
+        # what the force dragged too much was booked with the slip of the step
+        mean = np.where(push < 0.0, np.minimum(mean, size[at] / stepper.part), mean)
+        taken = (friction * push * mean).sum(axis=1)
+        v, a = v.copy(), a.copy()
+        v[at] = old_v + change
+        a[at] = old_a + jumps(a[at] - old_a, dragged)[0]
+        return v, a, float((stepper.model.inertia.mass[nodes[at]] * taken).sum())
 
     def _pairs_let_go(self) -> tuple[np.ndarray, np.ndarray]:
         """Return ends (m,) of pairs that opened in this step, and their velocities (m, 3); see :meth:`_let_go`.

@@ -48,8 +48,9 @@ def write_mesh(
     Raises
     ------
     InputError
-        On all ranks: arrays of another shape or kind; a mesh that cannot be simulated (coordinates that are not finite,
-        bars of zero length, two bars between the same nodes, nodes without bars); a file that cannot be written.
+        On all ranks, for arrays of wrong shape or type; a mesh that cannot be simulated (coordinates that are not
+        finite, bars of zero length, two bars between the same nodes, nodes without bars); a file that cannot be
+        written.
     """
     if comm is None:
         from mpi4py import MPI
@@ -112,7 +113,7 @@ def _array(path: Path, name: str, values: ArrayLike, width: int, kinds: str) -> 
 
 
 def _members(path: Path, kind: str, name: str, values: ArrayLike, n: int) -> np.ndarray:
-    """Numbers of the members of a group, ascending."""
+    """Return the numbers of the members of a group, ascending."""
     where = f"{path}: {kind}[{name!r}]"
     if not isinstance(name, str) or not name or "/" in name or name == ".":
         raise InputError(f"{where}: expected a name without slashes")

@@ -1,4 +1,4 @@
-"""Which library solves the eigenvalue problem."""
+"""Choice of the library that solves the eigenvalue problem."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ __all__ = ["SOLVERS", "available", "choose", "describe_modes", "solver_module"]
 SOLVERS = "pfem_petsc.modes.eigen"
 LIBRARIES = {"slepc": "slepc4py.SLEPc", "scipy": "scipy.sparse.linalg"}
 DENSE_UP_TO = 600
-"""Components up to which all eigenvalues are computed by NumPy, which takes less time than an iteration is worth."""
+"""Maximum number of components for which NumPy computes all eigenvalues, faster than an iteration."""
 DENSE_AT_MOST = 6_000
-"""Components up to which NumPy serves where no library for sparse matrices is there: about 2 minutes and 1 GB."""
+"""Maximum number of components for NumPy without a library for sparse matrices: about 2 minutes and 1 GB."""
 GATHERED_AT_MOST = 300_000
-"""Components up to which matrices are gathered on one rank for SciPy."""
+"""Maximum number of components for which matrices are gathered on one rank for SciPy."""
 
 
 @cache
 def available(package: str) -> bool:
-    """Whether a library is there and can be loaded; PETSc must be initialised before."""
+    """Return whether a library is installed and can be loaded; PETSc must be initialised before."""
     try:
         importlib.import_module(package)
     except ImportError:
@@ -36,12 +36,12 @@ def available(package: str) -> bool:
 
 
 def describe_modes(model: Model) -> dict[str, str]:
-    """Label and text of the modes that a case asks for; none if it does not. Collective.
+    """Return label and text of the modes that a case requests, empty if none. Collective.
 
     Raises
     ------
     InputError
-        On all ranks, where no library is there for them.
+        On all ranks, if no suitable library is installed.
     """
     case = model.case
     if case.modes is None:
@@ -54,18 +54,18 @@ def describe_modes(model: Model) -> dict[str, str]:
 
 
 def choose(asked: str, free: int, source: str) -> str:
-    """The name of the solver for so many free components.
+    """Return the name of the solver for a number of free components.
 
     Parameters
     ----------
     asked : ``modes.solver``
-    free : components that nothing holds
+    free : number of free components
     source : file of the case, for the message
 
     Raises
     ------
     InputError
-        Where no library is there that can solve a problem of this size.
+        If no installed library can solve a problem of this size.
     """
     if asked == "auto":
         if free <= DENSE_UP_TO:
@@ -94,5 +94,5 @@ def choose(asked: str, free: int, source: str) -> str:
 
 
 def solver_module(name: str) -> ModuleType:
-    """The module of a solver, with ``largest(problem, count, start)`` and ``definite(problem)``."""
+    """Return the module of a solver, with ``largest(problem, count, start)`` and ``definite(problem)``."""
     return lookup(SOLVERS, name, "modes.solver")

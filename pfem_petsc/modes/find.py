@@ -23,14 +23,14 @@ if TYPE_CHECKING:
 
 __all__ = ["Found", "find_modes"]
 
-_SHIFT = 1e-4  # of the squared frequency wave speed / length, by which the shift lies below zero
-_ROUNDING = 1e-13  # of the largest eigenvalue: smaller ones are zero
-_MORE = 4  # modes computed beyond those asked for, so that repeated ones are whole
-_AGAIN = 3  # modes asked for in a search for those that were missed
+_SHIFT = 1e-4  # distance of the shift below zero, relative to the squared frequency wave speed / length
+_ROUNDING = 1e-13  # relative to the largest eigenvalue: smaller ones are zero
+_MORE = 4  # additional modes, so that repeated ones are complete
+_AGAIN = 3  # modes requested in a search for missed ones
 _SEARCHES = 40
-_NOTHING = 1e-10  # of the largest theta: others are those of directions in which A is zero
-_DEPENDENT = 1e-10  # eigenvalue of a Gram matrix of unit vectors, below which they depend on each other
-_NO_LOAD = 1e-9  # of the axial stiffness: axial forces that are none
+_NOTHING = 1e-10  # relative to the largest theta: smaller ones belong to directions in which A is zero
+_DEPENDENT = 1e-10  # eigenvalue of a Gram matrix of unit vectors below which they are dependent
+_NO_LOAD = 1e-9  # relative to the axial stiffness: smaller axial forces count as zero
 
 
 @dataclass(frozen=True)
@@ -42,10 +42,10 @@ class Found:
     kind : "vibration" or "buckling"
     eigenvalues : (k,) squares of the circular frequencies [1/s2], or load factors; ascending
     shapes : (k, owned, 3): of vibrations [kg^-1/2], with x^T M x = 1; of buckling with a largest component of 1
-    negative : number of negative eigenvalues among those of vibrations
-    solver : in words
-    iterations : solves with the matrix B
-    at_walls : nodes that walls hold
+    negative : number of negative eigenvalues of vibrations
+    solver : description
+    iterations : number of solves with the matrix B
+    at_walls : number of nodes in contact with walls
     """
 
     kind: str
@@ -58,7 +58,7 @@ class Found:
 
     @property
     def values(self) -> np.ndarray:
-        """(k,) frequencies [Hz], minus the growth rate over 2 pi where the eigenvalue is negative; or load factors."""
+        """(k,) frequencies [Hz], for negative eigenvalues minus the growth rate over 2 pi; or load factors."""
         if self.kind == "buckling":
             return self.eigenvalues
         return np.sign(self.eigenvalues) * np.sqrt(np.abs(self.eigenvalues)) / (2.0 * np.pi)
@@ -78,19 +78,19 @@ class _Solver(Protocol):
 
 
 def find_modes(model: Model, state: State, settings: Settings, consistent: bool) -> Found:
-    """The lowest modes of a state. Collective.
+    """Compute the lowest modes of a state. Collective.
 
     Parameters
     ----------
     model : Model
     state : State, complete
     settings : table ``[modes]``
-    consistent : whether the mass is
+    consistent : whether the mass matrix is consistent
 
     Raises
     ------
     InputError, SimulationFailure
-        On all ranks: no solver, no free component, a state whose contact is not known, no axial forces for buckling.
+        On all ranks, if there is no solver, no free component, unsupported contact, or no axial force for buckling.
     """
     holds = Holds(model, state)
     free = 3 * model.mesh.n_nodes - holds.number
@@ -114,7 +114,7 @@ def _vibration(
     mass = matrices.mass()
     zero = _ROUNDING * top
     small = max(_SHIFT * (model.wave_speed / model.length) ** 2, 10.0 * zero)
-    # a shift near zero where that is below all eigenvalues, else one that certainly is
+    # a shift near zero if that is below all eigenvalues, else a rigorous lower bound
     shifts = [-small] if low == 0.0 else [-small, low - small]
     for shift in shifts:
         pencil = Pencil(mass, join(stiffness, -shift, mass), state.position, holds.held, free)
@@ -199,10 +199,10 @@ def _lowest(
     zero: float,
     nothing: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The ``count`` largest positive theta (k,), and unique vectors (k, owned, 3) with x^T B x = 1. Collective.
+    """Return the ``count`` largest positive theta (k,), and unique vectors (k, owned, 3), x^T B x = 1. Collective.
 
-    An iteration may find a repeated eigenvalue less often than it is there, so searches are repeated in the complement
-    of what was found, until one changes nothing.
+    An iteration may miss copies of a repeated eigenvalue, so searches are repeated in the complement of the vectors
+    found, until one finds nothing new.
     """
     wanted = min(count + _MORE, pencil.free)
     theta, known = np.empty(0), np.empty((0, 3 * model.mesh.n_owned))
@@ -234,14 +234,14 @@ def _lowest(
 
 
 def _start(model: Model, holds: Holds, search: int) -> np.ndarray:
-    """A vector (3 owned,) that depends on the mesh alone, and on the number of the search. Collective."""
+    """Return a start vector (3 owned,) that depends only on the mesh and the number of the search. Collective."""
     numbers = model.mesh.node_ids[: model.mesh.n_owned].astype(np.float64)[:, None] * 3.0 + np.arange(3)
     start = np.sin(12.9898 * (numbers + 1.0) + 78.233 * (search + 1.0) + 0.37 * np.sqrt(numbers * (search + 2.0)))
     return holds.to_own(start[None])[0].ravel()
 
 
 def _ritz(comm: MPI.Comm, pencil: Pencil, vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Theta (k,), descending, and vectors orthonormal in B, from the space of vectors (m, components). Collective."""
+    """Return theta (k,), descending, and B-orthonormal vectors in the span of vectors (m, components). Collective."""
     a, b = _products(pencil.a, vectors), _products(pencil.b, vectors)
     grams = comm.allreduce(np.stack([vectors @ a.T, vectors @ b.T]))
     first, second = 0.5 * (grams + grams.transpose(0, 2, 1))

@@ -1,4 +1,4 @@
-"""Matrices of the free components on rank 0, and vectors back to where they belong."""
+"""Gathers matrices of the free components on rank 0, and scatters vectors to their owners."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["Gathered"]
 
 
 class Gathered:
-    """The matrices of a pencil on rank 0 without what is held. Construction is collective.
+    """The matrices of a pencil on rank 0 without held components. Construction is collective.
 
     Attributes
     ----------
@@ -46,12 +46,12 @@ class Gathered:
         return rows[kept], columns[kept], values[kept]
 
     def whole(self, vectors: np.ndarray) -> np.ndarray | None:
-        """On rank 0 vectors (k, size) of which each rank has its part (k, owned); None on the others. Collective."""
+        """Gather vectors (k, size) on rank 0 from each rank's part (k, owned); None on the others. Collective."""
         parts = self.comm.gather(vectors[:, self._free])
         return None if parts is None else np.concatenate(parts, axis=1)
 
     def scattered(self, vectors: np.ndarray | None) -> np.ndarray:
-        """This rank's part (k, owned) of vectors (k, size) that rank 0 has. Collective."""
+        """Return this rank's part (k, owned) of vectors (k, size) on rank 0. Collective."""
         parts = None
         if vectors is not None:
             parts = np.split(vectors, np.cumsum(self._counts)[:-1], axis=1)

@@ -1,7 +1,7 @@
-"""What does not move in a mode: components that supports prescribe, and what walls that press on nodes hold.
+"""Held components of a mode: those prescribed by supports, and those of nodes in contact with walls.
 
-A wall that presses on a node holds it along the normal, one with friction, or to which the node is tied, in all
-directions. A wall that a node touches without a force does not hold it. Where the wall is curved, its force turns with
+A wall with a contact force holds a node along the normal; a wall with friction, or one to which the node is tied, holds
+it in all directions. A wall that a node touches without a force does not hold it. The force of a curved wall turns with
 the node: -F dn/dx is part of the stiffness there.
 """
 
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 __all__ = ["Holds"]
 
 _PRESSES = (
-    1e-9  # of the sum of the axial stiffnesses at a node times the model's length: a force of contact that counts
+    1e-9  # of the sum of axial stiffnesses at a node times the model's length: the smallest contact force that counts
 )
-_DIFFERENCE = 1e-6  # of the model's length: half the distance over which normals of curved walls are compared
+_DIFFERENCE = 1e-6  # relative to the model's length: step of the central difference of normals of curved walls
 
 
 class Holds:
@@ -38,16 +38,16 @@ class Holds:
 
     Attributes
     ----------
-    held : (owned, 3) bool, components in each node's own directions, which are x, y, z but for nodes at walls
+    held : (owned, 3) bool, components in the local axes of each node, which are x, y, z except for nodes at walls
     number : of held components in the whole model
-    at_walls : number of nodes of the whole model that walls hold
-    curvature : owned nodes (m,) and blocks (m, 3, 3) [N/m] by which forces of curved walls change the stiffness; None
-        where there are none
+    at_walls : number of nodes of the whole model in contact with walls
+    curvature : owned nodes (m,) and blocks (m, 3, 3) [N/m] that forces of curved walls add to the stiffness; None if
+        there are none
 
     Raises
     ------
     SimulationFailure
-        On all ranks, where contact between nodes or a wall with mass holds what modes do not know.
+        On all ranks, for contact between nodes or with a wall with mass, which modes do not support.
     """
 
     def __init__(self, model: Model, state: State) -> None:
@@ -69,7 +69,7 @@ class Holds:
     def _take(self, walls: _Walls) -> None:
         nodes = walls.nodes
         directions = np.concatenate([walls.directions, np.einsum("mi,ij->mij", self.held[nodes], np.eye(3))], axis=1)
-        # right singular vectors: orthonormal, those that are held first
+        # right singular vectors: orthonormal, held ones first
         _, values, self._turns = np.linalg.svd(directions)
         self._nodes = nodes
         self.held[nodes] = values > RANK * values[:, :1]
@@ -77,7 +77,7 @@ class Holds:
             self.curvature = walls.curved
 
     def _turning(self) -> PETSc.Mat:
-        """Block-diagonal: from each node's own directions to x, y, z."""
+        """Return the block-diagonal matrix from the local axes of nodes to x, y, z."""
         owned, first = self._mesh.n_owned, 3 * self._mesh.first_node
         blocks = np.broadcast_to(np.eye(3), (owned, 3, 3)).copy()
         blocks[self._nodes] = self._turns.transpose(0, 2, 1)
@@ -89,8 +89,8 @@ class Holds:
         return turn
 
     def taken_out(self, matrix: PETSc.Mat, diagonal: float | np.ndarray) -> PETSc.Mat:
-        """A matrix in the nodes' own directions, with ``diagonal`` (owned,) at held components and no coupling of them
-        to others; the one given may be changed. Collective."""
+        """Return a matrix in the local axes, with ``diagonal`` (owned,) at held components and without their coupling
+        to others; the given matrix may be changed. Collective."""
         if self._turn is not None:
             matrix = matrix.ptap(self._turn)
         matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
@@ -105,30 +105,30 @@ class Holds:
         return matrix
 
     def to_axes(self, shapes: np.ndarray) -> np.ndarray:
-        """Shapes (k, owned, 3) from the nodes' own directions to x, y, z; what is held is zero."""
+        """Transform shapes (k, owned, 3) from the local axes to x, y, z; held components are zero."""
         shapes = np.where(self.held, 0.0, shapes)
         shapes[:, self._nodes] = np.einsum("mij,kmi->kmj", self._turns, shapes[:, self._nodes])
         return shapes
 
     def to_own(self, shapes: np.ndarray) -> np.ndarray:
-        """The other way round, what is held left out."""
+        """Transform shapes to the local axes, with held components set to zero."""
         shapes = shapes.copy()
         shapes[:, self._nodes] = np.einsum("mij,kmj->kmi", self._turns, shapes[:, self._nodes])
         return np.where(self.held, 0.0, shapes)
 
 
 def model_wide(comm: object, count: int) -> bool:
-    """Whether any rank has some. Collective."""
+    """Return whether any rank has a nonzero count. Collective."""
     return comm.allreduce(count) > 0
 
 
 class _Walls:
-    """Nodes of this rank that walls press on.
+    """Nodes of this rank in contact with walls.
 
     Attributes
     ----------
     nodes : (m,) ascending
-    directions : (m, walls + 3, 3) held, zero rows where there are fewer
+    directions : (m, walls + 3, 3) held directions, padded with zero rows
     curved : nodes (c,) and blocks (c, 3, 3) of :attr:`Holds.curvature`
     """
 
@@ -165,7 +165,7 @@ class _Walls:
     def _curved(
         self, model: Model, state: State, touched: np.ndarray, normals: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Minus the force times the derivative of the normal, for nodes at curved walls."""
+        """Return minus the force times the derivative of the normal, for nodes at curved walls."""
         contact, nodes = model.contact, self.nodes
         displacements = contact.motion.displacements(state.time)
         blocks = np.zeros((len(nodes), 3, 3))
@@ -174,7 +174,7 @@ class _Walls:
         forces = np.zeros(touched.shape)
         for m, node in enumerate(nodes):
             at = np.flatnonzero(touched[m])
-            # supports take what they hold; the walls' forces are what is left of the contact force
+            # prescribed components go to the supports; the walls' forces are the rest of the contact force
             forces[m, at] = np.linalg.lstsq(normals[m, at].T, state.contact[node], rcond=None)[0]
         h = _DIFFERENCE * model.length
         for k in np.flatnonzero(~contact.flat):

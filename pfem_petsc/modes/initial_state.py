@@ -1,4 +1,4 @@
-"""The state of a case without an analysis: the mesh as it is, at time zero."""
+"""The state of a case without an analysis: the initial mesh at time zero."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class _Nothing(Scheme):
 
 
 class _InitialStepper(Stepper):
-    """Completes the initial state: internal forces, loads, supports at time zero; it makes no steps."""
+    """Initialises internal forces, loads and supports at time zero; makes no steps."""
 
     def __init__(self, model: Model) -> None:
         super().__init__(model, _Nothing(), 0.0)
@@ -64,7 +64,7 @@ class _InitialStepper(Stepper):
 
 @dataclass(frozen=True)
 class InitialStatePlan:
-    """What a run without an analysis will do: no step.
+    """The plan of a run without an analysis, which has no steps.
 
     Attributes
     ----------
@@ -79,20 +79,20 @@ class InitialStatePlan:
     axis: Axis = TIME
 
     def beyond(self, steps: np.ndarray, times: np.ndarray) -> np.ndarray:
-        """Which of recorded steps with their times lie beyond the end."""
+        """Return which of the recorded steps and times lie beyond the end."""
         return steps > 0
 
     def entries(self, case: Case) -> dict[str, str]:
-        """Label and text of what a user checks before a run."""
+        """Return label and text of a summary for the user before a run."""
         return {"analysis": "none: modes of the initial state"}
 
     def record(self) -> dict[str, Any]:
-        """What a restart must not work out anew."""
+        """Return the numbers that a restart must not compute again."""
         return {}
 
 
 class InitialState(Analysis):
-    """The initial state, which is the last one. Construction is collective.
+    """The initial state, which is also the last one. Construction is collective.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ class InitialState(Analysis):
     Raises
     ------
     InputError
-        On all ranks, where the case has initial velocities.
+        On all ranks, if the case has initial velocities.
     """
 
     last_step = 0

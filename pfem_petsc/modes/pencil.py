@@ -5,7 +5,7 @@ Both problems are brought into the form A x = theta B x with B positive definite
 - vibration, (K - lambda M) x = 0: A = M, B = K - shift M with a shift below all lambda, theta = 1/(lambda - shift);
 - buckling, (K0 + lambda Kg) x = 0: A = -Kg, B = K0, theta = 1/lambda.
 
-Components that are held stay in the matrices without coupling; their theta is positive and below all others, or zero.
+Held components remain in the matrices without coupling; their theta is positive and below all others, or zero.
 """
 
 from __future__ import annotations
@@ -26,20 +26,20 @@ if TYPE_CHECKING:
 
 __all__ = ["Pencil", "StateMatrices", "bar_stiffness", "buckling_bars", "join"]
 
-_LOADING = 1e-8  # relative change of all lengths that tells the tangents of loading and unloading apart
-_KINK = 1e-6  # relative difference of these tangents beyond which the bar is at a kink of its law
+_LOADING = 1e-8  # relative change of all lengths that distinguishes the tangents of loading and unloading
+_KINK = 1e-6  # relative difference of these tangents above which the bar is at a kink of its law
 
 
 @dataclass
 class Pencil:
-    """A x = theta B x in PETSc matrices, and what an iteration needs to know of it.
+    """The problem A x = theta B x in PETSc matrices, with data for an iteration.
 
     Attributes
     ----------
     a, b : PETSc matrices; b is positive definite if the shift lies below all eigenvalues
     points : (owned, 3) positions of the nodes [m], for multigrid
     held : (owned, 3) bool, components that are held
-    free : number of components that nothing holds, of the whole model
+    free : number of free components of the whole model
     """
 
     a: PETSc.Mat
@@ -55,10 +55,10 @@ class Pencil:
 
 
 def bar_stiffness(model: Model, x: np.ndarray) -> np.ndarray:
-    """Stiffness of the bars (b, 5) at local positions (nodes, 3): direction, dN/dl - N/l, N/l [N/m].
+    """Return the stiffness of the bars (b, 5) at local positions (nodes, 3): direction, dN/dl - N/l, N/l [N/m].
 
-    Where the law has a kink at the state, as on the yield surface, dN/dl is the larger one, that of unloading: small
-    vibrations about the state do not yield further. The rate of strain has no part in it.
+    If the law has a kink at the state, as on the yield surface, dN/dl is the larger one, that of unloading: small
+    vibrations about the state do not yield further. The strain rate has no effect.
     """
     bars = model.bars
     step, bars.step = bars.step, 0.0
@@ -76,7 +76,7 @@ def bar_stiffness(model: Model, x: np.ndarray) -> np.ndarray:
 
 
 def buckling_bars(model: Model, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Bars (b, 5) of K0 and Kg, both on the geometry of the mesh; see :func:`bar_stiffness`.
+    """Return the bars (b, 5) of K0 and Kg, both on the geometry of the mesh; see :func:`bar_stiffness`.
 
     K0: dN/dl of the unstressed bars with their virgin material, along the bar. Kg: N/l0 across it, where N is the
     axial force at the local positions ``x``.
@@ -108,13 +108,13 @@ def _linearised(model: Model, x: np.ndarray) -> np.ndarray:
 
 
 class StateMatrices:
-    """Assembled matrices of a model with what supports and walls hold taken out of the problem.
+    """Assembled matrices of a model in which components held by supports and walls are decoupled.
 
     Parameters
     ----------
     model : Model
     holds : Holds
-    consistent : whether the mass is
+    consistent : whether the mass matrix is consistent
     """
 
     def __init__(self, model: Model, holds: Holds, consistent: bool) -> None:
@@ -125,9 +125,9 @@ class StateMatrices:
         self._ends = model.mesh.bars.astype(np.int64)
 
     def stiffness(self, bars: np.ndarray, diagonal: float | np.ndarray, added: tuple | None = None) -> PETSc.Mat:
-        """The matrix of bars (b, 5), with ``diagonal`` (owned,) at what is held. Collective.
+        """Return the matrix of bars (b, 5), with ``diagonal`` (owned,) at held components. Collective.
 
-        ``added``: owned nodes (m,) and blocks (m, 3, 3) [N/m] that are added
+        ``added``: owned nodes (m,) and blocks (m, 3, 3) [N/m] to add
         """
         matrix = HessianMatrix(self.model.mesh, self.model.supports.fixed, False)
 
@@ -139,7 +139,7 @@ class StateMatrices:
         return self.holds.taken_out(matrix.fill(fill), diagonal)
 
     def mass(self) -> PETSc.Mat:
-        """The mass matrix [kg]; what is held keeps its lumped mass. Collective."""
+        """Return the mass matrix [kg]; held components keep their lumped mass. Collective."""
         mesh, inertia = self.model.mesh, self.inertia
         if not inertia.consistent:
             return _diagonal(mesh.comm, np.repeat(inertia.mass, 3))
@@ -152,10 +152,10 @@ class StateMatrices:
         return self.holds.taken_out(matrix.fill(fill), inertia.mass)
 
     def bounds(self, bars: np.ndarray, blocks: tuple | None = None) -> tuple[float, float]:
-        """Numbers below and above all eigenvalues of the bars' stiffness (b, 5) and the mass [1/s2]. Collective.
+        """Return bounds below and above all eigenvalues of the bars' stiffness (b, 5) and the mass [1/s2]. Collective.
 
         A bar's matrix is (a n n^T + c (I - n n^T)) times [[1, -1], [-1, 1]], which lies between 2 min(a, c, 0) and
-        2 max(a, c, 0) times the unit matrix of its ends; a consistent mass is no less than a third of the lumped one.
+        2 max(a, c, 0) times the identity; a consistent mass is at least a third of the lumped one.
         """
         axial, transverse = bars[:, 3] + bars[:, 4], bars[:, 4]
         low = self._at_nodes(2.0 * np.minimum(np.minimum(axial, transverse), 0.0))
@@ -171,7 +171,7 @@ class StateMatrices:
         return -factor * float(mine[0]), factor * float(mine[1])
 
     def _at_nodes(self, values: np.ndarray) -> np.ndarray:
-        """Sums over the bars of each owned node."""
+        """Return sums over the bars of each owned node."""
         mesh = self.model.mesh
         sums = np.zeros(mesh.n_local)
         for end in (0, 1):
@@ -180,7 +180,7 @@ class StateMatrices:
 
 
 def join(first: PETSc.Mat, factor: float, second: PETSc.Mat) -> PETSc.Mat:
-    """First + factor second, a new symmetric matrix, where the second has no other entries. Collective."""
+    """Return first + factor second as a new symmetric matrix with the pattern of the first. Collective."""
     total = first.duplicate(copy=True)
     total.axpy(factor, second, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
     total.setOption(PETSc.Mat.Option.SYMMETRIC, True)

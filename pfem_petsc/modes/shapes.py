@@ -1,9 +1,9 @@
-"""Vectors of a few lowest eigenvalues made unique: the same on any number of ranks.
+"""Unique vectors of the lowest eigenvalues, the same on any number of ranks.
 
-Eigenvalue solvers give any basis of a repeated eigenvalue, and any sign. Here the basis follows from the space alone:
-its first vectors are the projections of the rigid motions (translations along x, y, z, rotations about them) that have
-one, the next have the largest component that a vector of the space can have. The largest component of each shape, of
-several the first in mesh numbering, is positive.
+Eigenvalue solvers return an arbitrary basis of a repeated eigenvalue, with arbitrary signs. Here the basis depends on
+the space only: its first vectors are the nonzero projections of the rigid motions (translations along x, y, z,
+rotations about them), the next have the largest component that a vector of the space can have. The largest component of
+each shape, the first in mesh numbering if there are several, is positive.
 """
 
 from __future__ import annotations
@@ -13,20 +13,20 @@ from mpi4py import MPI
 
 __all__ = ["Basis"]
 
-_EQUAL = 1e-9  # relative difference of eigenvalues that are the same
-_TIE = 1e-6  # relative difference of components that are equally large
-_SEEN = 1e-3  # of a rigid motion: its projection on a space, below which it says nothing
+_EQUAL = 1e-9  # relative difference below which eigenvalues count as equal
+_TIE = 1e-6  # relative difference below which components count as equal
+_SEEN = 1e-3  # smallest projection of a unit rigid motion on a space that is used
 
 
 class Basis:
-    """Makes vectors of a rank's components unique.
+    """Makes vectors unique, given each rank's components.
 
     Parameters
     ----------
     comm : MPI.Comm
     numbers : (owned,) mesh numbers of the nodes
     points : (owned, 3) [m]
-    mass : (owned,) lumped mass [kg], which weighs the projections
+    mass : (owned,) lumped mass [kg], the weight of the projections
     """
 
     def __init__(self, comm: MPI.Comm, numbers: np.ndarray, points: np.ndarray, mass: np.ndarray) -> None:
@@ -39,9 +39,9 @@ class Basis:
         self._motions = np.concatenate([translations, rotations])
 
     def unique(self, values: np.ndarray, shapes: np.ndarray, zero: float) -> np.ndarray:
-        """Shapes (k, owned, 3), orthonormal in B, of eigenvalues (k,) in ascending order, made unique. Collective.
+        """Make B-orthonormal shapes (k, owned, 3) of ascending eigenvalues (k,) unique. Collective.
 
-        ``zero`` is a difference of eigenvalues that is rounding.
+        ``zero`` : difference of eigenvalues within rounding.
         """
         shapes, first = shapes.copy(), 0
         while first < len(values):
@@ -55,7 +55,7 @@ class Basis:
         return shapes * self._signs(shapes)[:, None, None]
 
     def _basis(self, space: np.ndarray) -> np.ndarray:
-        """Orthogonal matrix whose rows are the new basis in terms of the given one (k, owned, 3). Collective."""
+        """Return the orthogonal matrix whose rows are the new basis in terms of the given one. Collective."""
         weighted = space * self._mass[:, None]
         mine = np.concatenate(
             [np.einsum("knc,mnc->mk", weighted, self._motions), [np.einsum("knc,knc->k", weighted, space)]]
@@ -75,7 +75,7 @@ class Basis:
         return np.array(rows)
 
     def _peak(self, space: np.ndarray, rows: list[np.ndarray]) -> np.ndarray:
-        """Coefficients (k,) of the vector without parts in ``rows`` with the largest component. Collective."""
+        """Return coefficients (k,) of the vector orthogonal to ``rows`` with the largest component. Collective."""
         left = np.eye(len(space)) - sum((np.outer(row, row) for row in rows), np.zeros((len(space),) * 2))
         components = left @ space.reshape(len(space), len(self._places))
         at = self._first_largest(np.sqrt((components**2).sum(axis=0)))
@@ -91,7 +91,7 @@ class Basis:
         return np.where(signs < 0.0, -1.0, 1.0)
 
     def _first_largest(self, sizes: np.ndarray) -> int:
-        """Local place of the largest of all ranks' numbers, of equals the first in mesh numbering; -1 elsewhere."""
+        """Return the local index of the largest value of all ranks, the first in mesh numbering; -1 elsewhere."""
         largest = self._comm.allreduce(float(sizes.max(initial=0.0)), op=MPI.MAX)
         near = np.flatnonzero(sizes >= (1.0 - _TIE) * largest)
         none = np.iinfo(np.int64).max
@@ -103,7 +103,7 @@ class Basis:
 
 
 def same(one: float, other: float, zero: float) -> bool:
-    """Whether two eigenvalues are the same but for rounding."""
+    """Return whether two eigenvalues are equal up to rounding."""
     if not np.isfinite(one) or not np.isfinite(other):
         return one == other
     return abs(other - one) <= max(zero, _EQUAL * max(abs(one), abs(other)))

@@ -1,7 +1,7 @@
-"""Modes in a result file: the group ``/modes``, made empty with the file and filled at the end of the run.
+"""Modes in a result file: the group ``/modes``, created empty with the file and filled at the end of the run.
 
 ``eigenvalue`` (modes,), ``frequency`` [Hz] or ``load_factor`` (modes,), ``shape`` (modes, nodes, 3) in mesh numbering;
-the attribute ``kind``. ``/checks/modes`` has a checksum a mode, written last: a mode without one is not seen.
+the attribute ``kind``. ``/checks/modes`` has one checksum per mode, written last; a mode without one is ignored.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ NAMES = {"vibration": ("frequency", "Hz"), "buckling": ("load_factor", "")}
 
 
 def create_modes(file: h5py.File, kind: str, n_nodes: int) -> None:
-    """Make the group without modes, in place of one that is there. One process."""
+    """Create the group without modes, replacing an existing one. Not collective."""
     clear_modes(file)
     group = file.create_group(MODES)
     group.attrs.create("kind", kind.encode(), dtype=h5py.string_dtype("utf-8", len(kind)))
@@ -49,13 +49,13 @@ def _create_shape(group: h5py.Group, n_nodes: int, unit: str) -> None:
 
 
 def clear_modes(file: h5py.File) -> None:
-    """Remove the group, if there is one. One process."""
+    """Remove the group if it exists. Not collective."""
     file.pop(MODES, None)
     file[CHECKS].pop(MODES, None)
 
 
 def prepare_modes(path: Path, kind: str | None, n_nodes: int) -> None:
-    """Bring a file that is to be continued to no modes, of this kind or of none. One process."""
+    """Prepare a file to be continued: an empty group of this kind, or no group for None. Not collective."""
     with h5py.File(path, "r+", locking=False) as file:
         if kind is not None:
             create_modes(file, kind, n_nodes)
@@ -72,7 +72,7 @@ def write_modes(
     values: np.ndarray,
     shapes: np.ndarray,
 ) -> None:
-    """Write all modes, in place of those that are there. Collective.
+    """Write all modes, replacing existing ones. Collective.
 
     Parameters
     ----------
@@ -124,14 +124,14 @@ def _write_slab(dataset: h5py.Dataset, mode: int, first: int, slab: np.ndarray, 
 
 
 def complete_modes(file: h5py.File) -> int:
-    """How many modes are complete."""
+    """Return the number of complete modes."""
     if MODES not in file or MODES not in file[CHECKS]:
         return 0
     return min(len(file[CHECKS][MODES]), *(len(dataset) for dataset in file[MODES].values()))
 
 
 def mode_damages(file: h5py.File, deep: bool) -> Iterator[str]:
-    """What is wrong with the modes, a line each."""
+    """Yield one line for each defect of the modes."""
     n = complete_modes(file)
     if not n:
         return

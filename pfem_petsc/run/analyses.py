@@ -1,4 +1,4 @@
-"""Which analysis a case asks for."""
+"""Selection of the analysis of a case."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ __all__ = ["make_analysis"]
 
 
 def make_analysis(model: Model, recorded: Mapping[str, Any] | None) -> Analysis:
-    """The analysis of a model's case. Collective.
+    """Create the analysis of a model's case. Collective.
 
-    ``recorded``: record of the plan of the run that is continued, None for a new run
+    ``recorded``: record of the plan of the continued run, None for a new run
     """
-    describe_modes(model)  # what cannot be computed at the end is refused at the start
+    describe_modes(model)  # refuses at the start modes that cannot be computed at the end
     if model.case.static is not None:
         return StaticAnalysis(model, recorded)
     if model.case.time is None:

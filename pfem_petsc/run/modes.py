@@ -1,4 +1,4 @@
-"""The modes of the state at the end of a run: found, told, and written."""
+"""Computes, reports and writes the modes of the state at the end of a run."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _PER_LINE = 5
 
 
 def record_modes(stepper: Stepper, writer: ResultWriter, folder: Path, progress: Progress) -> None:
-    """Find the modes of the stepper's state, write them and tell of them. Collective.
+    """Find the modes of the stepper's state, write and report them. Collective.
 
     Raises
     ------
@@ -65,7 +65,7 @@ def _told(found: Found, asked: int) -> list[str]:
 
 
 def _write_file(stepper: Stepper, found: Found, folder: Path) -> None:
-    """A file of its own for ParaView: a step a mode, its time the number of the mode. Collective."""
+    """Write a separate file for ParaView, with one step per mode, whose time is the number of the mode. Collective."""
     model, state = stepper.model, stepper.state
     name, _ = NAMES[found.kind]
     columns = {"time": (), "step": (), name: (), "eigenvalue": ()}
@@ -89,5 +89,5 @@ def _write_file(stepper: Stepper, found: Found, folder: Path) -> None:
 
 
 def remove_modes(folder: Path, comm: object) -> None:
-    """Remove the file of modes of a run that is continued: they are not those of its new end. Collective."""
+    """Remove the file of modes of a continued run, which do not belong to its new end. Collective."""
     on_root(comm, (folder / MODES_FILE).unlink, True)

@@ -1,4 +1,4 @@
-"""The static analysis of a case with a table ``[static]``: its plan, what it refuses, and its steps."""
+"""The static analysis of a case with a table ``[static]``: its plan, checks and steps."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _DIRECT_UP_TO = 30_000  # unknowns; beyond, multigrid takes less time and memory
 
 @dataclass(frozen=True)
 class StaticPlan:
-    """What a static run will do.
+    """The plan of a static run.
 
     Attributes
     ----------
@@ -51,17 +51,17 @@ class StaticPlan:
     axis: Axis = LOAD_FACTOR
 
     def beyond(self, steps: np.ndarray, times: np.ndarray) -> np.ndarray:
-        """Which of recorded steps with their times lie beyond the end."""
+        """Return which of the recorded steps and times lie beyond the end."""
         return times > (np.inf if self.end is None else self.end * (1.0 + TIME))
 
     def entries(self, case: Case) -> dict[str, str]:
-        """Label and text of what a user checks before a run."""
+        """Return label and text of a summary for the user before a run."""
         given = case.static.parameters.model_dump(exclude_none=True)
         words = ", ".join(f"{key} = {value}" for key, value in given.items())
         return {"static analysis": f"{case.static.method} ({words})"}
 
     def record(self) -> dict[str, Any]:
-        """What a restart must not work out anew."""
+        """Return the numbers that a restart must not compute again."""
         return {}
 
 
@@ -76,7 +76,7 @@ class StaticAnalysis(Analysis):
     Raises
     ------
     InputError
-        On all ranks, where the case asks for what a static analysis does not have.
+        On all ranks, if the case has features that a static analysis does not support.
     """
 
     def __init__(self, model: Model, recorded: Mapping[str, Any] | None = None) -> None:
@@ -94,7 +94,7 @@ class StaticAnalysis(Analysis):
 
     @property
     def last_step(self) -> int:
-        """Number of the last step once it is reached, before that a number beyond all."""
+        """Number of the last step once it is reached, before that a number larger than any step."""
         return self.stepper.state.step if self.stepper.done else NEVER
 
     @property
@@ -118,7 +118,7 @@ class StaticAnalysis(Analysis):
 
 
 def _linear(model: Model) -> LinearChoice:
-    """The linear solver: a factorisation where it is affordable, which needs no definiteness; else multigrid."""
+    """Choose the linear solver: a factorisation, which needs no definiteness, if affordable; else multigrid."""
     solver, unknowns = model.case.solver, 3 * model.mesh.n_nodes
     request = solver.linear
     if request == "auto":
@@ -127,7 +127,7 @@ def _linear(model: Model) -> LinearChoice:
 
 
 def _check(model: Model) -> None:
-    """Refuse what only makes sense over time."""
+    """Refuse features that need time."""
     case = model.case
     source = case.source
     if any(any(entry.velocity) or any(entry.angular_velocity) for entry in case.initial):

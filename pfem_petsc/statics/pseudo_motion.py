@@ -1,21 +1,22 @@
 """The pseudo-motion of dynamic relaxation: nodes with fictitious mass move towards equilibrium, losing their energy.
 
-Explicit steps of length 1 with a mass chosen for them. Of bars with axial stiffness k and geometric stiffness g >= 0
-the energy of a displacement is at most twice that of their ends on their own, u.K u <= 2 sum_i u_i.K_ii u_i, so that
-the highest frequency of masses m_i = s K_i/2, with K_i the largest eigenvalue of the diagonal block K_ii, is at most
-2/sqrt(s): the limit of central differences at s = 1. That is the choice m = dt^2/2 S of Barnes (1999) with the least S
-that is safe. K_i is bounded anew every few steps, as bars turn and tighten.
+The pseudo-steps are explicit steps of size 1 with suitable masses. For bars with axial stiffness k and geometric
+stiffness g >= 0 the energy of a displacement is at most twice that of their ends alone,
+u.K u <= 2 sum_i u_i.K_ii u_i. Hence the highest frequency with masses m_i = s K_i/2, with K_i the largest eigenvalue of
+the diagonal block K_ii, is at most 2/sqrt(s), the limit of central differences at s = 1. This is the choice
+m = dt^2/2 S of Barnes (1999) with the smallest safe S. The bound of K_i is updated every few steps, as bars rotate and
+tighten.
 
-Two ways to take the energy:
+Damping:
 
-- ``kinetic``: when the kinetic energy has passed a peak, the nodes go back to where it was, by half a step less than
-  two, and start again from rest (Cundall 1976; Topping & Ivanyi 2008, section 2.6; Barnes 1999).
+- ``kinetic``: when the kinetic energy has passed a peak, the nodes return to the positions of the peak, one and a half
+  steps back, and start again from rest (Cundall 1976; Topping & Ivanyi 2008, section 2.6; Barnes 1999).
 - ``fire``: velocities are turned towards the forces, and stopped when they point uphill; the step adapts (Bitzek et al.
   2006, doi:10.1103/PhysRevLett.97.170201, in the form of Guenole et al. 2020, doi:10.1016/j.commatsci.2020.109584).
   Norms are those of the masses, as if the coordinates were sqrt(m) x.
 
-Walls: positions are projected onto what the walls allow in each step, as in explicit steps in time. The residual of a
-node is what is left of it once the walls push: m (P(x + r/m) - x).
+Walls: positions are projected onto the region that the walls allow in each step, as in explicit time steps. The
+residual of a node with the wall forces is m (P(x + r/m) - x).
 """
 
 from __future__ import annotations
@@ -49,15 +50,15 @@ the forces of supports, of walls, of bars [N2], ranks that failed."""
 
 
 class PseudoMotion:
-    """Moves positions of their own towards an equilibrium of the model. Construction is collective.
+    """Moves a copy of the positions towards an equilibrium of the model. Construction is collective.
 
     Attributes
     ----------
     x : (local, 3) positions with ghosts [m]
     f : (local, 3) internal force there [N]
     v : (owned, 3) pseudo-velocity [m per step]
-    residual : (owned, 3) force that nothing balances [N]
-    contact : (owned, 3) force of walls [N]; ``walls`` their sums, ``held`` the nodes that they push
+    residual : (owned, 3) unbalanced force [N]
+    contact : (owned, 3) force of walls [N]; ``walls`` their sums, ``held`` the nodes in contact
     mass : (owned,) [N/m]: the pseudo-step is 1
     energy : StrainEnergy at ``x``
     sums : (9,) see :data:`RESIDUAL`
@@ -107,7 +108,7 @@ class PseudoMotion:
         self._evaluate()
 
     def _lead_supports(self, start: np.ndarray, end: np.ndarray) -> None:
-        """Take prescribed components (k,) to their places in as many pseudo-steps as keep bars from being crushed."""
+        """Move prescribed components (k,) to their positions in enough pseudo-steps to avoid crushed bars."""
         supports = self.model.supports
         self._start, self._end, self._arrival = start, end, 0
         if supports.any:
@@ -122,7 +123,7 @@ class PseudoMotion:
 
     @property
     def load(self) -> float:
-        """What the residual is compared with [N]: 2-norm of loads or reactions, of bar forces where there are none."""
+        """Reference of the residual [N]: 2-norm of loads or reactions, or of bar forces if there are none."""
         acting = max(self._external_norm, float(np.sqrt(self.sums[SUPPORTS] + self.sums[WALLS])))
         bars = float(np.sqrt(self.sums[BARS]))
         return acting if acting > _SELF_STRESS * bars else bars
@@ -133,7 +134,7 @@ class PseudoMotion:
         return float(np.sqrt(self.sums[RESIDUAL]))
 
     def required(self, tolerance: float) -> float:
-        """2-norm of the residual [N] that counts as equilibrium: a share of the load, or rounding."""
+        """Return the 2-norm of the residual [N] that counts as equilibrium: a fraction of the load, or rounding."""
         return max(tolerance * self.load, self.model.rounding)
 
     def relax(self, tolerance: float, most: int) -> bool:
@@ -142,7 +143,7 @@ class PseudoMotion:
         Raises
         ------
         SimulationFailure
-            On all ranks: bars collapsed, walls leave a node no place, or positions are not finite.
+            On all ranks, for collapsed bars, infeasible walls, or positions that are not finite.
         """
         while self.steps < self._arrival or not self.norm <= self.required(tolerance):
             if self.steps >= most:
@@ -155,7 +156,7 @@ class PseudoMotion:
         return True
 
     def shift(self, keep: float, push: float, step: float) -> None:
-        """v = keep v + push residual/m, x = x + step v, and both as walls allow."""
+        """Compute v = keep v + push residual/m, x = x + step v, both with the constraints of walls."""
         owned = self.model.mesh.n_owned
         u = self._u
         move_freely(self.residual, self.mass, keep, push, step, self._reach, self.v, u)
@@ -165,11 +166,11 @@ class PseudoMotion:
         self.x[:owned] += u
 
     def go_back(self, u: np.ndarray) -> None:
-        """Subtract (owned, 3) from the positions [m]; the next step brings them back onto the walls' allowed side."""
+        """Subtract (owned, 3) from the positions [m]; the next step projects them onto the walls again."""
         self.x[: self.model.mesh.n_owned] -= u
 
     def _project(self, u: np.ndarray) -> None:
-        """Correct increments (owned, 3) from ``x`` as walls ask, and keep the forces that this takes."""
+        """Project increments (owned, 3) from ``x`` onto the walls, and store the forces."""
         owned, contact = self.model.mesh.n_owned, self.model.contact
         try:
             self.held, force, self.walls = contact.explicit(self.x[:owned], u, self.mass, self.time, self._tolerance)
@@ -180,7 +181,7 @@ class PseudoMotion:
         self.contact[self.held] = force
 
     def _evaluate(self) -> None:
-        """Forces, residual and sums at the positions."""
+        """Compute forces, residual and sums at the positions."""
         model = self.model
         model.mesh.update_ghosts(self.x)
         self.energy = model.bars.forces(self.x, self.f, commit=False)
@@ -203,7 +204,7 @@ class PseudoMotion:
             self._fail()
 
     def _estimate(self) -> None:
-        """Masses for the present positions."""
+        """Compute masses at the current positions."""
         model = self.model
         bars = model.bars
         bars.linearise(self.x, 1.0, self._stored)
@@ -215,7 +216,7 @@ class PseudoMotion:
         self.mass[self.mass == 0.0] = 1.0
 
     def _fail(self) -> None:
-        """Raise on all ranks what one has met."""
+        """Raise on all ranks a failure of any rank."""
         model, when = self.model, f"load factor {self.time:.6g}, pseudo-step {self.steps}"
         with agreed(model.comm):
             if self._failure is not None:
@@ -230,7 +231,7 @@ class PseudoMotion:
         raise SimulationFailure(f"{when}: sums of forces overflow double precision; correct loads and stiffness")
 
     def worst(self) -> tuple[float, int]:
-        """Largest residual of a node [N], and its mesh number. Collective."""
+        """Return the largest residual of a node [N], and its mesh number. Collective."""
         size = np.linalg.norm(self.residual, axis=1)
         mine = (0.0, -1)
         if len(size):
@@ -239,8 +240,8 @@ class PseudoMotion:
         return max(self.model.comm.allgather(mine))
 
     def potential(self, x: np.ndarray, energy: StrainEnergy) -> tuple[float, float]:
-        """Strain energy less work of the loads from the present positions to ``x`` (owned, 3), and the sum of their
-        magnitudes [J]. Collective."""
+        """Return the strain energy minus the work of the loads from the current positions to ``x`` (owned, 3), and the
+        sum of their magnitudes [J]. Collective."""
         works = self.external * (x - self.x[: len(x)])
         sums = np.array([energy.total - works.sum(), abs(energy.total) + np.abs(works).sum()])
         self.model.comm.Allreduce(MPI.IN_PLACE, sums)
@@ -248,7 +249,7 @@ class PseudoMotion:
 
 
 class KineticDamping:
-    """Nodes start again from rest where their kinetic energy has a peak."""
+    """Restarts nodes from rest at peaks of the kinetic energy."""
 
     def begin(self, motion: PseudoMotion) -> None:
         """From rest."""
@@ -259,10 +260,10 @@ class KineticDamping:
         self._energy, self._resting = 0.0, True
 
     def move(self, motion: PseudoMotion) -> None:
-        """One pseudo-step. Velocities are those half a step before the positions."""
+        """Make one pseudo-step. Velocities are those half a step before the positions."""
         energy = motion.sums[KINETIC]
         if energy < self._energy:
-            # x - 3/2 v + r/(2 m) of the step before: where the peak was, by a parabola through three energies
+            # x - 3/2 v + r/(2 m) of the previous step: the peak, by a parabola through three energies
             motion.go_back(1.5 * motion.v - 0.5 * self._before / motion.mass[:, None])
             motion.v[:] = 0.0
             self._rest()
@@ -275,7 +276,7 @@ class KineticDamping:
 
 
 class FireDamping:
-    """Velocities are turned towards the forces; uphill they are stopped, half a step back."""
+    """Turns velocities towards the forces; uphill motion is stopped, half a step back."""
 
     start, grows, shrinks, fades, delay = 0.02, 1.1, 0.5, 0.99, 5
     first, largest, smallest = 0.5, 0.9, 0.02
@@ -285,7 +286,7 @@ class FireDamping:
         self._step, self._turn, self._downhill = self.first, self.start, 0
 
     def move(self, motion: PseudoMotion) -> None:
-        """One pseudo-step: semi-implicit Euler, then the turn."""
+        """Make one pseudo-step: semi-implicit Euler, then the turn."""
         power, weighted, square = motion.sums[POWER], motion.sums[WEIGHTED], motion.sums[KINETIC]
         if power > 0.0 or square == 0.0:
             self._downhill += 1

@@ -1,4 +1,4 @@
-"""Increments of the load factor by dynamic relaxation, the last digits by Newton's method."""
+"""Increments of the load factor by dynamic relaxation, with the last digits by Newton's method."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ if TYPE_CHECKING:
 
 __all__ = ["RelaxationStepper"]
 
-_HANDOVERS = (1e-2, 1e-4, 1e-6)  # residuals over the load at which Newton's method is tried
-_NEAR = 0.05  # of the model's length: a solution farther from the relaxed positions is another equilibrium
-_DOWN = 1e-10  # of the energies: what a solution may lie above the relaxed positions by rounding
+_HANDOVERS = (1e-2, 1e-4, 1e-6)  # residuals relative to the load at which Newton's method is tried
+_NEAR = 0.05  # relative to the model's length: a solution farther from the relaxed positions is another equilibrium
+_DOWN = 1e-10  # relative to the energies: allowed rise of the energy above the relaxed positions, by rounding
 
 
 class RelaxationStepper(StaticStepper):
-    """Finds each equilibrium from the positions of the one before, however far it is, by a pseudo-motion.
+    """Finds each equilibrium from the positions of the previous one, at any distance, by a pseudo-motion.
 
-    Internal variables of bars go once from the equilibrium before to the one found: what the pseudo-motion passes
-    through leaves no trace in them. Newton's method, tried from the relaxed positions, has the last word where it
-    stays near and does not climb; else relaxation goes on to its own tolerance.
+    Internal variables of bars are updated once, from the previous equilibrium to the new one; the path of the
+    pseudo-motion does not affect them. The solution of Newton's method, tried from the relaxed positions, is accepted
+    if it is near and its energy is not higher; otherwise relaxation continues to its own tolerance.
 
     Attributes
     ----------
     pseudo_steps : of the last increment
-    residual : over the load, of the last increment when relaxation ended
+    residual : relative to the load, at the end of relaxation in the last increment
     """
 
     kept_numbers = (*StaticStepper.kept_numbers, "pseudo_steps", "residual")
@@ -46,7 +46,7 @@ class RelaxationStepper(StaticStepper):
         _check(model)
         super().__init__(model, choice, parameters)
         self.parameters = parameters
-        self.guard = None  # large rotations are what it is for
+        self.guard = None  # relaxation allows large rotations
         self.motion = PseudoMotion(model, parameters.damping)
         self.pseudo_steps, self.residual = 0, 0.0
 
@@ -56,7 +56,7 @@ class RelaxationStepper(StaticStepper):
         Raises
         ------
         SimulationFailure
-            On all ranks, when relaxation does not converge in ``max_iterations`` pseudo-steps.
+            On all ranks, if relaxation does not converge in ``max_iterations`` pseudo-steps.
         """
         state, left = self.state, self.end - self.state.time
         last = left <= self.limits.step * (1.0 + TIME)
@@ -86,7 +86,7 @@ class RelaxationStepper(StaticStepper):
         return self._relaxed(balance)
 
     def _polish(self, balance: Balance) -> Solution | None:
-        """The solution of Newton's method from the relaxed positions, None where there is none near. Collective."""
+        """Return the solution of Newton's method from the relaxed positions, None if none is near. Collective."""
         state, model, motion = self.state, self.model, self.motion
         kept = state.contact, state.support, self.held
         self.held = np.zeros_like(self.held)
@@ -110,7 +110,7 @@ class RelaxationStepper(StaticStepper):
         return solution
 
     def _relaxed(self, balance: Balance) -> Solution:
-        """The relaxed positions as the solution."""
+        """Return the relaxed positions as the solution."""
         state, model, motion = self.state, self.model, self.motion
         owned, fixed = model.mesh.n_owned, model.supports.fixed
         state.contact = motion.contact.copy()
@@ -123,7 +123,7 @@ class RelaxationStepper(StaticStepper):
         return Solution(u, motion.f.copy(), motion.walls, contacts=int(pushed.sum()))
 
     def _unfinished(self) -> SimulationFailure:
-        """What to tell when the pseudo-steps are used up."""
+        """Return the message about an increment without convergence."""
         motion, most = self.motion, self.parameters.max_iterations
         size, node = motion.worst()
         return SimulationFailure(
@@ -134,12 +134,12 @@ class RelaxationStepper(StaticStepper):
         )
 
     def _guess(self, balance: Balance) -> np.ndarray:
-        """The relaxed positions."""
+        """Return the relaxed positions."""
         return self.motion.x[: self.model.mesh.n_owned] - balance.predictor
 
 
 def _check(model: Model) -> None:
-    """Refuse what relaxation does not have."""
+    """Refuse features that relaxation does not support."""
     case = model.case
     if model.links:
         what = "contact_pair" if case.contact_pair else "constraint"

@@ -1,4 +1,4 @@
-"""Loops over owned nodes and local bars of a pseudo-step of dynamic relaxation."""
+"""Compiled loops over owned nodes and local bars for a pseudo-step of dynamic relaxation."""
 
 from __future__ import annotations
 

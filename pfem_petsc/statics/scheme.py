@@ -10,9 +10,9 @@ __all__ = ["Equilibrium"]
 
 
 class Equilibrium(Scheme):
-    """f_int(x1) = f_ext(t1) + r, where t is the load factor; the unknown is the displacement of the increment.
+    """The balance f_int(x1) = f_ext(t1) + r, where t is the load factor; the unknown is the displacement increment.
 
-    The state's memory holds ``rate``: displacement per load factor of the last increment, which predicts the next.
+    The state's memory has ``rate``: displacement per load factor in the last increment, which predicts the next one.
     """
 
     inertial = False

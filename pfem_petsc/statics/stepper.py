@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 __all__ = ["StaticStepper"]
 
-_FEW = 5  # Newton iterations up to which the next increment is larger
+_FEW = 5  # maximum number of Newton iterations after which the next increment is larger
 _GROWTH = 1.5
 
 
@@ -35,8 +35,8 @@ class Increments(Protocol):
 class StaticStepper(ImplicitStepper):
     """Advances the equilibrium from one load factor to the next; the state's time is the load factor.
 
-    An increment that does not converge, or that the guard rejects, is halved; after one that took few Newton
-    iterations the next is larger, up to ``largest``.
+    An increment that does not converge, or that the guard rejects, is halved; after an increment with few Newton
+    iterations the next one is larger, up to ``largest``.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ class StaticStepper(ImplicitStepper):
 
     Attributes
     ----------
-    increment : that is tried next
+    increment : the next increment
     """
 
     kept_numbers = (*ImplicitStepper.kept_numbers, "increment")
@@ -75,7 +75,7 @@ class StaticStepper(ImplicitStepper):
         return f"step {self.state.step + 1}, load factor {self.state.time:.6g}"
 
     def start(self) -> None:
-        """The state at load factor zero, as the mesh is: equilibrium begins with the first increment. Collective."""
+        """Initialise the state at load factor zero from the mesh; the first increment is equilibrated. Collective."""
         state, model = self.state, self.model
         state.v = np.zeros_like(self.zero)
         state.a = np.zeros_like(self.zero)
@@ -94,7 +94,7 @@ class StaticStepper(ImplicitStepper):
         Raises
         ------
         NotConverged
-            On all ranks, when the smallest increment does not converge either.
+            On all ranks, if the smallest increment does not converge.
         """
         state, left = self.state, self.end - self.state.time
         size = self.increment if self.increment < left * (1.0 - TIME) else left
@@ -107,7 +107,7 @@ class StaticStepper(ImplicitStepper):
                 break
             except NotConverged as failure:
                 if self.model.temperatures.varying:
-                    # the failed solve has heated the bars to its own end
+                    # the failed solve has applied the temperatures of its end
                     self.model.temperatures.apply(state.time)
                 if 0.5 * size < self.limits.smallest:
                     raise self._no_further(failure) from failure
@@ -119,7 +119,7 @@ class StaticStepper(ImplicitStepper):
         state.step += 1
 
     def _no_further(self, failure: NotConverged) -> SimulationFailure:
-        """What to tell of the load factor beyond which no equilibrium was found."""
+        """Return the message about the load factor beyond which no equilibrium was found."""
         return SimulationFailure(
             f"no equilibrium found beyond load factor {self.state.time:.6g} with increments down to "
             f"{self.limits.smallest:.3g}: it is a limit point, or part of the truss is a mechanism; static.method = "
@@ -128,7 +128,7 @@ class StaticStepper(ImplicitStepper):
         )
 
     def _guess(self, balance: Balance) -> np.ndarray:
-        """The increment in proportion to the last one; prescribed components at their exact positions."""
+        """Return the increment proportional to the last one, with prescribed components at exact positions."""
         guess = self.scheme.expected_move(self.state, balance.time - self.state.time)
         supports = self.model.supports
         if supports.any:

@@ -22,7 +22,7 @@ class Parameters(StrictModel):
 
 
 def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
-    """This rank's part: node i + j (nx + 1) at (i lx/nx, j ly/ny, 0), first the bars along x, then those along y.
+    """Generate this rank's part: node i + j (nx + 1) at (i lx/nx, j ly/ny, 0); bars along x, then along y.
 
     Node groups ``corners``, ``edges`` (corners included) and ``centre`` (the node next to the middle); bar groups
     ``warp`` (along x) and ``weft`` (along y).

@@ -28,7 +28,7 @@ class Parameters(StrictModel):
 
 
 def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
-    """This rank's part, about the z axis: node i at the bottom, z = 0, node i + sides at the top.
+    """Generate this rank's part, about the z axis: node i at the bottom, z = 0, node i + sides at the top.
 
     The first two corners of the bottom lie along x. Strut i goes from node i to node i + sides, the cable beside it
     from node i to the head of the strut before. Node groups ``bottom``, ``top``, and ``first``, ``second`` (corners of

@@ -10,7 +10,7 @@ from ..pencil import Pencil
 __all__ = ["Solver"]
 
 
-_SINGULAR = 1e-13  # of the largest entry: a pivot that is zero but for rounding
+_SINGULAR = 1e-13  # relative to the largest entry: a pivot that is zero up to rounding
 
 
 class Solver:
@@ -18,7 +18,7 @@ class Solver:
 
     name = "dense matrices (NumPy)"
     finds_all = True
-    """whether repeated eigenvalues are found as often as they are there"""
+    """whether repeated eigenvalues are found with their multiplicity"""
 
     def __init__(self, pencil: Pencil) -> None:
         self.iterations = 0
@@ -48,7 +48,7 @@ class Solver:
         return self._gathered.scattered(vectors)
 
     def destroy(self) -> None:
-        """Nothing to free."""
+        """Do nothing: there are no resources to free."""
 
     def _dense(self, entries: tuple[np.ndarray, ...]) -> np.ndarray:
         full = np.zeros((self._gathered.size,) * 2)

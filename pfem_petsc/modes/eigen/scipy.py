@@ -14,7 +14,7 @@ from ..pencil import Pencil
 __all__ = ["Solver"]
 
 _TOLERANCE = 1e-11  # relative, of theta
-_SINGULAR = 1e-13  # of the largest entry: a pivot that is zero but for rounding
+_SINGULAR = 1e-13  # relative to the largest entry: a pivot that is zero up to rounding
 
 
 class Solver:
@@ -48,7 +48,7 @@ class Solver:
             return False
         if not np.array_equal(self._factor.perm_r, self._factor.perm_c):
             return None
-        # L D L^T without exchange of rows: by Sylvester's law the signs of D are those of the eigenvalues
+        # L D L^T without row exchanges: by Sylvester's law the signs of D are those of the eigenvalues
         return bool((self._factor.U.diagonal() > _SINGULAR * self._b.diagonal().max()).all())
 
     def largest(self, count: int, start: np.ndarray, known: np.ndarray) -> np.ndarray:
@@ -66,7 +66,7 @@ class Solver:
         gram = known @ products if len(known) else np.eye(0)
 
         def complement(x: np.ndarray) -> np.ndarray:
-            """Without the part in the known vectors, which are orthogonal in B to all others."""
+            """Remove the component in the span of the known vectors, which are B-orthogonal to all others."""
             return x - known.T @ np.linalg.solve(gram, products.T @ x) if len(known) else x
 
         def applied(x: np.ndarray) -> np.ndarray:
@@ -96,5 +96,5 @@ class Solver:
         return np.ascontiguousarray(complement(vectors).T), solves[0]
 
     def destroy(self) -> None:
-        """Let go of matrices and factors."""
+        """Free matrices and factors."""
         self._a = self._b = self._factor = None

@@ -15,10 +15,10 @@ from ..pencil import Pencil
 __all__ = ["DIRECT_UP_TO", "Solver"]
 
 DIRECT_UP_TO = 400_000
-"""Components up to which B is factorised."""
+"""Maximum number of components for which B is factorised."""
 _PREFIX = "pfem_modes_"
 _TOLERANCE = 1e-11  # relative, of theta; its square is the error of the eigenvalue
-_LINEAR = 1e-12  # of solves with multigrid: the iterations take them to be exact
+_LINEAR = 1e-12  # tolerance of solves with multigrid, which the iterations treat as exact
 
 
 class Solver:
@@ -71,7 +71,7 @@ class Solver:
         pc.setCoordinates(points - total[:3] / total[3])
 
     def _definite(self) -> bool | None:
-        """By the signs of the factors, which are those of the eigenvalues (Sylvester)."""
+        """Return whether B is positive definite, by the signs of its factors (Sylvester's law)."""
         pc = self._ksp.getPC()
         if not self.direct or pc.getType() != "cholesky":
             return None
@@ -79,8 +79,8 @@ class Solver:
         if pc.getFactorSolverType() == "mumps":
             pc.setFactorSetUpSolverType()
             factor = pc.getFactorMatrix()
-            factor.setMumpsIcntl(24, 1)  # pivots that are zero are counted
-            factor.setMumpsIcntl(13, 1)  # and the signs of those of the last front, which several ranks may share
+            factor.setMumpsIcntl(24, 1)  # count zero pivots
+            factor.setMumpsIcntl(13, 1)  # and signs of pivots of the last front, which several ranks may share
         self._ksp.setUp()
         factor = pc.getFactorMatrix()
         if pc.getFactorSolverType() == "mumps" and factor.getMumpsInfog(1) < 0:
@@ -112,7 +112,7 @@ class Solver:
         return vectors
 
     def destroy(self) -> None:
-        """Free SLEPc's objects."""
+        """Free the SLEPc objects."""
         self._eps.destroy()
 
 

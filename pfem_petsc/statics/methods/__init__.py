@@ -1,1 +1,1 @@
-"""Methods that find equilibria, one module each: ``static.method`` names it."""
+"""Methods that find equilibria, one per module; ``static.method`` names the module."""

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Parameters", "make_stepper"]
 
-_SMALLEST = 2.0**-10  # of the first increment
+_SMALLEST = 2.0**-10  # relative to the first increment
 
 
 class Parameters(StrictModel):
@@ -27,9 +27,9 @@ class Parameters(StrictModel):
     end: PositiveFloat = 1.0
     """last load factor"""
     min_step: PositiveFloat | None = None
-    """smallest increment; default: a 1024th of ``step``"""
+    """smallest increment; default: ``step`` / 1024"""
     max_step: PositiveFloat | None = None
-    """largest increment, to which they grow after increments of few Newton iterations; default: ``step``"""
+    """largest increment, up to which increments grow after few Newton iterations; default: ``step``"""
 
     @property
     def smallest(self) -> float:
@@ -51,7 +51,7 @@ class Parameters(StrictModel):
 
 
 def make_stepper(model: Model, parameters: Parameters, choice: LinearChoice) -> StaticStepper:
-    """The stepper of a case. Collective."""
+    """Create the stepper of a case. Collective."""
     from ..stepper import StaticStepper
 
     return StaticStepper(model, choice, parameters)

@@ -17,34 +17,34 @@ __all__ = ["Parameters", "make_stepper"]
 
 
 class Parameters(StrictModel):
-    """Increments of the load factor, and when their relaxation ends."""
+    """Increments of the load factor, and the end of their relaxation."""
 
     step: PositiveFloat = 1.0
     """increment of the load factor"""
     end: PositiveFloat = 1.0
     """last load factor"""
     damping: Literal["kinetic", "fire"] = "kinetic"
-    """what takes the energy of the pseudo-motion"""
+    """damping of the pseudo-motion"""
     tolerance: Annotated[float, Field(gt=0.0, lt=1.0)] = 1e-9
-    """residual over the load, in 2-norms, at which relaxation ends"""
+    """residual relative to the load, in 2-norms, at which relaxation ends"""
     max_iterations: PositiveInt = 200_000
-    """pseudo-steps allowed in an increment"""
+    """maximum number of pseudo-steps in an increment"""
     newton: bool = True
-    """whether Newton's method takes over for the last digits, where it finds the same equilibrium"""
+    """whether Newton's method computes the last digits, if it finds the same equilibrium"""
 
     @property
     def smallest(self) -> float:
-        """The smallest increment: they are not halved."""
+        """The smallest increment; increments are not halved."""
         return self.step
 
     @property
     def largest(self) -> float:
-        """The largest increment: they do not grow."""
+        """The largest increment; increments do not grow."""
         return self.step
 
 
 def make_stepper(model: Model, parameters: Parameters, choice: LinearChoice) -> RelaxationStepper:
-    """The stepper of a case. Collective."""
+    """Create the stepper of a case. Collective."""
     from ..relaxation import RelaxationStepper
 
     return RelaxationStepper(model, choice, parameters)

@@ -53,7 +53,7 @@ def _active_system(matrix, active, count, system):
 
 @kernel
 def find_multipliers(matrix, values, tolerance, z):
-    """See :func:`complementary`; False where there is no solution."""
+    """See :func:`complementary`; return False if there is no solution."""
     n = len(values)
     active = np.empty(n, dtype=np.int64)
     held = np.zeros(n, dtype=np.bool_)

@@ -1,4 +1,4 @@
-"""Which rows over several nodes a rank has, where their nodes are, and which rows share nodes."""
+"""The rows over several nodes on a rank: their nodes, owners, and groups of rows that share nodes."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ if TYPE_CHECKING:
 
 __all__ = ["Alike", "RowLayout"]
 
-_TAG = 7700  # of messages between ranks that have nodes of the same rows, apart from those of ghosts and pairs
+_TAG = 7700  # of messages between ranks with nodes of the same rows, distinct from those of ghosts and pairs
 
 
 @dataclass(frozen=True)
 class Alike:
-    """Groups of the same numbers of rows and nodes: rows (g, p), nodes (g, q), and which of these rows have, (g, p, k),
-    -1 for none."""
+    """Groups with equal numbers of rows and nodes: rows (g, p), nodes (g, q), and indices (g, p, k) of the rows' nodes
+    among these, -1 for none."""
 
     rows: np.ndarray
     nodes: np.ndarray
     ends: np.ndarray
 
     def dense(self, gradients: np.ndarray) -> np.ndarray:
-        """Gradients (g, p, 3 q) from those of rows (g, p, k, 3)."""
+        """Return gradients (g, p, 3 q) from those of rows (g, p, k, 3)."""
         dense = np.zeros((*self.rows.shape, self.nodes.shape[1], 3))
         group, row, end = np.nonzero(self.ends >= 0)
         dense[group, row, self.ends[group, row, end]] = gradients[group, row, end]
@@ -42,18 +42,17 @@ class Alike:
 
 
 class RowLayout:
-    """The rows of all sources that this rank has: those of its nodes, and of the groups of these. Construction is
-    collective.
+    """The rows of all sources on this rank: those of its nodes, and those of their groups. Construction is collective.
 
     Attributes
     ----------
     sources : of the rows here
     source, ids : (r,) index of the source of each row, and the row's number there
-    ends : (r, k) indices of its nodes, -1 behind the last one; last : (r,) place of the last one
+    ends : (r, k) indices of its nodes, padded with -1; last : (r,) position of the last node
     numbers : (n,) mesh numbers of the nodes, ascending
-    where : (n,) local index of an owned node, else -1 less its row among those that others own
+    where : (n,) local index of an owned node, else -1 minus its row among those of other ranks
     mine, here : (n,) bool, nodes that this rank owns, and their local indices (m,)
-    partners : GhostExchange that brings values of nodes that others own
+    partners : GhostExchange for values at nodes that other ranks own
     counted : (r,) bool, rows whose last node this rank owns; order : their numbering over all ranks
     last_owners : (r,) rank that owns the last node of each row
     free : (n, 3) 1.0 where a component may move, 0.0 where a support prescribes it
@@ -75,7 +74,7 @@ class RowLayout:
         self.order = NaturalOrder(mesh.comm, numbers[self.counted], int(counts.sum()))
 
     def _find(self, sources: Sequence[Constraint]) -> None:
-        """Bring the rows of all sources to the ranks of their nodes."""
+        """Send the rows of all sources to the ranks of their nodes."""
         mesh, comm = self.mesh, self.mesh.comm
         shapes = np.array([[*source.nodes.shape, source.data.shape[1]] for source in sources])
         before, largest = np.zeros_like(shapes), shapes.copy()
@@ -132,7 +131,7 @@ class RowLayout:
 
     @cached_property
     def alike(self) -> list[Alike]:
-        """All groups, those of the same shape together."""
+        """Return all groups, collected by shape."""
         shapes, found = np.stack([np.diff(self.starts), np.diff(self.node_starts)]), []
         place = np.empty(len(self.numbers), dtype=np.int64)
         place[self.nodes] = np.arange(len(self.nodes)) - self.node_starts[self.group_of_node[self.nodes]]
@@ -144,14 +143,14 @@ class RowLayout:
         return found
 
     def gather(self, values: np.ndarray) -> np.ndarray:
-        """Values (n, ...) of the nodes from those of owned nodes (owned, ...). Collective."""
+        """Return values (n, ...) at the nodes from those at owned nodes (owned, ...). Collective."""
         values = np.asarray(values, dtype=float)
         width = int(np.prod(values.shape[1:]))
         far = self.partners.bring(values[self.partners.rows].reshape(-1, width)) if width else np.empty((0, 0))
         return self.spread(values, far.reshape(len(far), *values.shape[1:]))
 
     def spread(self, values: np.ndarray, far: np.ndarray) -> np.ndarray:
-        """Values (n, ...) of the nodes from those of owned nodes (owned, ...) and those that partners sent (m, ...)."""
+        """Return values (n, ...) at the nodes from those at owned nodes (owned, ...) and those received (m, ...)."""
         if len(self._away) == 0:
             return values.take(self.where, axis=0)
         every = np.empty((len(self.numbers), *values.shape[1:]))
@@ -161,7 +160,7 @@ class RowLayout:
         return every
 
     def of_counted(self, values: np.ndarray) -> np.ndarray:
-        """Values (r, ...) of the rows here from those of counted rows (c, ...). Collective."""
+        """Return values (r, ...) of this rank's rows from those of counted rows (c, ...). Collective."""
         comm, shape = self.mesh.comm, values.shape[1:]
         owners = self.last_owners
         asking = Router(comm, owners)

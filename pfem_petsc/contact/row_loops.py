@@ -1,4 +1,4 @@
-"""Compiled loops over rows of several nodes and over the groups that hang together.
+"""Compiled loops over rows of several nodes and over groups of rows that share nodes.
 
 Rows are padded to the same number of nodes: ``ends`` (r, k) indices of nodes, negative for none.
 """
@@ -33,7 +33,7 @@ def _root(parent, i):
 
 @kernel
 def group_rows(ends, n, label):
-    """Label (n,) nodes with the lowest node that rows (r, k) join them to."""
+    """Label nodes (n,) with the lowest node to which rows (r, k) connect them."""
     for i in range(n):
         label[i] = i
     for r in range(len(ends)):
@@ -51,8 +51,8 @@ def group_rows(ends, n, label):
 
 @kernel
 def leaving_nodes(rows, predictor, u, stiffness, start, leaving):
-    """Put predictor + u and stiffness of owned nodes (m,) into ``leaving`` (m, 4...), and positions at the start,
-    unless these are (0, 3)."""
+    """Write predictor + u and stiffness of owned nodes (m,) into ``leaving`` (m, 4...), and initial positions unless
+    these are (0, 3)."""
     started = len(start) > 0
     for k in range(len(rows)):
         i = rows[k]
@@ -65,9 +65,9 @@ def leaving_nodes(rows, predictor, u, stiffness, start, leaving):
 
 @kernel
 def free_positions(where, predictor, u, far, x):
-    """Positions x (n, 3) of nodes from predictor + u (owned, 3), and those that others own from ``far`` (m, 3 or more).
+    """Fill positions x (n, 3) from predictor + u (owned, 3), or from ``far`` (m, 3 or more) for nodes of other ranks.
 
-    ``where`` (n,): index of an owned node, else -1 less the row of ``far``.
+    ``where`` (n,): index of an owned node, else -1 minus the row of ``far``.
     """
     for k in range(len(where)):
         i = where[k]
@@ -77,14 +77,14 @@ def free_positions(where, predictor, u, far, x):
 
 @kernel
 def free_stiffness(where, stiffness, far, hard):
-    """The stiffness (n,) of the same nodes, from that of owned nodes (owned,) and ``far`` (m, 4 or more)."""
+    """Fill the stiffness (n,) of the same nodes from owned nodes (owned,) and ``far`` (m, 4 or more)."""
     for k in range(len(where)):
         hard[k] = stiffness[where[k]] if where[k] >= 0 else far[-1 - where[k], 3]
 
 
 @kernel
 def gather_rows(at, array, vectors):
-    """Vectors (k, 3, r) of rows with nodes ``at`` (r, k) from those of nodes (n, 3)."""
+    """Fill vectors (k, 3, r) of rows with nodes ``at`` (r, k) from those of nodes (n, 3)."""
     for r in range(len(at)):
         for k in range(at.shape[1]):
             i = at[r, k]
@@ -94,14 +94,14 @@ def gather_rows(at, array, vectors):
 
 @kernel
 def broken_groups(starts, rows, node_starts, nodes, values, x, near, tolerance, chosen, tolerances):
-    """Mark groups with a row below its bound, or with nodes near walls; gives their number.
+    """Mark groups with a row below its bound, or with nodes near walls; return their number.
 
     Parameters
     ----------
     starts, rows, node_starts, nodes : rows and nodes of each group: rows[starts[g] : starts[g + 1]]
     values : (r,) rows; x : (n, 3) positions; near : (n,) bool, (0,) for none
-    tolerance : a row broken by no more counts as kept, or by no more than rounding of the group's positions
-    chosen, tolerances : (groups,) out; tolerances of chosen groups alone
+    tolerance : a row violated by at most this, or by rounding of the group's positions, counts as satisfied
+    chosen, tolerances : (groups,) output; tolerances of chosen groups only
     """
     count = 0
     walled = len(near) > 0
@@ -125,8 +125,8 @@ def broken_groups(starts, rows, node_starts, nodes, values, x, near, tolerance, 
 
 @kernel
 def advance_groups(groups, node_starts, nodes, x, moves, at, tolerances, settled):
-    """Put nodes of groups (g,) to x + moves (n, 3) in ``at`` (n, 3), and tell in ``settled`` (g,) whether they were
-    there already, to the tolerances (groups,)."""
+    """Set nodes of groups (g,) to x + moves (n, 3) in ``at`` (n, 3), and set ``settled`` (g,) if they were there
+    already, to the tolerances (groups,)."""
     for k in range(len(groups)):
         g = groups[k]
         same = True
@@ -141,7 +141,7 @@ def advance_groups(groups, node_starts, nodes, x, moves, at, tolerances, settled
 
 @kernel
 def linearise(rows, ends, gradients, free, x, at, own, values):
-    """Put ``own`` (m,) of some rows (m,) at positions ``at`` (n, 3), led on to ``x`` (n, 3), into ``values`` (r,)."""
+    """Write ``own`` of rows (m,) at positions ``at`` (n, 3), extrapolated to ``x`` (n, 3), into ``values`` (r,)."""
     for k in range(len(rows)):
         r = rows[k]
         total = 0.0
@@ -190,7 +190,7 @@ def push_nodes(where, load, free, stiffness, u, contact):
 
 @kernel
 def mark_pressed(ends, where, force, held):
-    """Mark owned nodes (owned,) on which rows press; gives how often."""
+    """Mark owned nodes (owned,) with active rows; return the number of marks."""
     count = 0
     for r in range(len(force)):
         if force[r] > 0.0:

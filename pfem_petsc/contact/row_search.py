@@ -1,8 +1,8 @@
-"""Which rows over several nodes a rank has: those of its own nodes, and what hangs together with them.
+"""Distribution of rows over several nodes: a rank has the rows of its own nodes, and those connected with them.
 
-Rows are tables of integers, whose first two columns tell them apart and sort them; some further columns are the PETSc
-numbers of their nodes. Each rank that owns a node of a row has the row. Where a node is in several rows, all ranks that
-own a node of such a group have the whole group, so that they solve the same problem and nothing has to be agreed on.
+Rows are tables of integers, identified and sorted by their first two columns; some further columns are the PETSc
+numbers of their nodes. Each rank that owns a node of a row has the row. If a node is in several rows, all ranks that
+own a node of such a group have the whole group, so they solve the same problem without communication.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ __all__ = ["once", "owner_starts", "petsc_numbers", "to_owners", "with_groups"]
 
 
 def owner_starts(mesh: DistributedMesh) -> np.ndarray:
-    """(ranks + 1,) first PETSc number owned by each rank, and the end. Collective."""
+    """Return the first PETSc number owned by each rank, and the end, (ranks + 1,). Collective."""
     return np.concatenate([[0], np.cumsum(mesh.comm.allgather(mesh.n_owned))]).astype(np.int64)
 
 
 def petsc_numbers(mesh: DistributedMesh, numbers: np.ndarray) -> np.ndarray:
-    """PETSc numbers of nodes given by mesh numbers (n,), which any rank may own. Collective."""
+    """Return the PETSc numbers of nodes given by mesh numbers (n,), which any rank may own. Collective."""
     comm, ids = mesh.comm, mesh.node_ids[: mesh.n_owned]
     to_slab = Router(comm, slab_of(ids, mesh.n_nodes, comm.size))
     known, at = to_slab.send(ids), to_slab.send(mesh.first_node + np.arange(mesh.n_owned))
@@ -40,13 +40,13 @@ def petsc_numbers(mesh: DistributedMesh, numbers: np.ndarray) -> np.ndarray:
 
 
 def once(rows: np.ndarray) -> np.ndarray:
-    """Each row (r, k) once, sorted by the first two columns, which tell rows apart."""
+    """Return the rows (r, k) without duplicates, sorted by the first two columns, which identify them."""
     rows = rows[np.lexsort((rows[:, 1], rows[:, 0]))]
     return rows[np.append(True, (np.diff(rows[:, :2], axis=0) != 0).any(axis=1))[: len(rows)]]
 
 
 def to_owners(rows: np.ndarray, columns: Sequence[int], starts: np.ndarray, comm: MPI.Comm) -> np.ndarray:
-    """The rows of all ranks that have a node of this rank, each once. Collective.
+    """Return the rows of all ranks with a node of this rank, without duplicates. Collective.
 
     Parameters
     ----------
@@ -62,9 +62,9 @@ def to_owners(rows: np.ndarray, columns: Sequence[int], starts: np.ndarray, comm
 
 
 def with_groups(rows: np.ndarray, columns: Sequence[int], starts: np.ndarray, comm: MPI.Comm) -> np.ndarray:
-    """Add the rows that share nodes with those of this rank, and so on, until no rank learns of more. Collective.
+    """Add the rows connected with those of this rank through shared nodes, repeated until complete. Collective.
 
-    ``rows`` (r, k) are all that have a node of this rank; see :func:`to_owners`.
+    ``rows`` (r, k) are all rows with a node of this rank; see :func:`to_owners`.
     """
     own = rows
     order = [np.argsort(own[:, at], kind="stable") for at in columns]

@@ -1,6 +1,6 @@
 """Complementarity problems of groups of rows over several nodes, with the walls at these nodes, one after the other.
 
-A row on its own has its solution in closed form; others go to the dual active-set method of
+A single row has a closed-form solution; others use the dual active-set method of
 :mod:`~pfem_petsc.contact.complementarity`.
 """
 
@@ -21,23 +21,23 @@ __all__ = ["solve_row_groups"]
 def solve_row_groups(
     groups, starts, rows, node_starts, nodes, ends, gradients, values, stiffness, free, planes, tolerances, force, moves
 ):
-    """Forces of the rows of some groups, and how the nodes move, from the problems with their walls.
+    """Solve for the forces of the rows of some groups and the displacements of their nodes, with their walls.
 
     Parameters
     ----------
     groups : (g,) which groups; starts, rows, node_starts, nodes :
         see :func:`~pfem_petsc.contact.row_loops.broken_groups`
-    ends, gradients, values : (r, k), (r, k, 3), (r,) at the free positions; infinite for rows that are no concern
-    stiffness, free : (n,), (n, 3) of nodes; ``free`` is 0.0 where supports hold
-    planes : (first (n,), normals (m, w, 3), gaps (m, w)): place of a node among the planes, -1 for none, and distances
-        from walls at the free positions, infinite where a wall is no concern
-    tolerances : (groups,) a row broken by no more counts as kept
-    force, moves : (r,), (n, 3) out; written for these groups
+    ends, gradients, values : (r, k), (r, k, 3), (r,) at the free positions; infinite for rows that do not apply
+    stiffness, free : (n,), (n, 3) of nodes; ``free`` is 0.0 where supports prescribe
+    planes : (first (n,), normals (m, w, 3), gaps (m, w)): index of a node among the planes, -1 for none, and distances
+        from walls at the free positions, infinite where a wall does not apply
+    tolerances : (groups,) a row violated by at most this counts as satisfied
+    force, moves : (r,), (n, 3) output; written for these groups only
 
     Returns
     -------
     int
-        First of the groups whose rows contradict each other, else -1.
+        First of the groups with infeasible rows, else -1.
     """
     first_plane, normals, gaps = planes
     walls = gaps.shape[1]
@@ -54,7 +54,7 @@ def solve_row_groups(
                 for k in range(walls):
                     if gaps[first_plane[i], k] < math.inf:
                         n_walled += 1
-        if end - begin == 1 and n_walled == 0:  # a row on its own
+        if end - begin == 1 and n_walled == 0:  # a single row
             r = rows[begin]
             force[r] = 0.0
             square, gram = 0.0, 0.0

@@ -36,7 +36,7 @@ class Rows(RowLayout):
     """The rows of all sources that this rank has, and what they are at positions of their nodes."""
 
     def _each(self, rows: np.ndarray | None, method: str, *arrays: np.ndarray) -> list[np.ndarray]:
-        """What a method of each source makes of arrays (n, 3), for some rows, ascending, or all."""
+        """Return the results of a method of each source for arrays (n, 3), for some rows, ascending, or all."""
         found = []
         for source, at, first in zip(self.sources, self._at, self._first, strict=False):
             if rows is not None:
@@ -88,7 +88,7 @@ class Rows(RowLayout):
 
         Parameters
         ----------
-        jacobian, values : (r, k, 3) gradients, (r,) rows at the free positions; infinite for rows that are no concern
+        jacobian, values : (r, k, 3) gradients, (r,) rows at the free positions; infinite for rows that do not apply
         stiffness : (n,) force for a displacement of a node [N/m]
         planes : see :data:`Planes`
         tolerance : rows broken by no more count as kept [m]
@@ -146,7 +146,7 @@ class Rows(RowLayout):
         near: np.ndarray,
         given: Callable[[], tuple[np.ndarray, np.ndarray | None, Planes]],
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Forces (r,) [N] that keep the rows, and the gradients (r, k, 3) along which they act, where there are forces.
+        """Return forces (r,) [N] that satisfy the rows, and the gradients (r, k, 3) along which they act.
 
         Parameters
         ----------

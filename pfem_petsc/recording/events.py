@@ -1,4 +1,4 @@
-"""Events of a run that lie between steps: recorded in a table of their own, and told."""
+"""Events of a run between steps, recorded in a separate table and reported."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ __all__ = ["Events"]
 
 
 class Events(Observer):
-    """Records what a stepper found on the way to its last state: its ``events``, the same on all ranks.
+    """Records the ``events`` that a stepper found before its last state, the same on all ranks.
 
     Parameters
     ----------
     stepper : Stepper
-    tell : takes a message
+    tell : receives a message
 
     Attributes
     ----------
@@ -34,20 +34,20 @@ class Events(Observer):
         self.writer: ResultWriter | None = None
 
     def due(self, step: int) -> bool:
-        """After steps with events."""
+        """Return whether the step has events."""
         return bool(self._stepper.events)
 
     def steps_left(self, step: int) -> int:
-        """None must be waited for: steppers with events make their steps one by one."""
+        """Return no limit: steppers with events make single steps."""
         return NEVER
 
     def observe(self, made: Step) -> None:
-        """Record and tell them."""
+        """Record and report the events."""
         events, self._stepper.events = self._stepper.events, []
         for event in events:
             self.writer.append_event(event.row() if self._root else None)
             self._tell(str(event))
 
     def remarks(self) -> list[str]:
-        """Where the analysis ended, where that is not known before."""
+        """Return a remark about the end of the analysis, if it is not known in advance."""
         return self._stepper.remarks()

@@ -1,4 +1,4 @@
-"""Which motions of a truss meet no stiffness: rigid-body motions and mechanisms, with the nodes that move."""
+"""Motions of a truss without stiffness: rigid-body motions and mechanisms, with the nodes that move."""
 
 from __future__ import annotations
 
@@ -11,5 +11,5 @@ __all__ = ["free_motions"]
 
 
 def free_motions(model: Model) -> str:
-    """What to add to the message about a stiffness that is singular; empty where nothing is free. Collective."""
+    """Return an addition to the message about a singular stiffness; empty if there are no free motions. Collective."""
     return ""

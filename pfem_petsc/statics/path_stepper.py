@@ -354,7 +354,7 @@ class PathStepper(StaticStepper):
             self.model.temperatures.apply(self.state.time)
 
     def _no_path(self, failure: NotConverged) -> SimulationFailure:
-        """What to tell of a path that cannot go on."""
+        """Return the message about a path that cannot be continued."""
         return SimulationFailure(
             f"the path cannot be followed beyond point {self.state.step} at load factor {self.state.time:.6g} with "
             f"steps down to {self.keys.smallest:.3g}: {failure}{free_motions(self.model)}"

@@ -54,7 +54,7 @@ class Constraint(ABC):
     data: np.ndarray
 
     def of(self, nodes: np.ndarray, data: np.ndarray) -> Self:
-        """The same constraint with other rows (r, k), (r, m)."""
+        """Return the constraint with other rows (r, k), (r, m)."""
         other = copy.copy(self)
         other.nodes, other.data = nodes, data
         return other

@@ -25,7 +25,7 @@ class Parameters(StrictModel):
 
 
 def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
-    """This rank's part: node 0 is the apex, node 1 + i the foot of bar i, in the plane z = 0.
+    """Generate this rank's part: node 0 is the apex, node 1 + i the foot of bar i, in the plane z = 0.
 
     Node groups ``apex`` and ``feet``; bar group ``legs`` (all).
     """

@@ -146,8 +146,8 @@ def test_failure_is_not_called_done():
 
 def test_nothing_is_formatted_when_nothing_is_due(monkeypatch):
     calls = []
-    original = module.engineering
-    monkeypatch.setattr(module, "engineering", lambda *a: calls.append(a) or original(*a))
+    original = module.Axis.place
+    monkeypatch.setattr(module.Axis, "place", lambda *a: calls.append(a) or original(*a))
     clock, stream = Clock(), io.StringIO()
     progress = Progress(COMM, "Rod", 10**6, 1.0, stream=stream, clock=clock)
     for step in range(1, 10001):

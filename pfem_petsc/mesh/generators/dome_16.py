@@ -24,7 +24,7 @@ class Parameters(StrictModel):
 
 
 def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
-    """Generate this rank's part: node 0 is the apex, 1 to 4 the corners of the square, 5 to 8 the feet, from the x axis.
+    """Generate this rank's part: node 0 is the apex, 1 to 4 the corners of the square, 5 to 8 the feet, from x on.
 
     Bars: apex to corners, the square, corners to the two feet next to each. Node groups ``apex``, ``ring``, ``feet``;
     bar groups ``spokes``, ``ring``, ``legs``.

@@ -182,6 +182,21 @@ def dome_16(run):
     assert limits(run("dome_16", "static.max_points=40")) == pytest.approx([0.09566, -0.09612, 0.3209], abs=1.1e-4)
 
 
+@number
+def guyed_mast(run):
+    """The top leans by 19 mm, guys pull with 10 to 20 kN, and supports bear weight and wind."""
+    history = run("guyed_mast")
+    steel = 40 * (3 * 1.2 * 1.2e-3 + 3 * np.hypot(1.2, 1.2) * 3e-4) + 41 * 3 * 1.2 * 3e-4
+    reach = 30.0 - 1.2 / np.sqrt(3.0)
+    ropes = 3 * 1.5e-4 * (np.hypot(reach, 24.0) + np.hypot(reach, 48.0))
+    weight = 7850.0 * (steel + ropes) * 9.81 + 123 * 20.0
+    assert history["support_force"][-1] == pytest.approx([-123 * 120.0, 0.0, weight], rel=1e-7, abs=1e-3)
+    top = history["probe/top/position"]
+    assert top[-1, :, 0].mean() - top[0, :, 0].mean() == pytest.approx(0.0194, abs=1e-4)
+    pulls = np.linalg.norm(history["probe/anchors/reaction"][-1], axis=1)
+    assert pulls == pytest.approx([2.19e4, 3.69e4, 3.69e4], rel=0.01)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", built_in_cases())
 def test_promised_numbers(name, run):

@@ -7,7 +7,7 @@ from pydantic import ValidationError
 
 from pfem_petsc.errors import InputError
 from pfem_petsc.mesh.checks import check_mesh
-from pfem_petsc.mesh.generators import lattice, net, prism, ring, rod
+from pfem_petsc.mesh.generators import lattice, mast, net, prism, ring, rod
 
 pytestmark = pytest.mark.parallel
 
@@ -25,6 +25,8 @@ GENERATED = {
     "one_mesh": (net, {"size": [1.0, 1.0], "cells": [1, 1]}),
     "prism": (prism, {"radius": 0.5, "height": 1.0}),
     "prism_of_five": (prism, {"radius": 0.5, "height": 1.0, "sides": 5, "twist": 100.0}),
+    "mast": (mast, {"height": 8.0, "width": 1.0, "bays": 5, "radius": 4.0, "levels": 2, "elements": 3}),
+    "mast_of_one_bay": (mast, {"height": 1.0, "width": 1.0, "bays": 1, "radius": 2.0}),
     "one_cell": (lattice, {"kind": "cubic", "cells": [1, 1, 1], "pitch": 1.0}),
 }
 

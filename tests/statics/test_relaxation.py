@@ -226,6 +226,27 @@ def test_chain_that_rests_on_a_floor(comm, shared_tmp_path):
     assert fairlead[:2] / np.hypot(*fairlead[:2]) == pytest.approx(top[:2] / np.hypot(*top[:2]), abs=1e-6)
 
 
+def test_a_shallow_truss_snaps_through(comm, shared_tmp_path):
+    """Beyond its limit load the crown goes to where bars pull: the equilibrium of the closed form below."""
+    stiffness, rest, push = 1e5, np.hypot(1.0, 0.2), 600.0
+    case = chain(
+        shared_tmp_path,
+        comm,
+        [[0, 0, 0], [1, 0, 0.2], [2, 0, 0]],
+        (push,),
+        support=[{"node_set": "ends", "fix": "xyz"}, {"node_set": "at1", "fix": "y"}],
+        static={"method": "relaxation", "step": 0.25},
+    )
+    _, x = run(case, comm, shared_tmp_path / "out")
+    z = x[1, 2]
+    length = np.hypot(1.0, z)
+    assert z < -0.2
+    assert -2.0 * stiffness * (length / rest - 1.0) * z / length == pytest.approx(push, rel=1e-8)
+    if comm.rank == 0:
+        z = open_result(shared_tmp_path / "out").history["probe/all/position"][:, 1, 2]
+        assert z[1] > 0.15 > -0.2 > z[2]  # the limit is at 0.49
+
+
 def test_bars_that_yield_remember_equilibria_alone(comm, shared_tmp_path):
     """Two bars pushed and let go: what Newton's method gives, although the pseudo-motion swings beyond."""
     histories = []

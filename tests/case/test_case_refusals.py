@@ -52,7 +52,7 @@ REFUSED = {
         ["time.beta", "a key of chung_lee, newmark, not of wilson, which takes theta"],
     ),
     "other wall's key": (["wall.0.radius=1.0"], ["wall[0].radius", "a key of cylinder, sphere, not of a wall of type"]),
-    "other generator's key": (["mesh.cells=[1,1,1]"], ["mesh.cells", "a key of lattice, not of generator rod"]),
+    "other generator's key": (["mesh.cells=[1,1,1]"], ["mesh.cells", "a key of lattice", "not of generator rod"]),
     "misspelt scheme key": (
         ["time.integrator=newmark", "time.betta=0.5"],
         ["time.betta", "newmark takes beta, gamma", "did you mean 'beta'?"],

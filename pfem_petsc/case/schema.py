@@ -185,7 +185,7 @@ class Case:
         return {key: value for key, value in data.items() if value not in ({}, [])}
 
     def _as_stage(self) -> dict[str, Any]:
-        """The case as a stage of the one that it belongs to: its name, what it computes, and the tables that it gives."""
+        """Return name, analysis and given tables of a stage, as its case has them."""
         tables = self._tables()
         tables["output"] = {key: tables["output"][key] for key in ("fields_every", "history_every")}
         analysis = "time" if self.time is not None else "static"

@@ -1,7 +1,7 @@
 """Stages of a case: each is a case of its own, made of the tables in force, so that all checks of a case serve.
 
-A table that a stage gives replaces that table from this stage on; the others stay in force. ``initial`` is the exception:
-velocities are added at the start of the stage that gives them, and at no later one.
+A table that a stage gives replaces that table from this stage on; the others stay in force. ``initial`` is the
+exception: velocities are added at the start of the stage that gives them, and at no later one.
 """
 
 from __future__ import annotations

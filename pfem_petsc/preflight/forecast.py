@@ -42,7 +42,7 @@ def forecast(
     columns: Mapping[str, tuple[int, ...]],
     types: Mapping[str, Any],
 ) -> dict[str, str]:
-    """Return label and text of the estimates of memory and, if the number of steps is known, time and disk. Collective."""
+    """Return label and text of the estimates of memory and, if the steps are known, of time and disk. Collective."""
     held = model.comm.allreduce(_needed(model, plan))
     entries = {"memory needed": f"about {engineering(held, 'B', 3)} on all ranks"}
     if plan.steps is not None:

@@ -150,7 +150,11 @@ class Recorder:
         stepper, state = self.stepper, self.stepper.state
         vector, at = np.empty(self.layout.width), self._at
         vector[self._to] = sums[self._from]
-        vector[at["time"]], vector[at["step"]], vector[at["step_size"]] = stepper.place, stepper.number, stepper.smallest
+        vector[at["time"]], vector[at["step"]], vector[at["step_size"]] = (
+            stepper.place,
+            stepper.number,
+            stepper.smallest,
+        )
         for name in stepper.columns:
             vector[at[name]] = getattr(stepper, name)
         vector[at["newton_iterations"]], vector[at["linear_iterations"]] = self.iterations

@@ -49,8 +49,8 @@ class StageColumns:
 class StageRows:
     """Puts the rows of one stage into the columns of all.
 
-    What a stage does not have, such as a wall that is gone, is zero; sums, contact times and the load factor stay as they
-    were.
+    What a stage does not have, such as a wall that is gone, is zero; sums, contact times and the load factor keep their
+    values.
 
     Parameters
     ----------

@@ -33,7 +33,7 @@ __all__ = ["StagedPlan", "Stages"]
 
 @dataclass(frozen=True)
 class StagedPlan:
-    """What a run with stages will do: the plans of its stages on one axis; see :class:`~pfem_petsc.stepping.prepare.Plan`.
+    """The plans of all stages on one axis; see :class:`~pfem_petsc.stepping.prepare.Plan`.
 
     Attributes
     ----------
@@ -123,6 +123,7 @@ class Stages:
     def __init__(self, case: Case, comm: MPI.Comm, recorded: Mapping[str, Any] | None, number: int = 0) -> None:
         self.case, self.comm = case, comm
         self._cases = case.stages
+        self.analysis: Analysis
         self.columns: StageColumns | None = None
         self.fields: tuple[list[str], list[str]] | None = None
         first = Model(self._cases[0], comm)

@@ -11,7 +11,11 @@ PLATE = {"name": "plate", "type": "plane", "point": [0.0, 0.0, 0.1], "normal": [
 
 BLOCK = {
     "mesh": {"generator": "lattice", "kind": "octet", "cells": [1, 1, 1], "pitch": 0.1},
-    "node_set": {"centre": {"nearest": [0.0, 0.0, 0.0]}, "base": {"box": [[-1, -1, -1e-3], [1, 1, 1e-3]]}, "side": {"nearest": [0.1, 0.0, 0.0]}},
+    "node_set": {
+        "centre": {"nearest": [0.0, 0.0, 0.0]},
+        "base": {"box": [[-1, -1, -1e-3], [1, 1, 1e-3]]},
+        "side": {"nearest": [0.1, 0.0, 0.0]},
+    },
     "material": {
         "m": {
             "young_modulus": 7e9,

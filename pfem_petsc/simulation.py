@@ -10,7 +10,7 @@ from typing import Any, Self
 import numpy as np
 from mpi4py import MPI
 
-from .analysis import Step
+from .analysis import Analysis, Step
 from .case.schema import Case
 from .contact.start import check_start
 from .errors import EarlyStop, InputError, PfemError
@@ -23,13 +23,14 @@ from .preflight.inspection import inspect, warnings_before
 from .preflight.summary import summarise
 from .recording.recorder import Recorder
 from .restart.folder import Restart, find_restart, finished, finished_message
-from .run.analyses import make_analysis
 from .run.compilation import ReportedCompilation
 from .run.outputs import Outputs
+from .run.stages import Stages
 from .run.stop import StopRequest
 from .run.synchroniser import Synchroniser
 from .stepping.fused_steps import WORTH, Batches
 from .stepping.model import Model
+from .stepping.stepper import Stepper
 
 __all__ = ["Simulation", "Step"]
 
@@ -101,21 +102,21 @@ class Simulation:
             self._prepare()
 
     def _prepare(self) -> None:
-        case = self.case
-        self.model = Model(case, self.comm)
-        recorded = self.restart.attributes["plan"] if self.restart is not None else None
-        self.analysis = make_analysis(self.model, recorded)
-        self.plan = self.analysis.plan
+        case, restart = self.case, self.restart
+        recorded, number = (restart.attributes["plan"], restart.stage) if restart is not None else (None, 0)
+        self._stages = Stages(case, self.comm, recorded, number)
+        self.plan = self._stages.plan
         self._reached: float | None = None
         if self.restart is not None and self.restart.continues or self.notes:
             self._reached = finished(case, self.comm, self.folder, self.plan.end)
-        check_start(self.model.contact, self.model.mesh.points[: self.model.mesh.n_owned], self.model.length)
-        self.mesh, self.stepper = self.model.mesh, self.analysis.stepper
+        self.mesh = self.model.mesh
+        if number == 0:
+            check_start(self.model.contact, self.mesh.points[: self.mesh.n_owned], self.model.length)
         self._started = False
         minutes = case.output.checkpoint_minutes
         interval = 60.0 * minutes if minutes else None
         self._synchroniser = Synchroniser(self.comm, self.analysis, self._stop, self._lock, interval)
-        self.outputs = Outputs(self.analysis, self._synchroniser, self.folder, self.quiet, self._compilation)
+        self.outputs = Outputs(self._stages, self._synchroniser, self.folder, self.quiet, self._compilation)
 
     def __enter__(self) -> Self:
         return self
@@ -149,6 +150,21 @@ class Simulation:
             )
 
     @property
+    def analysis(self) -> Analysis:
+        """What advances the state, of the present stage."""
+        return self._stages.analysis
+
+    @property
+    def model(self) -> Model:
+        """The model, of the present stage."""
+        return self.analysis.model
+
+    @property
+    def stepper(self) -> Stepper:
+        """What makes the steps of the present stage."""
+        return self.analysis.stepper
+
+    @property
     def finished(self) -> bool:
         """Whether a restart was requested and the output folder already has results up to the end."""
         return self._reached is not None
@@ -172,9 +188,9 @@ class Simulation:
         """Return label and text of further checks and of a forecast of the run; and warnings. Collective."""
         self._usable()
         recorder = Recorder(self.stepper, None)
-        entries, warnings = inspect(self.case, self.model)
+        entries, warnings = inspect(self.model.case, self.model)
         entries |= forecast(self.case, self.model, self.plan, self.outputs.fields, recorder.columns, recorder.types)
-        return entries, self.model.warnings + warnings_before(self.case, self.model, self.plan) + warnings
+        return entries, self.model.warnings + warnings_before(self.model.case, self.model, self.plan) + warnings
 
     def on_step(self, function: Callable[[Step], object], every: int = 1) -> None:
         """Register a function to be called on all ranks after each step whose number is a multiple of ``every``.
@@ -240,11 +256,16 @@ class Simulation:
             self.start()
             self._synchroniser.synchronise()
             self.outputs.stop_early()
-            while self.state.step < self.analysis.last_step:
-                if batches is not None:
-                    self.outputs.advance_together(batches)
-                yield self._advance()
-                self.outputs.stop_early()
+            while True:
+                while self.state.step < self.analysis.last_step:
+                    if batches is not None:
+                        self.outputs.advance_together(batches)
+                    yield self._advance()
+                    self.outputs.stop_early()
+                if self._stages.at_last:
+                    break
+                self.outputs.begin_stage()
+                batches = None if batches is None else batches.anew()
             # a run that was killed after its last checkpoint may not have done this
             self.outputs.complete()
             self.outputs.record_modes()

@@ -20,6 +20,8 @@ LISTS = {
     ("constraint",),
     ("initial", "on"),
     ("output", "probe"),
+    ("stage",),
+    *(("stage", *key) for key in (("load",), ("support",), ("temperature",), ("wall",), ("initial", "on"))),
 }
 """Keys under which a missing value is created as a list of tables."""
 

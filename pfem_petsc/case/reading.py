@@ -35,7 +35,7 @@ _LONG_KEY = re.compile(r"""(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*)""" +
 KEYS = [
     *("title", "mesh", "node_set", "material", "section", "initial", "support"),
     *("load", "gravity", "temperature", "wall", "contact_pair", "constraint", "contact"),
-    *("time", "static", "modes", "output", "solver"),
+    *("time", "static", "stage", "modes", "output", "solver"),
 ]
 """Top-level keys of a case file."""
 
@@ -253,8 +253,8 @@ def _analyses(data: Mapping[str, Any], problems: Problems) -> dict[str, Any]:
     """The tables that say what is computed, of which a case has at least one."""
     if "time" in data and "static" in data:
         problems.add((), "expected one of the tables [time], [static], not both")
-    if not any(key in data for key in ("time", "static", "modes")):
-        problems.add((), "expected one of the tables [time], [static], [modes]: what is to be computed")
+    if not any(key in data for key in ("time", "static", "stage", "modes")):
+        problems.add((), "expected one of the tables [time], [static], [[stage]], [modes]: what is to be computed")
     return {
         "time": _time(data, problems) if "time" in data else None,
         "static": _static(data, problems) if "static" in data else None,

@@ -15,6 +15,7 @@ from .checks import check_names
 from .overrides import apply_overrides
 from .problems import Problems
 from .reading import KEYS, parse_toml, read_tables
+from .stages import stages_of
 from .toml import plain, table_text
 
 __all__ = ["Case"]
@@ -36,6 +37,10 @@ class Case:
     gravity : :class:`~pfem_petsc.case.tables.Gravity` or None
     contact, output, solver : tables of :mod:`~pfem_petsc.case.settings`
     time, static, modes : what is computed, None for what is not; ``time`` and ``static`` exclude each other
+    stage : the cases of its stages, empty for a case without them
+    stages : the same, or the case itself
+    number : of a stage among those of its case, from 0
+    given : tables that a stage gives itself, and does not have from the stages before
 
     Notes
     -----
@@ -44,8 +49,8 @@ class Case:
 
     def __init__(self, attributes: Mapping[str, Any], *, name: str, source: str, folder: Path) -> None:
         for key in KEYS:
-            self.__dict__[key] = attributes[key]
-        self.__dict__.update(name=name, source=source, folder=Path(folder), overrides=())
+            self.__dict__[key] = attributes.get(key, ()) if key == "stage" else attributes[key]
+        self.__dict__.update(name=name, source=source, folder=Path(folder), overrides=(), number=0, given=())
 
     def __setattr__(self, key: str, value: Any) -> None:
         raise AttributeError(
@@ -62,8 +67,27 @@ class Case:
         return f"<Case {self.name}: {self.title}>"
 
     @property
+    def stages(self) -> tuple[Case, ...]:
+        """What is computed one after the other: the cases of the stages, or the case itself."""
+        return self.stage or (self,)
+
+    @property
+    def every_wall(self) -> list[Any]:
+        """The walls of all stages, one for each name, as it is first given."""
+        named: dict[str, Any] = {}
+        for stage in self.stages:
+            named = {**{wall.name: wall for wall in stage.wall}, **named}
+        return list(named.values())
+
+    def holds(self, table: str) -> bool:
+        """Whether what a table describes goes on from the stage before, as it was at its end."""
+        return self.number > 0 and table not in self.given
+
+    @property
     def end(self) -> float:
         """End of the analysis: a time [s], or a load factor; 0 without one."""
+        if self.stage:
+            return sum(stage.end for stage in self.stage)
         if self.time is not None:
             return self.time.end
         return getattr(self.static.parameters, "end", 0.0) if self.static is not None else 0.0
@@ -71,6 +95,8 @@ class Case:
     @property
     def mass(self) -> str:
         """The mass matrix of the analysis, ``lumped`` or ``consistent``."""
+        if self.stage:
+            return self.stage[0].mass
         if self.time is not None:
             return self.time.mass
         return (self.modes is not None and self.modes.mass) or "lumped"
@@ -132,20 +158,46 @@ class Case:
         problems = Problems(source, apply_overrides(data, overrides))
         attributes = read_tables(data, Path(folder), problems)
         check_names(attributes, data, problems)
+        stages = []
+        for stage in stages_of(data, problems) if "stage" in data else ():
+            tables = read_tables(stage.data, Path(folder), stage.problems)
+            check_names(tables, stage.data, stage.problems)
+            stages.append((stage, tables))
         problems.raise_if_any()
         name = Path(source).stem if name is None else name
         attributes["title"] = name if attributes["title"] is None else attributes["title"]
         case = cls(attributes, name=name, source=source, folder=Path(folder))
         case.__dict__["overrides"] = overrides
+        made = []
+        for k, (stage, tables) in enumerate(stages):
+            each = cls(tables, name=stage.name, source=f"{source}: stage[{k}]", folder=Path(folder))
+            made.append(each)
+            each.__dict__.update(title=attributes["title"], number=k, given=stage.given, overrides=overrides)
+        case.__dict__["stage"] = tuple(made)
         return case
 
     def to_dict(self) -> dict[str, Any]:
         """Return the case as nested tables with the keys of the case file and all defaults, without absent tables."""
+        data = self._tables()
+        if not self.output.probe:
+            del data["output"]["probe"]
+        data["stage"] = [stage._as_stage() for stage in self.stage]
+        return {key: value for key, value in data.items() if value not in ({}, [])}
+
+    def _as_stage(self) -> dict[str, Any]:
+        """Return name, analysis and given tables of a stage, as its case has them."""
+        tables = self._tables()
+        tables["output"] = {key: tables["output"][key] for key in ("fields_every", "history_every")}
+        analysis = "time" if self.time is not None else "static"
+        return {"name": self.name, **{key: tables[key] for key in (*self.given, analysis)}}
+
+    def _tables(self) -> dict[str, Any]:
+        """All tables by name, those without content included."""
         everywhere = [entry for entry in self.initial if entry.node_set is None]
         initial = _table(everywhere[0]) if everywhere else {}
         on = [_table(entry) for entry in self.initial if entry.node_set is not None]
         mesh = _table(self.mesh)
-        data = {
+        return {
             "title": self.title,
             "mesh": {**mesh, **_table(self.mesh.parameters)},
             "node_set": {name: _table(entry) for name, entry in self.node_set.items()},
@@ -166,9 +218,6 @@ class Case:
             "output": _table(self.output),
             "solver": _table(self.solver),
         }
-        if not self.output.probe:
-            del data["output"]["probe"]
-        return {key: value for key, value in data.items() if value not in ({}, [])}
 
     def to_toml(self) -> str:
         """Return the resolved case, with all defaults, as text from which :meth:`from_toml` reads an equal case."""

@@ -230,7 +230,8 @@ class ActiveSet:
         return Outcome(settled, candidates, links, trial, normal_forces, pull)
 
     def _when(self) -> str:
-        return f"step {self.state.step + 1}, t = {self.balance.time:.6g} s"
+        step, time = self.model.first_step + self.state.step + 1, self.model.origin + self.balance.time
+        return f"step {step}, t = {time:.6g} s"
 
     def _why(self, left: np.ndarray, x: np.ndarray) -> str:
         """Return why the solves of nodes (k,) at (owned, 3) do not converge, and the remedy. Collective."""

@@ -61,7 +61,7 @@ def check_positions(stepper: Stepper) -> None:
     depth, node, wall = min(comm.allgather(deepest))
     count = comm.allreduce(int((gaps[:, wall] < -tolerance).sum()))
     carried = comm.allreduce(deepest == (depth, node, wall) and _prescribed(contact, suspects[at], wall, x, time))
-    where = f"step {state.step}, t = {time:.6g} s"
+    where = f"step {stepper.number}, t = {stepper.place:.6g} s"
     if carried:
         raise SimulationFailure(_told(where, node, -depth, contact.names[wall], count))
     case = model.case

@@ -66,7 +66,7 @@ class Contact:
         self.walls = [
             lookup("pfem_petsc.contact.walls", wall.type, f"{case.source}: wall.type").Wall(wall) for wall in walls
         ]
-        self.motion = WallMotion(walls)
+        self.motion = WallMotion(walls, case.holds("wall"))
         self.moving = self.motion.moving
         self.all_nodes = np.array([wall.node_set is None for wall in walls], dtype=bool)
         self.members = np.ones((mesh.n_owned, len(walls)), dtype=bool)

@@ -24,10 +24,12 @@ class WallMotion:
     ----------
     moving : (w,) bool, walls that move
     bodies : FreeWalls, the walls with mass; NoFreeWalls if there are none
+    held : (w, 3) displacements at the start of a stage [m] of walls that stay in force and rest there
     """
 
-    def __init__(self, walls: Sequence[WallKeys]) -> None:
-        self._motions = [motion_of(wall) for wall in walls]
+    def __init__(self, walls: Sequence[WallKeys], holds: bool = False) -> None:
+        self._motions = [None if holds else motion_of(wall) for wall in walls]
+        self.held = np.zeros((len(walls), 3))
         self.bodies: FreeWalls | NoFreeWalls = NoFreeWalls()
         self.moving = np.array(
             [wall.velocity is not None or wall.motion is not None or wall.mass is not None for wall in walls],
@@ -74,7 +76,7 @@ class WallMotion:
 
     def displacements(self, time: float) -> np.ndarray:
         """Return displacements (w, 3) [m] at a time [s]."""
-        displacements = np.zeros((len(self._motions), 3))
+        displacements = self.held.copy()
         for k, motion in enumerate(self._motions):
             if motion is not None:
                 displacements[k] = motion.at(time)[0]

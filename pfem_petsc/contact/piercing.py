@@ -89,7 +89,7 @@ class Piercing:
         for count, bar, k in zip(counts.tolist(), lowest.tolist(), self.walls, strict=True):
             self.seen[k] += count > 0
             if count and k not in self.first:
-                self.first[k] = time
+                self.first[k] = time = self._model.origin + time
                 bars = f"bar {bar} lies" if count == 1 else f"{count} bars, bar {bar} among them, lie"
                 told.append(
                     f"t = {time:.6g} s: {bars} across wall {self._model.contact.names[k]!r}: only nodes touch walls; "

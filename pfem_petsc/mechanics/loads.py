@@ -35,6 +35,9 @@ class ExternalForce:
     ramped : whether gravity and loads without a table are multiplied by the time, which is a load factor then
     active : whether there are any forces (on any rank, at any time)
     steady : whether the forces are constant
+    held : (owned, 3) forces of loads at the start of a stage [N], None for none; held constant where the stage gives no
+        loads, else taken away, at once over time and in proportion with a load factor
+    held_gravity : (3,) the same of gravity [m/s2]
     """
 
     def __init__(self, case: Case, nodes: dict[str, np.ndarray], inertia: Inertia) -> None:
@@ -47,12 +50,42 @@ class ExternalForce:
         self.inertia = inertia
         self.ramped = case.static is not None
         self.active = bool(case.load) or bool(self.gravity.any())
+        self.held: np.ndarray | None = None
+        self.held_gravity = np.zeros(3)
+        self._keeps = case.holds("load"), case.holds("gravity")
+        if self._keeps[0]:
+            self.loads = []
         self.steady = not self.ramped and not any(table is not None for _, _, table in self.loads)
 
     def at(self, time: float, out: np.ndarray) -> np.ndarray:
         """``out`` (owned, 3) [N] at a time [s], or at a load factor."""
+        np.multiply(self.inertia.mass[:, None], self.gravity_at(time), out=out)
+        return self._add_loads(time, out)
+
+    def gravity_at(self, time: float) -> np.ndarray:
+        """Acceleration (3,) [m/s2] at a time [s], or at a load factor."""
+        if self._keeps[1]:
+            return self.held_gravity
+        own = (time if self.ramped else 1.0) * self.gravity
+        return own if self.held is None else own + self._left(time) * self.held_gravity
+
+    def loads_at(self, time: float) -> np.ndarray:
+        """Forces of loads alone (owned, 3) [N] at a time [s], or at a load factor."""
+        return self._add_loads(time, np.zeros((len(self.inertia.mass), 3)))
+
+    def _add_loads(self, time: float, out: np.ndarray) -> np.ndarray:
         full = time if self.ramped else 1.0
-        np.multiply(self.inertia.mass[:, None], full * self.gravity, out=out)
         for indices, force, table in self.loads:
             out[indices] += force * (table(time)[0] if table is not None else full)
+        if self.held is not None:
+            out += self.held if self._keeps[0] else self._left(time) * self.held
         return out
+
+    def _left(self, time: float) -> float:
+        """Share that is left of what a stage replaces."""
+        return max(1.0 - time, 0.0) if self.ramped else 0.0
+
+    def hold(self, force: np.ndarray, gravity: np.ndarray, active: bool) -> None:
+        """Take over what acts at the start of a stage: loads (owned, 3) [N] and gravity (3,) [m/s2]."""
+        self.held, self.held_gravity = force, gravity
+        self.active = self.active or active

@@ -33,7 +33,8 @@ class Supports:
         for index, support in enumerate(case.support):
             members = nodes[support.node_set]
             axes = ["xyz".index(letter) for letter in support.fix]
-            motion = motion_of(support)
+            # one that stays in force from the stage before holds its nodes where they are
+            motion = None if case.holds("support") else motion_of(support)
             for axis in axes:
                 if motion is not None and self.fixed[members, axis].any():
                     node = mesh.node_ids[members[self.fixed[members, axis]][0]]
@@ -51,6 +52,10 @@ class Supports:
         self._motions = motions
         self.moving = bool(motions)
         self.any = bool(case.support)
+
+    def hold(self, x: np.ndarray) -> None:
+        """Take the positions (owned, 3) [m] at the start of a stage for those that motions start from."""
+        self._start = x[self.fixed]
 
     def positions(self, time: float) -> np.ndarray:
         """Return prescribed positions (k,) [m] at a time [s], in the order of :attr:`nodes` and :attr:`components`."""

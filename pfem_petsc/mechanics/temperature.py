@@ -43,12 +43,23 @@ class Temperatures:
                     )
                 members = mesh.bar_groups[entry.bars]
             self._entries.append((members, entry.value, Table(entry.table) if entry.table is not None else None))
+        self._holds = case.holds("temperature")
+        if self._holds:
+            self.varying = False
         if self.any:
             bars.heat = np.zeros((2, len(mesh.bars)))
         self.values = bars.heat[1]
+        if self._holds:
+            self._entries = []
         if self.any:
             self.apply(0.0)
             bars.heat_at_start = bars.heat.copy()
+
+    def hold(self, heat: np.ndarray) -> None:
+        """Take the thermal strains and temperatures [K] (2, b) of the stage before, where they stay in force."""
+        if self._holds and self.any:
+            self._bars.heat[:] = heat
+            self._bars.heat_at_start = self._bars.heat.copy()
 
     def apply(self, time: float) -> None:
         """Set the thermal strains of the bars at a time [s]; later entries of the case override earlier ones."""

@@ -62,7 +62,7 @@ def plot(
             _energies(history, title, folder / "energies.png"),
             _momentum(history, title, folder / "momentum.png") if result.axis is TIME else None,
             _probes(history, title, folder / "probes.png"),
-            _forces(history, "wall", case.wall, title, folder / "walls.png"),
+            _forces(history, "wall", case.every_wall, title, folder / "walls.png"),
             _forces(history, "pair", (), title, folder / "pairs.png"),
             _forces(history, "constraint", (), title, folder / "constraints.png"),
             _solver(history, title, folder / "solver.png"),

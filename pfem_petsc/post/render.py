@@ -176,7 +176,7 @@ class _Film:
             points = self.positions(frame)
             low, high = np.fmin(low, points.min(axis=0)), np.fmax(high, points.max(axis=0))
         self.bounds = np.array([low, high])
-        walls = list(self.result.case.wall)
+        walls = self.result.case.every_wall
         self.surfaces = self._moved(walls)
         self.normals = [np.asarray(wall.normal, dtype=float) for wall in walls if hasattr(wall, "normal")]
         self.normals = [normal / np.linalg.norm(normal) for normal in self.normals]

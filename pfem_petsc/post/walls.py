@@ -81,8 +81,11 @@ def wall_shifts(result: Any, times: Sequence[float]) -> np.ndarray:
     """Return displacements (times, walls, 3) [m] of a result's walls from their initial positions.
 
     Positions of walls with mass are interpolated linearly between rows of the history; others follow from the case.
+    A wall that a stage no longer has stays where it was.
     """
-    walls = list(result.case.wall)
+    walls = result.case.every_wall
+    if result.case.stage:
+        return np.array([_shifts_in_stages(result, time) for time in times]).reshape(len(times), len(walls), 3)
     motion = WallMotion(walls)
     displacements = np.array([motion.displacements(time) for time in times]).reshape(len(times), len(walls), 3)
     for k, wall in enumerate(walls):
@@ -92,3 +95,30 @@ def wall_shifts(result: Any, times: Sequence[float]) -> np.ndarray:
             for axis in range(3):
                 displacements[:, k, axis] = np.interp(times, when, places[:, axis] - places[0, axis])
     return displacements
+
+
+def _shifts_in_stages(result: Any, time: float) -> np.ndarray:
+    """Displacements (walls, 3) [m] at a time, from the place where a wall is first given."""
+    walls = result.case.every_wall
+    times, numbers = np.asarray(result.history["time"]), np.asarray(result.history["stage"])
+    shifts = np.zeros((len(walls), 3))
+    for stage in result.case.stage:
+        rows = times[numbers == stage.number]
+        begin = times[numbers < stage.number].max(initial=0.0)
+        if not len(rows) or (begin >= time and stage.number):
+            break
+        own = min(time, rows[-1]) - begin
+        for wall, moved in zip(stage.wall, WallMotion(stage.wall).displacements(own), strict=True):
+            k = [each.name for each in walls].index(wall.name)
+            if wall.mass is not None:
+                places = np.asarray(result.history[f"wall/{wall.name}/position"])
+                shifts[k] = [np.interp(time, times, places[:, axis]) for axis in range(3)]
+                shifts[k] -= places[numbers == stage.number][0]
+            elif not stage.holds("wall"):
+                shifts[k] = _place(wall) - _place(walls[k]) + moved
+    return shifts
+
+
+def _place(wall: Any) -> np.ndarray:
+    """A point that the keys of a wall give (3,) [m]."""
+    return np.asarray(lookup("pfem_petsc.contact.walls", wall.type, "wall.type").Wall(wall).centre, dtype=float)

@@ -42,15 +42,16 @@ def forecast(
     columns: Mapping[str, tuple[int, ...]],
     types: Mapping[str, Any],
 ) -> dict[str, str]:
-    """Return label and text of the estimates of memory, time and disk space. Collective."""
-    size = result_bytes(case, model.mesh, plan.steps, fields.points, fields.cells, columns, types)
+    """Return label and text of the estimates of memory and, if the steps are known, of time and disk. Collective."""
     held = model.comm.allreduce(_needed(model, plan))
-    entries = {
-        "memory needed": f"about {engineering(held, 'B', 3)} on all ranks",
-        "run time": f"about {duration(_seconds(model, plan))} of steps on idle cores, to a factor of 3; start, "
-        "compiling and output come on top",
-        "result file": f"about {engineering(size, 'B', 3)}",
-    }
+    entries = {"memory needed": f"about {engineering(held, 'B', 3)} on all ranks"}
+    if plan.steps is not None:
+        size = result_bytes(case, model.mesh, plan.steps, fields.points, fields.cells, columns, types)
+        entries["run time"] = (
+            f"about {duration(_seconds(model, plan))} of steps on idle cores, to a factor of 3; start, "
+            "compiling and output come on top"
+        )
+        entries["result file"] = f"about {engineering(size, 'B', 3)}"
     if case.output.checkpoint_every or case.output.checkpoint_minutes:
         entries["checkpoints"] = f"two of about {engineering(checkpoint_bytes(model), 'B', 3)}"
     return entries

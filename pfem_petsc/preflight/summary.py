@@ -37,7 +37,7 @@ def summarise(case: Case, model: Model, plan: Plan) -> dict[str, str]:
         **plan.entries(case),
         **describe_modes(model),
         "linear solver": plan.linear.why if plan.linear is not None else "none: nodes are solved independently",
-        "walls": ", ".join(map(_described, case.wall)) or "none",
+        "walls": ", ".join(map(_described, case.every_wall)) or "none",
         "memory": f"{engineering(peak, 'B', 3)} in use on all ranks",
     }
 

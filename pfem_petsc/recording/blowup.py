@@ -46,8 +46,8 @@ class BlowUp:
             On all ranks, if the energy is not finite, or a thousand times the energy input.
         """
         held = row["kinetic_energy"] + row["elastic_energy"]
-        when = f"step {state.step}, t = {state.time:.6g} s"
-        if not np.isfinite(held) and state.step == 0:
+        when = f"step {row['step']}, t = {row['time']:.6g} s"
+        if not np.isfinite(held) and row["step"] == 0:
             raise SimulationFailure(
                 f"{when}: the energy is not finite at the start{self._where(state)}: correct loads, velocities and "
                 "material (SI units)"

@@ -35,6 +35,11 @@ class Checkpointing(Observer):
         self._checkpoints, self._history, self._snapshots = checkpoints, history, snapshots
         self._synchroniser = synchroniser
 
+    @property
+    def last_step(self) -> int:
+        """Step of the last one."""
+        return self._checkpoints.last_step
+
     def due(self, step: int) -> bool:
         """Return whether a checkpoint is due by the number of the step or by wall-clock time."""
         return super().due(step) or self._synchroniser.checkpoint_due
@@ -47,7 +52,8 @@ class Checkpointing(Observer):
         """Flush the results, from which a restart continues, then write a checkpoint."""
         history = self._history
         history.writer.flush_history()
-        self._checkpoints.write(history.ledger, history.recorder, history.blow_up, history.row, self._snapshots.last)
+        sums = history.ledger, history.recorder, history.blow_up
+        self._checkpoints.write(*sums, history.row, self._snapshots.last, history.stage())
         self._synchroniser.checkpoint_written()
 
     def complete(self) -> None:

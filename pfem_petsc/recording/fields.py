@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -50,11 +50,16 @@ class Fields:
     ----------
     points, cells : names of the fields that the case selects; by default all that it has, except internal variables of
         material laws other than the plastic strain
+
+    Parameters
+    ----------
+    model : Model
+    names : of fields in place of those that the case selects; a case with stages has the same in all of them
     """
 
-    def __init__(self, model: Model) -> None:
+    def __init__(self, model: Model, names: Collection[str] | None = None) -> None:
         self.model = model
-        wanted = model.case.output.fields
+        wanted = model.case.output.fields if names is None else names
         taken = [field for field in FIELDS if (field.default(model) if wanted is None else field.name in wanted)]
         self._points = [field for field in taken if field.place == "nodes"]
         self._cells = [field for field in taken if field.place == "bars"]

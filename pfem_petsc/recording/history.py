@@ -15,6 +15,7 @@ from .blowup import BlowUp
 from .contact_watch import ContactWatch, NoContactWatch
 from .observer import NEVER, Observer
 from .recorder import Recorder
+from .stages import StageColumns, StageRows, carried_sums
 
 if TYPE_CHECKING:
     from ..run.synchroniser import Synchroniser
@@ -35,14 +36,23 @@ class History(Observer):
     plan : Plan
     synchroniser : Synchroniser
     warn : receives a warning
+    columns : of all stages of the case, None for a case without stages
 
     Attributes
     ----------
+    columns, types : of the rows
     row : the last row
     writer : of the result file
     """
 
-    def __init__(self, stepper: Stepper, plan: Plan, synchroniser: Synchroniser, warn: Callable[[str], None]) -> None:
+    def __init__(
+        self,
+        stepper: Stepper,
+        plan: Plan,
+        synchroniser: Synchroniser,
+        warn: Callable[[str], None],
+        columns: StageColumns | None = None,
+    ) -> None:
         model = stepper.model
         self.every = model.case.output.history_every
         self._stepper, self._synchroniser, self._model = stepper, synchroniser, model
@@ -54,6 +64,39 @@ class History(Observer):
         self.row: dict[str, Any] | None = None
         self.writer: ResultWriter | None = None
         stepper.booking = self._book
+        self.rows = None if columns is None else StageRows(columns, model.case.number, self.recorder.layout)
+        self.columns, self.types = (columns or self.recorder).columns, (columns or self.recorder).types
+
+    def go_on(self, earlier: History, kick: tuple[float, np.ndarray]) -> None:
+        """Begin a stage where the one before has ended, whose rows these continue. Collective.
+
+        ``kick``: work [J] and momentum (3,) [N s] of the velocities that the stage adds.
+        """
+        recorder, before = self.recorder, earlier.recorder
+        last = earlier.rows.fill(before.row())
+        recorder.carried = carried_sums(recorder, last, kick)
+        recorder.start_energy, recorder.energy_scale = before.start_energy, before.energy_scale
+        self.rows.begin(last)
+        self.row, self.writer = last, earlier.writer
+        self.blow_up.load_state(earlier.blow_up.kept())
+        self.contact_watch.check(self.rows.fill(recorder.row()))
+
+    def stage(self) -> dict[str, Any] | None:
+        """What a checkpoint must hold of the stages before; None for a case without stages."""
+        if self.rows is None:
+            return None
+        carried = self.recorder.carried
+        return {
+            "carried": None if carried is None else carried.tolist(),
+            "rest": self.rows.rest.tolist(),
+            "watch": self.contact_watch.start,
+        }
+
+    def load_stage(self, kept: dict[str, Any]) -> None:
+        """Take what :meth:`stage` gave."""
+        self.recorder.carried = None if kept["carried"] is None else np.array(kept["carried"])
+        self.rows.rest[:] = kept["rest"]
+        self.contact_watch.start = kept["watch"]
 
     def _book(self) -> None:
         """Add energies and iterations of a step, or of each part of a bisected step."""
@@ -77,6 +120,8 @@ class History(Observer):
 
     def take(self, row: Row) -> None:
         """Check a row, store it and add it to the history."""
+        if self.rows is not None:
+            row = self.rows.fill(row)
         self.blow_up.check(row, self._stepper.state)
         self.contact_watch.check(row)
         self.row = row
@@ -84,7 +129,7 @@ class History(Observer):
 
     def complete(self) -> None:
         """Record the row of the last step."""
-        if self.row["step"] != self._stepper.state.step:
+        if self.row["step"] != self._stepper.number:
             self.record()
 
     @property

@@ -38,6 +38,7 @@ class Recorder:
     energy_scale : largest energy of any kind in the rows so far [J]
     iterations : Newton and linear-solver iterations since the last row
     alarmed : whether any rank raised a fault flag with the last row
+    carried : (width of a row,) sums of the stages before, added to its columns; None without
     probe_nodes : probe name to the mesh numbers of its nodes, ascending, the order of rows in a probe's columns
     """
 
@@ -73,6 +74,7 @@ class Recorder:
             for quantity in _PROBED:
                 self.columns[f"probe/{probe.name}/{quantity}"] = (len(all_nodes), 3)
         self.layout = RowLayout(self.columns, self.types)
+        self.carried: np.ndarray | None = None
         self._contact = ContactColumns(self.model.contact)
         probed = sum(12 * len(nodes) for nodes in self.probe_nodes.values())
         links = PAIR.width * len(self.model.links.columns)
@@ -148,7 +150,11 @@ class Recorder:
         stepper, state = self.stepper, self.stepper.state
         vector, at = np.empty(self.layout.width), self._at
         vector[self._to] = sums[self._from]
-        vector[at["time"]], vector[at["step"]], vector[at["step_size"]] = stepper.clock, state.step, stepper.smallest
+        vector[at["time"]], vector[at["step"]], vector[at["step_size"]] = (
+            stepper.place,
+            stepper.number,
+            stepper.smallest,
+        )
         for name in stepper.columns:
             vector[at[name]] = getattr(stepper, name)
         vector[at["newton_iterations"]], vector[at["linear_iterations"]] = self.iterations
@@ -157,6 +163,8 @@ class Recorder:
         total = at["centre_of_mass"]
         vector[total : total + 3] /= self.model.total_mass
         energies = sums[_ENERGIES]
+        if self.carried is not None:
+            energies = energies + self.carried[self._to[_ENERGIES]]
         held = float(_SIGNS @ energies)
         if self.start_energy is None:
             self.start_energy = held
@@ -172,4 +180,4 @@ class Recorder:
         vector[begin : begin + width] = sums[links:probes]
         begin += width
         vector[begin:] = sums[probes:]
-        return vector
+        return vector if self.carried is None else vector + self.carried

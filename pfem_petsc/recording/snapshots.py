@@ -50,14 +50,15 @@ class Snapshots(Observer):
             return
         check_positions(self._stepper)
         at_nodes = fields.at_nodes(state, self._stepper.acceleration)
-        self.writer.write_snapshot(self._stepper.clock, state.step, state.position, at_nodes, fields.at_bars(state))
-        self.last = state.step
+        number, place = self._stepper.number, self._stepper.place
+        self.writer.write_snapshot(place, number, state.position, at_nodes, fields.at_bars(state))
+        self.last = number
         for text in self._piercing.look(state.x, state.time):
             self._warn(text)
 
     def complete(self) -> None:
         """Write the snapshot of the last step."""
-        if self.last != self._stepper.state.step:
+        if self.last != self._stepper.number:
             self.write()
 
     def remarks(self) -> list[str]:

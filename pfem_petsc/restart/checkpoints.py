@@ -37,6 +37,7 @@ class Checkpoints:
 
     def __init__(self, case: Case, stepper: Stepper, plan: Plan, folder: Path) -> None:
         self.case, self.plan, self.path = case, plan, folder / NAME
+        self.stage = stepper.model.case.number
         self.comm = stepper.model.comm
         self.state = RunState(stepper)
         self.last_step = -1
@@ -53,8 +54,18 @@ class Checkpoints:
         every = self.case.output.checkpoint_every
         return bool(every) and step % every == 0
 
-    def write(self, ledger: Ledger, recorder: Recorder, blow_up: BlowUp, row: dict[str, Any], snapshot: int) -> None:
+    def write(
+        self,
+        ledger: Ledger,
+        recorder: Recorder,
+        blow_up: BlowUp,
+        row: dict[str, Any],
+        snapshot: int,
+        stage: dict[str, Any] | None = None,
+    ) -> None:
         """Write a checkpoint with the last history row and the step of the last snapshot. Collective.
+
+        ``stage``: what the history keeps of the stages before, None for a case without stages.
 
         Raises
         ------
@@ -62,6 +73,8 @@ class Checkpoints:
             On all ranks; earlier checkpoints are kept.
         """
         scalars = self.state.scalars(ledger, recorder, blow_up, row, snapshot)
+        if stage is not None:
+            scalars["stage"] = {"number": self.stage, "history": stage, "start": self.state.stage_start()}
         if scalars["step"] == self.last_step:
             return
         attributes = {

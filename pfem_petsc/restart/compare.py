@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,6 +25,8 @@ __all__ = ["changed_keys", "check_mesh_is_the_same", "check_version", "mesh_mark
 FREE = ("title", "time.end", "static.end", "modes", "output", "solver")
 """Keys and tables that a restart may change: they do not change what is simulated."""
 
+_OF_STAGES = re.compile(r"stage\[(\d+)\]\.(.*)")
+
 
 def changed_keys(path: Path, before: Mapping[str, Any], now: Mapping[str, Any], source: str) -> list[str]:
     """Return the changes of a restart, ``time.end: 1.0 -> 2.0`` for every key that differs.
@@ -40,10 +43,11 @@ def changed_keys(path: Path, before: Mapping[str, Any], now: Mapping[str, Any], 
         If a key differs that a restart cannot change.
     """
     # tuples become lists, as in the checkpoint
-    old, new = _flat(before), _flat(json.loads(json.dumps(now)))
+    old, new = (_flat(json.loads(json.dumps(case))) for case in (before, now))
     keys = [key for key in dict.fromkeys([*old, *new]) if old.get(key) != new.get(key)]
     lines = {key: f"{key}: {_text(old, key)} -> {_text(new, key)}" for key in keys}
-    refused = [key for key in keys if not any(key == free or key.startswith(free + ".") for free in FREE)]
+    last = len(now.get("stage", ())) - 1
+    refused = [key for key in keys if not _is_free(key, last)]
     if refused:
         more = f" (and {len(refused) - 5} more)" if len(refused) > 5 else ""
         raise InputError(
@@ -52,6 +56,16 @@ def changed_keys(path: Path, before: Mapping[str, Any], now: Mapping[str, Any], 
             "the case, or start without --restart"
         )
     return list(lines.values())
+
+
+def _is_free(key: str, last: int) -> bool:
+    """Whether a restart may change a key; of stages, the end of the ``last`` alone."""
+    found = _OF_STAGES.match(key)
+    if found is not None:
+        key = found[2]
+        if key.endswith(".end") and int(found[1]) != last:
+            return False
+    return any(key == free or key.startswith(free + ".") for free in FREE)
 
 
 def check_version(path: Path, attributes: Mapping[str, Any]) -> None:

@@ -62,6 +62,12 @@ class Restart:
         return int(self.scalars["step"])
 
     @property
+    def stage(self) -> int:
+        """Number of the stage in which it was written; 0 for a case without stages."""
+        stage = self.scalars.get("stage")
+        return 0 if stage is None else int(stage["number"])
+
+    @property
     def last(self) -> tuple[int, int]:
         """Steps of the last snapshot and of the last history row before the checkpoint."""
         return int(self.scalars["snapshot"]), int(self.scalars["row"]["step"])

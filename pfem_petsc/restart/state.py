@@ -35,6 +35,7 @@ from ..mesh.exchange import Router
 from ..mesh.slab import slab_of
 from ..output.checkpoint import Checkpoint
 from ..parallel.natural import NaturalOrder
+from ..stepping.stage import StageStart
 
 if TYPE_CHECKING:
     from ..recording.blowup import BlowUp
@@ -50,6 +51,7 @@ STATE_VERSION = 5
 _MEMORY = "memory."
 _KEPT = "stepper."
 _LAW = "law."
+_STAGE = "stage."
 
 
 class RunState:
@@ -101,7 +103,7 @@ class RunState:
         }
         memories = self.comm.allgather(sorted(stepper.state.memory))
         return {
-            "step": stepper.state.step,
+            "step": stepper.number,
             "time": stepper.state.time,
             "stepper": {name: getattr(stepper, name) for name in stepper.kept_numbers},
             "iterations": list(recorder.iterations),
@@ -118,6 +120,10 @@ class RunState:
             "ranks": self.comm.allgather(mine),
         }
 
+    def stage_start(self) -> dict[str, Any] | None:
+        """The numbers of what the stage starts from; its arrays are among those of nodes. None for a first stage."""
+        return None if self.model.start is None else self.model.start.scalars()
+
     def orders(self, scalars: dict[str, Any]) -> dict[str, NaturalOrder]:
         """Return the orders of the arrays of a checkpoint with these numbers: nodal rows by owner, bars in slabs."""
         slab = np.arange(self.bar_order.first, self.bar_order.first + self.bar_order.count)
@@ -129,8 +135,13 @@ class RunState:
         """Restore the stepper from a checkpoint, instead of its ``start``. Collective."""
         stepper, state, owned = self.stepper, self.stepper.state, self.model.mesh.n_owned
         scalars = checkpoint.scalars
+        if scalars.get("stage") is not None and scalars["stage"]["start"] is not None:
+            held = {name.removeprefix(_STAGE): a for name, a in checkpoint.arrays.items() if name.startswith(_STAGE)}
+            self.model.begin_stage(StageStart.restored(scalars["stage"]["start"], held))
         for name in scalars["node_arrays"]:
             values = checkpoint.arrays[name]
+            if name.startswith(_STAGE):
+                continue
             if name.startswith(_MEMORY):
                 state.memory[name.removeprefix(_MEMORY)] = values.copy()
             elif name.startswith(_KEPT):
@@ -146,7 +157,7 @@ class RunState:
             state.memory = {name: array for name, array in state.memory.items() if name in mine}
         self.model.mesh.update_ghosts(state.x)
         self._load_bars(checkpoint)
-        state.step, state.time = int(scalars["step"]), float(scalars["time"])
+        state.step, state.time = int(scalars["step"]) - self.model.first_step, float(scalars["time"])
         for name, value in scalars["stepper"].items():
             setattr(stepper, name, value)
         mine = self._share(scalars["ranks"])
@@ -186,6 +197,8 @@ class RunState:
                 found[item.name] = value[:owned]
         found |= {_MEMORY + name: array for name, array in state.memory.items()}
         found |= {_KEPT + name: _numbers(getattr(self.stepper, name)) for name in self.stepper.kept_arrays}
+        if self.model.start is not None:
+            found |= {_STAGE + name: array for name, array in self.model.start.arrays().items()}
         # a case without walls has no columns for them
         return {name: array for name, array in found.items() if 0 not in array.shape[1:]}
 
@@ -216,6 +229,7 @@ class RunState:
                 target = bars.heat[0] if name == "thermal_strain" else self.model.temperatures.values
                 target[:] = values
         bars.put_history(history)
+        self.model.temperatures.hold(bars.heat)
 
 
 def _summed(shares: list[Any], factor: float = 1.0) -> Any:

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from ..case.schema import Case
 from ..errors import printable
 from ..output.progress import Progress
 from ..output.vtkhdf import ResultWriter
 from ..preflight.inspection import warnings_before
 from ..preflight.summary import summarise
 from ..recording.fields import Fields
+from ..recording.history import History
 from ..recording.recorder import Recorder
 from ..restart.folder import RESULT, Restart
 from ..stepping.model import Model
@@ -21,13 +23,18 @@ __all__ = ["open_progress", "open_result_file"]
 
 
 def open_progress(
-    model: Model, plan: Plan, start: tuple[int, float], folder: Path, quiet: bool, notes: Iterable[str]
+    case: Case,
+    model: Model,
+    plan: Plan,
+    start: tuple[int, float],
+    folder: Path,
+    quiet: bool,
+    notes: Iterable[str],
 ) -> Progress:
     """Open the progress report and write summary, warnings and notes. Collective.
 
     ``start``: step and time [s] from which the run continues.
     """
-    case = model.case
     progress = Progress(
         model.comm,
         printable(case.title),
@@ -40,7 +47,7 @@ def open_progress(
         axis=plan.axis,
     )
     progress.summary(summarise(case, model, plan))
-    for warning in model.warnings + warnings_before(case, model, plan):
+    for warning in model.warnings + warnings_before(model.case, model, plan):
         progress.warning(warning)
     if plan.scheme.notice:
         progress.message(plan.scheme.notice)
@@ -50,10 +57,17 @@ def open_progress(
 
 
 def open_result_file(
-    model: Model, plan: Plan, recorder: Recorder, fields: Fields, folder: Path, restart: Restart | None, step: int
+    case: Case,
+    model: Model,
+    plan: Plan,
+    history: History,
+    fields: Fields,
+    events: Mapping[str, Any],
+    folder: Path,
+    restart: Restart | None,
+    step: int,
 ) -> ResultWriter:
     """Open the result file, new or, if a restart continues it, truncated after ``step``. Collective."""
-    case = model.case
     continues = restart is not None and restart.continues
     return ResultWriter(
         folder / RESULT,
@@ -61,20 +75,19 @@ def open_result_file(
         model.mesh,
         point_fields=fields.points,
         cell_fields=fields.cells,
-        columns=recorder.columns,
-        column_types=recorder.types,
+        columns=history.columns,
+        column_types=history.types,
         case_text=case.to_toml(),
-        attributes=_attributes(model, plan, recorder),
+        attributes=_attributes(case, model, plan, history.recorder),
         precision=case.output.precision,
         append_after_step=step if continues else None,
         last=restart.last if continues else None,
         modes=case.modes.kind if case.modes is not None else None,
-        events=recorder.stepper.event_columns,
+        events=events,
     )
 
 
-def _attributes(model: Model, plan: Plan, recorder: Recorder) -> dict[str, Any]:
-    case = model.case
+def _attributes(case: Case, model: Model, plan: Plan, recorder: Recorder) -> dict[str, Any]:
     attributes: dict[str, Any] = {
         "name": case.name,
         "folder": str(case.folder.resolve()),
@@ -84,6 +97,8 @@ def _attributes(model: Model, plan: Plan, recorder: Recorder) -> dict[str, Any]:
         "linear_solver": plan.linear.why if plan.linear is not None else "none",
         "partitioner": model.mesh.partitioner,
     }
+    if case.stage:
+        attributes["stages"] = [stage.name for stage in case.stage]
     if plan.steps is not None:
         attributes["steps"] = plan.steps
     for name, nodes in recorder.probe_nodes.items():

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from ..analysis import Step
+from ..analysis import Analysis, Step
 from ..errors import EarlyStop, SimulationFailure
 from ..output.progress import Progress
 from ..output.vtkhdf import ResultWriter
@@ -19,10 +19,10 @@ from ..recording.snapshots import Snapshots
 from ..restart.checkpoints import Checkpoints
 from ..restart.folder import Restart, prepare_folder
 from ..stepping.fused_steps import Batches
-from ..stepping.time_stepping import TimeStepping
 from .compilation import ReportedCompilation
 from .modes import record_modes, remove_modes
 from .opening import open_progress, open_result_file
+from .stages import Stages
 from .synchroniser import Synchroniser
 
 __all__ = ["Outputs"]
@@ -33,7 +33,7 @@ class Outputs:
 
     Parameters
     ----------
-    analysis : TimeStepping
+    stages : Stages
     synchroniser : Synchroniser
     folder : of the results
     quiet : whether to print nothing on stdout
@@ -47,15 +47,15 @@ class Outputs:
 
     def __init__(
         self,
-        analysis: TimeStepping,
+        stages: Stages,
         synchroniser: Synchroniser,
         folder: Path,
         quiet: bool,
         compilation: ReportedCompilation,
     ) -> None:
-        self._analysis, self._synchroniser, self._folder, self._quiet = analysis, synchroniser, folder, quiet
+        self._stages, self._synchroniser, self._folder, self._quiet = stages, synchroniser, folder, quiet
         self._compilation = compilation
-        self.fields = Fields(analysis.model)
+        self.fields = self._fields()
         self.progress: Progress | None = None
         self.history: History | None = None
         self.snapshots: Snapshots | None = None
@@ -65,6 +65,14 @@ class Outputs:
         self._callbacks: list[Callback] = []
         self._writer: ResultWriter | None = None
         self._continues = False
+
+    @property
+    def _analysis(self) -> Analysis:
+        return self._stages.analysis
+
+    def _fields(self) -> Fields:
+        names = self._stages.fields
+        return Fields(self._analysis.model, None if names is None else [*names[0], *names[1]])
 
     @property
     def is_open(self) -> bool:
@@ -92,40 +100,82 @@ class Outputs:
             On all ranks.
         """
         analysis, folder = self._analysis, self._folder
-        stepper, model, plan = analysis.stepper, analysis.model, analysis.plan
-        checkpoints = Checkpoints(model.case, stepper, plan, folder)
+        case, stepper, model, plan = self._stages.case, analysis.stepper, analysis.model, self._stages.plan
+        checkpoints = Checkpoints(case, stepper, plan, folder)
         if restart is not None:
             # before any change to the folder, because the checkpoint may be refused
             checkpoint = checkpoints.restore(restart)
         aside = prepare_folder(model.comm, folder, restart, plan)
         notes = [*notes, *([] if aside is None else [f"{folder}: held results, which are in {aside} now"])]
-        start = analysis.state.step, analysis.state.time
-        self.progress = open_progress(model, plan, start, folder, self._quiet, notes)
+        start = stepper.number, stepper.place
+        self.progress = open_progress(case, model, plan, start, folder, self._quiet, notes)
         self._compilation.progress = self.progress
         if restart is None:
             analysis.start()
             self._synchroniser.synchronise()
-        warn = self.progress.warning
-        self.history = history = History(stepper, plan, self._synchroniser, warn)
-        if hasattr(stepper, "message"):
-            stepper.message = warn
-        self.events = Events(stepper, self.progress.message)
-        self.snapshots = Snapshots(analysis, self.fields, warn)
-        self.checkpointing = Checkpointing(checkpoints, history, self.snapshots, self._synchroniser)
-        self._report = ProgressReport(self.progress, analysis, history)
+        self._observe(checkpoints)
+        history = self.history
         if restart is not None:
             self._continues = restart.continues
             sums = history.ledger, history.recorder, history.blow_up
             history.row = checkpoints.state.load_sums(checkpoint, *sums)
             self.snapshots.last = restart.last[0]
             history.contact_watch.start = history.recorder.start_energy
+            if restart.scalars.get("stage") is not None:
+                history.load_stage(restart.scalars["stage"]["history"])
             changes = f"; changed: {'; '.join(restart.changed)}" if restart.changed else ""
             place = f"step {start[0]}, {plan.axis.place(start[1])}"
             self.progress.message(f"restart from {restart.path}: {place}{changes}")
         if restart is not None:
             remove_modes(folder, model.comm)
-        self._writer = open_result_file(model, plan, history.recorder, self.fields, folder, restart, start[0])
+        events = self._stages.events
+        self._writer = open_result_file(case, model, plan, history, self.fields, events, folder, restart, start[0])
         history.writer = self.events.writer = self.snapshots.writer = self._writer
+
+    def _observe(self, checkpoints: Checkpoints) -> None:
+        """Make the observers of the present stage. Collective."""
+        analysis, warn = self._analysis, self.progress.warning
+        stepper = analysis.stepper
+        self.history = History(stepper, analysis.plan, self._synchroniser, warn, self._stages.columns)
+        if hasattr(stepper, "message"):
+            stepper.message = warn
+        self.events = Events(stepper, self.progress.message)
+        self.snapshots = Snapshots(analysis, self.fields, warn)
+        self.checkpointing = Checkpointing(checkpoints, self.history, self.snapshots, self._synchroniser)
+        self._report = ProgressReport(self.progress, analysis, self.history)
+
+    def begin_stage(self) -> None:
+        """End the present stage with a row and a snapshot, begin the next, and go on with it. Collective.
+
+        Raises
+        ------
+        SimulationFailure
+            On all ranks, where the next stage cannot begin in the present state.
+        """
+        stages, history, snapshots, last = self._stages, self.history, self.snapshots, self.checkpointing.last_step
+        writer = self._writer
+        self._complete_stage()
+        self.tell_remarks()
+        kick = stages.advance()
+        stepper = stages.analysis.stepper
+        name, number = stepper.model.case.name, stages.number
+        self.progress.message(
+            f"stage {name!r} ({number + 1} of {len(stages.case.stage)}) begins after step {stepper.number}, "
+            f"{stages.plan.axis.place(stepper.place)}"
+        )
+        self._synchroniser.follow(stages.analysis)
+        self.fields = self._fields()
+        checkpoints = Checkpoints(stages.case, stepper, stages.plan, self._folder)
+        checkpoints.last_step = last
+        self._observe(checkpoints)
+        self.history.go_on(history, kick)
+        self.events.writer = self.snapshots.writer = writer
+        self.snapshots.last = snapshots.last
+
+    def _complete_stage(self) -> None:
+        """The row and the snapshot of the last step of a stage."""
+        self.history.complete()
+        self.snapshots.complete()
 
     def record_start(self) -> None:
         """Record the first row and snapshot, unless the continued results contain them. Collective."""
@@ -136,7 +186,7 @@ class Outputs:
     def after(self, made: Step) -> Step:
         """Serve the observers that are due after a step; return the step with its row. Collective."""
         step, synchroniser = made.step, self._synchroniser
-        last = step == self._analysis.last_step
+        last = self._analysis.state.step == self._analysis.last_step
         history, *others = self._recording
         recorded = history.due(step)
         if recorded:
@@ -148,8 +198,10 @@ class Outputs:
         for observer in others:
             if observer.due(step):
                 observer.observe(made)
-        if last:
+        if last and self._stages.at_last:
             self.complete()
+        elif last:
+            self._complete_stage()
         if recorded or last:
             made = made._replace(row=history.row)
         for observer in (self._report, *self._callbacks):
@@ -169,7 +221,7 @@ class Outputs:
         SimulationFailure
             As for a single step.
         """
-        left = self.steps_left(self._analysis.state.step)
+        left = self.steps_left(self._analysis.stepper.number)
         if not batches.advance(self._analysis, self.history, left):
             self._synchroniser.synchronise()
 
@@ -181,13 +233,13 @@ class Outputs:
         EarlyStop
             On all ranks.
         """
-        code, state = self._synchroniser.request, self._analysis.state
-        if not code or state.step >= self._analysis.last_step:
+        code, analysis = self._synchroniser.request, self._analysis
+        if not code or (self._stages.at_last and analysis.state.step >= analysis.last_step):
             return
         self.checkpointing.write()
-        place = self._analysis.plan.axis.exact(self._analysis.stepper.clock)
+        place = self._stages.plan.axis.exact(analysis.stepper.place)
         raise EarlyStop(
-            f"{self._synchroniser.stop.reason(code)}; step {state.step} is finished, {place}, and "
+            f"{self._synchroniser.stop.reason(code)}; step {analysis.stepper.number} is finished, {place}, and "
             f"a checkpoint written: continue with --restart (results in {self._folder})"
         )
 

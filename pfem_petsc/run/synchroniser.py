@@ -54,6 +54,10 @@ class Synchroniser:
         self._last = (0, time.monotonic())
         self._next = 0
 
+    def follow(self, analysis: Analysis) -> None:
+        """Go on with the analysis of the next stage."""
+        self._analysis = analysis
+
     @property
     def alarm(self) -> bool:
         """Whether this rank has a fault."""
@@ -75,7 +79,7 @@ class Synchroniser:
         PfemError
             On all ranks: the fault of the lowest rank that has one.
         """
-        fault, step = self._analysis.fault, self._analysis.state.step
+        fault, step = self._analysis.fault, self._analysis.stepper.number
         try:
             self._lock.renew()
         except SimulationFailure as lost:

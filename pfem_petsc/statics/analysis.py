@@ -110,8 +110,8 @@ class StaticAnalysis(Analysis):
 
     def advance(self) -> Step:
         self.stepper.step()
-        state, solution = self.stepper.state, self.stepper.solution
-        return Step(state.step, self.stepper.clock, solution.newton, solution.linear, None)
+        solution = self.stepper.solution
+        return Step(self.stepper.number, self.stepper.place, solution.newton, solution.linear, None)
 
     def close(self) -> None:
         self.stepper.destroy()

@@ -167,9 +167,7 @@ class _Search:
         displacement = np.nan
         if stepper.direction is not None:
             displacement = stepper.direction.at(stepper.state.position + point.u)
-        self.events.append(
-            Event(kind, float(point.load_factor), stepper.state.step + 1, float(displacement), multiplicity)
-        )
+        self.events.append(Event(kind, float(point.load_factor), stepper.number + 1, float(displacement), multiplicity))
         if kind == "bifurcation":
             number = stepper.bifurcations + sum(event.kind == kind for event in self.events)
             if stepper.turns_at(number, point, multiplicity):

@@ -37,3 +37,4 @@ class PathEquilibrium(Equilibrium):
 
     def finish(self, state: State, balance: Balance, u: np.ndarray, h: float) -> None:
         state.position[:] = balance.predictor + u
+        state.a = np.zeros_like(u)

@@ -66,6 +66,11 @@ class RelaxationStepper(StaticStepper):
         self._make_part(self.end if last else state.time + size)
         state.step += 1
 
+    def settle(self) -> None:
+        """See :class:`StaticStepper`. Collective."""
+        self.motion.x[:] = self.state.x
+        super().settle()
+
     def solve(self, balance: Balance) -> Solution:
         """See :meth:`~pfem_petsc.stepping.stepper.Stepper.solve`."""
         model, motion, parameters = self.model, self.motion, self.parameters

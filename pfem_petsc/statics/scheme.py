@@ -44,3 +44,4 @@ class Equilibrium(Scheme):
     def finish(self, state: State, balance: Balance, u: np.ndarray, h: float) -> None:
         state.position[:] = balance.predictor + u
         state.memory["rate"] = u / h
+        state.a = np.zeros_like(u)

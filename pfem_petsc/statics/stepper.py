@@ -69,13 +69,13 @@ class StaticStepper(ImplicitStepper):
         return self.state.time >= self.end * (1.0 - TIME)
 
     def when(self, balance: Balance) -> str:
-        return f"step {self.state.step + 1}, load factor {balance.time:.6g}"
+        return f"step {self.number + 1}, load factor {balance.time:.6g}"
 
     def arrived(self) -> str:
-        return f"step {self.state.step + 1}, load factor {self.state.time:.6g}"
+        return f"step {self.number + 1}, load factor {self.state.time:.6g}"
 
     def start(self) -> None:
-        """Initialise the state at load factor zero from the mesh; the first increment is equilibrated. Collective."""
+        """Initialise the state at load factor zero; the first increment is equilibrated. Collective."""
         state, model = self.state, self.model
         state.v = np.zeros_like(self.zero)
         state.a = np.zeros_like(self.zero)
@@ -84,6 +84,10 @@ class StaticStepper(ImplicitStepper):
         self.evaluate(commit=True)
         if model.external.active:
             state.external = model.external.at(0.0, np.empty_like(state.v))
+        if model.start is not None:
+            # what the state lacks of equilibrium works on the way to it: that is booked as inertia's
+            lack = state.external - state.f[: model.mesh.n_owned] + state.contact + state.support
+            state.a = lack / model.inertia.mass[:, None]
         self.totals_at_start = self._totals()
         self.scheme.start(state, self.h)
         model.contact.motion.start(self.h)
@@ -117,6 +121,20 @@ class StaticStepper(ImplicitStepper):
         if self.solution.newton <= _FEW:
             self.increment = max(size, min(_GROWTH * size, self.limits.largest))
         state.step += 1
+
+    def settle(self) -> None:
+        """Solve once more at the load factor that is reached, to rounding: motion that begins there begins at rest."""
+        state, guard = self.state, self.guard
+        balance = Equilibrium().balance(state, 0.0)
+        self.accuracy, self.guard = 0.0, None
+        try:
+            self.solution = ImplicitStepper.solve(self, balance)
+        except NotConverged:
+            return
+        finally:
+            self.accuracy, self.guard = 1.0, guard
+        state.position[:] = balance.predictor + self.solution.u
+        self.evaluate(commit=True)
 
     def _no_further(self, failure: NotConverged) -> SimulationFailure:
         """Return the message about the load factor beyond which no equilibrium was found."""

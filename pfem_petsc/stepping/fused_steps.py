@@ -164,6 +164,10 @@ class Batches:
         self._batch: Batch | None = None
         self._refused = False
 
+    def anew(self) -> Batches:
+        """The same for the next stage."""
+        return Batches(self._min_steps)
+
     def advance(self, analysis: TimeStepping, history: History, left: int) -> bool:
         """Make fused steps that need only rows of the history.
 
@@ -200,7 +204,7 @@ class Batches:
                 contact.log.note(touched[k], stepper.h, comm)
                 contact.log.changes += int(sums[HEAD.width])
                 sums[HEAD.width] = contact.log.changes
-            if history.due(state.step):
+            if history.due(stepper.number):
                 history.take(history.recorder.row_of(sums))
         if failed:
             state.step, state.time = begin + made, (begin + made) * stepper.h

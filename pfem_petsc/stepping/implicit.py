@@ -75,6 +75,7 @@ class ImplicitStepper(Stepper):
         self.message: Callable[[str], None] = lambda text: None
         self.held = np.zeros(model.mesh.n_owned, dtype=bool)  # nodes in contact with walls in the last step
         self._mass: MassSolver | None = None
+        self.accuracy = 1.0  # of a solve, as a factor on the tolerance of steps; zero: to rounding
 
     def step(self) -> None:
         """Advance by one step; a part that does not converge is bisected, and parts grow again from step to step.
@@ -213,7 +214,7 @@ class ImplicitStepper(Stepper):
         model, state = self.model, self.state
         if model.temperatures.varying:
             model.temperatures.apply(balance.time)
-        tolerance = residual_tolerance(model, state, balance, self.part)
+        tolerance = self.accuracy * residual_tolerance(model, state, balance, self.part)
         active_set = ActiveSet(model, self.state, balance, self.held, self.links)
         candidates, links = active_set.candidates, active_set.links
         newton = linear = 0

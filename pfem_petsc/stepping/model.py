@@ -25,6 +25,8 @@ from ..parallel.agreement import agreed
 
 if TYPE_CHECKING:
     from ..case.schema import Case
+    from ..mesh.distribution import DistributedMesh
+    from .stage import StageStart
 
 __all__ = ["Model"]
 
@@ -49,24 +51,17 @@ class Model:
     warnings : about the mesh
     links : pairs and constraints that couple nodes to nodes, see :mod:`pfem_petsc.contact.links`
     can_touch : whether nodes can touch walls or each other
+    start : where a stage starts from, None for the start of a run
     """
 
-    def __init__(self, case: Case, comm: MPI.Comm) -> None:
+    def __init__(self, case: Case, comm: MPI.Comm, mesh: DistributedMesh | None = None) -> None:
         self.case = case
         self.comm = comm
-        try:
-            slab = load_slab(case.mesh, comm)
-        except InputError as error:
-            # a generator knows its keys, but not the file that contains them
-            raise error if case.mesh.generator is None else InputError(f"{case.source}: {error}") from error
-        self.warnings = list(slab.warnings)
-        with agreed(comm):
-            sections = section_of_bars(case, slab)
-        self.mesh = distribute(slab, sections, comm)
-        del slab, sections
-        mesh = self.mesh
+        self.start: StageStart | None = None
+        self.warnings: list[str] = []
+        self.mesh = mesh = self._load_mesh() if mesh is None else mesh
         self.nodes = resolve_node_sets(case, mesh)
-        adjusted = adjust_start(case, self.nodes, mesh)
+        adjusted = adjust_start(case, self.nodes, mesh) if case.number == 0 else 0
         if adjusted:
             self.warnings.append(f"{adjusted} node{'s' * (adjusted > 1)} that started beyond walls moved onto them")
         self.bars = Bars(mesh, case)
@@ -98,6 +93,37 @@ class Model:
         speeds = [np.sqrt(m.largest_modulus() / m.density) for m in case.material.values()]
         self.wave_speed = max(speeds)
 
+    def _load_mesh(self) -> DistributedMesh:
+        case, comm = self.case, self.comm
+        try:
+            slab = load_slab(case.mesh, comm)
+        except InputError as error:
+            # a generator knows its keys, but not the file that they are in
+            raise error if case.mesh.generator is None else InputError(f"{case.source}: {error}") from error
+        self.warnings += slab.warnings
+        with agreed(comm):
+            sections = section_of_bars(case, slab)
+        return distribute(slab, sections, comm)
+
+    @property
+    def first_step(self) -> int:
+        """Number of the step at whose end the stage starts; 0 for the start of a run."""
+        return self.start.step if self.start is not None else 0
+
+    @property
+    def origin(self) -> float:
+        """Where the stage starts on the axis of the results, on which its own time is counted from zero."""
+        return self.start.time if self.start is not None else 0.0
+
+    def begin_stage(self, start: StageStart) -> None:
+        """Hold supports, loads and walls that stay in force as they are at the start of a stage. Collective."""
+        self.start = start
+        self.supports.hold(start.position)
+        active = self.comm.allreduce(bool(start.force.any()) or bool(start.gravity.any()), op=MPI.LOR)
+        self.external.hold(start.force, start.gravity, active)
+        if self.case.holds("wall"):
+            self.contact.motion.held = np.array(start.walls).reshape(-1, 3)
+
     @property
     def steady(self) -> bool:
         """Whether the model is constant in time, and the fused loop supports its bars and contact."""
@@ -108,7 +134,8 @@ class Model:
         """Return initial velocities (owned, 3) [m/s]; later ``[initial]`` tables override earlier ones. Collective."""
         mesh, comm = self.mesh, self.comm
         v = np.zeros((mesh.n_owned, 3))
-        points = mesh.points[: mesh.n_owned]
+        # a stage adds to what its nodes have already
+        points = mesh.points[: mesh.n_owned] if self.start is None else self.start.position
         for initial in self.case.initial:
             members = self.nodes[initial.node_set] if initial.node_set is not None else np.arange(mesh.n_owned)
             spin = np.array(initial.angular_velocity)

@@ -106,7 +106,8 @@ class Stepper(ABC):
     def start(self) -> None:
         """Initialise velocity, internal force and acceleration of the state. Collective."""
         state, model = self.state, self.model
-        state.v = model.initial_velocity()
+        velocity = model.initial_velocity()
+        state.v = velocity if model.start is None else state.v + velocity
         supports = model.supports
         if supports.any:
             state.position[supports.at] = supports.positions(0.0)
@@ -178,11 +179,25 @@ class Stepper(ABC):
         """The step whose end the state is at, complete or not, and its time, for messages."""
         # the step is counted when it is complete, its time is set on arrival
         step = self.state.step + (self.state.time > (self.state.step + TIME) * self.h)
-        return f"step {step}, t = {self.state.time:.6g} s"
+        return self.at(step, self.state.time)
+
+    def at(self, step: int, time: float) -> str:
+        """A step and a time of the stage as they are counted in the results, for messages."""
+        return f"step {self.model.first_step + step}, t = {self.model.origin + time:.6g} s"
+
+    @property
+    def number(self) -> int:
+        """Number of the last step, over all stages."""
+        return self.model.first_step + self.state.step
+
+    @property
+    def place(self) -> float:
+        """Time of the state in the results, over all stages."""
+        return self.model.origin + self.clock
 
     @property
     def clock(self) -> float:
-        """Time of the state in the results, which increases from step to step."""
+        """Time of the state in the results, from the start of the stage; increases from step to step."""
         return self.state.time
 
     def step(self) -> None:
@@ -214,7 +229,7 @@ class Stepper(ABC):
             self.treatment.after()
         self.booking()
         if carried.of and self.fault is None:
-            where = f"step {state.step + 1}, t = {end:.6g} s"
+            where = self.at(state.step + 1, end)
             crossing = carried.crossing(places, carried.places(state.position, end), where)
             self.fault = SimulationFailure(crossing) if crossing else None
 
@@ -268,6 +283,9 @@ class Stepper(ABC):
         """What users should know at the end of a run."""
         return []
 
+    def settle(self) -> None:  # noqa: B027 - steps leave nothing to settle, static ones aside
+        """Reduce the residual of a static state to rounding, before a stage that begins there. Collective."""
+
     def destroy(self) -> None:  # noqa: B027 - most steppers have nothing to free
         """Free PETSc objects; the stepper cannot make further steps. Collective; may be called again."""
 
@@ -276,7 +294,7 @@ class Stepper(ABC):
         step = self.state.step + 1
         if self.scheme.solves_next_position and self.state.time > 0.0:
             step += 1  # the position solved for belongs to the next step
-        return f"step {step}, t = {balance.time:.6g} s"
+        return self.at(step, balance.time)
 
     def evaluate(self, commit: bool) -> None:
         """Evaluate internal force and energies at the state's positions; a collapsed bar becomes a fault."""

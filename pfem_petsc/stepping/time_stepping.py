@@ -46,8 +46,8 @@ class TimeStepping(Analysis):
 
     def advance(self) -> Step:
         self.stepper.step()
-        state, solution = self.stepper.state, self.stepper.solution
-        return Step(state.step, state.time, solution.newton, solution.linear, None)
+        solution = self.stepper.solution
+        return Step(self.stepper.number, self.stepper.place, solution.newton, solution.linear, None)
 
     def close(self) -> None:
         destroy = getattr(self.stepper, "destroy", None)

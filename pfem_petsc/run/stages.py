@@ -1,0 +1,211 @@
+"""The stages of a case: planned before the first step, and begun one after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from mpi4py import MPI
+
+from ..contact.start import check_start
+from ..errors import InputError, SimulationFailure
+from ..output.units import TIME as AXIS
+from ..output.units import Axis
+from ..recording.fields import Fields
+from ..recording.recorder import Recorder
+from ..recording.stages import StageColumns
+from ..stepping.model import Model
+from ..stepping.stage import end_of_stage, hand_over
+from ..tolerances import TIME
+from .analyses import make_analysis
+
+if TYPE_CHECKING:
+    from ..analysis import Analysis
+    from ..case.schema import Case
+    from ..integrators.base import Scheme
+    from ..solvers.linear import LinearChoice
+    from ..stepping.stepper import Stepper
+
+__all__ = ["StagedPlan", "Stages"]
+
+
+@dataclass(frozen=True)
+class StagedPlan:
+    """The plans of all stages on one axis; see :class:`~pfem_petsc.stepping.prepare.Plan`.
+
+    Attributes
+    ----------
+    plans : of the stages
+    names : of the stages
+    """
+
+    plans: tuple[Any, ...]
+    names: tuple[str, ...]
+
+    @property
+    def scheme(self) -> Scheme:
+        """Of the first stage."""
+        return self.plans[0].scheme
+
+    @property
+    def linear(self) -> LinearChoice | None:
+        """Of the first stage."""
+        return self.plans[0].linear
+
+    @property
+    def step(self) -> float:
+        """Of the first stage."""
+        return self.plans[0].step
+
+    @property
+    def steps(self) -> int | None:
+        """Steps of all stages, None where that of one is not known before."""
+        counts = [plan.steps for plan in self.plans]
+        return None if None in counts else sum(counts)
+
+    @property
+    def end(self) -> float | None:
+        """Where the last stage ends, None where that is not known before."""
+        ends = [plan.end for plan in self.plans]
+        return None if None in ends else sum(ends)
+
+    @property
+    def axis(self) -> Axis:
+        """Time [s]; a static stage takes as much of it as its load factor or points count."""
+        return AXIS._replace(key=f"stage[{len(self.plans) - 1}].{self.plans[-1].axis.key}")
+
+    def beyond(self, steps: np.ndarray, times: np.ndarray) -> np.ndarray:
+        """Which of recorded steps with their times lie beyond the end."""
+        return times > (np.inf if self.end is None else self.end * (1.0 + TIME))
+
+    def entries(self, case: Case) -> dict[str, str]:
+        """Label and text of what a user checks before a run."""
+        found = {}
+        for name, plan, stage in zip(self.names, self.plans, case.stages, strict=True):
+            texts = plan.entries(stage)
+            found[f"stage {name}"] = "; ".join(f"{label}: {text}" for label, text in texts.items())
+        return found
+
+    def record(self) -> dict[str, Any]:
+        """What a restart must not work out anew."""
+        return {"stages": [plan.record() for plan in self.plans]}
+
+
+class Stages:
+    """The stages of a case, one of which is being computed. Construction is collective.
+
+    A case without stages is its own only stage, and is built as ever. Otherwise the model of every stage is built once
+    before the first step, so that what is wrong with a later one is found then.
+
+    Parameters
+    ----------
+    case : Case
+    comm : MPI.Comm
+    recorded : record of the plan of the run that is continued, None for a new run
+    number : of the stage to begin with
+
+    Attributes
+    ----------
+    analysis : of the present stage
+    plan : of the whole run
+    columns : of the history, None for a case without stages
+    fields : names of the fields to write (of nodes, of bars), None for a case without stages
+    events : columns of events
+
+    Raises
+    ------
+    InputError
+        On all ranks.
+    """
+
+    def __init__(self, case: Case, comm: MPI.Comm, recorded: Mapping[str, Any] | None, number: int = 0) -> None:
+        self.case, self.comm = case, comm
+        self._cases = case.stages
+        self.analysis: Analysis
+        self.columns: StageColumns | None = None
+        self.fields: tuple[list[str], list[str]] | None = None
+        first = Model(self._cases[0], comm)
+        if not case.stage:
+            self.analysis = make_analysis(first, recorded)
+            self.plan = self.analysis.plan
+            self.events = self.analysis.stepper.event_columns
+            return
+        self.events: dict[str, Any] = {}
+        records = [None] * len(case.stage) if recorded is None else recorded["stages"]
+        plans, recorders, warnings = [], [], []
+        points, cells = {}, {}
+        for k, (stage, record) in enumerate(zip(self._cases, records, strict=True)):
+            model = first if k == 0 else Model(stage, comm, first.mesh)
+            analysis = make_analysis(model, record)
+            plans.append(analysis.plan)
+            recorders.append(Recorder(analysis.stepper, None))
+            self.events = {**self.events, **analysis.stepper.event_columns}
+            fields = Fields(model)
+            points |= dict.fromkeys(fields.points)
+            cells |= dict.fromkeys(fields.cells)
+            warnings += [f"stage {stage.name!r}: {text}" for text in model.warnings]
+            if k == number:
+                self.analysis = analysis
+            else:
+                analysis.close()
+        self.plan = StagedPlan(tuple(plans), tuple(stage.name for stage in self._cases))
+        self.columns = StageColumns(recorders)
+        self.fields = list(points), list(cells)
+        self.model.warnings = warnings
+
+    @property
+    def model(self) -> Model:
+        """Of the present stage."""
+        return self.analysis.model
+
+    @property
+    def number(self) -> int:
+        """Of the present stage, from 0."""
+        return self.model.case.number
+
+    @property
+    def at_last(self) -> bool:
+        """Whether no stage comes after the present one."""
+        return self.number == len(self._cases) - 1
+
+    def advance(self) -> tuple[float, np.ndarray]:
+        """Begin the next stage where the present one has ended. Collective.
+
+        Returns
+        -------
+        Work [J] and momentum (3,) [N s] of the velocities that the stage adds, on all ranks.
+
+        Raises
+        ------
+        SimulationFailure
+            On all ranks, where the stage cannot begin there.
+        """
+        old, number = self.analysis, self.number + 1
+        stage = self._cases[number]
+        where = f"stage {stage.name!r}, begun after step {old.stepper.number}, t = {old.stepper.place:.6g} s"
+        old.stepper.settle()
+        try:
+            model = Model(stage, self.comm, old.model.mesh)
+            model.begin_stage(end_of_stage(old.stepper))
+            check_start(model.contact, old.state.position, model.length)
+            analysis = make_analysis(model, self.plan.plans[number].record())
+        except InputError as error:
+            raise SimulationFailure(f"{where}: {error}") from error
+        hand_over(old.stepper, analysis.stepper)
+        old.close()
+        self.analysis = analysis
+        kick = _kick(analysis.stepper)
+        analysis.start()
+        return kick
+
+
+def _kick(stepper: Stepper) -> tuple[float, np.ndarray]:
+    """Work [J] and momentum (3,) [N s] of the velocities that a stage adds to those it is handed. Collective."""
+    model = stepper.model
+    added = model.initial_velocity()
+    momentum = model.inertia.mass_times(added, np.empty_like(added))
+    mean = stepper.state.v + 0.5 * added
+    sums = model.comm.allreduce(np.append(momentum.sum(axis=0), (momentum * mean).sum()))
+    return float(sums[3]), sums[:3]

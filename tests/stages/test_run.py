@@ -1,0 +1,52 @@
+"""Stages on one state: continuity, balances and restarts."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.kills import differences
+from helpers.stages import BLOCK, check_balances
+from helpers.stopped import everywhere
+
+from pfem_petsc import Case, Simulation, open_result
+
+
+def run(data, comm, folder, stop_after=-1, **options):
+    """Run to the end, or to a step after which a checkpoint is written; the step that was reached."""
+    with Simulation(Case.from_dict(data, name="block"), comm, output=folder, quiet=True, **options) as simulation:
+        for made in simulation:
+            if made.step == stop_after:
+                simulation.outputs.checkpointing.write()
+                break
+        return simulation.stepper.number
+
+
+@pytest.mark.parallel
+def test_four_stages_on_one_state(comm, shared_tmp_path):
+    run(BLOCK, comm, shared_tmp_path / "out")
+    result = open_result(shared_tmp_path / "out")
+    history = result.history
+    check_balances({name: history[name] for name in history})
+    assert history["step"][-1] == 146
+    assert (np.diff(history["time"]) > 0.0).all()
+    np.testing.assert_allclose(history["time"][[0, 4, 44, -1]], [0.0, 1.0, 1.0 + 2e-4, 2.0 + 3e-4], rtol=1e-12)
+    np.testing.assert_array_equal(np.unique(history["stage"], return_index=True)[1], [0, 5, 45, 79])
+    assert (np.diff(result.times) > 0.0).all()
+    # the end of each stage has a row and a snapshot
+    assert {4, 44, 144, 146} <= set(history["step"]) & set(result.steps)
+    assert history["plastic_dissipation"][4] > 0.0
+    assert (history["wall/plate/force"][1:45, 2] < 0.0).all()
+    assert not history["wall/plate/force"][45:].any()
+    assert result.attributes["stages"] == ["press", "shake", "fly", "settle"]
+
+
+@pytest.mark.parallel
+def test_restart_in_any_stage_is_bitwise(comm, shared_tmp_path):
+    # MUMPS, which small models take on several ranks, repeats to rounding only
+    data = {**BLOCK, "solver": {"linear": "cg"}}
+    whole, stopped = shared_tmp_path / "whole", shared_tmp_path / "stopped"
+    run(data, comm, whole)
+    for step in (3, 4, 20, 99, 145):
+        assert run(data, comm, stopped, step, restart=step > 3) == step
+    assert run(data, comm, stopped, restart=True) == 146
+    assert everywhere(comm, differences, *(folder / "result.vtkhdf" for folder in (whole, stopped))) == {}

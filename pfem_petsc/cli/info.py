@@ -13,7 +13,7 @@ from .parser import PROGRAM, add_result, surviving
 if TYPE_CHECKING:
     import numpy as np
 
-    from ..output.result import Result
+    from ..output.result import Modes, Result
 
 RANKS = "one"
 
@@ -61,10 +61,22 @@ def describe(result: Result) -> list[str]:
         rows["history"] = "0 rows"
     width = max(map(len, rows))
     lines += [f"  {label:{width}}  {text}" for label, text in rows.items()]
+    if result.n_modes:
+        lines += _modes(result.modes)
     lines += ["history columns:", "  " + " ".join(names)]
     if count:
         lines += _energies(history, names)
     return lines
+
+
+def _modes(modes: Modes) -> list[str]:
+    """The frequencies or load factors, some in a line."""
+    from ..output.modes import NAMES
+
+    name, unit = NAMES[modes.kind]
+    values = [f"{value:.6g}" for value in modes.values]
+    heading = f"modes of {modes.kind}, {name.replace('_', ' ')}{f' [{unit}]' if unit else ''}:"
+    return [heading, *("  " + "  ".join(values[k : k + 8]) for k in range(0, len(values), 8))]
 
 
 def _energies(history: Mapping[str, np.ndarray], names: list[str]) -> list[str]:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
+from ..errors import InputError
 from .parser import PROGRAM, add_result, surviving
 
 RANKS = "one"
@@ -13,7 +15,8 @@ EXAMPLE = f"""\
 examples:
   {PROGRAM} render results/rod_impact
   {PROGRAM} render results/ring_impact --field velocity --component x --clim -20 20
-  {PROGRAM} render results/lattice_drop -o pictures --frames 60 --size 1920x1080 --view iso"""
+  {PROGRAM} render results/lattice_drop -o pictures --frames 60 --size 1920x1080 --view iso
+  {PROGRAM} render results/taut_cable --modes 1,3"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -28,6 +31,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--frames", metavar="N[,N...]", type=_frames, help="how many snapshots to draw, or their numbers; default: all"
     )
     parser.add_argument("--fps", type=float, default=24.0, help="frames per second of the film; default: %(default)g")
+    parser.add_argument(
+        "--modes",
+        metavar="N[,N...]",
+        nargs="?",
+        const=[],
+        type=_modes,
+        help="draw the modes of a case with [modes], or those of these numbers, into DIR/modes; --frames is then the "
+        "number of frames of a period",
+    )
     parser.add_argument("--size", metavar="WxH", type=_size, default=(1280, 720), help="pixels; default: 1280x720")
     parser.add_argument("--view", default="auto", help="xy, xz, yz, iso or auto; default: %(default)s")
     parser.add_argument("--video", default="mp4", help="mp4, gif, both or none; default: %(default)s")
@@ -48,26 +60,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Draw, and print the names of the files written."""
-    from ..post.render import render
+    options = {
+        name: getattr(arguments, name)
+        for name in ("fps", "size", "view", "video", "poster", "cmap", "scale", "bar_width", "nodes", "title")
+    }
+    if arguments.clim is not None:
+        options["clim"] = tuple(arguments.clim)
+    path = surviving(arguments.result)
+    if arguments.modes is not None:
+        written = _draw_modes(path, arguments, options)
+    else:
+        from ..post.render import render
 
-    written = render(
-        surviving(arguments.result),
-        arguments.output,
-        field=arguments.field,
-        component=arguments.component,
-        frames=arguments.frames,
-        fps=arguments.fps,
-        size=arguments.size,
-        view=arguments.view,
-        video=arguments.video,
-        poster=arguments.poster,
-        clim=None if arguments.clim is None else tuple(arguments.clim),
-        cmap=arguments.cmap,
-        scale=arguments.scale,
-        bar_width=arguments.bar_width,
-        nodes=arguments.nodes,
-        title=arguments.title,
-    )
+        shown = {name: getattr(arguments, name) for name in ("field", "component", "frames")}
+        written = render(path, arguments.output, **shown, **options)
     frames = [path for path in written if path.parent.name == "frames"]
     for path in written:
         if path not in frames:
@@ -75,6 +81,22 @@ def run(arguments: argparse.Namespace) -> int:
     if frames:
         print(f"{frames[0]} ... {frames[-1].name}: {len(frames)} frames")
     return 0
+
+
+def _draw_modes(path: Path, arguments: argparse.Namespace, options: dict[str, Any]) -> list[Path]:
+    from ..post.modes import render_modes
+
+    if isinstance(arguments.frames, list):
+        raise InputError("render: --frames is the number of frames of a period with --modes: give one number")
+    period = {} if arguments.frames is None else {"period": arguments.frames}
+    return render_modes(path, arguments.output, modes=arguments.modes or None, **period, **options)
+
+
+def _modes(text: str) -> list[int]:
+    try:
+        return [int(part) for part in text.split(",")]
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a list of numbers of modes like 1,2,5") from None
 
 
 def _frames(text: str) -> int | list[int]:

@@ -11,6 +11,7 @@ from ..errors import InputError
 from ..registry import lookup
 
 if TYPE_CHECKING:
+    from ..case.settings import Modes
     from ..stepping.model import Model
 
 __all__ = ["SOLVERS", "available", "choose", "describe_modes", "solver_module"]
@@ -21,6 +22,7 @@ DENSE_UP_TO = 600
 """Maximum number of components for which NumPy computes all eigenvalues, faster than an iteration."""
 DENSE_AT_MOST = 6_000
 """Maximum number of components for NumPy without a library for sparse matrices: about 2 minutes and 1 GB."""
+_PART = 0.2  # of all modes, from which on computing all of them takes less time than iterations
 GATHERED_AT_MOST = 300_000
 """Maximum number of components for which matrices are gathered on one rank for SciPy."""
 
@@ -47,18 +49,18 @@ def describe_modes(model: Model) -> dict[str, str]:
     if case.modes is None:
         return {}
     free = 3 * model.mesh.n_nodes - model.comm.allreduce(int(model.supports.fixed.sum()))
-    name = choose(case.modes.solver, free, case.source)
+    name = choose(case.modes, free, case.source)
     what = "natural vibrations" if case.modes.kind == "vibration" else "buckling modes"
     mass = f", {case.modes.mass or case.mass} mass" if case.modes.kind == "vibration" else ""
     return {"modes": f"{min(case.modes.count, free)} {what} of the state at the end{mass}, solver {name}"}
 
 
-def choose(asked: str, free: int, source: str) -> str:
+def choose(settings: Modes, free: int, source: str) -> str:
     """Return the name of the solver for a number of free components.
 
     Parameters
     ----------
-    asked : ``modes.solver``
+    settings : table ``[modes]``
     free : number of free components
     source : file of the case, for the message
 
@@ -67,8 +69,9 @@ def choose(asked: str, free: int, source: str) -> str:
     InputError
         If no installed library can solve a problem of this size.
     """
+    asked, most = settings.solver, min(settings.count, free)
     if asked == "auto":
-        if free <= DENSE_UP_TO:
+        if free <= DENSE_UP_TO or (free <= DENSE_AT_MOST and most > _PART * free):
             return "dense"
         if available(LIBRARIES["slepc"]):
             return "slepc"

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Found", "find_modes"]
 
-_SHIFT = 1e-4  # distance of the shift below zero, relative to the squared frequency wave speed / length
+_SHIFT = 1e-3  # distance of the shift below zero, relative to the squared frequency wave speed / length
 _ROUNDING = 1e-13  # relative to the largest eigenvalue: smaller ones are zero
 _MORE = 4  # additional modes, so that repeated ones are complete
 _AGAIN = 3  # modes requested in a search for missed ones
@@ -44,7 +44,7 @@ class Found:
     shapes : (k, owned, 3): of vibrations [kg^-1/2], with x^T M x = 1; of buckling with a largest component of 1
     negative : number of negative eigenvalues of vibrations
     solver : description
-    iterations : number of solves with the matrix B
+    iterations : number of restarts (SLEPc) or solves (SciPy); 0 without iterations
     at_walls : number of nodes in contact with walls
     """
 
@@ -97,7 +97,7 @@ def find_modes(model: Model, state: State, settings: Settings, consistent: bool)
     if free == 0:
         raise SimulationFailure(f"{model.case.source}: modes: supports and walls hold all nodes: nothing can move")
     matrices = StateMatrices(model, holds, consistent)
-    name = choose(settings.solver, free, model.case.source)
+    name = choose(settings, free, model.case.source)
     count = min(settings.count, free)
     if settings.kind == "buckling":
         return _buckling(model, state, holds, matrices, name, count, free)

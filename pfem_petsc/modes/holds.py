@@ -10,6 +10,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from mpi4py import MPI
 from petsc4py import PETSc
 
 from ..errors import SimulationFailure
@@ -22,9 +23,11 @@ if TYPE_CHECKING:
 
 __all__ = ["Holds"]
 
-_PRESSES = (
-    1e-9  # of the sum of axial stiffnesses at a node times the model's length: the smallest contact force that counts
+_LINKED = (
+    "modes: {} (contact_pair, constraint): modes of states in which nodes hold each other are not available; let the "
+    "analysis end in a state without that contact"
 )
+_PRESSES = 1e-12  # of the sum of axial stiffnesses at a node times the model's length: the smallest force that counts
 _DIFFERENCE = 1e-6  # relative to the model's length: step of the central difference of normals of curved walls
 
 
@@ -55,6 +58,8 @@ class Holds:
         self.held = model.supports.fixed.copy()
         self.curvature: tuple[np.ndarray, np.ndarray] | None = None
         self._nodes, self._turns = np.empty(0, dtype=np.int64), np.empty((0, 3, 3))
+        if model.links:
+            _refuse_links(model)
         walls = None
         with agreed(model.comm):
             walls = _Walls(model, state) if model.can_touch else None
@@ -117,6 +122,14 @@ class Holds:
         return np.where(self.held, 0.0, shapes)
 
 
+def _refuse_links(model: Model) -> None:
+    """Collective."""
+    totals = model.comm.allreduce(np.abs(model.links.totals()).sum())
+    scale = model.comm.allreduce(float(model.nodal_stiffness.max(initial=0.0)), op=MPI.MAX) * model.length
+    if totals > _PRESSES * scale:
+        raise SimulationFailure(_LINKED.format("nodes of the truss press on each other"))
+
+
 def model_wide(comm: object, count: int) -> bool:
     """Return whether any rank has a nonzero count. Collective."""
     return comm.allreduce(count) > 0
@@ -135,7 +148,7 @@ class _Walls:
     def __init__(self, model: Model, state: State) -> None:
         contact, owned = model.contact, model.mesh.n_owned
         weight = np.abs(state.contact).max(axis=1, initial=0.0)
-        presses = weight > _PRESSES * 1e-3 * model.nodal_stiffness * model.length
+        presses = weight > _PRESSES * model.nodal_stiffness * model.length
         tied = contact.ties.held if contact.ties.any else np.zeros(owned, dtype=bool)
         self.nodes = nodes = np.flatnonzero(presses | tied)
         x, displacements = state.position[nodes], contact.motion.displacements(state.time)
@@ -145,11 +158,8 @@ class _Walls:
         touched = np.abs(gaps) <= 10.0 * BEYOND * contact.length
         unknown = nodes[~touched.any(axis=1) & ~tied[nodes]]
         if len(unknown):
-            raise SimulationFailure(
-                f"modes: node {model.mesh.node_ids[unknown[0]]} is held by contact with other nodes (contact_pair, "
-                "constraint), or its wall has left it in the last step: modes of such states are not available; let "
-                "the analysis end in a state without that contact"
-            )
+            what = f"node {model.mesh.node_ids[unknown[0]]} has a contact force, and no wall is there"
+            raise SimulationFailure(_LINKED.format(what))
         massive = [k for k in contact.motion.bodies.at if touched[:, k].any()]
         if massive:
             raise SimulationFailure(

@@ -212,6 +212,8 @@ class _Film:
         return points if self.scale == 1.0 else self.start + self.scale * (points - self.start)
 
     def time(self, frame: int) -> str:
+        if hasattr(self.result, "caption"):
+            return self.result.caption(frame)
         axis, time = self.result.axis, self.result.times[frame]
         return f"{axis.symbol} = {time * self.time_factor:.2f} {self.time_unit}" if axis.unit else axis.place(time)
 
@@ -269,7 +271,8 @@ def _draw_poster(film: _Film, file: Path, title: str, style: dict[str, Any]) -> 
     from .page import Page
     from .poster import grid, instants
 
-    tiles = instants(film.result, film.frames, POSTER_TILES)
+    own = getattr(film.result, "instants", None)
+    tiles = instants(film.result, film.frames, POSTER_TILES) if own is None else own(POSTER_TILES)
     look = film.camera(1.0)
     corners = np.array(np.meshgrid(*film.bounds.T)).reshape(3, -1).T
     shape = [np.ptp(np.concatenate([corners, *film.places]) @ way) for way in (look.right, look.up)]

@@ -120,7 +120,7 @@ def _needed(model: Model, plan: Plan) -> float:
     """Return the maximum memory of this rank [B]."""
     bars = len(model.mesh.bars)
     kind = "" if plan.linear is None else plan.linear.preconditioner
-    if kind in DIRECT:
+    if kind in DIRECT or model.case.modes is not None:
         # fill-in in three dimensions: the factors of n unknowns have O(n^(4/3)) entries
         each = _PER_BAR_FACTORISED * (model.mesh.n_bars / _FACTORISED_AT) ** (1.0 / 3.0)
     else:

@@ -158,6 +158,62 @@ def test_state_under_load(shared_tmp_path, comm):
     assert frequency == pytest.approx([np.sqrt(stiffness / mass) / (2.0 * np.pi)], rel=1e-9)
 
 
+@pytest.mark.parametrize("held", [False, True])
+def test_multigrid_in_place_of_a_factorisation(held, shared_tmp_path, comm, monkeypatch):
+    """As for models that are too large to be factorised; the numbers are those of dense matrices."""
+    pytest.importorskip("slepc4py")
+    from pfem_petsc.modes.eigen import slepc
+
+    data = block("dense", count=8).to_dict()
+    if held:
+        data |= {"node_set": {"feet": {"group": "bottom"}}, "support": [{"node_set": "feet", "fix": "xyz"}]}
+    expected = modes_of(Case.from_dict(data), shared_tmp_path / "dense", comm)
+    monkeypatch.setattr(slepc, "DIRECT_UP_TO", 0)
+    data["modes"]["solver"] = "slepc"
+    found = modes_of(Case.from_dict(data), shared_tmp_path / "multigrid", comm)
+    assert found[0] == pytest.approx(expected[0], rel=1e-8)
+    assert found[2] == pytest.approx(expected[2], abs=1e-8 * np.abs(expected[2]).max())
+
+
+def test_buckled_state(shared_tmp_path, comm):
+    """A spring pushes the arch to where its own stiffness is negative; the frequency is that of both together."""
+    import h5py
+
+    if comm.rank == 0:
+        with h5py.File(shared_tmp_path / "mesh.h5", "w") as file:
+            file["points"] = np.array([[-1.0, 0, 0], [0, 0, 0.1], [1.0, 0, 0], [0, 0, 1.1]])
+            file["bars"] = [[0, 1], [1, 2], [1, 3]]
+            file["bar_groups/spring"] = [2]
+    comm.Barrier()
+    spring = 0.05 * ARCH_AREA
+    case = Case.from_dict(
+        {
+            "mesh": {"file": "mesh.h5"},
+            "node_set": {"held": {"indices": [0, 2]}, "driver": {"indices": [3]}, "apex": {"indices": [1]}},
+            "material": {"it": {"young_modulus": ARCH_YOUNG, "density": 1000.0}},
+            "section": {
+                "arch": {"area": ARCH_AREA, "material": "it"},
+                "spring": {"bars": "spring", "area": spring, "material": "it"},
+            },
+            "support": [
+                {"node_set": "held", "fix": "xyz"},
+                {"node_set": "apex", "fix": "xy"},
+                {"node_set": "driver", "fix": "xyz", "motion": [[0, 0, 0, 0], [1, 0, 0, -0.09]]},
+            ],
+            "static": {"step": 0.1},
+            "modes": {"count": 1},
+        },
+        folder=shared_tmp_path,
+    )
+    _, eigenvalue, _, points = modes_of(case, shared_tmp_path / "out", comm)
+    z = points[1, 2]
+    length, rest = np.hypot(1.0, z), np.hypot(1.0, 0.1)
+    own = 2.0 * ARCH_YOUNG * ARCH_AREA * (1.0 / rest - 1.0 / length + z * z / length**3)
+    assert own < 0.0
+    mass = 1000.0 * (ARCH_AREA * rest + 0.5 * spring)
+    assert eigenvalue == pytest.approx([(own + ARCH_YOUNG * spring) / mass], rel=1e-9)
+
+
 def test_unstable_state(shared_tmp_path, comm, capfd):
     """Two bars in line that heat compresses: the middle node is unstable across, with -2N/l/m as eigenvalue."""
     case = string("auto", count=3, bars=2, temperature=[{"value": STRAIN / 1e-5}])

@@ -62,7 +62,6 @@ class Solver:
     def _multigrid(self) -> None:
         self._ksp.setType("cg")
         self._ksp.setTolerances(rtol=_LINEAR, max_it=2000)
-        self._ksp.setErrorIfNotConverged(False)
         pc = self._ksp.getPC()
         pc.setType("gamg")
         pc.setOperators(self.pencil.b)
@@ -91,12 +90,23 @@ class Solver:
     def largest(self, count: int, start: np.ndarray, known: np.ndarray) -> np.ndarray:
         """See :mod:`pfem_petsc.modes.eigen`."""
         eps, b = self._eps, self.pencil.b
-        eps.setDeflationSpace([_vector(b, each) for each in known])
-        eps.setInitialSpace([_vector(b, start)])
         size = b.getSize()[0]
+        spaces = [_vector(b, each) for each in known], [_vector(b, start)]
+        eps.setDeflationSpace(spaces[0])
+        eps.setInitialSpace(spaces[1])
         eps.setDimensions(min(count, size), min(size, 2 * count + 20))
-        eps.solve()
-        self.iterations += self._ksp.getTotalIterations() if hasattr(self._ksp, "getTotalIterations") else 0
+        try:
+            eps.solve()
+        except PETSc.Error as failure:
+            reason = str(failure).strip().splitlines()[-1]
+            raise SimulationFailure(
+                f"modes: {self.name}: PETSc or SLEPc failed ({reason}); take another modes.solver, or other options "
+                f"-{_PREFIX}..."
+            ) from failure
+        finally:
+            for vector in (*spaces[0], *spaces[1]):
+                vector.destroy()
+        self.iterations += eps.getIterationNumber()
         found = eps.getConverged()
         if found < min(count, size - len(known)):
             raise SimulationFailure(

@@ -1,8 +1,8 @@
 """From one stage to the next: what a stage starts from, and the state that is handed over to it.
 
-Within a stage, time is counted from its start, for its tables and its steps; ``StageStart`` holds the place of that start
-on the axis of the results. Positions, velocities, internal variables, temperatures, contact pairs and contacts with
-walls are handed over. The scheme starts from them as at the start of a run.
+Within a stage time is counted from its start, for its tables and for its steps; ``StageStart`` says where that lies on
+the axis of the results. Positions, velocities, internal variables, temperatures, contact pairs and who touches which
+wall go over; the scheme begins anew from them, as it does at the start of a run.
 """
 
 from __future__ import annotations

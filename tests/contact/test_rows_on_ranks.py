@@ -13,6 +13,7 @@ from pfem_petsc import Case
 from pfem_petsc.contact.constraint_link import _part
 from pfem_petsc.contact.constraints.base import Constraint
 from pfem_petsc.contact.constraints.base import ConstraintKeys as Parameters
+from pfem_petsc.contact.links import Links
 from pfem_petsc.errors import SimulationFailure
 from pfem_petsc.mesh.slab import slab_range
 from pfem_petsc.stepping.model import Model
@@ -198,3 +199,20 @@ def test_rows_that_contradict_each_other_fail_where_they_are(ropes, comm):
         failed = str(failure)
     assert bool(failed) == (len(link.rows.source) > 0)
     assert "satisfy their constraints, walls and supports" in failed or not failed
+
+
+def test_nodes_that_several_things_hold_count_once():
+    """Walls and two links: a node that more than one of them holds is in contact once."""
+
+    class Holds:
+        columns = ()
+
+        def __init__(self, *nodes: int) -> None:
+            self.nodes = list(nodes)
+
+        def mark(self, held: np.ndarray) -> None:
+            held[self.nodes] = True
+
+    assert Links([Holds(1, 2), Holds(2, 5)]).count_held(np.array([5, 0]), 7) == 4
+    assert Links([Holds(), Holds()]).count_held(np.array([3]), 7) == 1
+    assert Links().count_held(np.array([3, 4]), 7) == 2

@@ -9,6 +9,7 @@ solver serves.
 
 from __future__ import annotations
 
+import atexit
 import weakref
 from typing import TYPE_CHECKING
 
@@ -19,7 +20,7 @@ from petsc4py import PETSc
 from ..contact.transform import Transform
 from ..errors import NotConverged
 from ..solvers.lagged import LaggedPreconditioner
-from ..solvers.linear import DIRECT, LinearChoice, configure
+from ..solvers.linear import LinearChoice, configure
 from ..solvers.reasons import linear_reason
 from ..stepping.problem import StepProblem
 
@@ -34,6 +35,7 @@ __all__ = ["BorderedSystem"]
 
 _PREFIX = "pfem_path_"
 _RTOL = 1e-8  # of iterative solves: tangents, which tell where the load factor turns, have no further correction
+_USABLE = 1e-4  # of the right-hand side: residual of an iterative solve that did not get to the end
 _SHARE = 1e-5  # of the load factor, for differences in it: those of loads that are linear in it are exact
 
 
@@ -77,17 +79,14 @@ class BorderedSystem:
         self._ksp = PETSc.KSP().create(mesh.comm)
         self._ksp.setOptionsPrefix(_PREFIX)
         # beyond a critical point the stiffness is indefinite
-        own = (
-            choice
-            if self.direct or choice.preconditioner in DIRECT
-            else LinearChoice("gmres", choice.preconditioner, "")
-        )
+        own = choice if self.direct else LinearChoice("gmres", choice.preconditioner, "indefinite")
         ours = None if lagged is None else _Preconditioning(self)
         configure(self._ksp, own, False, ours)
         if not self.direct:
             self._ksp.setTolerances(rtol=_RTOL, max_it=2000)
         self._ksp.setOperators(hessian.mat, hessian.mat)
         self._ksp.setFromOptions()
+        atexit.register(_let_go, weakref.ref(self._ksp))
         self.problem: StepProblem | None = None
 
     def begin(self, state: State) -> None:
@@ -177,12 +176,25 @@ class BorderedSystem:
     def _attempt(self) -> int:
         self._ksp.solve(self._b, self._x)
         self.linear += self._ksp.getIterationNumber()
-        return self._ksp.getConvergedReason()
+        reason = self._ksp.getConvergedReason()
+        if reason < 0 and not self.direct and self._ksp.getResidualNorm() <= _USABLE * self._b.norm():
+            return 1  # next to a critical point more is not to be had, and Newton's method corrects it
+        return reason
 
     def destroy(self) -> None:
         """Free the PETSc objects."""
         for thing in (self._ksp, self._b, self._x):
             thing.destroy()
+
+
+def _let_go(reference: weakref.ref) -> None:
+    """Take what is written in Python from a solver that is still there when Python ends: PETSc would call it later."""
+    ksp = reference()
+    if ksp:
+        ksp.getPC().setType("none")
+        for matrix in ksp.getOperators():
+            if matrix and matrix.getType() == "python":
+                matrix.incRef()
 
 
 class _Preconditioning:

@@ -34,6 +34,7 @@ EVENTS: dict[str, Any] = {
 
 _TRIALS = 60
 _LOCATED = 1e-8  # last change of the length, over the step
+_NARROW = 1e-3  # interval, over the step, whose last trial will do where no further one converges
 _FLAT = 1e-9  # slope of the load factor at a limit point, over that of the first response
 _BESIDE = 4e-3  # length beside a bifurcation, over the step, at which the path is well determined
 _DEPTH = 8  # bisections to tell critical points of a step apart
@@ -209,7 +210,12 @@ class _Search:
         fa = fb = None
         size, side, point, previous = 0.5 * (a + b), 0, None, None
         for trial in range(_TRIALS):
-            point = self._tried(size, a, b)
+            try:
+                point = self._tried(size, a, b)
+            except NotConverged:
+                if point is None or b - a > _NARROW * self.size:
+                    raise
+                break  # as close as the linear solver gets
             f = value(point)
             size = self.stepper.measure(point)
             if abs(f) <= zero or (previous is not None and abs(size - previous) <= _LOCATED * self.size):

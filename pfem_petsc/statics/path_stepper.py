@@ -84,6 +84,9 @@ class PathStepper(StaticStepper):
         self.mode = np.zeros_like(self.state.position)
         self.events: list[Event] = []
         self._point: Point | None = None
+        if self.points.stability is not None and self.points.stability.refusal is not None:
+            refusal = self.points.stability.refusal
+            self.scheme.notice = f"bifurcations are not looked for, only limit points: {refusal}"
 
     @property
     def clock(self) -> float:
@@ -94,14 +97,6 @@ class PathStepper(StaticStepper):
     def done(self) -> bool:
         """Whether the path has reached one of its limits."""
         return bool(self.ended)
-
-    @property
-    def notes(self) -> list[str]:
-        """What users must be told at the start."""
-        stability = self.points.stability
-        if stability is None or stability.refusal is None:
-            return []
-        return [f"bifurcations are not looked for, only limit points: {stability.refusal}"]
 
     def remarks(self) -> list[str]:
         """Where the path ended, and why."""
@@ -199,11 +194,10 @@ class PathStepper(StaticStepper):
             if moved:
                 at_rest = LoadFactor(0.0, self.keys.step)
                 u, _, newton = self.points.newton(at_rest, u, state.time)
-            self.metric.weight = 1.0
-            tangent, slope = self.points.tangent(u, state.time)
+            self.system.linearise(u)
+            response = self.system.response(u, state.time)
         except NotConverged as failure:
             raise self._no_path(failure) from failure
-        response = tangent / slope
         size = float(np.sqrt(dot(self.model.comm, response, response)))
         if not size > 0.0 or not np.isfinite(size):
             raise SimulationFailure(
@@ -354,10 +348,13 @@ class PathStepper(StaticStepper):
             self.model.temperatures.apply(self.state.time)
 
     def _no_path(self, failure: NotConverged) -> SimulationFailure:
-        """Return the message about a path that cannot be continued."""
+        """What to tell of a path that cannot go on."""
+        hint = ""
+        if self._by_component:
+            hint = '; where the displacement along static.direction turns back, static.method = "arc_length" goes on'
         return SimulationFailure(
             f"the path cannot be followed beyond point {self.state.step} at load factor {self.state.time:.6g} with "
-            f"steps down to {self.keys.smallest:.3g}: {failure}{free_motions(self.model)}"
+            f"steps down to {self.keys.smallest:.3g}: {failure}{hint}{free_motions(self.model, self.state)}"
         )
 
 

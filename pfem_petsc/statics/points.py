@@ -127,7 +127,10 @@ class PointSolver:
             system.linearise(u)
             r, v = system.solve(-g), system.response(u, load_factor)
             along = comm.allreduce(np.array([(terms.by_u * r).sum(), (terms.by_u * v).sum()]))
-            change = -(terms.value + along[0]) / (along[1] + terms.by_load)
+            rate = float(along[1]) + terms.by_load
+            if rate == 0.0:
+                raise NotConverged(f"{self.place}: the load does not move the truss in the direction of the path")
+            change = -(terms.value + along[0]) / rate
             u += r + change * v
             load_factor += float(change)
             system.prescribe(u, load_factor)

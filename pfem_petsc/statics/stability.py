@@ -27,6 +27,7 @@ LARGEST = 30_000
 """Unknowns beyond which bifurcations are not looked for: a factorisation a point would take most of the time."""
 _SWEEPS = 6  # of inverse iteration; where its result matters, the eigenvalue is far nearer to zero than the next
 _ALIKE = 1e-6
+_PREFIX = "pfem_inertia_"
 
 
 class Spectrum(NamedTuple):
@@ -80,10 +81,27 @@ class Stability:
         them: first of the component that has the largest, of these the first in the mesh; then of the next within what
         is left. So they do not depend on the ranks.
         """
-        vectors = self._eigen_near(count) if self.dense else self._factorised_near(count)
+        return self.combined(self.nearest(count)[1])
+
+    def nearest(self, count: int, shift: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+        """Eigenvalues (n,) nearest to zero [N/m], and modes (n, owned, 3), ``count`` of them or all that there are.
+
+        ``shift`` [N/m] is what a factorisation needs where the stiffness is singular.
+        """
+        if self.dense:
+            return self._eigen_near(count)
+        if shift:
+            self._mat.shift(shift)
+        self._factorise()
+        unknowns = self.comm.allreduce(int(np.count_nonzero(~self._fixed)))
+        values, vectors = self._near(min(count, unknowns))
+        return values - shift, vectors
+
+    def combined(self, vectors: np.ndarray) -> list[np.ndarray]:
+        """Combinations of modes (n, owned, 3) that do not depend on which modes they are made of, see :meth:`modes`."""
         ids = 3 * self.mesh.node_ids[: self.mesh.n_owned, None] + np.arange(3)
         found = []
-        for _ in range(count):
+        for _ in range(len(vectors)):
             size = np.einsum("knc,knc->nc", vectors, vectors)
             largest = self.comm.allreduce(float(size.max(initial=0.0)), op=MPI.MAX)
             candidates = np.where(size >= (1.0 - _ALIKE) * largest, ids, np.iinfo(np.int64).max)
@@ -119,28 +137,27 @@ class Stability:
         self._free = np.flatnonzero(~fixed.ravel())
         return np.linalg.eigh(matrix[np.ix_(self._free, self._free)])
 
-    def _eigen_near(self, count: int) -> np.ndarray:
+    def _eigen_near(self, count: int) -> tuple[np.ndarray, np.ndarray]:
         values, vectors = self._eigen()
         near = np.argsort(np.abs(values), kind="stable")[:count]
         whole = np.zeros((3 * self.mesh.n_nodes, len(near)))
         whole[self._free] = vectors[:, near]
-        return whole.T.reshape(len(near), -1, 3)[:, self.mesh.node_ids[: self.mesh.n_owned]]
+        return values[near], whole.T.reshape(len(near), -1, 3)[:, self.mesh.node_ids[: self.mesh.n_owned]]
 
     def _factorise(self) -> None:
         if self._factor is not None:
             self._factor.destroy()
         self._factor = PETSc.PC().create(self.comm)
-        self._factor.setOptionsPrefix("pfem_inertia_")
+        self._factor.setOptionsPrefix(_PREFIX)
         self._factor.setOperators(self._mat)
         self._factor.setType("cholesky")
         if self._mumps:
             self._factor.setFactorSolverType("mumps")
+            options = PETSc.Options(_PREFIX)
+            if not options.hasName("mat_mumps_icntl_24"):
+                options["mat_mumps_icntl_24"] = 1  # detection of null pivots, without which there is no inertia
         self._factor.setFromOptions()
         self._factor.setUp()
-
-    def _factorised_near(self, count: int) -> np.ndarray:
-        self._factorise()
-        return self._near(count)[1]
 
     def _near(self, count: int) -> tuple[np.ndarray, np.ndarray]:
         """Eigenvalues nearest to zero, and vectors (count, owned, 3), by inverse iteration with the factorisation."""

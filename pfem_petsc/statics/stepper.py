@@ -12,6 +12,7 @@ from ..solvers.linear import LinearChoice
 from ..stepping.implicit import ImplicitStepper
 from ..stepping.prescribed import NoRates
 from ..tolerances import TIME
+from .free_motions import free_motions
 from .scheme import Equilibrium
 
 if TYPE_CHECKING:
@@ -142,7 +143,7 @@ class StaticStepper(ImplicitStepper):
             f"no equilibrium found beyond load factor {self.state.time:.6g} with increments down to "
             f"{self.limits.smallest:.3g}: it is a limit point, or part of the truss is a mechanism; static.method = "
             f'"arc_length" follows the path beyond a limit point, "relaxation" finds the equilibrium of slack '
-            f"structures. The last attempt: {failure}"
+            f"structures. The last attempt: {failure}{free_motions(self.model, self.state)}"
         )
 
     def _guess(self, balance: Balance) -> np.ndarray:

@@ -1,0 +1,139 @@
+"""Paths that cannot be followed, cases that ask for what paths do not have, and motions that meet no stiffness."""
+
+import numpy as np
+import pytest
+from mpi4py import MPI
+
+import pfem_petsc.statics.stability
+from pfem_petsc import Case, Simulation, open_result
+from pfem_petsc.errors import InputError, SimulationFailure
+
+
+def von_mises(static=None, **tables):
+    data = Case.load("von_mises").to_dict()
+    if static is not None:
+        data["static"] = static
+    data |= tables
+    return Case.from_dict(data, name="von_mises", source="case.toml")
+
+
+def failure(case, folder, comm=MPI.COMM_SELF):
+    with pytest.raises(SimulationFailure) as raised, Simulation(case, comm, output=folder, quiet=True) as simulation:
+        simulation.run()
+    return str(raised.value)
+
+
+FOLLOWED = {"node_set": "apex", "direction": [0.0, 0.0, -1.0]}
+
+
+@pytest.mark.parametrize(
+    ("static", "words"),
+    [
+        ({"method": "displacement"}, "node_set and direction are missing"),
+        ({"method": "arc_length", "displacement": 0.1}, "displacement needs node_set"),
+        ({"method": "arc_length", "node_set": "apex"}, "node_set and direction belong together"),
+        ({"method": "arc_length", "node_set": "apx", "direction": [0.0, 0.0, 1.0]}, "apex"),
+        ({"method": "arc_length", **FOLLOWED, "direction": [0.0, 0.0, 0.0]}, "is none"),
+        ({"method": "arc_length", "step": 0.1, "max_step": 0.01}, "max_step = 0.01 is smaller"),
+        ({"method": "arc_length", "branch_at": [0]}, "from 1"),
+        ({"method": "arc_length", "branch_at": [1], "critical_points": False}, "critical_points"),
+        ({"method": "displacement", **FOLLOWED, "constraint": "spherical"}, "constraint"),
+    ],
+)
+def test_keys_that_are_refused(static, words):
+    with pytest.raises(InputError, match=words):
+        von_mises(static)
+
+
+def test_contact_is_refused(tmp_path):
+    wall = {"name": "floor", "type": "plane", "point": [0.0, 0.0, -0.5], "normal": [0.0, 0.0, 1.0]}
+    with pytest.raises(InputError, match="remove walls"):
+        Simulation(von_mises(wall=[wall]), MPI.COMM_SELF, output=tmp_path / "a", quiet=True)
+
+
+def test_nothing_that_depends_on_the_load_factor_is_refused(tmp_path):
+    with pytest.raises(InputError, match="nothing depends on the load factor"):
+        Simulation(von_mises(load=[]), MPI.COMM_SELF, output=tmp_path / "a", quiet=True)
+
+
+def test_load_on_supports_alone_fails(tmp_path):
+    text = failure(von_mises(load=[{"node_set": "feet", "force": [0.0, 0.0, -1.0]}]), tmp_path / "a")
+    assert "moves no node" in text
+
+
+def test_path_that_cannot_go_on_keeps_its_points(tmp_path):
+    """A load whose table stops at 0.2: no point has a larger load, and lengths ask for one."""
+    load = [{"node_set": "apex", "force": [0.0, 0.0, -100.0], "table": [[0.0, 0.0], [0.2, 0.2]]}]
+    text = failure(von_mises(load=load), tmp_path / "a")
+    assert "cannot be followed beyond point" in text
+    reached = float(text.split("at load factor ")[1].split()[0])
+    history = open_result(tmp_path / "a").history
+    assert history["load_factor"][-1] == pytest.approx(reached, rel=1e-5)
+    assert len(history["load_factor"]) > 3
+
+
+def test_displacement_that_turns_back(tmp_path):
+    """The dome of 16 bars goes up again after the third limit point: displacement control says so and stops."""
+    data = Case.load("dome_16").to_dict()
+    del data["static"]["constraint"]
+    data["static"]["method"] = "displacement"
+    text = failure(Case.from_dict(data), tmp_path / "a")
+    assert "arc_length" in text
+    history = open_result(tmp_path / "a").history
+    assert (history["event/kind"] == "limit").sum() == 3
+    assert 0.143 < 0.1016 - history["probe/apex/position"][-1, 0, 2] < 0.16
+
+
+class TestFreeMotions:
+    @pytest.mark.parametrize("dense", [True, False])
+    @pytest.mark.parametrize("method", ["newton", "arc_length"])
+    def test_rotation_of_two_bars(self, method, dense, tmp_path, monkeypatch):
+        """An arch that nothing stops to turn about the line through its feet."""
+        if not dense:
+            monkeypatch.setattr(pfem_petsc.statics.stability, "DENSE", 0)
+        case = von_mises({"method": method}, support=[{"node_set": "feet", "fix": "xyz"}])
+        text = failure(case, tmp_path / "a")
+        assert "leaves 1 motion free, of the truss as a rigid body: node 0 along (0, 1, 0)" in text
+
+    @pytest.mark.parallel
+    def test_mechanisms_of_the_dome(self, comm, shared_tmp_path):
+        """Feet held in z alone: 23 unknowns and 16 bars leave 7 motions, 3 of the dome as a whole."""
+        data = Case.load("dome_16").to_dict()
+        data["support"] = [{"node_set": "feet", "fix": "z"}]
+        text = failure(Case.from_dict(data), shared_tmp_path / "a", comm)
+        assert "leaves 7 motions free, 3 of them of the truss as a rigid body: node" in text
+
+    def test_limit_point_is_no_free_motion(self, tmp_path):
+        """Newton's method stops next to the limit load, where the stiffness is small."""
+        text = failure(von_mises({"method": "newton", "step": 0.05, "min_step": 1e-6, "end": 1.0}), tmp_path / "a")
+        reached = float(text.split("beyond load factor ")[1].split()[0])
+        assert 0.38 < reached < 0.3810873
+        assert "free" not in text
+
+
+def test_factorised_inertia_finds_the_same(tmp_path, monkeypatch):
+    """Events of the dome by inertia and inverse iteration are those by all eigenvalues, branch included."""
+    case = Case.load("dome_16", ["static.branch_at=[2]", "static.max_points=37", "output.fields_every=0"])
+    found = []
+    for name, dense in (("dense", 450), ("factorised", 0)):
+        monkeypatch.setattr(pfem_petsc.statics.stability, "DENSE", dense)
+        Simulation(case, MPI.COMM_SELF, output=tmp_path / name, quiet=True).run()
+        found.append(open_result(tmp_path / name).history)
+    for column in ("kind", "multiplicity", "step"):
+        assert found[0][f"event/{column}"].tolist() == found[1][f"event/{column}"].tolist()
+    np.testing.assert_allclose(found[0]["event/load_factor"], found[1]["event/load_factor"], rtol=1e-8)
+    np.testing.assert_allclose(found[0]["probe/ring/position"], found[1]["probe/ring/position"], atol=1e-8)
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize(
+    "solver", [("gamg", "assembled"), ("gamg", "matrix_free"), ("mumps", "matrix_free"), ("mumps", "assembled")]
+)
+def test_linear_solvers_find_the_same_path(solver, comm, shared_tmp_path):
+    linear, operator = solver
+    limits = ["static.max_points=20", "static.iterations=4", "output.fields_every=0"]
+    case = Case.load("dome_16", [*limits, f"solver.linear={linear}", f"solver.operator={operator}"])
+    Simulation(case, comm, output=shared_tmp_path / "a", quiet=True).run()
+    if comm.rank == 0:
+        history = open_result(shared_tmp_path / "a").history
+        assert history["event/load_factor"] == pytest.approx([0.09565880620, -0.09612898292], rel=1e-8)

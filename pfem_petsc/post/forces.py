@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..output.units import TIME, engineering
-from .chart import COLOURS, Chart, window_mean
+from .chart import COLOURS, Chart, literal, window_mean
 
 __all__ = ["draw_forces"]
 
@@ -56,4 +56,4 @@ def draw_forces(
 
 
 def _note(axes: Any, text: str) -> None:
-    axes.annotate(text, (1.0, 1.02), xycoords="axes fraction", fontsize=8, color="#5b6472", ha="right")
+    axes.annotate(literal(text), (1.0, 1.02), xycoords="axes fraction", fontsize=8, color="#5b6472", ha="right")

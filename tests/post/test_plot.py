@@ -70,8 +70,8 @@ def test_pairs_and_constraints_have_pictures(tmp_path, result):
 
 def test_walls_without_a_force_take_no_panels(tmp_path, result):
     alone = Image.open(plot(result, tmp_path / "alone")[-2])
-    result.history["wall/far $away/force"] = 0.0 * result.history["wall/wall/force"]
-    result.history["wall/far $away/contacts"] = 0 * result.history["wall/wall/contacts"]
+    result.history[r"wall/far $\bad$/force"] = 0.0 * result.history["wall/wall/force"]
+    result.history[r"wall/far $\bad$/contacts"] = 0 * result.history["wall/wall/contacts"]
     (written,) = (path for path in plot(result, tmp_path) if path.name == "walls.png")
     beside = Image.open(written)
     assert abs(beside.height - alone.height) < 20
@@ -161,6 +161,12 @@ def test_curves_of_an_earlier_call_stay(tmp_path, result):
     (first,) = plot(result, tmp_path, curves=["kinetic_energy"])
     (second,) = plot(result, tmp_path, curves=["momentum"])
     assert [first.name, second.name] == ["curves.png", "curves_2.png"]
+
+
+def test_characters_that_the_font_lacks_are_boxes_without_a_warning(tmp_path, result, recwarn):
+    result.case.title = "a wall of 壁"
+    plot(result, tmp_path, curves=["kinetic_energy"])
+    assert not [str(warning.message) for warning in recwarn if "Glyph" in str(warning.message)]
 
 
 @pytest.mark.slow

@@ -36,5 +36,6 @@ def lookup(package: str, name: str, where: str) -> ModuleType:
     """
     known = choices(package)
     if name not in known:
-        raise InputError(f"{where}: unknown value {name!r}{nearest(name, known)}")
+        hint = nearest(name, known) if known else "; none is built in, CONTRIBUTING.md says how to add one"
+        raise InputError(f"{where}: unknown value {name!r}{hint}")
     return importlib.import_module(f"{package}.{name}")

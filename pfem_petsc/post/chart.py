@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +13,7 @@ import numpy as np
 from ..errors import InputError
 from ..output.units import TIME, Axis, prefix_for
 
-__all__ = ["COLOURS", "STYLE", "Chart", "literal", "thinned", "window_mean"]
+__all__ = ["COLOURS", "STYLE", "Chart", "boxes_allowed", "literal", "thinned", "window_mean"]
 
 COLOURS = ("#2563b0", "#d9482b", "#2a9d5c", "#8a4fbf", "#e09f1f", "#3aa7c9", "#6b7280", "#b5307c")
 
@@ -84,6 +86,14 @@ def window_mean(time: np.ndarray, values: np.ndarray, width: float) -> np.ndarra
 def literal(text: str) -> str:
     """Return a text in which dollar signs do not start a formula."""
     return text.replace("$", r"\$")
+
+
+@contextmanager
+def boxes_allowed() -> Iterator[None]:
+    """Draw without warnings of characters that the font lacks: they are boxes in the picture, for everybody to see."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph .* missing", UserWarning)
+        yield
 
 
 class Chart:
@@ -165,7 +175,8 @@ class Chart:
         """
         try:
             file.parent.mkdir(parents=True, exist_ok=True)
-            self.figure.savefig(file)
+            with boxes_allowed():
+                self.figure.savefig(file)
         except OSError as error:
             raise InputError(
                 f"{file}: the picture cannot be written ({error.strerror}); give another folder"

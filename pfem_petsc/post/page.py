@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .camera import Camera
-from .chart import literal
+from .chart import boxes_allowed, literal
 from .fields import ColourScale
 
 if TYPE_CHECKING:
@@ -53,7 +53,8 @@ class Page:
         path = font_manager.findfont("DejaVu Sans")
         self._font = ImageFont.truetype(path, max(9, round(20 * self._unit)))
         self._drawn_height = drawn_height or self.region[3]
-        self._background = self._draw(title, field, scale, camera)
+        with boxes_allowed():
+            self._background = self._draw(title, field, scale, camera)
 
     @staticmethod
     def region_of(size: tuple[int, int]) -> tuple[int, int, int, int]:

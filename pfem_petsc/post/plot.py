@@ -15,11 +15,10 @@ from ..energies import LOST, STORED, SUPPLIED
 from ..errors import InputError
 from ..output.units import TIME, engineering, unit_of
 from ..registry import nearest
-from .chart import COLOURS, STYLE, Chart, window_mean
+from .chart import COLOURS, STYLE, Chart
+from .forces import draw_forces
 
 __all__ = ["plot"]
-
-WINDOW = 0.02  # width of the moving average of wall forces, relative to the run
 
 History = Mapping[str, np.ndarray]
 
@@ -62,9 +61,9 @@ def plot(
             _energies(history, title, folder / "energies.png"),
             _momentum(history, title, folder / "momentum.png") if result.axis is TIME else None,
             _probes(history, title, folder / "probes.png"),
-            _forces(history, "wall", case.every_wall, title, folder / "walls.png"),
-            _forces(history, "pair", (), title, folder / "pairs.png"),
-            _forces(history, "constraint", (), title, folder / "constraints.png"),
+            draw_forces(history, "wall", case.every_wall, title, folder / "walls.png"),
+            draw_forces(history, "pair", (), title, folder / "pairs.png"),
+            draw_forces(history, "constraint", (), title, folder / "constraints.png"),
             _solver(history, title, folder / "solver.png"),
         ]
     return [file for file in drawn if file is not None]
@@ -224,36 +223,6 @@ def _range(chart: Chart, axes: Any, quantity: str, values: np.ndarray) -> None:
         k = "xyz".index(name)
         low, high = values[::every, :, k].min(axis=1) * factor, values[::every, :, k].max(axis=1) * factor
         axes.fill_between(time, low, high, color=COLOURS[k], alpha=0.15, linewidth=0)
-
-
-def _forces(history: History, source: str, walls: Iterable[Any], title: str, file: Path) -> Path | None:
-    """Forces of all walls, or of all pairs or constraints, and the nodes in contact where they are counted."""
-    names = [name.removeprefix(f"{source}/").removesuffix("/force") for name in history if name.endswith("/force")]
-    names = [name for name in names if f"{source}/{name}/force" in history]
-    if not names:
-        return None
-    time = _read(history, "time")
-    normals = {wall.name: np.asarray(wall.normal, dtype=float) for wall in walls if hasattr(wall, "normal")}
-    counted = [f"{source}/{name}/contacts" in history for name in names]
-    rows, heights = sum(3 if c else 2 for c in counted), [h for c in counted for h in (0.9, 0.9, 0.5)[: 2 + c]]
-    chart = _chart(history, title, rows, heights=heights)
-    panels = iter(chart.axes[:, 0])
-    width = WINDOW * float(time[-1] - time[0])
-    for name, counts in zip(names, counted, strict=True):
-        # peaks (the inertia of a node that is stopped within a step) and means need different scales
-        force = _read(history, f"{source}/{name}/force")
-        if name in normals:
-            values, label = force @ normals[name] / np.linalg.norm(normals[name]), "normal force"
-        else:
-            values, label = np.linalg.norm(force, axis=1), "force"
-        smooth = window_mean(time, values, width)
-        heading = f"{source.capitalize()} '{name}'"
-        chart.curves(next(panels), label, "N", [("as computed", values)], heading, [{"linewidth": 0.9}])
-        mean = f"{label},\nmean of the\n{engineering(width, 's', 3)} before"
-        chart.curves(next(panels), mean, "N", [("mean", smooth)], styles=[{"linewidth": 1.6}])
-        if counts:
-            chart.counts(next(panels), "nodes in\ncontact", history[f"{source}/{name}/contacts"], COLOURS[1])
-    return chart.save(file)
 
 
 def _solver(history: History, title: str, file: Path) -> Path | None:

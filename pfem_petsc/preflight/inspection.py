@@ -11,7 +11,7 @@ from .overlaps import nodes_on_bars, overlapping_bars
 from .parts import count_parts
 from .reach import bars_larger_than_walls
 from .rigidity import global_rigidity, model_directions, unbraced_nodes
-from .sanity import odd_numbers
+from .sanity import far_points, odd_numbers
 from .walls import wall_gaps
 
 if TYPE_CHECKING:
@@ -66,6 +66,7 @@ def inspect(case: Case, model: Model) -> tuple[dict[str, str], list[str]]:
             f"{found.unknowns} free directions{where}, {found.rigid_motions} rigid motions, {found.mechanisms} "
             f"mechanisms, {found.self_stresses} states of self-stress"
         )
+    entries |= far_points(case, model)
     for name, text in wall_gaps(model)[0].items():
         entries[f"wall {name}"] = text
     if case.mesh.generator is None:

@@ -14,14 +14,17 @@ if TYPE_CHECKING:
     from ..case.schema import Case
     from ..stepping.model import Model
 
-__all__ = ["odd_numbers"]
+__all__ = ["far_points", "odd_numbers"]
+
+_SLENDER = 1e4
+"""Length over thickness of a bar beyond which one of the two is mostly in another unit: a cable of 100 m and 1 cm."""
 
 _HINT = "case files are in SI units (m, kg, s, N, Pa)"
 
 
 def odd_numbers(case: Case, model: Model) -> list[str]:
     """Return one message for each suspicious value: key, value, reason. Collective."""
-    texts = [*_materials(case), *_sections(case), *_mesh(case, model)]
+    texts = [*_materials(case), *_sections(case), *_mesh(case, model), *_slender(case, model), *_weightless(case)]
     return [f"{case.source}: {text}" for text in texts]
 
 
@@ -43,6 +46,50 @@ def _sections(case: Case) -> Iterator[str]:
     for name, section in case.section.items():
         if not 1e-18 <= section.area <= 10.0:
             yield f"section.{name}.area = {section.area:g} m2: no bar has that; 1 mm2 is 1e-6 m2"
+
+
+def _weightless(case: Case) -> Iterator[str]:
+    for wall in case.wall:
+        if wall.gravity and case.gravity is None:
+            yield f"wall {wall.name!r}: gravity = true, but the case has no [gravity]: none acts on it"
+
+
+def _slender(case: Case, model: Model) -> Iterator[str]:
+    """Bars far longer than thick: a mesh in millimetres with areas in square metres."""
+    mesh = model.mesh
+    longest = np.zeros(len(case.section))
+    for block in mesh.blocks:
+        rest = model.bars.rest[block.start : block.counted]
+        longest[block.section] = max(longest[block.section], float(rest.max(initial=0.0)))
+    longest = np.max(model.comm.allgather(longest), axis=0)
+    for (name, section), length in zip(case.section.items(), longest.tolist(), strict=True):
+        thickness = math.sqrt(section.area)
+        if length > _SLENDER * thickness and section.area >= 1e-18:  # smaller areas are reported as such
+            yield (
+                f"section.{name}: a bar of {engineering(length, 'm')} is {length / thickness:,.0f} times as long as it "
+                f"is thick (area = {section.area:g} m2): is the mesh in millimetres? {_HINT}"
+            )
+
+
+def far_points(case: Case, model: Model) -> dict[str, str]:
+    """Label and text of node sets whose nearest node is far from the point. Collective."""
+    mesh, comm = model.mesh, model.comm
+    points = mesh.points[: mesh.n_owned]
+    longest = max(comm.allgather(float(model.bars.rest.max(initial=0.0))))
+    found = {}
+    for name, node_set in case.node_set.items():
+        if node_set.nearest is None:
+            continue
+        away = np.linalg.norm(points - np.array(node_set.nearest), axis=1)
+        mine = int(away.argmin()) if len(away) else -1
+        here = (float(away[mine]), int(mesh.node_ids[mine])) if mine >= 0 else (np.inf, -1)
+        distance, node = min(comm.allgather(here))
+        if distance > longest:
+            found[f"node set {name}"] = (
+                f"the nearest node is node {node}, {engineering(distance, 'm')} away from the point: farther than the "
+                "longest bar is long"
+            )
+    return found
 
 
 def _mesh(case: Case, model: Model) -> Iterator[str]:

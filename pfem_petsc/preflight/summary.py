@@ -38,6 +38,8 @@ def summarise(case: Case, model: Model, plan: Plan) -> dict[str, str]:
         **describe_modes(model),
         "linear solver": plan.linear.why if plan.linear is not None else "none: nodes are solved independently",
         "walls": ", ".join(map(_described, case.every_wall)) or "none",
+        **({"contact pairs": ", ".join(pair.name for pair in case.contact_pair)} if case.contact_pair else {}),
+        **({"constraints": ", ".join(f"{c.name} ({c.kind})" for c in case.constraint)} if case.constraint else {}),
         "memory": f"{engineering(peak, 'B', 3)} in use on all ranks",
     }
 

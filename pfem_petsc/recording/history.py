@@ -139,11 +139,21 @@ class History(Observer):
         return self.row["energy_imbalance"] / scale if scale > 0.0 else None
 
     def remarks(self) -> list[str]:
-        """Return remarks about walls without contact, which may be unintended."""
+        """Return remarks about walls and pairs without contact, which may be unintended."""
         contact = self._model.contact
         times = contact.log.times(self._model.comm)
         touched = np.array(times["sum"]) > 0.0
         for flags in times["flags"]:
             touched |= np.array(flags, dtype=bool)
         names = np.array(contact.names, dtype=object)[~touched]
-        return [f"wall {name!r} was never touched by a node" for name in names]
+        # impulses are those of inertial schemes, and of several stages together
+        known = self._stepper.scheme.inertial and self.rows is None
+        pairs = [pair.name for pair in self._model.case.contact_pair if known and not self._pressed(pair.name)]
+        return [
+            *(f"wall {name!r} was never touched by a node" for name in names),
+            *(f"contact pair {name!r} never carried a force" for name in pairs),
+        ]
+
+    def _pressed(self, name: str) -> bool:
+        """Return whether a pair has had a force: its forces have one direction, so that their impulses add up."""
+        return any(bool(np.any(self.row[f"pair/{name}/{kind}"])) for kind in ("impulse", "jump_impulse"))

@@ -6,6 +6,7 @@ from helpers.lattices import lattice_case, planes, simulation
 
 from pfem_petsc import Case, Simulation
 from pfem_petsc.errors import InputError, SimulationFailure
+from pfem_petsc.preflight.inspection import warnings_before
 
 SCHEMES = [("central_differences", {}), ("chung_lee", {}), ("newmark", {}), ("houbolt", {})]
 SPEED = np.array([1.0, -0.5, -4.0])
@@ -123,6 +124,16 @@ def test_refused(comm, shared_tmp_path):
     with pytest.raises(InputError, match="change velocities by jumps"):
         case = lattice_case(planes([[0, 0, 1.0]], [-0.1], mass=1.0), contact={"treatment": "stick"})
         simulation(case, comm, shared_tmp_path)
+
+
+@pytest.mark.parallel
+def test_gravity_of_a_wall_in_a_case_without_is_told(comm, shared_tmp_path):
+    case = lattice_case(planes([[0, 0, 1.0]], [-0.1], gravity=True, mass=1.0, name="ram"))
+    with_gravity = Case.from_dict({**case, "gravity": {"acceleration": [0.0, 0.0, -9.81]}})
+    for told, built in ((1, Case.from_dict(case)), (0, with_gravity)):
+        run = Simulation(built, comm, check_only=True)
+        texts = warnings_before(run.case, run.model, run.plan)
+        assert sum("wall 'ram': gravity = true, but the case has no [gravity]" in t for t in texts) == told
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ from helpers.lattices import planes, rotation, simulation
 from helpers.rods_that_meet import DIRECTION, TRAPEZOID, half, two_rods
 from helpers.turning import with_mesh_file
 
+from pfem_petsc import Case, Simulation
 from pfem_petsc.errors import InputError
 
 EXPLICIT = [{"integrator": name} for name in ("central_differences", "chung_lee", "hulbert_chung")]
@@ -187,3 +188,17 @@ def test_ranks_that_own_no_node_of_a_pair(walls, comm, shared_tmp_path):
     assert max(row["pair/faces/force"][0] for row in rows) > 0.05
     assert max(abs(row["momentum"][0]) for row in rows) < 1e-14
     assert max(abs(row["energy_imbalance"]) for row in rows) < 1e-14
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("end, told", [(0.2, 1), (0.8, 0)])
+def test_pairs_that_never_press_are_told_at_the_end(comm, shared_tmp_path, end, told):
+    """The gap of 0.1 closes at t = 0.5."""
+    data = two_rods()
+    data["time"]["end"] = end
+    run = Simulation(Case.from_dict(data), comm, output=shared_tmp_path / "rods", quiet=True)
+    assert run.summary()["contact pairs"] == "faces"
+    assert run.run() == 0
+    if comm.rank == 0:
+        log = (shared_tmp_path / "rods" / "log.txt").read_text()
+        assert log.count("contact pair 'faces' never carried a force") == told

@@ -165,7 +165,7 @@ def test_vtk_with_other_cells(tmp_path):
 
     path = tmp_path / "solid.vtu"
     pyvista.Sphere().cast_to_unstructured_grid().save(path)
-    assert "cells of types [5]; bars are lines (type 3)" in refusal(path)
+    assert "cells of types [5]; bars are lines (type 3), and there are none" in refusal(path)
     pyvista.Sphere().save(tmp_path / "sphere.vtp")
     (tmp_path / "sphere.vtp").rename(path)
     assert "FILE" in refusal(path)

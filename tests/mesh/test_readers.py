@@ -78,6 +78,26 @@ def test_vtk(comm, shared_tmp_path, suffix):
     assert list(mesh.node_groups) == ["group_2"]
 
 
+def test_vtk_with_other_cells_between_the_lines(comm, shared_tmp_path):
+    """Vertices and triangles, as other programs add them, are left out, and so are they from the groups of cells."""
+
+    def write(path):
+        import pyvista
+
+        cells, kinds, legs = [1, 0], [1], [1]
+        for number, ends in enumerate(BARS):
+            cells, kinds, legs = [*cells, 2, *ends], [*kinds, 3], [*legs, int(number in LEGS)]
+        grid = pyvista.UnstructuredGrid([*cells, 3, 0, 1, 2], np.array([*kinds, 5], np.uint8), POINTS)
+        grid.cell_data["section"] = np.array([*legs, 1], np.int32)
+        grid.point_data["group"] = np.where(np.isin(np.arange(len(POINTS)), TOP), 2, -1)
+        grid.save(path)
+
+    slab = read(written(comm, shared_tmp_path, "mixed.vtu", write), comm)
+    (warning,) = slab.warnings
+    assert warning.endswith("mixed.vtu: left out 2 cells that are no lines")
+    check_sample(whole(slab, comm), ("group_2",), ("section_1",))
+
+
 def test_hdf5_of_another_writer(comm, shared_tmp_path):
     check_sample(whole(read(written(comm, shared_tmp_path, "truss.h5", write_hdf5), comm), comm))
 

@@ -68,6 +68,19 @@ def test_pairs_and_constraints_have_pictures(tmp_path, result):
     assert len(saturated(written["pairs.png"])) > 500
 
 
+def test_walls_without_a_force_take_no_panels(tmp_path, result):
+    alone = Image.open(plot(result, tmp_path / "alone")[-2])
+    result.history[r"wall/far $\bad$/force"] = 0.0 * result.history["wall/wall/force"]
+    result.history[r"wall/far $\bad$/contacts"] = 0 * result.history["wall/wall/contacts"]
+    (written,) = (path for path in plot(result, tmp_path) if path.name == "walls.png")
+    beside = Image.open(written)
+    assert abs(beside.height - alone.height) < 20
+    assert np.asarray(beside.convert("L")).size and beside.tobytes() != alone.tobytes()  # the note names it
+    # nothing to show at all: the panels say so
+    result.history["wall/wall/force"] = 0.0 * result.history["wall/wall/force"]
+    assert "walls.png" in [path.name for path in plot(result, tmp_path)]
+
+
 def test_named_curves(tmp_path, result):
     written = plot(result, tmp_path, curves=["kinetic_energy", "momentum", "probe/tip/velocity", "wall/wall/contacts"])
     assert [path.name for path in written] == ["curves.png"] and len(saturated(written[0])) > 500
@@ -148,6 +161,12 @@ def test_curves_of_an_earlier_call_stay(tmp_path, result):
     (first,) = plot(result, tmp_path, curves=["kinetic_energy"])
     (second,) = plot(result, tmp_path, curves=["momentum"])
     assert [first.name, second.name] == ["curves.png", "curves_2.png"]
+
+
+def test_characters_that_the_font_lacks_are_boxes_without_a_warning(tmp_path, result, recwarn):
+    result.case.title = "a wall of 壁"
+    plot(result, tmp_path, curves=["kinetic_energy"])
+    assert not [str(warning.message) for warning in recwarn if "Glyph" in str(warning.message)]
 
 
 @pytest.mark.slow

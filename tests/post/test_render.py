@@ -231,3 +231,8 @@ def test_a_window_of_another_kind_than_asked_for_does_not_count(tmp_path, monkey
     assert headless._works("vtkOSOpenGLRenderWindow")
     headless.require_rendering.__wrapped__()
     assert os.environ[headless.VARIABLE] == "vtkOSOpenGLRenderWindow"
+
+
+def test_title_with_characters_that_the_font_lacks(tmp_path, recwarn):
+    draw(tmp_path, SyntheticResult(tmp_path / "result.vtkhdf", *ring(), title="壁"), frames=[0])
+    assert not [str(warning.message) for warning in recwarn if "Glyph" in str(warning.message)]

@@ -236,3 +236,33 @@ def test_a_rod_and_a_bent_chain_are_no_subdivided_truss(comm, shared_tmp_path):
         simulation = Simulation(case_of(shared_tmp_path, comm, points, bars), comm, check_only=True)
         told = warnings_before(simulation.case, simulation.model, simulation.plan)
         assert not any("collinear" in text for text in told)
+
+
+@pytest.mark.parametrize(
+    ("scale", "area", "told"), [(1.0, 1e-4, False), (90.0, 1e-4, False), (1e3, 1e-4, True), (1e3, 1e2, False)]
+)
+def test_a_mesh_in_millimetres_is_told(comm, shared_tmp_path, scale, area, told):
+    """A tower of bars of 1 m to 1.4 m with areas in square metres, in metres and in millimetres."""
+    points = scale * np.array(CUBE)
+    case = case_of(shared_tmp_path, comm, points, CUBE_EDGES)
+    data = case.to_dict()
+    for section in data["section"].values():
+        section["area"] = area
+    simulation = Simulation(Case.from_dict(data), comm, check_only=True)
+    texts = [
+        text
+        for text in warnings_before(simulation.case, simulation.model, simulation.plan)
+        if "is the mesh in millimetres?" in text
+    ]
+    assert len(texts) == told
+    assert not told or "a bar of 1.000 km is 100,000 times as long as it is thick (area = 0.0001 m2)" in texts[0]
+
+
+@pytest.mark.parametrize(("point", "told"), [([1.0, 1.0, 1.9], False), ([0.0, 0.0, 3.5], True)])
+def test_a_node_far_from_the_point_it_is_asked_for_is_told(comm, shared_tmp_path, point, told):
+    data = case_of(shared_tmp_path, comm, CUBE, CUBE_EDGES).to_dict()
+    data["node_set"] = {"top": {"nearest": point}}
+    simulation = Simulation(Case.from_dict(data), comm, check_only=True)
+    text = simulation.inspect()[0].get("node set top", "")
+    assert bool(text) == told
+    assert not told or text.startswith("the nearest node is node 4, 2.500 m away from the point: farther than")

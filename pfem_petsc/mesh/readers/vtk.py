@@ -1,4 +1,4 @@
-"""VTK files of lines (.vtu, .vtkhdf): cells are bars, integer cell arrays are groups.
+"""VTK files (.vtu, .vtkhdf): lines are bars, integer cell arrays are groups; other cells are left out, with a warning.
 
 A cell array of integers named ``group`` or ``section`` assigns every bar with value i to the bar group ``group_i`` or
 ``section_i``; a field array of strings named ``group_names`` or ``section_names`` replaces these names by its i-th
@@ -57,6 +57,8 @@ def _read(path: Path) -> WholeMesh:
             mesh = WholeMesh(points=arrays["points"], bars=arrays["bars"])
             for key in arrays.files:
                 kind, slash, name = key.partition("/")
+                if key == "left_out" and arrays[key]:
+                    mesh.warnings.append(f"{path}: left out {arrays[key]} cells that are no lines")
                 if slash:
                     getattr(mesh, kind)[name] = arrays[key]
     return mesh

@@ -63,27 +63,32 @@ def _arrays(grid: Any) -> dict[str, np.ndarray]:
 
     if grid is None or not grid.IsA("vtkUnstructuredGrid"):
         raise ValueError(f"holds a {grid.GetClassName() if grid else 'nothing'}, not an unstructured grid")
-    n_nodes, n_bars = grid.GetNumberOfPoints(), grid.GetNumberOfCells()
-    if n_nodes == 0 or n_bars == 0:
-        raise ValueError(f"{n_nodes} points and {n_bars} cells: not a mesh of bars, or a damaged file")
+    n_nodes, n_cells = grid.GetNumberOfPoints(), grid.GetNumberOfCells()
+    if n_nodes == 0 or n_cells == 0:
+        raise ValueError(f"{n_nodes} points and {n_cells} cells: not a mesh of bars, or a damaged file")
     types = grid.GetDistinctCellTypesArray()
     found = sorted(types.GetValue(i) for i in range(types.GetNumberOfTuples()))
-    if found != [_VTK_LINE]:
-        raise ValueError(f"cells of types {found}; bars are lines (type {_VTK_LINE}), and nothing else is read")
+    if _VTK_LINE not in found:
+        raise ValueError(f"cells of types {found}; bars are lines (type {_VTK_LINE}), and there are none")
+    lines = np.flatnonzero(vtk_to_numpy(grid.GetCellTypesArray()) == _VTK_LINE)
     ends = vtk_to_numpy(grid.GetCells().GetConnectivityArray())
-    if len(ends) != 2 * n_bars:
-        raise ValueError(f"{n_bars} lines with {len(ends)} ends; a bar has two")
+    offsets = vtk_to_numpy(grid.GetCells().GetOffsetsArray())
+    first = offsets[lines]
+    if np.any(offsets[lines + 1] - first != 2) or first.min() < 0 or first.max() > len(ends) - 2:
+        raise ValueError("lines that have not two ends; a bar has two")
     arrays = {
         "points": vtk_to_numpy(grid.GetPoints().GetData()).astype(np.float64),
-        "bars": ends.reshape(-1, 2).astype(np.int64),
+        "bars": ends[first[:, None] + np.array([0, 1])].astype(np.int64),
+        "left_out": np.array(n_cells - len(lines)),
     }
-    for kind, data in (("node_groups", grid.GetPointData()), ("bar_groups", grid.GetCellData())):
-        for name, members in _groups(data, grid.GetFieldData()).items():
+    for kind, data, kept in (("node_groups", grid.GetPointData(), None), ("bar_groups", grid.GetCellData(), lines)):
+        for name, members in _groups(data, grid.GetFieldData(), kept).items():
             arrays[f"{kind}/{name}"] = members
     return arrays
 
 
-def _groups(data: Any, fields: Any) -> dict[str, np.ndarray]:
+def _groups(data: Any, fields: Any, kept: np.ndarray | None) -> dict[str, np.ndarray]:
+    """Members by name, numbered among the points, or among the cells that are ``kept``."""
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
     groups = {}
@@ -94,6 +99,7 @@ def _groups(data: Any, fields: Any) -> dict[str, np.ndarray]:
         values = vtk_to_numpy(array)
         if values.ndim != 1 or not np.array_equal(values, np.rint(values)):
             raise ValueError(f"array {array_name!r} must hold one whole number for each")
+        values = values if kept is None else values[kept]
         names = fields.GetAbstractArray(f"{array_name}_names")
         n_names = names.GetNumberOfValues() if names is not None and names.IsA("vtkStringArray") else 0
         for value in np.unique(values[values >= 0]):

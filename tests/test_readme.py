@@ -61,6 +61,7 @@ def test_python_example_of_arrays_runs(tmp_path):
         timeout=200,
     )
     assert done.returncode == 0, done.stderr
+    assert not done.stderr
     ratios = eval(done.stdout.strip().splitlines()[-1], {"np": np})
     assert len(ratios) == 5 and ratios == pytest.approx([ratios[0]] * 5, rel=0.1)
 

@@ -41,6 +41,14 @@ def lattice(n: int = 5) -> tuple[np.ndarray, np.ndarray]:
     return points, np.concatenate(bars)
 
 
+class SyntheticCase(SimpleNamespace):
+    """A case without stages."""
+
+    @property
+    def every_wall(self):
+        return self.wall
+
+
 class SyntheticResult:
     """Interface of :func:`pfem_petsc.open_result` over made-up motion along -``normal`` and back."""
 
@@ -52,7 +60,7 @@ class SyntheticResult:
         self.n_nodes, self.n_bars = len(points), len(bars)
         self.point_fields, self.cell_fields = ["displacement", "velocity"], ["plastic_strain", "strain", "stress"]
         self.times = np.linspace(0.0, end, snapshots)
-        self.case = SimpleNamespace(title=title, name="synthetic", wall=list(walls), gravity=None)
+        self.case = SyntheticCase(title=title, name="synthetic", wall=list(walls), stage=(), gravity=None)
         normal = np.array(walls[0].normal if walls else (-1.0, 0.0, 0.0))
         normal = normal / np.linalg.norm(normal)
         away = (points - np.array(walls[0].point if walls else (1.2, 0, 0))) @ normal

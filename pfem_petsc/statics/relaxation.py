@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -82,7 +81,6 @@ class RelaxationStepper(StaticStepper):
             model.temperatures.apply(balance.time)
         motion.begin(self.state, balance.time, self.state.external)
         stages = [share for share in self._handovers if share > parameters.tolerance]
-        newton = 0
         for share in (*stages, parameters.tolerance):
             done = motion.relax(share, parameters.max_iterations)
             if not done:
@@ -91,7 +89,7 @@ class RelaxationStepper(StaticStepper):
             if parameters.newton:
                 solution = self._polish(balance)
                 if solution is not None:
-                    return replace(solution, newton=newton + solution.newton, linear=solution.linear)
+                    return solution
         solution = self._relaxed(balance)
         self._look_at_stability(solution)
         return solution

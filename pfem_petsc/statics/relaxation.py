@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,6 +10,7 @@ from ..errors import InputError, NotConverged, SimulationFailure
 from ..integrators.base import Balance
 from ..stepping.solution import Solution
 from ..tolerances import TIME
+from .minimum import MinimumCheck
 from .pseudo_motion import PseudoMotion
 from .stepper import StaticStepper
 
@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 
 __all__ = ["RelaxationStepper"]
 
-_HANDOVERS = (1e-2, 1e-4, 1e-6)  # residuals relative to the load at which Newton's method is tried
+# residuals relative to the load at which Newton's method is tried; the last one alone for large models
+_HANDOVERS = (1e-2, 1e-4, 1e-6)
 _NEAR = 0.05  # relative to the model's length: a solution farther from the relaxed positions is another equilibrium
 _DOWN = 1e-10  # relative to the energies: allowed rise of the energy above the relaxed positions, by rounding
 
@@ -31,7 +32,8 @@ class RelaxationStepper(StaticStepper):
 
     Internal variables of bars are updated once, from the previous equilibrium to the new one; the path of the
     pseudo-motion does not affect them. The solution of Newton's method, tried from the relaxed positions, is accepted
-    if it is near and its energy is not higher; otherwise relaxation continues to its own tolerance.
+    if it is near, its energy is not higher, and it is a minimum: the residual is small near an unstable equilibrium,
+    too. Otherwise relaxation continues to its own tolerance.
 
     Attributes
     ----------
@@ -48,6 +50,7 @@ class RelaxationStepper(StaticStepper):
         self.parameters = parameters
         self.guard = None  # relaxation allows large rotations
         self.motion = PseudoMotion(model, parameters.damping)
+        self.minimum = MinimumCheck(model) if parameters.newton else None
         self.pseudo_steps, self.residual = 0, 0.0
 
     def step(self) -> None:
@@ -77,8 +80,7 @@ class RelaxationStepper(StaticStepper):
         if model.temperatures.varying:
             model.temperatures.apply(balance.time)
         motion.begin(self.state, balance.time, self.state.external)
-        stages = [share for share in _HANDOVERS if share > parameters.tolerance] if parameters.newton else []
-        newton = 0
+        stages = [share for share in self._handovers if share > parameters.tolerance]
         for share in (*stages, parameters.tolerance):
             done = motion.relax(share, parameters.max_iterations)
             if not done:
@@ -87,8 +89,30 @@ class RelaxationStepper(StaticStepper):
             if parameters.newton:
                 solution = self._polish(balance)
                 if solution is not None:
-                    return replace(solution, newton=newton + solution.newton, linear=solution.linear)
-        return self._relaxed(balance)
+                    return solution
+        solution = self._relaxed(balance)
+        self._look_at_stability(solution)
+        return solution
+
+    @property
+    def _handovers(self) -> tuple[float, ...]:
+        """Residuals relative to the load at which Newton's method is tried."""
+        if self.minimum is None:
+            return ()
+        return _HANDOVERS if self.minimum.refusal is None else _HANDOVERS[-1:]
+
+    def _look_at_stability(self, solution: Solution) -> None:
+        """Warn about an unstable equilibrium. Collective."""
+        if self.minimum is None or self.minimum.refusal is not None:
+            return
+        motion = self.motion
+        count = self.minimum.falling(motion.x, solution.walls, motion.time)
+        if count > 0:
+            self.message(
+                f"load factor {motion.time:.6g}: the equilibrium is unstable, with {count} negative "
+                f"eigenvalue{'s' * (count > 1)} of the stiffness: nothing has moved it away from there, as in a "
+                "symmetric start; add a small load that does"
+            )
 
     def _polish(self, balance: Balance) -> Solution | None:
         """Return the solution of Newton's method from the relaxed positions, None if none is near. Collective."""
@@ -108,8 +132,11 @@ class RelaxationStepper(StaticStepper):
         energy = model.bars.forces(self._after, np.empty_like(self._after), commit=False)
         here, size = motion.potential(motion.x[: len(x)], motion.energy)
         there, _ = motion.potential(x, energy)
-        reached = max(model.comm.allgather(float(away)))
-        if reached > _NEAR * model.length or there > here + _DOWN * size or energy.failed >= 0:
+        reached, collapsed = max(model.comm.allgather(float(away))), model.comm.allgather(energy.failed >= 0)
+        failed = reached > _NEAR * model.length or there > here + _DOWN * size or sum(collapsed) > 0
+        if not failed and self.minimum.refusal is None:
+            failed = self.minimum.falling(self._after, solution.walls, balance.time) > 0
+        if failed:
             state.contact, state.support, self.held = kept
             return None
         return solution
@@ -137,6 +164,11 @@ class RelaxationStepper(StaticStepper):
             f"({size:.3g} N). Increase static.max_iterations or static.tolerance; if the residual does not fall, "
             "nothing balances the load there"
         )
+
+    def destroy(self) -> None:
+        super().destroy()
+        if self.minimum is not None:
+            self.minimum.destroy()
 
     def _guess(self, balance: Balance) -> np.ndarray:
         """Return the relaxed positions."""

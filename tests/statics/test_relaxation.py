@@ -247,6 +247,52 @@ def test_a_shallow_truss_snaps_through(comm, shared_tmp_path):
         assert z[1] > 0.15 > -0.2 > z[2]  # the limit is at 0.49
 
 
+def column(folder, comm, bend, **static):
+    """Two bars on top of each other, beside their joint one of k = E A/(100 m); 1.2 times the load k l/2 = 5 N."""
+    points = [[0.0, 0.0, 0.0], [bend, 0.0, 1.0], [0.0, 0.0, 2.0], [100.0, 0.0, 1.0]]
+    return case_of(
+        folder,
+        comm,
+        points,
+        [[0, 1], [1, 2], [1, 3]],
+        node_set={"feet": {"indices": [0, 3]}, "joint": {"indices": [1]}, "top": {"indices": [2]}},
+        material={"m": {"young_modulus": 1e6, "density": 1.0}},
+        section={"s": {"area": 1e-3, "material": "m"}},
+        support=[
+            {"node_set": "feet", "fix": "xyz"},
+            {"node_set": "joint", "fix": "y"},
+            {"node_set": "top", "fix": "xy"},
+        ],
+        load=[{"node_set": "top", "force": [0.0, 0.0, -6.0]}],
+        static={"method": "relaxation", **static},
+    )
+
+
+def test_a_column_that_is_hardly_bent_buckles(comm, shared_tmp_path):
+    """It passes the unstable equilibrium, where Newton's method would stay, with a small residual; its top falls
+    through, as the load that it bears decreases, and it hangs."""
+    results = [
+        run(column(shared_tmp_path, comm, 1e-6, newton=newton), comm, shared_tmp_path / str(newton))
+        for newton in (True, False)
+    ]
+    assert results[0][1] == pytest.approx(results[1][1], abs=1e-6)
+    assert results[0][1][2] == pytest.approx([0.0, 0.0, -2.012], abs=1e-4)
+
+
+def test_an_unstable_equilibrium_is_told(comm, shared_tmp_path, capsys):
+    case = chain(
+        shared_tmp_path,
+        comm,
+        [[0, 0, 0], [0, 0, 1], [0, 0, 2]],
+        support=[{"node_set": "at0", "fix": "xyz"}, {"node_set": "at2", "fix": "xy"}],
+        load=[{"node_set": "at2", "force": [0.0, 0.0, -10.0]}],
+    )
+    _, x = run(case, comm, shared_tmp_path / "out")
+    assert x[:, 2] == pytest.approx([0.0, 1.0 - 1e-4, 2.0 - 2e-4], abs=1e-9)
+    told = comm.bcast(capsys.readouterr().err)
+    assert "load factor 1: the equilibrium is unstable, with 2 negative eigenvalues" in told
+
+
 def test_bars_that_yield_remember_equilibria_alone(comm, shared_tmp_path):
     """Two bars pushed and let go: what Newton's method gives, although the pseudo-motion swings beyond."""
     histories = []

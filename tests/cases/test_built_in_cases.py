@@ -47,6 +47,18 @@ def forces(history, wall):
 
 
 @number
+def dome_earthquake(run):
+    """The weight on the supports, the sag of the apex, and how far the shaking moves it relative to the feet."""
+    history = run("dome_earthquake")
+    begun = np.flatnonzero(history["stage"] == 0)[-1]
+    assert history["support_force"][begun, 2] == pytest.approx(268119.188, rel=1e-8)
+    way = history["probe/apex/position"][:, 0, 2] - history["probe/feet/position"][:, 0, 2]
+    assert way[begun] - way[0] == pytest.approx(-33.551e-3, abs=1e-6)
+    assert abs(way[begun:] - way[begun]).max() == pytest.approx(4.7e-3, abs=0.1e-3)
+    assert abs(history["energy_imbalance"]).max() < 1e-7 * history["elastic_energy"].max()
+
+
+@number
 def rod_impact(run):
     """Contact from 0.1 to about 2.1; force spike 2.5 times rho c A v; 2.5 % of the energy lost (formulas: 5.1)."""
     history = run("rod_impact")

@@ -40,6 +40,11 @@ class Checkpointing(Observer):
         """Step of the last one."""
         return self._checkpoints.last_step
 
+    @property
+    def at_end(self) -> bool:
+        """Whether :meth:`complete` writes one."""
+        return self._checkpoints.wanted
+
     def due(self, step: int) -> bool:
         """Return whether a checkpoint is due by the number of the step or by wall-clock time."""
         return super().due(step) or self._synchroniser.checkpoint_due

@@ -55,6 +55,9 @@ def _told(found: Found, asked: int) -> list[str]:
             f"{found.at_walls} nodes are held by walls that press on them: along the normals, by friction and ties in "
             "all directions"
         )
+    zeros = int((found.eigenvalues == 0.0).sum())
+    if zeros:
+        lines.append(f"{zeros} frequencies are zero: rigid-body motions or mechanisms, which no stiffness resists")
     if len(found.values) < asked:
         lines.append(f"{asked} modes are asked for, the state has {len(found.values)}")
     for first in range(0, len(found.values), _PER_LINE):

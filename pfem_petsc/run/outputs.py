@@ -18,6 +18,7 @@ from ..recording.report import ProgressReport
 from ..recording.snapshots import Snapshots
 from ..restart.checkpoints import Checkpoints
 from ..restart.folder import Restart, prepare_folder
+from ..signals import early
 from ..stepping.fused_steps import Batches
 from .compilation import ReportedCompilation
 from .modes import record_modes, remove_modes
@@ -257,11 +258,26 @@ class Outputs:
 
         Raises
         ------
+        EarlyStop
+            On all ranks, if a request to stop has come before.
         PfemError
             On all ranks.
         """
-        if self._analysis.model.case.modes is not None and self.is_open:
-            record_modes(self._analysis.stepper, self._writer, self._folder, self.progress)
+        if self._analysis.model.case.modes is None or not self.is_open:
+            return
+        code, stop = self._synchroniser.synchronise(), self._synchroniser.stop
+        if code and self._analysis.state.step:
+            if not self.checkpointing.at_end:
+                self.checkpointing.write()
+            raise EarlyStop(
+                f"{stop.reason(code)}; the last step is finished, a checkpoint is written, and the modes are not "
+                f"computed: continue with --restart (results in {self._folder})"
+            )
+        self._writer.flush_history()
+        # the libraries for eigenvalues do not return to look at requests: from here on a signal ends the program
+        stop.release()
+        early().release()
+        record_modes(self._analysis.stepper, self._writer, self._folder, self.progress)
 
     def tell_remarks(self) -> None:
         """Report the observers' remarks, such as walls that were never touched. Collective."""

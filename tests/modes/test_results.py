@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+
 import h5py
 import numpy as np
 import pytest
@@ -10,7 +12,7 @@ from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation
 from pfem_petsc.cli.main import main
-from pfem_petsc.errors import InputError, SimulationFailure
+from pfem_petsc.errors import EarlyStop, InputError, SimulationFailure
 from pfem_petsc.modes import choice
 from pfem_petsc.output.result import open_result
 from pfem_petsc.output.verify import examine
@@ -131,6 +133,28 @@ def test_restart_after_modes_were_not_reached(tmp_path, monkeypatch):
     assert open_result(tmp_path / "out").n_modes == 0
     run(case, tmp_path / "out", restart=True)
     assert open_result(tmp_path / "out").n_modes == 1
+
+
+def test_a_request_to_stop_before_the_modes(tmp_path):
+    """The wall time is over after the only step: a checkpoint, from which a restart computes the modes."""
+    tables = press(0.5) | {"static": {"step": 1.0}}
+    case = arch_of(tmp_path, MPI.COMM_SELF, tables, modes={"count": 1})
+    with pytest.raises(EarlyStop, match="the modes are not computed: continue with --restart"):
+        Simulation(case, MPI.COMM_SELF, output=tmp_path / "out", quiet=True, wall_time=1e-9).run()
+    assert open_result(tmp_path / "out").n_modes == 0
+    run(case, tmp_path / "out", restart=True)
+    assert open_result(tmp_path / "out").n_modes == 1
+
+
+def test_signals_end_the_program_while_modes_are_computed(tmp_path, monkeypatch):
+    """The libraries do not look at requests to stop; the handler of before the run is in force again."""
+    from pfem_petsc.run import outputs
+
+    seen = []
+    monkeypatch.setattr(outputs, "record_modes", lambda *_: seen.append(signal.getsignal(signal.SIGTERM)))
+    before = signal.getsignal(signal.SIGTERM)
+    run(block(), tmp_path)
+    assert seen == [before]
 
 
 def test_modes_of_the_initial_state_again(tmp_path):

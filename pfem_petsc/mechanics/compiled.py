@@ -15,7 +15,7 @@ from typing import Any
 import numba
 import numpy as np
 from numba.core import event
-from numba.core.caching import IndexDataCacheFile
+from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.dispatcher import Dispatcher
 from numba.extending import _Intrinsic, register_jitable
 
@@ -41,8 +41,10 @@ def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
             "start compiles anew; set NUMBA_CACHE_DIR to a writable folder"
         )
         return numba.njit(**options)(function)
-    file = getattr(getattr(compiled, "_cache", None), "_cache_file", None)
-    if isinstance(file, IndexDataCacheFile):
+    cache = getattr(compiled, "_cache", None)
+    file = getattr(cache, "_cache_file", None)
+    if isinstance(cache, FunctionCache) and isinstance(file, IndexDataCacheFile):
+        cache.__class__ = _Cache
         file.__class__ = _CacheFile
         file._function = function
         file._variant = _variant(function)
@@ -78,6 +80,17 @@ def _variant(function: Callable[..., Any]) -> str:
 def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a function into the loops that call it, with the options of :func:`kernel`."""
     return register_jitable(fastmath=_FAST, error_model="numpy")(function)
+
+
+class _Cache(FunctionCache):
+    """Cache of one loop whose keys do not depend on the process.
+
+    Numba's own key includes the pickled closure, which for functions of a closure within a closure differs between
+    processes. The digest that stamps the index covers closures.
+    """
+
+    def _index_key(self, signature: Any, codegen: Any) -> tuple[Any, ...]:
+        return signature, codegen.magic_tuple()
 
 
 class _CacheFile(IndexDataCacheFile):

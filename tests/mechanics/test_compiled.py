@@ -120,3 +120,22 @@ def test_every_process_finds_the_machine_code_of_another():
         command = [sys.executable, "-c", program]
         digests.add(subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout)
     assert len(digests) == 1
+
+
+def test_every_process_finds_the_fused_loop_of_another():
+    """Keys of loops that are made of other loops are the same in all processes: a start must not compile them anew."""
+    program = (
+        "from pfem_petsc.integrators.central_differences import Scheme\n"
+        "from pfem_petsc.mechanics.kernels import make_kernels\n"
+        "from pfem_petsc.mechanics.materials.elastic import LAW\n"
+        "from pfem_petsc.mechanics.strain import engineering\n"
+        "from pfem_petsc.stepping.fused_loop import make_fused_loop\n"
+        "loop = make_fused_loop(make_kernels(LAW, engineering).sweep_forces, *Scheme.loops)\n"
+        "print(loop._cache._index_key((), loop.targetctx.codegen()), loop._cache._cache_file._source_stamp)"
+    )
+    keys = set()
+    for seed in ("1", "2"):
+        environment = os.environ | {"PYTHONHASHSEED": seed}
+        command = [sys.executable, "-c", program]
+        keys.add(subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout)
+    assert len(keys) == 1

@@ -181,7 +181,7 @@ class _Search:
         """The point at a length, guessed by the cubic through both ends with their tangents."""
         stepper = self.stepper
         u, load_factor, _, _ = self._cubic(self._start, 0.0, self.last, self.size, size)
-        return stepper.points.find(stepper.constraint(size), u, load_factor)
+        return stepper.points.find(stepper.control.constraint(size), u, load_factor)
 
     def _cubic(
         self, first: Point, low: float, second: Point, high: float, size: float
@@ -246,7 +246,9 @@ class _Search:
 
     def _tried(self, size: float, a: float, b: float) -> Point:
         """The point at a length, or close by where the stiffness is singular to the last digit."""
-        try:
-            return self._at(size)
-        except NotConverged:
-            return self._at(size + 1e-3 * (b - a))
+        for share in (0.0, 1e-3, 0.05, -0.05):
+            try:
+                return self._at(min(max(size + share * (b - a), a), b) if share else size)
+            except NotConverged as failure:
+                last = failure
+        raise last

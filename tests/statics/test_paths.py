@@ -223,11 +223,38 @@ class TestDomeOf16:
         np.testing.assert_allclose(np.sort(turned[1]), np.sort(turned[-1]), atol=1e-6)
 
 
+COARSE = ["static.step=0.05", "output.fields_every=0"]
+
+
+class TestCoarseSteps:
+    """Steps of the dome that are far too large."""
+
+    def test_same_critical_points(self, history, tmp_path):
+        """Steps of five times the length, up to a third of the limit load at the start, find the same."""
+        coarse = run(Case.load("dome_16", [*COARSE, "static.max_step=10"]), tmp_path / "a", MPI.COMM_SELF)
+        assert len(coarse["step"]) < 0.4 * len(history["step"])
+        for column in ("kind", "multiplicity"):
+            assert coarse[f"event/{column}"].tolist() == history[f"event/{column}"].tolist()
+        for column in ("load_factor", "displacement"):
+            np.testing.assert_allclose(coarse[f"event/{column}"], history[f"event/{column}"], rtol=1e-8)
+
+    def test_guard(self, tmp_path):
+        """A first step of thirty limit loads jumps to the inverted dome; the guard halves it."""
+        jump = ["static.step=3", "static.max_step=100", "static.max_points=5", "output.fields_every=0"]
+        free = run(Case.load("dome_16", [*jump, "solver.guard=false"]), tmp_path / "free", MPI.COMM_SELF)
+        assert free["probe/apex/position"][1, 0, 2] == pytest.approx(0.1016 - 0.22, abs=1e-9)
+        guarded = run(Case.load("dome_16", jump), tmp_path / "guarded", MPI.COMM_SELF)
+        apex = guarded["probe/apex/position"][:, 0, 2]
+        assert np.abs(np.diff(apex)).max() < 0.15
+        assert guarded["step_size"][1] <= 0.75
+        assert "bifurcation" in guarded["event/kind"]
+
+
 @pytest.mark.parallel
 @pytest.mark.parametrize("branch", ["[]", "[2]"])
 def test_same_path_on_any_number_of_ranks(branch, tmp_path):
     comm = MPI.COMM_WORLD
-    case = Case.load("dome_16", [f"static.branch_at={branch}", "static.max_points=45", "output.fields_every=0"])
+    case = Case.load("dome_16", [f"static.branch_at={branch}", *COARSE, "static.max_points=18"])
     folder = comm.bcast(str(tmp_path))
     together = run(case, f"{folder}/together", comm)
     alone = run(case, tmp_path / f"alone{comm.rank}", MPI.COMM_SELF)

@@ -178,7 +178,10 @@ class _Search:
         return _End(self.stepper.measure(point), point.slope, point.negatives)
 
     def _at(self, size: float) -> Point:
-        """The point at a length, guessed by the cubic through both ends with their tangents."""
+        """The point at a length, guessed by the cubic through both ends with their tangents.
+
+        Trials in between would be closer, but next to a bifurcation their tangents are lost in rounding.
+        """
         stepper = self.stepper
         u, load_factor, _, _ = self._cubic(self._start, 0.0, self.last, self.size, size)
         return stepper.points.find(stepper.control.constraint(size), u, load_factor)

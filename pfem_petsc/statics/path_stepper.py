@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 __all__ = ["PathStepper"]
 
 _FACTORS = 0.5, 1.5  # of the length from point to point
+_UNRESOLVED = 2.0**-6  # of the length first tried, down to which a step is halved for a critical point not located
 _TURN = 0.5  # cosine between tangents of successive points, below which the step is halved while it can be
 
 
@@ -250,7 +251,14 @@ class PathStepper(StaticStepper):
         point, reached = self._limited(point)
         if self.turning or self.points.stability is None:
             return point, [], reached
-        events, turn = find_critical(self, point)
+        try:
+            events, turn = find_critical(self, point)
+        except NotConverged as failure:
+            # beside an imperfect bifurcation a step may have come to a path that does not lead there
+            if size > _UNRESOLVED * self.arc and 0.5 * size >= self.keys.smallest:
+                raise
+            self.message(f"a critical point was not located: {failure}")
+            events, turn = [], None
         if turn is not None:
             point, reached = turn, ""
         return point, events, reached

@@ -95,7 +95,13 @@ class _Interval(NamedTuple):
 
 
 def find_critical(stepper: PathStepper, last: Point) -> tuple[list[Event], Point | None]:
-    """Critical points up to a point, in their order, and the one at which the path is to turn. Collective."""
+    """Critical points up to a point, in their order, and the one at which the path is to turn. Collective.
+
+    Raises
+    ------
+    NotConverged
+        On all ranks, where one is not found between state and point: the point may lie on another path.
+    """
     return _Search(stepper, last).run()
 
 
@@ -115,10 +121,7 @@ class _Search:
         """See :func:`find_critical`."""
         stepper, last = self.stepper, self.last
         start = _End(0.0, stepper.slope, stepper.negatives)
-        try:
-            self._look(_Interval(start, _End(self.size, last.slope, last.negatives)), 0)
-        except NotConverged as failure:
-            stepper.message(f"a critical point could not be located: {failure}")
+        self._look(_Interval(start, _End(self.size, last.slope, last.negatives)), 0)
         return self.events, self.turn
 
     def _look(self, interval: _Interval, depth: int) -> None:
@@ -142,13 +145,41 @@ class _Search:
         def distance(point: Point) -> float:
             return point.nearest if point.negatives == before else -point.nearest
 
-        size = self.stepper.measure(self._locate(interval, distance, 0.0))
+        tried: list[tuple[float, float]] = []
+        try:
+            size = self.stepper.measure(self._locate(interval, distance, 0.0, tried))
+        except NotConverged:
+            size = self._between(interval, distance, tried)
         beyond = self._at(size + _BESIDE * self.size)
         many = abs(beyond.negatives - before) or 1
         self._note("bifurcation", self._crossing(size, beyond), many)
         end = self._end(beyond)._replace(negatives=before + (many if second.negatives > before else -many))
         if end.size < second.size:
             self._look(_Interval(end, second), depth + 1)
+
+    def _between(self, interval: _Interval, value: Callable[[Point], float], tried: list[tuple[float, float]]) -> float:
+        """Where a value is zero, by inverse interpolation of trials (length, value).
+
+        Next to a bifurcation equations nearly lose their solution, and Newton's method takes too many iterations; the
+        value beside it is well known.
+        """
+        before = [trial for trial in tried if trial[1] > 0.0]
+        beyond = [trial for trial in tried if trial[1] <= 0.0]
+        low = max(before)[0] if before else interval.first.size
+        high = min(beyond)[0] if beyond else interval.second.size
+        guess = 0.5 * (low + high)
+        if before and beyond:
+            (a, fa), (b, fb) = max(before), min(beyond)
+            guess = (a * fb - b * fa) / (fb - fa)
+        for side in (-2.0, -1.0, 1.0, 2.0):
+            size = guess + side * _BESIDE * self.size
+            if size not in [trial[0] for trial in tried]:
+                tried.append((size, value(self._at(size))))
+        near = np.array(sorted(tried, key=lambda trial: abs(trial[0] - guess))[:4])
+        sizes, values = near.T
+        others = [np.delete(values, k) for k in range(len(values))]
+        weights = [np.prod(other / (other - f)) for f, other in zip(values, others, strict=True)]
+        return float(np.dot(weights, sizes))
 
     def _crossing(self, size: float, beyond: Point) -> Point:
         """The point at a bifurcation, between points on both sides of it.
@@ -178,10 +209,13 @@ class _Search:
         return _End(self.stepper.measure(point), point.slope, point.negatives)
 
     def _at(self, size: float) -> Point:
-        """The point at a length, guessed by the cubic through both ends with their tangents."""
+        """The point at a length, guessed by the cubic through both ends with their tangents.
+
+        Trials in between would be closer, but next to a bifurcation their tangents are lost in rounding.
+        """
         stepper = self.stepper
         u, load_factor, _, _ = self._cubic(self._start, 0.0, self.last, self.size, size)
-        return stepper.points.find(stepper.constraint(size), u, load_factor)
+        return stepper.points.find(stepper.control.constraint(size), u, load_factor)
 
     def _cubic(
         self, first: Point, low: float, second: Point, high: float, size: float
@@ -204,8 +238,17 @@ class _Search:
         at, along = np.tensordot(values, u, 1), np.tensordot(rates, u, 1)
         return at, float(np.dot(values, loads)), along, float(np.dot(rates, loads))
 
-    def _locate(self, interval: _Interval, value: Callable[[Point], float], zero: float) -> Point:
-        """Where a value changes sign: regula falsi (Illinois), with bisection where that is slow."""
+    def _locate(
+        self,
+        interval: _Interval,
+        value: Callable[[Point], float],
+        zero: float,
+        tried: list[tuple[float, float]] | None = None,
+    ) -> Point:
+        """Where a value changes sign: regula falsi (Illinois), with bisection where that is slow.
+
+        ``tried`` takes length and value of trials.
+        """
         a, b = interval.first.size, interval.second.size
         fa = fb = None
         size, side, point, previous = 0.5 * (a + b), 0, None, None
@@ -218,6 +261,8 @@ class _Search:
                 break  # as close as the linear solver gets
             f = value(point)
             size = self.stepper.measure(point)
+            if tried is not None:
+                tried.append((size, f))
             if abs(f) <= zero or (previous is not None and abs(size - previous) <= _LOCATED * self.size):
                 break
             previous = size
@@ -246,7 +291,9 @@ class _Search:
 
     def _tried(self, size: float, a: float, b: float) -> Point:
         """The point at a length, or close by where the stiffness is singular to the last digit."""
-        try:
-            return self._at(size)
-        except NotConverged:
-            return self._at(size + 1e-3 * (b - a))
+        for share in (0.0, 1e-3, 0.05, -0.05):
+            try:
+                return self._at(min(max(size + share * (b - a), a), b) if share else size)
+            except NotConverged as failure:
+                last = failure
+        raise last

@@ -12,9 +12,10 @@ from ..solvers.linear import LinearChoice
 from ..stepping.solution import Solution
 from ..tolerances import TIME
 from .bordered import BorderedSystem
+from .controls import ByArc, ByComponent, Control
 from .critical import EVENTS, Event, find_critical
 from .free_motions import free_motions
-from .path_constraints import Along, Arc, Component, Constraint, Direction, LoadFactor, Metric, dot
+from .path_constraints import Along, Component, Direction, LoadFactor, Metric, dot
 from .path_scheme import PathEquilibrium
 from .points import Point, PointSolver
 from .stepper import StaticStepper
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 __all__ = ["PathStepper"]
 
 _FACTORS = 0.5, 1.5  # of the length from point to point
+_UNRESOLVED = 2.0**-6  # of the length first tried, down to which a step is halved for a critical point not located
 _TURN = 0.5  # cosine between tangents of successive points, below which the step is halved while it can be
 
 
@@ -73,11 +75,11 @@ class PathStepper(StaticStepper):
         self.direction = None
         if keys.node_set is not None:
             self.direction = Direction(model, keys.node_set, keys.direction)
-        self._by_component = component
+        self.control: Control = ByComponent(self.direction) if component else ByArc(self.metric)
         self.system = BorderedSystem(model, self.hessian, choice, self.lagged, self.scheme, keys.step)
         self.points = PointSolver(model, self.state, self.system, self.metric, keys.critical_points)
         self.arc, self.slope, self.negatives = keys.step, 0.0, -1
-        self.weight, self.scale = 0.0, 0.0  # of the metric, and of the direction; zero before the first point
+        self.weight = 0.0  # of the metric; zero before the first point
         self.ended, self.outcome = 0, ""
         self.bifurcations, self.turning = 0, 0  # turning: the next point lies along (1) or against (-1) the mode
         self._turn = 0
@@ -92,6 +94,24 @@ class PathStepper(StaticStepper):
     def clock(self) -> float:
         """Number of the point: the load factor need not increase."""
         return float(self.state.step)
+
+    @property
+    def scale(self) -> float:
+        """Of the displacement that is prescribed [m]; zero with lengths of arc."""
+        return self.control.scale
+
+    @scale.setter
+    def scale(self, value: float) -> None:
+        if value:
+            self.control.scale = value
+
+    def measure(self, point: Point) -> float:
+        """The measure of a point. Collective."""
+        return self.control.measure(point.u, point.load_factor - self.state.time)
+
+    def rate(self, point: Point) -> float:
+        """Derivative of the measure along the tangent at a point. Collective."""
+        return self.control.rate(point.u, point.load_factor - self.state.time, point.tangent, point.slope)
 
     @property
     def done(self) -> bool:
@@ -163,26 +183,6 @@ class PathStepper(StaticStepper):
         walls = self.model.contact.nothing
         return Solution(point.u, self.system.problem.f, walls, point.newton, self.system.linear)
 
-    def constraint(self, size: float) -> Constraint:
-        """Of the point at a length from the last one."""
-        if self._by_component:
-            return Component(self.direction, size * self.scale, self.scale)
-        return Arc(self.metric, size)
-
-    def measure(self, point: Point) -> float:
-        """The length for which :meth:`constraint` gives a point. Collective."""
-        if self._by_component:
-            return self.direction.of(point.u) / self.scale
-        return self.metric.length(point.u, point.load_factor - self.state.time)
-
-    def rate(self, point: Point) -> float:
-        """Derivative of :meth:`measure` at a point along its tangent. Collective."""
-        if self._by_component:
-            return self.direction.of(point.tangent) / self.scale
-        change = point.load_factor - self.state.time
-        length = self.metric.length(point.u, change)
-        return self.metric.product(point.u, change, point.tangent, point.slope) / length if length else 1.0
-
     def _begin_path(self) -> bool:
         """Tangent and metric at the start; whether a point was made, as the start was not in equilibrium."""
         state, u = self.state, np.zeros_like(self.zero)
@@ -205,17 +205,9 @@ class PathStepper(StaticStepper):
                 "on supports alone, or tables are constant there"
             )
         self.weight = self.metric.weight = 1.0 / size**2
-        if self._by_component:
-            self.scale = abs(self.direction.of(response))
-            if not self.scale > 1e-12 * size:
-                raise SimulationFailure(
-                    "static.direction: the load does not move the nodes of static.node_set along it at the start of "
-                    'the path; take another direction, or static.method = "arc_length"'
-                )
+        sign = self._begin_component(response, size) if isinstance(self.control, ByComponent) else 1.0
         length = self.metric.length(response, 1.0)
-        tangent, slope = response / length, 1.0 / length
-        if self._by_component and self.direction.of(response) < 0.0:
-            tangent, slope = -tangent, -slope
+        tangent, slope = sign * response / length, sign / length
         negatives, nearest = self.points.spectrum(u)
         point = Point(u, state.time, tangent, slope, negatives, nearest, newton)
         if moved:
@@ -223,6 +215,17 @@ class PathStepper(StaticStepper):
         else:
             self._keep(point)
         return moved
+
+    def _begin_component(self, response: np.ndarray, size: float) -> float:
+        """Scale of the displacement that is prescribed; the sign of load factors that increase it. Collective."""
+        along = self.direction.of(response)
+        if not abs(along) > 1e-12 * size:
+            raise SimulationFailure(
+                "static.direction: the load does not move the nodes of static.node_set along it at the start of "
+                'the path; take another direction, or static.method = "arc_length"'
+            )
+        self.scale = abs(along)
+        return float(np.sign(along))
 
     def _next(self, size: float) -> tuple[Point, list[Event], str]:
         """The point at a length, or the limit that comes before it; critical points on the way; and the limit reached.
@@ -238,32 +241,27 @@ class PathStepper(StaticStepper):
             guess, load_factor = size * mode, state.time
             point = self.points.find(Along(self.metric, mode, size), guess, load_factor)
         else:
-            guess, load_factor = self._predict(size)
-            point = self.points.find(self.constraint(size), guess, load_factor)
+            tangent = state.memory["tangent"]
+            length = self.control.advance(tangent, size)
+            guess, load_factor = length * tangent, state.time + length * self.slope
+            point = self.points.find(self.control.constraint(size), guess, load_factor)
         self._suspect(point, guess)
         if not self.turning:
             self._refuse_turn(point, size)
         point, reached = self._limited(point)
         if self.turning or self.points.stability is None:
             return point, [], reached
-        events, turn = find_critical(self, point)
+        try:
+            events, turn = find_critical(self, point)
+        except NotConverged as failure:
+            # beside an imperfect bifurcation a step may have come to a path that does not lead there
+            if size > _UNRESOLVED * self.arc and 0.5 * size >= self.keys.smallest:
+                raise
+            self.message(f"a critical point was not located: {failure}")
+            events, turn = [], None
         if turn is not None:
             point, reached = turn, ""
         return point, events, reached
-
-    def _predict(self, size: float) -> tuple[np.ndarray, float]:
-        """Displacement and load factor at a length along the tangent."""
-        state = self.state
-        tangent, factor = state.memory["tangent"], size
-        if self._by_component:
-            along = self.direction.of(tangent) / self.scale
-            if not along > 1e-9:
-                raise NotConverged(
-                    "the displacement along static.direction does not increase any more along the path; "
-                    'static.method = "arc_length" follows it'
-                )
-            factor = size / along
-        return factor * tangent, state.time + factor * self.slope
 
     def _refuse_turn(self, point: Point, size: float) -> None:
         """A tangent that has turned too much is that of another path, or of a corner that the step has cut."""
@@ -272,7 +270,7 @@ class PathStepper(StaticStepper):
             raise NotConverged(
                 f"{self.points.place}: the path turns by {np.degrees(np.arccos(max(cosine, -1.0))):.3g} degrees"
             )
-        if self._by_component and cosine < 0.0:
+        if self.control.scale and cosine < 0.0:
             raise NotConverged(
                 f"{self.points.place}: the displacement along static.direction turns back; static.method = "
                 '"arc_length" follows the path'
@@ -289,7 +287,7 @@ class PathStepper(StaticStepper):
         if keys.displacement is not None:
             start, way = self.direction.at(state.position), self.direction.of(point.u)
             if start + way >= keys.displacement * (1.0 - TIME):
-                scale = self.scale or abs(way)
+                scale = self.control.scale or abs(way)
                 constraint = Component(self.direction, keys.displacement - start, scale)
                 limits.append(
                     ((keys.displacement - start) / way, constraint, f"static.displacement = {keys.displacement:g} m")
@@ -350,7 +348,7 @@ class PathStepper(StaticStepper):
     def _no_path(self, failure: NotConverged) -> SimulationFailure:
         """What to tell of a path that cannot go on."""
         hint = ""
-        if self._by_component:
+        if self.control.scale:
             hint = '; where the displacement along static.direction turns back, static.method = "arc_length" goes on'
         return SimulationFailure(
             f"the path cannot be followed beyond point {self.state.step} at load factor {self.state.time:.6g} with "

@@ -191,7 +191,9 @@ def star_dome(run):
 @number
 def dome_16(run):
     """Limit points of the path up to the second bifurcation."""
-    assert limits(run("dome_16", "static.max_points=40")) == pytest.approx([0.09566, -0.09612, 0.3209], abs=1.1e-4)
+    assert limits(run("dome_16", "static.step=0.05", "static.max_points=15")) == pytest.approx(
+        [0.09566, -0.09612, 0.3209], abs=1.1e-4
+    )
 
 
 @number

@@ -113,7 +113,9 @@ class TestFreeMotions:
 
 def test_factorised_inertia_finds_the_same(tmp_path, monkeypatch):
     """Events of the dome by inertia and inverse iteration are those by all eigenvalues, branch included."""
-    case = Case.load("dome_16", ["static.branch_at=[2]", "static.max_points=37", "output.fields_every=0"])
+    case = Case.load(
+        "dome_16", ["static.branch_at=[2]", "static.step=0.05", "static.max_points=16", "output.fields_every=0"]
+    )
     found = []
     for name, dense in (("dense", 450), ("factorised", 0)):
         monkeypatch.setattr(pfem_petsc.statics.stability, "DENSE", dense)
@@ -131,7 +133,7 @@ def test_factorised_inertia_finds_the_same(tmp_path, monkeypatch):
 )
 def test_linear_solvers_find_the_same_path(solver, comm, shared_tmp_path):
     linear, operator = solver
-    limits = ["static.max_points=20", "static.iterations=4", "output.fields_every=0"]
+    limits = ["static.step=0.05", "static.max_points=9", "output.fields_every=0"]
     case = Case.load("dome_16", [*limits, f"solver.linear={linear}", f"solver.operator={operator}"])
     Simulation(case, comm, output=shared_tmp_path / "a", quiet=True).run()
     if comm.rank == 0:

@@ -5,7 +5,7 @@ import pytest
 from helpers.runs import run
 from mpi4py import MPI
 
-from pfem_petsc import Case
+from pfem_petsc import Case, Simulation, open_result
 
 INCH, PSI, POUND = 0.0254, 6894.757293168, 4.4482216152605
 
@@ -223,11 +223,38 @@ class TestDomeOf16:
         np.testing.assert_allclose(np.sort(turned[1]), np.sort(turned[-1]), atol=1e-6)
 
 
+COARSE = ["static.step=0.05", "output.fields_every=0"]
+
+
+class TestCoarseSteps:
+    """Steps of the dome that are far too large."""
+
+    def test_same_critical_points(self, history, tmp_path):
+        """Steps of five times the length, up to a third of the limit load at the start, find the same."""
+        coarse = run(Case.load("dome_16", [*COARSE, "static.max_step=10"]), tmp_path / "a", MPI.COMM_SELF)
+        assert len(coarse["step"]) < 0.4 * len(history["step"])
+        for column in ("kind", "multiplicity"):
+            assert coarse[f"event/{column}"].tolist() == history[f"event/{column}"].tolist()
+        for column in ("load_factor", "displacement"):
+            np.testing.assert_allclose(coarse[f"event/{column}"], history[f"event/{column}"], rtol=1e-8)
+
+    def test_guard(self, tmp_path):
+        """A first step of thirty limit loads jumps to the inverted dome; the guard halves it."""
+        jump = ["static.step=3", "static.max_step=100", "static.max_points=5", "output.fields_every=0"]
+        free = run(Case.load("dome_16", [*jump, "solver.guard=false"]), tmp_path / "free", MPI.COMM_SELF)
+        assert free["probe/apex/position"][1, 0, 2] == pytest.approx(0.1016 - 0.22, abs=1e-9)
+        guarded = run(Case.load("dome_16", jump), tmp_path / "guarded", MPI.COMM_SELF)
+        apex = guarded["probe/apex/position"][:, 0, 2]
+        assert np.abs(np.diff(apex)).max() < 0.15
+        assert guarded["step_size"][1] <= 0.75
+        assert "bifurcation" in guarded["event/kind"]
+
+
 @pytest.mark.parallel
 @pytest.mark.parametrize("branch", ["[]", "[2]"])
 def test_same_path_on_any_number_of_ranks(branch, tmp_path):
     comm = MPI.COMM_WORLD
-    case = Case.load("dome_16", [f"static.branch_at={branch}", "static.max_points=45", "output.fields_every=0"])
+    case = Case.load("dome_16", [f"static.branch_at={branch}", *COARSE, "static.max_points=18"])
     folder = comm.bcast(str(tmp_path))
     together = run(case, f"{folder}/together", comm)
     alone = run(case, tmp_path / f"alone{comm.rank}", MPI.COMM_SELF)
@@ -236,3 +263,39 @@ def test_same_path_on_any_number_of_ranks(branch, tmp_path):
         np.testing.assert_allclose(together[column], alone[column], atol=1e-8)
     assert together["event/kind"].tolist() == alone["event/kind"].tolist()
     np.testing.assert_allclose(together["event/load_factor"], alone["event/load_factor"], rtol=1e-8)
+
+
+def test_imperfect_column_is_followed_into_its_bend(tmp_path):
+    """A lattice column with a hundred-thousandth of its load across: large steps do not stay on the straight column.
+
+    The straight path beyond the buckling load, which is unstable, and the path of the bent column do not meet. A step
+    from one to the other is given away by a critical point that is not found in between.
+    """
+    found = {}
+    for step in (0.05, 0.01):
+        case = Case.from_dict(
+            {
+                "mesh": {"generator": "lattice", "kind": "octet", "cells": [1, 1, 8], "pitch": 0.1},
+                "node_set": {"foot": {"group": "bottom"}, "head": {"group": "top"}},
+                "material": {"it": {"young_modulus": 70e9, "density": 2700.0}},
+                "section": {"it": {"area": 1e-6, "material": "it"}},
+                "support": [{"node_set": "foot", "fix": "xyz"}],
+                "load": [{"node_set": "head", "force": [0.03, 0.0, -3000.0]}],
+                "static": {
+                    "method": "arc_length",
+                    "step": step,
+                    "max_step": 2 * step,
+                    "min_step": 1e-6,
+                    "node_set": "head",
+                    "direction": [1.0, 0.0, 0.0],
+                    "displacement": 0.01,
+                },
+                "output": {"fields_every": 0},
+            }
+        )
+        simulation = Simulation(case, MPI.COMM_SELF, output=tmp_path / str(step), quiet=True)
+        assert simulation.run() == 0
+        assert simulation.stepper.negatives == 0
+        found[step] = open_result(tmp_path / str(step)).history["load_factor"]
+    assert found[0.05][-1] == pytest.approx(found[0.01][-1], rel=1e-7)
+    assert found[0.05].max() < 1.001 * found[0.01].max()

@@ -64,7 +64,9 @@ def check_balances(history: dict[str, np.ndarray], tolerance: float = 1e-9) -> N
     scale = max(abs(history[name]).max() for name in ("elastic_energy", "kinetic_energy", "external_work"))
     assert abs(history["energy_imbalance"]).max() <= tolerance * scale
     impulses = sum(history[name] for name in HEAD.sizes if name.endswith("_impulse"))
-    impulses = impulses + sum(history[name] for name in history if name.endswith(("/impulse", "/jump_impulse")))
+    impulses = impulses + sum(
+        history[name] for name in history if name.startswith("wall/") and name.endswith("impulse")
+    )
     change = history["momentum"] - history["momentum"][0]
     made = impulses - impulses[0]
     scale = max(abs(impulses).max(), abs(change).max())

@@ -194,3 +194,59 @@ def test_temperatures_stay_and_change(run):
     history = run(bar(stages, {"thermal_expansion": 1e-5}))
     x = history["probe/tip/position"][:, 0, 0]
     np.testing.assert_allclose(x[[2, 4, 6]], [1.001, 1.001 + 1e-3, 1.0], rtol=1e-12)
+
+
+@pytest.mark.parallel
+def test_a_wall_with_mass_moves_on(run):
+    """A bar and a wall that it pushes have one momentum, over a change of the integrator too."""
+    heavy = {**RIGHT, "point": [1.001, 0.0, 0.0], "mass": 2.0}
+    stages = [
+        {"name": "meets", "time": FLY, "initial": {"velocity": [1.0, 0.0, 0.0]}, "wall": [heavy]},
+        {"name": "pushes", "time": {**FLY, "integrator": "generalized_alpha"}},
+    ]
+    history = run(bar(stages, support=[LINE]))
+    total = history["momentum"][:, 0] + 2.0 * history["wall/right/velocity"][:, 0]
+    np.testing.assert_allclose(total, 1.0, rtol=1e-9)
+    assert history["wall/right/velocity"][200, 0] > 0.1
+    place = history["wall/right/position"][:, 0]
+    assert np.diff(place)[200] == pytest.approx(1e-4 * history["wall/right/velocity"][200, 0], rel=0.05)
+
+
+@pytest.mark.parallel
+def test_ties_stay(run):
+    sticky = {**RIGHT, "point": [1.001, 0.0, 0.0], "tied": True}
+    stages = [
+        {"name": "meets", "time": FLY, "initial": {"velocity": [1.0, 0.0, 0.0]}, "wall": [sticky]},
+        {"name": "hangs", "static": {"step": 0.5}, "load": [{"node_set": "base", "force": [-10.0, 0.0, 0.0]}]},
+        {"name": "swings", "time": {**FLY, "integrator": "newmark"}, "load": []},
+    ]
+    history = run(bar(stages, support=[LINE]))
+    x = history["probe/all/position"][:, :, 0]
+    np.testing.assert_allclose(x[200:, 1], 1.001, rtol=1e-9)
+    assert x[202, 0] == pytest.approx(0.001 - 10.0 / YOUNG, rel=1e-6)
+    assert np.ptp(x[203:, 0]) > 1e-4
+
+
+@pytest.mark.parallel
+def test_pairs_go_on(run):
+    """Two bars one after the other, pressed together by a support, held so, and let go."""
+    gap, delta = 1e-4, 2e-3
+    way = {"node_set": "last", "fix": "x", "motion": [[0.0, 0.0, 0.0, 0.0], [1.0, -gap - delta, 0.0, 0.0]]}
+    tables = {
+        "mesh": {"generator": "two_rods", "length": 1.0, "elements": 1, "gap": gap},
+        "node_set": {"all": {"all": True}, "a": {"group": "first_end"}, "b": {"group": "second_start"}},
+        "contact_pair": [{"name": "faces", "first": "a", "second": "b", "direction": [1.0, 0.0, 0.0]}],
+        "output": {"fields_every": 0},
+    }
+    tables["node_set"] |= {"base": {"nearest": [0.0, 0.0, 0.0]}, "last": {"nearest": [5.0, 0.0, 0.0]}}
+    stages = [
+        {"name": "press", "static": {"step": 0.5}, "support": [LINE, HELD, way]},
+        {"name": "held", "time": FLY},
+        {"name": "go", "time": {**FLY, "integrator": "newmark"}, "support": [LINE, HELD]},
+    ]
+    history = run(bar(stages, **tables))
+    force = 0.5 * YOUNG * AREA * delta
+    np.testing.assert_allclose(history["pair/faces/force"][2:203, 0], force, rtol=1e-9)
+    assert history["pair/faces/impulse"][202, 0] == pytest.approx(force * 0.02, rel=1e-9)
+    assert history["pair/faces/impulse"][-1, 0] > history["pair/faces/impulse"][202, 0]
+    assert not history["pair/faces/force"][-1].any()

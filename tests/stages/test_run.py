@@ -7,8 +7,10 @@ import pytest
 from helpers.kills import differences
 from helpers.stages import BLOCK, check_balances
 from helpers.stopped import everywhere
+from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation, open_result
+from pfem_petsc.errors import InputError
 
 
 def run(data, comm, folder, stop_after=-1, **options):
@@ -50,3 +52,28 @@ def test_restart_in_any_stage_is_bitwise(comm, shared_tmp_path):
         assert run(data, comm, stopped, step, restart=step > 3) == step
     assert run(data, comm, stopped, restart=True) == 146
     assert everywhere(comm, differences, *(folder / "result.vtkhdf" for folder in (whole, stopped))) == {}
+
+
+@pytest.mark.parallel
+def test_a_later_end_of_the_last_stage_continues_it(comm, shared_tmp_path):
+    data = {**BLOCK, "solver": {"linear": "cg"}, "output": {**BLOCK["output"], "checkpoint_every": 1000}}
+    first, last = BLOCK["stage"][0], BLOCK["stage"][2]
+    cases = [{**data, "stage": [first, {**last, "time": {**last["time"], "end": end}}]} for end in (4e-5, 9e-5)]
+    whole, continued = shared_tmp_path / "whole", shared_tmp_path / "continued"
+    assert run(cases[1], comm, whole) == 94
+    assert run(cases[0], comm, continued) == 44
+    assert run(cases[1], comm, continued, restart=True) == 94
+    assert everywhere(comm, differences, *(folder / "result.vtkhdf" for folder in (whole, continued))) == {}
+    finished = Simulation(Case.from_dict(cases[1], name="block"), comm, output=continued, quiet=True, restart=True)
+    assert finished.finished
+    finished.close()
+    other = {**cases[1], "stage": [{**first, "static": {"step": 0.5}}, cases[1]["stage"][1]]}
+    with pytest.raises(InputError, match=r"stage\[0\]\.static\.step: 0\.25 -> 0\.5"):
+        run(other, comm, continued, restart=True)
+
+
+def test_a_later_stage_that_cannot_run_is_found_before_the_first_step(tmp_path):
+    wrong = {"name": "wrong", "time": {"integrator": "central_differences", "step": 1.0, "end": 2.0}}
+    with pytest.raises(InputError, match=r"stage\[4\]: time\.step = 1 s is above the limit"):
+        run({**BLOCK, "stage": [*BLOCK["stage"], wrong]}, MPI.COMM_SELF, tmp_path / "out")
+    assert not (tmp_path / "out").exists()

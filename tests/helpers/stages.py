@@ -71,3 +71,21 @@ def check_balances(history: dict[str, np.ndarray], tolerance: float = 1e-9) -> N
     made = impulses - impulses[0]
     scale = max(abs(impulses).max(), abs(change).max())
     assert abs(change - made).max() <= tolerance * scale
+
+_PUSH = {"node_set": "apex", "force": [0.0, 0.0, -1000.0]}
+_PATH = {"method": "arc_length", "step": 0.03, "node_set": "apex", "direction": [0.0, 0.0, -1.0]}
+DOME = {
+    "mesh": {"generator": "star_dome"},
+    "node_set": {"apex": {"group": "apex"}, "feet": {"group": "feet"}},
+    "material": {"m": {"young_modulus": 3.03e9, "density": 1000.0}},
+    "section": {"s": {"area": 3.17e-4, "material": "m"}},
+    "support": [{"node_set": "feet", "fix": "xyz"}],
+    "output": {"fields_every": 5},
+    "stage": [
+        {"name": "path", "load": [_PUSH], "static": {**_PATH, "displacement": 0.009}},
+        {"name": "free", "load": [], "time": {"integrator": "newmark", "step": 1e-4, "end": 1e-3}},
+        {"name": "relax", "static": {"method": "relaxation", "step": 1.0}},
+        {"name": "again", "load": [_PUSH], "static": {**_PATH, "displacement": 0.009}},
+    ],
+}
+"""Pushed along its path over the limit point, let go, brought to rest, and pushed again."""

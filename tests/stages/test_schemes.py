@@ -56,8 +56,7 @@ def drawn(seed):
                 stage["initial"] = {"velocity": [chance.uniform(-1.0, 1.0) for _ in range(3)]}
         if chance.random() < 0.4:
             stage["load"] = [{"node_set": "side", "force": [chance.uniform(-1.0, 1.0) for _ in range(3)]}]
-        # a static analysis does not begin in balance where it is hot from the start
-        if chance.random() < 0.4 and (k or "time" in stage):
+        if chance.random() < 0.4:
             stage["temperature"] = [{"value": chance.uniform(0.0, 30.0)}]
         if chance.random() < 0.4:
             stage["gravity"] = {"acceleration": [0.0, 0.0, chance.uniform(-100.0, 0.0)]}

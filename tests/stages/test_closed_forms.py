@@ -131,7 +131,6 @@ def test_supports_hold_where_they_are_and_move_from_there(run):
     assert history["probe/tip/position"][-1, 0, 0] == pytest.approx(1.4, rel=1e-12)
 
 
-@pytest.mark.parallel
 def test_preload_flight_and_rest_on_a_floor(run):
     """Pressed between two walls, let go by one of them, and fallen back onto the other."""
     press, mass, stiffness = 0.01, 0.5, YOUNG * AREA
@@ -160,7 +159,6 @@ def test_preload_flight_and_rest_on_a_floor(run):
     assert history["kinetic_energy"][-1] < 1e-9
 
 
-@pytest.mark.parallel
 def test_velocities_are_added_at_the_start_of_their_stage(run):
     kick = {"name": "kick", "time": FLY, "initial": {"velocity": [0.3, 0.0, 0.0]}}
     stages = [{"name": "flies", "time": FLY, "support": [LINE], "initial": {"velocity": [0.2, 0.0, 0.0]}}, kick]
@@ -184,7 +182,6 @@ def test_a_wall_that_nodes_are_beyond_when_its_stage_begins_is_refused(run):
         run(bar(stages))
 
 
-@pytest.mark.parallel
 def test_temperatures_stay_and_change(run):
     stages = [
         {"name": "heat", "static": {"step": 0.5}, "temperature": [{"table": [[0.0, 0.0], [1.0, 100.0]]}]},
@@ -196,7 +193,6 @@ def test_temperatures_stay_and_change(run):
     np.testing.assert_allclose(x[[2, 4, 6]], [1.001, 1.001 + 1e-3, 1.0], rtol=1e-12)
 
 
-@pytest.mark.parallel
 def test_a_wall_with_mass_moves_on(run):
     """A bar and a wall that it pushes have one momentum, over a change of the integrator too."""
     heavy = {**RIGHT, "point": [1.001, 0.0, 0.0], "mass": 2.0}
@@ -212,7 +208,6 @@ def test_a_wall_with_mass_moves_on(run):
     assert np.diff(place)[200] == pytest.approx(1e-4 * history["wall/right/velocity"][200, 0], rel=0.05)
 
 
-@pytest.mark.parallel
 def test_ties_stay(run):
     sticky = {**RIGHT, "point": [1.001, 0.0, 0.0], "tied": True}
     stages = [

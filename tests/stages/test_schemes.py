@@ -13,11 +13,10 @@ from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.case.reading import INTEGRATORS
 from pfem_petsc.registry import choices
 
-PRESSED = {"name": "press", "static": {"step": 0.25}, "wall": [FLOOR, {**PLATE, "point": [0.0, 0.0, 0.09999]}]}
 HELD = [{"node_set": "base", "fix": "xyz"}]
-STEPS = {"step": 2e-6, "end": 1e-4}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("walls", [False, True])
 @pytest.mark.parametrize("integrator", choices(INTEGRATORS))
 def test_what_is_in_equilibrium_stays_at_rest(integrator, walls, tmp_path):
@@ -48,7 +47,7 @@ def drawn(seed):
             stage["static"] = {"step": 0.5}
             stage["support"] = HELD
         else:
-            stage["time"] = {"integrator": chance.choice(choices(INTEGRATORS)), "step": 1e-6, "end": 2e-5}
+            stage["time"] = {"integrator": chance.choice(choices(INTEGRATORS)), "step": 1e-6, "end": 1e-5}
             stage["time"]["mass"] = chance.choice(["lumped", "lumped", "consistent"])
             if chance.random() < 0.5:
                 stage["support"] = []
@@ -77,6 +76,7 @@ def test_balances_of_stages_drawn_by_chance(seed, comm, shared_tmp_path):
     assert result.history["stage"][-1] == 3
 
 
+@pytest.mark.slow
 def test_steps_of_later_stages_are_made_together_to_the_last_bit(tmp_path):
     stages = [
         {"name": "weight", "static": {"step": 0.5}, "support": HELD},

@@ -190,7 +190,9 @@ class Simulation:
         recorder = Recorder(self.stepper, None)
         entries, warnings = inspect(self.model.case, self.model)
         entries |= forecast(self.case, self.model, self.plan, self.outputs.fields, recorder.columns, recorder.types)
-        return entries, self.model.warnings + warnings_before(self.model.case, self.model, self.plan) + warnings
+        return entries, self.model.warnings + warnings_before(
+            self.model.case, self.model, self.analysis.plan
+        ) + warnings
 
     def on_step(self, function: Callable[[Step], object], every: int = 1) -> None:
         """Register a function to be called on all ranks after each step whose number is a multiple of ``every``.
@@ -247,9 +249,10 @@ class Simulation:
             yield from self._steps(Batches(min_steps))
 
     def _steps(self, batches: Batches | None = None) -> Iterator[Step]:
-        if self._started and not self.outputs.is_open and self.state.step < self.analysis.last_step:
+        ended = self._stages.at_last and self.state.step >= self.analysis.last_step
+        if self._started and not self.outputs.is_open and not ended:
             raise InputError(
-                f"{self.folder}: the results of this simulation were closed at step {self.state.step}, when its "
+                f"{self.folder}: the results of this simulation were closed at step {self.stepper.number}, when its "
                 "iteration ended; continue with a new Simulation with restart=True, from a checkpoint"
             )
         try:

@@ -8,9 +8,11 @@ from pathlib import Path
 import pytest
 from mpi4py import MPI
 
+from pfem_petsc import Simulation, open_result
 from pfem_petsc.case import settings, tables
 from pfem_petsc.case.materials import LAWS
 from pfem_petsc.case.schema import Case
+from pfem_petsc.case.stages import ANALYSES, TABLES
 from pfem_petsc.mesh.readers.gmsh import read
 from pfem_petsc.registry import choices, lookup
 
@@ -63,3 +65,14 @@ def test_every_key_of_static_methods_is_named():
     for method in choices("pfem_petsc.statics.methods"):
         parameters = lookup("pfem_petsc.statics.methods", method, "").Parameters
         assert set(parameters.model_fields) <= named(text), method
+
+
+def test_example_of_stages_runs(tmp_path):
+    text = (DOCS / "stages.md").read_text()
+    case = Case.from_toml(re.search(r"^```toml\n(.*?)^```$", text, flags=re.MULTILINE | re.DOTALL)[1], tmp_path)
+    assert set(TABLES) | set(ANALYSES) <= named(text)
+    with Simulation(case, MPI.COMM_SELF, output=tmp_path / "out", quiet=True) as simulation:
+        simulation.run()
+    history = open_result(tmp_path / "out").history
+    assert history["momentum"][204, 0] > 0.0 > history["momentum"][-1, 0]
+    assert abs(history["energy_imbalance"]).max() < 1e-9 * history["elastic_energy"].max()

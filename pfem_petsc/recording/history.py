@@ -67,13 +67,16 @@ class History(Observer):
         self.rows = None if columns is None else StageRows(columns, model.case.number, self.recorder.layout)
         self.columns, self.types = (columns or self.recorder).columns, (columns or self.recorder).types
 
-    def go_on(self, earlier: History, kick: tuple[float, np.ndarray]) -> None:
-        """Begin a stage where the one before has ended, whose rows these continue. Collective.
+    def end_of_stage(self) -> Row:
+        """Return the row of the present state, not recorded, in the columns of all stages. Collective."""
+        return self.rows.fill(self.recorder.row())
 
-        ``kick``: work [J] and momentum (3,) [N s] of the velocities that the stage adds.
+    def go_on(self, earlier: History, last: Row, kick: tuple[float, np.ndarray]) -> None:
+        """Begin a stage after the one that has ended, whose rows these continue. Collective.
+
+        ``last``: row of its end; ``kick``: work [J] and momentum (3,) [N s] of the velocities that the stage adds.
         """
         recorder, before = self.recorder, earlier.recorder
-        last = earlier.rows.fill(before.row())
         recorder.carried = carried_sums(recorder, last, kick)
         recorder.start_energy, recorder.energy_scale = before.start_energy, before.energy_scale
         self.rows.begin(last)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,22 +29,24 @@ def accumulates(name: str) -> bool:
 class StageColumns:
     """The columns of a case with stages: those of all stages, and ``stage``, the number of the stage from 0.
 
-    Parameters
-    ----------
-    recorders : of the stages, in their order
-
     Attributes
     ----------
     columns, types : as :class:`~pfem_petsc.recording.recorder.Recorder` has them
     """
 
-    def __init__(self, recorders: Iterable[Recorder]) -> None:
+    def __init__(self) -> None:
         self.columns: dict[str, tuple[int, ...]] = {"time": (), "step": (), "stage": ()}
         self.types: dict[str, Any] = {"stage": np.int64}
-        for recorder in recorders:
-            self.columns |= recorder.columns
-            self.types |= recorder.types
-        self.layout = RowLayout(self.columns, self.types)
+
+    def add(self, recorder: Recorder) -> None:
+        """Add the columns of a stage."""
+        self.columns |= recorder.columns
+        self.types |= recorder.types
+
+    @cached_property
+    def layout(self) -> RowLayout:
+        """Of the rows, once the columns of all stages are there."""
+        return RowLayout(self.columns, self.types)
 
 
 class StageRows:

@@ -47,7 +47,8 @@ def open_progress(
         axis=plan.axis,
     )
     progress.summary(summarise(case, model, plan))
-    for warning in model.warnings + warnings_before(model.case, model, plan):
+    own = plan.plans[model.case.number] if case.stage else plan
+    for warning in model.warnings + warnings_before(model.case, model, own):
         progress.warning(warning)
     if plan.scheme.notice:
         progress.message(plan.scheme.notice)

@@ -157,6 +157,7 @@ class Outputs:
         writer = self._writer
         self._complete_stage()
         self.tell_remarks()
+        row = history.end_of_stage()
         kick = stages.advance()
         stepper = stages.analysis.stepper
         name, number = stepper.model.case.name, stages.number
@@ -169,7 +170,7 @@ class Outputs:
         checkpoints = Checkpoints(stages.case, stepper, stages.plan, self._folder)
         checkpoints.last_step = last
         self._observe(checkpoints)
-        self.history.go_on(history, kick)
+        self.history.go_on(history, row, kick)
         self.events.writer = self.snapshots.writer = writer
         self.snapshots.last = snapshots.last
 

@@ -134,13 +134,14 @@ class Stages:
             return
         self.events: dict[str, Any] = {}
         records = [None] * len(case.stage) if recorded is None else recorded["stages"]
-        plans, recorders, warnings = [], [], []
+        self.columns = StageColumns()
+        plans, warnings = [], []
         points, cells = {}, {}
         for k, (stage, record) in enumerate(zip(self._cases, records, strict=True)):
             model = first if k == 0 else Model(stage, comm, first.mesh)
             analysis = make_analysis(model, record)
             plans.append(analysis.plan)
-            recorders.append(Recorder(analysis.stepper, None))
+            self.columns.add(Recorder(analysis.stepper, None))
             self.events = {**self.events, **analysis.stepper.event_columns}
             fields = Fields(model)
             points |= dict.fromkeys(fields.points)
@@ -151,7 +152,6 @@ class Stages:
             else:
                 analysis.close()
         self.plan = StagedPlan(tuple(plans), tuple(stage.name for stage in self._cases))
-        self.columns = StageColumns(recorders)
         self.fields = list(points), list(cells)
         self.model.warnings = warnings
 

@@ -85,13 +85,17 @@ class StaticStepper(ImplicitStepper):
         self.evaluate(commit=True)
         if model.external.active:
             state.external = model.external.at(0.0, np.empty_like(state.v))
-        if model.start is not None:
-            # what the state lacks of equilibrium works on the way to it: that is booked as inertia's
-            lack = state.external - state.f[: model.mesh.n_owned] + state.contact + state.support
-            state.a = lack / model.inertia.mass[:, None]
+        # the force that the state lacks to equilibrium (heat, a stage before) does work in the first increment, which
+        # the ledger books as that of inertia
+        lack = state.external - state.f[: model.mesh.n_owned] + state.contact + state.support
+        state.a = lack / model.inertia.mass[:, None]
         self.totals_at_start = self._totals()
         self.scheme.start(state, self.h)
         model.contact.motion.start(self.h)
+
+    def acceleration(self) -> np.ndarray:
+        """See :class:`~pfem_petsc.stepping.stepper.Stepper`; zero."""
+        return np.zeros_like(self.state.a)
 
     def step(self) -> None:
         """Find the equilibrium at the next load factor.

@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from helpers.kills import differences
-from helpers.stages import BLOCK, check_balances
+from helpers.stages import BLOCK, DOME, check_balances
 from helpers.stopped import everywhere
+from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation, open_result
+from pfem_petsc.errors import InputError
 
 
 def run(data, comm, folder, stop_after=-1, **options):
@@ -27,26 +29,84 @@ def test_four_stages_on_one_state(comm, shared_tmp_path):
     result = open_result(shared_tmp_path / "out")
     history = result.history
     check_balances({name: history[name] for name in history})
-    assert history["step"][-1] == 146
+    assert history["step"][-1] == 58
     assert (np.diff(history["time"]) > 0.0).all()
-    np.testing.assert_allclose(history["time"][[0, 4, 44, -1]], [0.0, 1.0, 1.0 + 2e-4, 2.0 + 3e-4], rtol=1e-12)
-    np.testing.assert_array_equal(np.unique(history["stage"], return_index=True)[1], [0, 5, 45, 79])
+    np.testing.assert_allclose(history["time"][[0, 4, 16, -1]], [0.0, 1.0, 1.0 + 6e-5, 2.0 + 1e-4], rtol=1e-12)
+    np.testing.assert_array_equal(np.unique(history["stage"], return_index=True)[1], [0, 5, 17, 31])
     assert (np.diff(result.times) > 0.0).all()
     # the end of each stage has a row and a snapshot
-    assert {4, 44, 144, 146} <= set(history["step"]) & set(result.steps)
+    assert {4, 16, 56, 58} <= set(history["step"]) & set(result.steps)
     assert history["plastic_dissipation"][4] > 0.0
-    assert (history["wall/plate/force"][1:45, 2] < 0.0).all()
-    assert not history["wall/plate/force"][45:].any()
+    assert (history["wall/plate/force"][1:17, 2] < 0.0).all()
+    assert not history["wall/plate/force"][17:].any()
     assert result.attributes["stages"] == ["press", "shake", "fly", "settle"]
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 def test_restart_in_any_stage_is_bitwise(comm, shared_tmp_path):
     # MUMPS, which small models take on several ranks, repeats to rounding only
     data = {**BLOCK, "solver": {"linear": "cg"}}
     whole, stopped = shared_tmp_path / "whole", shared_tmp_path / "stopped"
     run(data, comm, whole)
-    for step in (3, 4, 20, 99, 145):
+    for step in (3, 4, 10, 30, 57):
         assert run(data, comm, stopped, step, restart=step > 3) == step
-    assert run(data, comm, stopped, restart=True) == 146
+    assert run(data, comm, stopped, restart=True) == 58
     assert everywhere(comm, differences, *(folder / "result.vtkhdf" for folder in (whole, stopped))) == {}
+
+
+@pytest.mark.slow
+def test_a_later_end_of_the_last_stage_continues_it(comm, shared_tmp_path):
+    data = {**BLOCK, "solver": {"linear": "cg"}, "output": {**BLOCK["output"], "checkpoint_every": 1000}}
+    first, last = BLOCK["stage"][0], BLOCK["stage"][2]
+    cases = [{**data, "stage": [first, {**last, "time": {**last["time"], "end": end}}]} for end in (4e-5, 9e-5)]
+    whole, continued = shared_tmp_path / "whole", shared_tmp_path / "continued"
+    assert run(cases[1], comm, whole) == 94
+    assert run(cases[0], comm, continued) == 44
+    assert run(cases[1], comm, continued, restart=True) == 94
+    assert everywhere(comm, differences, *(folder / "result.vtkhdf" for folder in (whole, continued))) == {}
+    finished = Simulation(Case.from_dict(cases[1], name="block"), comm, output=continued, quiet=True, restart=True)
+    assert finished.finished
+    finished.close()
+    other = {**cases[1], "stage": [{**first, "static": {"step": 0.5}}, cases[1]["stage"][1]]}
+    with pytest.raises(InputError, match=r"stage\[0\]\.static\.step: 0\.25 -> 0\.5"):
+        run(other, comm, continued, restart=True)
+
+
+def test_a_later_stage_that_cannot_run_is_found_before_the_first_step(tmp_path):
+    wrong = {"name": "wrong", "time": {"integrator": "central_differences", "step": 1.0, "end": 2.0}}
+    with pytest.raises(InputError, match=r"stage\[4\]: time\.step = 1 s is above the limit"):
+        run({**BLOCK, "stage": [*BLOCK["stage"], wrong]}, MPI.COMM_SELF, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_paths_in_stages_and_restarts_in_them(tmp_path):
+    assert run(DOME, MPI.COMM_SELF, tmp_path / "whole") > 30
+    result = open_result(tmp_path / "whole")
+    history = result.history
+    check_balances({name: history[name] for name in history if not name.startswith("event/")})
+    load_factor, stage = history["load_factor"], history["stage"]
+    # what is at rest again has the same path again
+    ends = [int(np.flatnonzero(stage == k)[-1]) for k in range(4)]
+    assert load_factor[ends[3]] == pytest.approx(load_factor[ends[0]], rel=1e-6)
+    np.testing.assert_array_equal(load_factor[ends[0] : ends[1] + 1], load_factor[ends[0]])
+    assert history["elastic_energy"][ends[2]] < 1e-12 * history["elastic_energy"].max()
+    limits = history["event/load_factor"]
+    assert len(limits) == 2 and limits[1] == pytest.approx(limits[0], rel=1e-6)
+    assert list(history["event/step"] > ends[2]) == [False, True]
+    for step in (4, ends[0], ends[0] + 5, ends[2], ends[2] + 3):
+        assert run(DOME, MPI.COMM_SELF, tmp_path / "stopped", step, restart=step > 4) == step
+    run(DOME, MPI.COMM_SELF, tmp_path / "stopped", restart=True)
+    assert differences(*(tmp_path / name / "result.vtkhdf" for name in ("whole", "stopped"))) == {}
+
+
+def test_modes_are_those_of_the_end_of_the_last_stage(tmp_path):
+    gravity = {"gravity": {"acceleration": [0.0, 0.0, -9.81]}, "modes": {"count": 2}}
+    weight = {"name": "weight", "static": {"step": 0.5}}
+    short = {"name": "short", "static": {"step": 0.5}, "load": []}
+    data = {key: value for key, value in DOME.items() if key != "stage"} | gravity
+    run({**data, "static": {"step": 0.5}}, MPI.COMM_SELF, tmp_path / "one")
+    run({**data, "stage": [weight, short]}, MPI.COMM_SELF, tmp_path / "two")
+    one, two = (open_result(tmp_path / name).modes.frequency for name in ("one", "two"))
+    np.testing.assert_allclose(two, one, rtol=1e-9)

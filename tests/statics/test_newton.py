@@ -175,3 +175,14 @@ def test_a_case_needs_an_analysis(shared_tmp_path, comm):
     del data["static"]
     with pytest.raises(InputError, match=r"\[time\], \[static\]"):
         Case.from_dict(data, folder=shared_tmp_path)
+
+
+@pytest.mark.parallel
+def test_energy_is_balanced_from_a_start_that_is_not_in_equilibrium(shared_tmp_path, comm):
+    """Hot from the start between fixed feet, with a load that does not begin at zero."""
+    material = {"steel": {"young_modulus": YOUNG, "density": 1000.0, "thermal_expansion": 1e-5}}
+    load = [{"node_set": "crown", "force": [0.0, 0.0, -50.0], "table": [[0.0, 1.0], [1.0, 2.0]]}]
+    case = truss(shared_tmp_path, comm, material=material, temperature=[{"value": 50.0}], load=load)
+    history = history_of(case, comm, shared_tmp_path)
+    assert abs(history["energy_imbalance"]).max() < 1e-10 * history["elastic_energy"].max()
+    assert not history["probe/crown/acceleration"].any()

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..contact.active_set import ActiveSet
+from ..contact.candidates import Candidates, expected_candidates
 from ..errors import InputError, NotConverged, SimulationFailure
 from ..integrators.base import Balance
 from ..stepping.solution import Solution
@@ -164,6 +167,13 @@ class RelaxationStepper(StaticStepper):
             f"({size:.3g} N). Increase static.max_iterations or static.tolerance; if the residual does not fall, "
             "nothing balances the load there"
         )
+
+    def _candidates(self, active_set: ActiveSet, balance: Balance) -> Candidates:
+        """Return the nodes near walls at the relaxed positions. Collective."""
+        model, motion = self.model, self.motion
+        relaxed = replace(self.state, x=motion.x, v=np.zeros_like(self.state.v))
+        displacements = model.contact.motion.displacements(balance.time)
+        return expected_candidates(model, relaxed, balance, self.held, displacements)
 
     def destroy(self) -> None:
         super().destroy()

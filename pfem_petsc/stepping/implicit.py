@@ -13,6 +13,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from ..contact.active_set import ActiveSet
+from ..contact.candidates import Candidates
 from ..errors import NotConverged, SimulationFailure
 from ..integrators.base import Balance
 from ..solvers.lagged import LaggedPreconditioner
@@ -216,7 +217,7 @@ class ImplicitStepper(Stepper):
             model.temperatures.apply(balance.time)
         tolerance = self.accuracy * residual_tolerance(model, state, balance, self.part)
         active_set = ActiveSet(model, self.state, balance, self.held, self.links)
-        candidates, links = active_set.candidates, active_set.links
+        candidates, links = self._candidates(active_set, balance), active_set.links
         newton = linear = 0
         while True:
             try:
@@ -257,6 +258,10 @@ class ImplicitStepper(Stepper):
         state.support[fixed] = g[fixed] - state.contact[fixed]
         internal = problem.f if balance.weight else state.f
         return Solution(u, internal, walls, newton, linear, held)
+
+    def _candidates(self, active_set: ActiveSet, balance: Balance) -> Candidates:
+        """Return the nodes that walls may stop, for the first solve. Collective."""
+        return active_set.candidates
 
     def _keep_momentum(self, problem: StepProblem, u: np.ndarray, g: np.ndarray) -> None:
         """Remove the net residual of a free truss by a translation, which strains no bar.

@@ -150,6 +150,19 @@ def taut_cable(run):
 
 
 @number
+def octet_compression(run):
+    """It yields at rho sigma_Y/3 of the relative density (formulas: 7), and the plate leaves it on its way back."""
+    history = run("octet_compression")
+    density = 6.0 * np.sqrt(2.0) * 1e-6 / (0.01**2 / 2.0)
+    force, factor = forces(history, "plate"), history["load_factor"]
+    slope = np.diff(force) / np.diff(factor)
+    first = force[np.argmax(slope < 0.5 * slope[0])]
+    assert first == pytest.approx(density * 200e6 / 3.0 * 0.03**2, rel=0.02)
+    assert force[-1] == 0.0
+    assert abs(history["energy_imbalance"]).max() < 1e-10 * history["plastic_dissipation"][-1]
+
+
+@number
 def hanging_net(run):
     """Corners carry a quarter of the weight each."""
     history = run("hanging_net")

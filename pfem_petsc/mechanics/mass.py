@@ -68,6 +68,11 @@ class Inertia:
             self._u = np.zeros((mesh.n_local, 3))
             self._out = np.zeros((mesh.n_local, 3))
 
+    def damp(self, damping: np.ndarray) -> None:
+        """Replace the damping by values of nodes (owned,). Collective."""
+        self.damping = damping
+        self.damped = bool(self.mesh.comm.allreduce(float(damping.sum())) > 0.0)
+
     @property
     def products(self) -> bool:
         """Whether M is not diagonal with one value per node, so that products need :meth:`mass_times`."""

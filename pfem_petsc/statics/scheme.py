@@ -12,15 +12,26 @@ __all__ = ["Equilibrium"]
 class Equilibrium(Scheme):
     """The balance f_int(x1) = f_ext(t1) + r, where t is the load factor; the unknown is the displacement increment.
 
+    With viscosity C the balance is f_int(x1) + C u/h = f_ext(t1) + r for the displacement u over the increment h.
+
     The state's memory has ``rate``: displacement per load factor in the last increment, which predicts the next one.
+
+    Parameters
+    ----------
+    lack : (owned,) viscosity over mass, None without viscosity
+
+    Attributes
+    ----------
+    releases : whether the balance is that of the state's own load factor, without viscosity
     """
 
     inertial = False
     remembers = ("rate",)
     dissipates = True
 
-    def __init__(self) -> None:
+    def __init__(self, lack: np.ndarray | None = None) -> None:
         super().__init__(NoParameters())
+        self.lack, self.releases = lack, False
 
     def start(self, state: State, h: float) -> None:
         state.memory["rate"] = np.zeros_like(state.v)
@@ -29,10 +40,10 @@ class Equilibrium(Scheme):
         return h * state.memory["rate"]
 
     def balance(self, state: State, h: float) -> Balance:
-        end = state.time + h
+        end = state.time if self.releases else state.time + h
         return Balance(
             alpha=0.0,
-            eta=0.0,
+            eta=0.0 if self.lack is None or self.releases or not h else 1.0 / h,
             predictor=state.position.copy(),
             v_hat=None,
             a_hat=None,
@@ -43,5 +54,7 @@ class Equilibrium(Scheme):
 
     def finish(self, state: State, balance: Balance, u: np.ndarray, h: float) -> None:
         state.position[:] = balance.predictor + u
-        state.memory["rate"] = u / h
-        state.a = np.zeros_like(u)
+        if not self.releases:
+            state.memory["rate"] = u / h
+        # the viscous force is what equilibrium lacks: the ledger books it as inertia
+        state.a = self.lack[:, None] * (u * balance.eta) if balance.eta else np.zeros_like(u)

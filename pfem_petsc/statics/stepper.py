@@ -44,19 +44,25 @@ class StaticStepper(ImplicitStepper):
     model : Model
     choice : LinearChoice
     limits : first, smallest and largest increment of the load factor, and the last load factor
+    stabilise : viscosity of the nodes over their stiffness
 
     Attributes
     ----------
     increment : the next increment
+    dissipated : energy dissipated by the viscosity of ``stabilise`` [J]
     """
 
-    kept_numbers = (*ImplicitStepper.kept_numbers, "increment")
+    kept_numbers = (*ImplicitStepper.kept_numbers, "increment", "dissipated")
     columns = ("load_factor",)
     remedy = "reduce static.step"
 
-    def __init__(self, model: Model, choice: LinearChoice, limits: Increments) -> None:
-        super().__init__(model, Equilibrium(), limits.step, choice)
+    def __init__(self, model: Model, choice: LinearChoice, limits: Increments, stabilise: float = 0.0) -> None:
+        viscosity = stabilise * model.nodal_stiffness
+        model.inertia.damp(viscosity)  # that of materials has no meaning without time
+        lack = viscosity / model.inertia.mass if stabilise else None
+        super().__init__(model, Equilibrium(lack), limits.step, choice)
         self.prescribed = NoRates(self)
+        self.stabilise, self.dissipated = stabilise, 0.0
         self.limits, self.increment, self.end = limits, limits.step, limits.end
 
     @property
@@ -125,7 +131,37 @@ class StaticStepper(ImplicitStepper):
         self.increment = size
         if self.solution.newton <= _FEW:
             self.increment = max(size, min(_GROWTH * size, self.limits.largest))
+        if self.stabilise:
+            self._count_dissipation(size)
+            if self.done:
+                self._release()
         state.step += 1
+
+    def _count_dissipation(self, size: float) -> None:
+        u = self.solution.u
+        local = float((self.model.inertia.damping[:, None] * u * u).sum()) / size
+        self.dissipated += self.model.comm.allreduce(local)
+
+    def _release(self) -> None:
+        """Find the equilibrium at the last load factor without the viscosity. Collective."""
+        self.scheme.releases = True
+        try:
+            self._make_part(self.end)
+        except NotConverged as failure:
+            raise SimulationFailure(
+                f"load factor {self.end:.6g} was reached with static.stabilise, but there is no equilibrium near "
+                f"without it: reduce static.stabilise or static.step. The last attempt: {failure}"
+            ) from failure
+        finally:
+            self.scheme.releases = False
+
+    def remarks(self) -> list[str]:
+        """Return what the viscosity has dissipated. Collective."""
+        if not self.stabilise:
+            return []
+        stored = self.model.comm.allreduce(self.energy.total)
+        share = f", {100.0 * self.dissipated / stored:.3g} % of the energy of the bars" if stored > 0.0 else ""
+        return [f"static.stabilise has dissipated {self.dissipated:.6g} J{share} (damping_dissipation)"]
 
     def settle(self) -> None:
         """Solve once more at the load factor that is reached, to rounding: motion that begins there begins at rest."""

@@ -64,6 +64,28 @@ def test_a_limit_point_ends_the_run_with_the_load_factor_that_was_reached(shared
     assert limit - 2e-4 < history["load_factor"][-1] <= limit
 
 
+@pytest.mark.parallel
+@pytest.mark.parametrize("stabilise", [1e-3, 1e-4])
+def test_stabilised_increments_snap_through(shared_tmp_path, comm, stabilise):
+    """Beyond the limit point the crown goes on to the inverted state, whose equilibrium has no viscosity left in it."""
+    static = {"step": 0.05, "min_step": 1e-6, "stabilise": stabilise}
+    history = history_of(truss(shared_tmp_path, comm, push=(0.0, 0.0, -600.0), static=static), comm, shared_tmp_path)
+    z = history["probe/crown/position"][-1, 0, 2]
+    length, rest = np.hypot(HALF, z), np.hypot(HALF, HEIGHT)
+    assert z < -HEIGHT
+    assert 2.0 * YOUNG * AREA * (1.0 - length / rest) * z / length == pytest.approx(600.0, rel=1e-8)
+    assert history["load_factor"][-1] == 1.0
+    assert (np.diff(history["damping_dissipation"]) >= 0.0).all()
+    assert history["damping_dissipation"][-1] > history["elastic_energy"][-1]
+    assert abs(history["energy_imbalance"]).max() < 1e-8 * history["external_work"][-1]
+
+
+def test_damping_of_materials_does_nothing_without_time(shared_tmp_path, comm):
+    damped = {"steel": {"young_modulus": YOUNG, "density": 1000.0, "damping": 1e5}}
+    history = history_of(truss(shared_tmp_path, comm, material=damped), comm, shared_tmp_path)
+    assert not history["damping_dissipation"].any()
+
+
 def test_increments_grow_up_to_the_largest(shared_tmp_path, comm):
     case = truss(shared_tmp_path, comm, static={"step": 0.01, "max_step": 0.2})
     steps = np.diff(history_of(case, comm, shared_tmp_path)["load_factor"])

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from pydantic import model_validator
 
-from ...case.base import PositiveFloat, StrictModel
+from ...case.base import NonNegativeFloat, PositiveFloat, StrictModel
 from ...errors import InputError
 
 if TYPE_CHECKING:
@@ -31,6 +31,9 @@ class Parameters(StrictModel):
     max_step: PositiveFloat | None = None
     """largest increment, up to which increments grow after few Newton iterations; default: ``step``"""
 
+    stabilise: NonNegativeFloat = 0.0
+    """viscosity of the nodes over their stiffness; 0: none. Carries the truss over limit points"""
+
     @property
     def smallest(self) -> float:
         """The smallest increment."""
@@ -54,4 +57,4 @@ def make_stepper(model: Model, parameters: Parameters, choice: LinearChoice) -> 
     """Create the stepper of a case. Collective."""
     from ..stepper import StaticStepper
 
-    return StaticStepper(model, choice, parameters)
+    return StaticStepper(model, choice, parameters, parameters.stabilise)

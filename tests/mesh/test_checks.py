@@ -21,7 +21,7 @@ def test_a_sound_mesh_passes(comm):
         (SQUARE, [*ROUND, [2, 1]], r"1 bars join the same two nodes .* bars 1 and 4 \(nodes 1 and 2\); keep one"),
         (SQUARE, [*ROUND, [0, 1]], r"bars 0 and 4 \(nodes 0 and 1\)"),
         (SQUARE, [*ROUND, [2, 2]], r"1 bars start and end at the same node: bar 4 \(nodes 2 and 2\)"),
-        ([*SQUARE, [1, 1, 0]], [*ROUND, [2, 4]], r"no length .* bar 4 \(nodes 2 and 4\), length 0"),
+        ([*SQUARE, [1, 1, 0]], [*ROUND, [2, 4]], r"a length that is zero .* bar 4 \(nodes 2 and 4\), length 0"),
         (SQUARE, [*ROUND, [3, 4]], r"an end that does not exist: bar 4 \(nodes 3 and 4\); .* 0 to 3"),
         (SQUARE, [*ROUND, [-1, 2]], r"an end that does not exist: bar 4 \(nodes -1 and 2\)"),
         ([*SQUARE, [5, 5, 5]], ROUND, r"1 nodes belong to no bar: node 4; remove"),

@@ -252,9 +252,9 @@ def _pairs(data: Any, problems: Problems) -> list[t.ContactPair]:
 def _analyses(data: Mapping[str, Any], problems: Problems) -> dict[str, Any]:
     """The tables that say what is computed, of which a case has at least one."""
     if "time" in data and "static" in data:
-        problems.add((), "expected one of the tables [time], [static], not both")
+        problems.add((), "[time] and [static] exclude each other: give one of them")
     if not any(key in data for key in ("time", "static", "stage", "modes")):
-        problems.add((), "expected one of the tables [time], [static], [[stage]], [modes]: what is to be computed")
+        problems.add((), "the table [time] is missing, or one of [static], [[stage]], [modes]: what is to be computed")
     return {
         "time": _time(data, problems) if "time" in data else None,
         "static": _static(data, problems) if "static" in data else None,

@@ -74,7 +74,7 @@ def stages_of(data: Mapping[str, Any], problems: Problems) -> list[StageTables]:
         return []
     for key in ANALYSES:
         if key in data:
-            problems.add((), f"expected one of the tables [{key}], [[stage]], not both: give [stage.{key}]")
+            problems.add((), f"[{key}] and [[stage]] exclude each other: give [stage.{key}]")
     last = len(rows) - 1
     common = {key: value for key, value in data.items() if key not in ("stage", "modes", *ANALYSES)}
     owner: dict[str, int] = {}

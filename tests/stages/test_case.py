@@ -94,5 +94,5 @@ def test_stages_are_a_list_of_at_least_one(stages):
 @pytest.mark.parametrize("table", ["time", "static"])
 def test_an_analysis_beside_stages_is_refused(table):
     given = {"time": {"integrator": "newmark", "step": 1e-6, "end": 1e-5}, "static": {"step": 0.5}}
-    with pytest.raises(InputError, match=rf"one of the tables \[{table}\], \[\[stage\]\], not both"):
+    with pytest.raises(InputError, match=rf"\[{table}\] and \[\[stage\]\] exclude each other"):
         Case.from_dict({**BLOCK, table: given[table]})

@@ -182,7 +182,7 @@ def test_a_restart_goes_on_to_the_last_bit(shared_tmp_path, comm):
         ({"support": []}, ["rigid-body motions", "[[support]]"]),
         ({"static": {"step": 0.1, "max_step": 0.01}}, ["max_step", "smaller than step"]),
         ({"static": {"method": "newtons"}}, ["static.method", "did you mean 'newton'"]),
-        ({"static": {}, "time": {"integrator": "newmark", "step": 1.0, "end": 1.0}}, ["[time], [static]", "not both"]),
+        ({"static": {}, "time": {"integrator": "newmark", "step": 1.0, "end": 1.0}}, ["[time] and [static]", "exclude each other"]),
     ],
 )
 def test_what_a_static_analysis_does_not_have_is_refused(shared_tmp_path, comm, tables, words):
@@ -195,7 +195,7 @@ def test_what_a_static_analysis_does_not_have_is_refused(shared_tmp_path, comm, 
 def test_a_case_needs_an_analysis(shared_tmp_path, comm):
     data = truss(shared_tmp_path, comm).to_dict()
     del data["static"]
-    with pytest.raises(InputError, match=r"\[time\], \[static\]"):
+    with pytest.raises(InputError, match=r"\[time\] is missing, or one of \[static\]"):
         Case.from_dict(data, folder=shared_tmp_path)
 
 

@@ -40,7 +40,7 @@ def test_restrictions_to_inactive_unknowns_are_freed(comm, shared_tmp_path):
 
     def restrictions():
         gc.collect()
-        # by type: isinstance would ask what weak proxies stand for
+        # by type: isinstance would ask for what weak proxies stand for
         return sum(type(thing) is matrix_free._Restriction for thing in gc.get_objects())
 
     before = restrictions()  # of other tests' runs

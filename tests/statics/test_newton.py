@@ -182,7 +182,10 @@ def test_a_restart_goes_on_to_the_last_bit(shared_tmp_path, comm):
         ({"support": []}, ["rigid-body motions", "[[support]]"]),
         ({"static": {"step": 0.1, "max_step": 0.01}}, ["max_step", "smaller than step"]),
         ({"static": {"method": "newtons"}}, ["static.method", "did you mean 'newton'"]),
-        ({"static": {}, "time": {"integrator": "newmark", "step": 1.0, "end": 1.0}}, ["[time] and [static]", "exclude each other"]),
+        (
+            {"static": {}, "time": {"integrator": "newmark", "step": 1.0, "end": 1.0}},
+            ["[time] and [static]", "exclude each other"],
+        ),
     ],
 )
 def test_what_a_static_analysis_does_not_have_is_refused(shared_tmp_path, comm, tables, words):

@@ -99,14 +99,14 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 def thinned(items: list[pytest.Item], ranks: int) -> list[pytest.Item]:
     """Return all tests except the thorough ones, with some of their sets of parameters.
 
-    Slow tests run with every fourth set; on several ranks the others run with every third or fifth set if they have
-    more than three. The selection depends on the number of ranks.
+    Tests with more than three sets run with every second, fourth or sixth on 1, 2 and more ranks, slow tests with a
+    quarter of these. The selection depends on the number of ranks.
     """
     sets: dict[tuple[Path, str], list[pytest.Item]] = {}
     for item in items:
         if item.get_closest_marker("thorough") is None:
             sets.setdefault((item.path, getattr(item, "originalname", item.name)), []).append(item)
-    stride = {1: 1, 2: 3}.get(ranks, 5)
+    stride = {1: 2, 2: 4}.get(ranks, 6)
     chosen: set[pytest.Item] = set()
     for group in sets.values():
         slow = group[0].get_closest_marker("slow") is not None

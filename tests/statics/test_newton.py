@@ -159,7 +159,11 @@ def test_a_wall_presses_a_truss(shared_tmp_path, comm):
 
 @pytest.mark.parallel
 def test_a_restart_goes_on_to_the_last_bit(shared_tmp_path, comm):
-    tables = {"output": {"fields_every": 1, "checkpoint_every": 3}, "static": {"step": 0.03, "max_step": 0.1}}
+    tables = {
+        "output": {"fields_every": 1, "checkpoint_every": 3},
+        "static": {"step": 0.03, "max_step": 0.1},
+        "solver": {"linear": "cg"},  # MUMPS on several ranks repeats to rounding alone
+    }
     whole = history_of(truss(shared_tmp_path, comm, **tables), comm, shared_tmp_path)
     whole = {name: whole[name] for name in whole}
     part = truss(shared_tmp_path, comm, **tables)

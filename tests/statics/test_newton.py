@@ -175,8 +175,8 @@ def test_a_restart_goes_on_to_the_last_bit(shared_tmp_path, comm):
     again = history_of(part, comm, folder, restart=True)
     assert set(again) == set(whole)
     for name, values in whole.items():
-        # of a node a rank, PT-Scotch gives the second run of a process other ones: sums are added in another order
-        rounding = 1e-15 if comm.size > 2 and name in ("energy_imbalance", "numerical_dissipation") else 0.0
+        # PT-Scotch gives the ranks other ones of so few nodes in the next run of a process: sums have another order
+        rounding = 0.0 if comm.size == 1 else 1e-12 * max(abs(values).max(), 1.0)
         np.testing.assert_allclose(again[name], values, rtol=0.0, atol=rounding, err_msg=name)
 
 

@@ -31,6 +31,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from mpi4py import MPI
 
+from ..mechanics.compiled import kernel
+
 if TYPE_CHECKING:
     from .model import Model
 
@@ -54,6 +56,28 @@ class _Worst(NamedTuple):
     nodes: tuple[int, int] = (-1, -1)
     change: float = 0.0
     turn: float = 0.0
+
+
+@kernel
+def _largest_miss(bars, rest, before, after, predicted):
+    """Largest change of a bar's vector that is not predicted, over its rest length, and the number of that bar."""
+    worst, at = -1.0, 0
+    for k in range(len(bars)):
+        a, b = bars[k, 0], bars[k, 1]
+        changed = missed = 0.0
+        for c in range(3):
+            end = after[b, c] - after[a, c]
+            change = end - (before[b, c] - before[a, c])
+            miss = end - (predicted[b, c] - predicted[a, c])
+            changed += change * change
+            missed += miss * miss
+        value = np.sqrt(min(changed, missed)) / rest[k]
+        # what is not a number is the worst of all
+        if value > worst or value != value:
+            worst, at = value, k
+            if value != value:
+                break
+    return worst, at
 
 
 class StepGuard:
@@ -101,18 +125,16 @@ class StepGuard:
     def _unpredicted(self, before: np.ndarray, after: np.ndarray) -> _Worst:
         """Return the bar of this rank with the largest unpredicted change."""
         mesh, rest = self.model.mesh, self.model.bars.rest
-        a, b = mesh.bars.T
-        if len(a) == 0:
+        if len(mesh.bars) == 0:
             return _Worst(0.0)
+        value, k = _largest_miss(mesh.bars, rest, before, after, self._predicted)
+        a, b = mesh.bars[k]
         start, end = before[b] - before[a], after[b] - after[a]
-        change = np.linalg.norm(end - start, axis=1)
-        missed = np.linalg.norm(end - (self._predicted[b] - self._predicted[a]), axis=1)
-        values = np.minimum(change, missed) / rest
-        k = int(np.argmax(values))
-        lengths = np.linalg.norm(start[k]) * np.linalg.norm(end[k])
-        turn = np.degrees(np.arccos(np.clip(start[k] @ end[k] / max(lengths, 1e-300), -1.0, 1.0)))
-        nodes = int(mesh.node_ids[a[k]]), int(mesh.node_ids[b[k]])
-        return _Worst(float(values[k]), int(mesh.bar_ids[k]), nodes, float(change[k] / rest[k]), float(turn))
+        lengths = np.linalg.norm(start) * np.linalg.norm(end)
+        turn = np.degrees(np.arccos(np.clip(start @ end / max(lengths, 1e-300), -1.0, 1.0)))
+        nodes = int(mesh.node_ids[a]), int(mesh.node_ids[b])
+        change = float(np.linalg.norm(end - start) / rest[k])
+        return _Worst(float(value), int(mesh.bar_ids[k]), nodes, change, float(turn))
 
     def _barrier(self, before: np.ndarray, after: np.ndarray, energy: float) -> str | None:
         """Check energies of bars at both ends and at mid-path, with the initial internal variables. Collective."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from typing import Any, NamedTuple
 
 from .errors import PfemError
@@ -28,8 +27,8 @@ class Step(NamedTuple):
     row: dict[str, Any] | None
 
 
-class Analysis(ABC):
-    """Advances a state step by step to its last step.
+class Analysis:
+    """Advances a state step by step to its last step, by a stepper.
 
     Examples are time stepping and static paths, whose time is the load factor. Recording, checkpoints, requests to stop
     and progress use this interface only and do not depend on the analysis. All methods are collective.
@@ -48,16 +47,15 @@ class Analysis(ABC):
     step_size: float
 
     @property
-    @abstractmethod
     def state(self) -> State:
         """The state of this rank's nodes, complete after :meth:`start` and after each step."""
+        return self.stepper.state
 
     @property
-    @abstractmethod
     def fault(self) -> PfemError | None:
         """A failure that only this rank knows; raised on all ranks at the next synchronisation."""
+        return self.stepper.fault
 
-    @abstractmethod
     def start(self) -> None:
         """Initialise the state; not called if a checkpoint is restored instead.
 
@@ -66,8 +64,8 @@ class Analysis(ABC):
         PfemError
             On all ranks.
         """
+        self.stepper.start()
 
-    @abstractmethod
     def advance(self) -> Step:
         """Make one step; its ``row`` is None, because rows are made by recording.
 
@@ -76,7 +74,10 @@ class Analysis(ABC):
         SimulationFailure
             On all ranks; the state is the last complete one, or undefined.
         """
+        self.stepper.step()
+        solution = self.stepper.solution
+        return Step(self.stepper.number, self.stepper.place, solution.newton, solution.linear, None)
 
-    @abstractmethod
     def close(self) -> None:
         """Free resources that are not freed automatically; the state remains accessible."""
+        self.stepper.destroy()

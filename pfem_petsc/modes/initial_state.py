@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..analysis import Analysis, Step
-from ..errors import InputError, PfemError
+from ..errors import InputError
 from ..integrators.base import Balance, NoParameters, Scheme, State
 from ..output.units import TIME, Axis
 from ..stepping.prescribed import NoRates
@@ -45,14 +45,7 @@ class _InitialStepper(Stepper):
         self.prescribed = NoRates(self)
 
     def start(self) -> None:
-        state, model = self.state, self.model
-        state.v = np.zeros_like(self.zero)
-        state.a = np.zeros_like(self.zero)
-        if model.supports.any:
-            state.position[model.supports.at] = model.supports.positions(0.0)
-        self.evaluate(commit=True)
-        if model.external.active:
-            state.external = model.external.at(0.0, np.empty_like(state.v))
+        self.start_without_motion()
         self.totals_at_start = self._totals()
 
     def accelerate(self, load: np.ndarray) -> np.ndarray:
@@ -123,19 +116,5 @@ class InitialState(Analysis):
         self.plan = InitialStatePlan()
         self.stepper = _InitialStepper(model)
 
-    @property
-    def state(self) -> State:
-        return self.stepper.state
-
-    @property
-    def fault(self) -> PfemError | None:
-        return self.stepper.fault
-
-    def start(self) -> None:
-        self.stepper.start()
-
     def advance(self) -> Step:
         raise NotImplementedError("the initial state has no steps")
-
-    def close(self) -> None:
-        self.stepper.destroy()

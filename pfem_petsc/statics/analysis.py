@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..analysis import Analysis, Step
+from ..analysis import Analysis
 from ..case.materials import law_name, law_of
-from ..errors import InputError, PfemError
-from ..integrators.base import Scheme, State
+from ..errors import InputError
+from ..integrators.base import Scheme
 from ..output.units import LOAD_FACTOR, POINT, Axis
 from ..registry import lookup
 from ..solvers.linear import LinearChoice, choose_linear
@@ -98,25 +98,6 @@ class StaticAnalysis(Analysis):
     def last_step(self) -> int:
         """Number of the last step once it is reached, before that a number larger than any step."""
         return self.stepper.state.step if self.stepper.done else NEVER
-
-    @property
-    def state(self) -> State:
-        return self.stepper.state
-
-    @property
-    def fault(self) -> PfemError | None:
-        return self.stepper.fault
-
-    def start(self) -> None:
-        self.stepper.start()
-
-    def advance(self) -> Step:
-        self.stepper.step()
-        solution = self.stepper.solution
-        return Step(self.stepper.number, self.stepper.place, solution.newton, solution.linear, None)
-
-    def close(self) -> None:
-        self.stepper.destroy()
 
 
 def _linear(model: Model) -> LinearChoice:

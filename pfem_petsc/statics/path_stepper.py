@@ -59,8 +59,9 @@ class PathStepper(StaticStepper):
         "scale",
         "ended",
         "bifurcations",
+        "turning",
+        "outcome",
     )
-    kept_numbers = (*kept_numbers, "turning", "outcome")
     kept_arrays = (*StaticStepper.kept_arrays, "mode")
     event_columns = EVENTS
     remedy = "reduce static.max_step or static.step; if such jumps are intended, set solver.guard = false"

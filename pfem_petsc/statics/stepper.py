@@ -84,13 +84,7 @@ class StaticStepper(ImplicitStepper):
     def start(self) -> None:
         """Initialise the state at load factor zero; the first increment is equilibrated. Collective."""
         state, model = self.state, self.model
-        state.v = np.zeros_like(self.zero)
-        state.a = np.zeros_like(self.zero)
-        if model.supports.any:
-            state.position[model.supports.at] = model.supports.positions(0.0)
-        self.evaluate(commit=True)
-        if model.external.active:
-            state.external = model.external.at(0.0, np.empty_like(state.v))
+        self.start_without_motion()
         # the force that the state lacks to equilibrium (heat, a stage before) does work in the first increment, which
         # the ledger books as that of inertia
         lack = state.external - state.f[: model.mesh.n_owned] + state.contact + state.support

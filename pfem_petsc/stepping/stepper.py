@@ -150,6 +150,17 @@ class Stepper(ABC):
             state.v = v
             motion.set_speeds(speeds)
 
+    def start_without_motion(self) -> None:
+        """Initialise positions, internal forces and loads at time zero, where nothing moves. Collective."""
+        state, model = self.state, self.model
+        state.v = np.zeros_like(self.zero)
+        state.a = np.zeros_like(self.zero)
+        if model.supports.any:
+            state.position[model.supports.at] = model.supports.positions(0.0)
+        self.evaluate(commit=True)
+        if model.external.active:
+            state.external = model.external.at(0.0, np.empty_like(state.v))
+
     def acceleration(self) -> np.ndarray:
         """Acceleration (owned, 3) to record [m/s2]; collective with consistent mass.
 

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ..analysis import Analysis, Step
-from ..errors import PfemError
-from ..integrators.base import State
+from ..analysis import Analysis
 from .prepare import Plan, make_stepper
 
 if TYPE_CHECKING:
@@ -32,24 +30,3 @@ class TimeStepping(Analysis):
         self.model, self.plan = model, plan
         self.last_step, self.step_size = plan.steps, plan.step
         self.stepper = make_stepper(model, plan)
-
-    @property
-    def state(self) -> State:
-        return self.stepper.state
-
-    @property
-    def fault(self) -> PfemError | None:
-        return self.stepper.fault
-
-    def start(self) -> None:
-        self.stepper.start()
-
-    def advance(self) -> Step:
-        self.stepper.step()
-        solution = self.stepper.solution
-        return Step(self.stepper.number, self.stepper.place, solution.newton, solution.linear, None)
-
-    def close(self) -> None:
-        destroy = getattr(self.stepper, "destroy", None)
-        if destroy is not None:
-            destroy()

@@ -19,6 +19,7 @@ __all__ = [
     "PROJECTED",
     "RANK",
     "ROUNDING",
+    "SINGULAR_PIVOT",
     "SINGULAR_ROW",
     "TIME",
 ]
@@ -47,3 +48,5 @@ RANK = 1e-8
 """relative to the largest singular value of unit normals: below it, normals are dependent; the root of rounding"""
 TIME = 1e-9
 """relative to a step or an end time: largest difference between the sum of steps and the requested time"""
+SINGULAR_PIVOT = 1e-13
+"""relative to the largest entry of a matrix: a pivot that is zero up to rounding"""

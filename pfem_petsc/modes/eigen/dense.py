@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from ...tolerances import SINGULAR_PIVOT
 from ..gathered import Gathered
 from ..pencil import Pencil
 
 __all__ = ["Solver"]
-
-
-_SINGULAR = 1e-13  # relative to the largest entry: a pivot that is zero up to rounding
 
 
 class Solver:
@@ -35,7 +33,7 @@ class Solver:
         except np.linalg.LinAlgError:
             return False
         pivots = np.diag(lower) ** 2
-        if pivots.min() <= _SINGULAR * np.diag(b).max():
+        if pivots.min() <= SINGULAR_PIVOT * np.diag(b).max():
             return False
         reduced = np.linalg.solve(lower, np.linalg.solve(lower, a).T)
         _, vectors = np.linalg.eigh(0.5 * (reduced + reduced.T))

@@ -8,13 +8,13 @@ import numpy as np
 
 from ...errors import SimulationFailure
 from ...parallel.agreement import on_root
+from ...tolerances import SINGULAR_PIVOT
 from ..gathered import Gathered
 from ..pencil import Pencil
 
 __all__ = ["Solver"]
 
 _TOLERANCE = 1e-11  # relative, of theta
-_SINGULAR = 1e-13  # relative to the largest entry: a pivot that is zero up to rounding
 
 
 class Solver:
@@ -49,7 +49,7 @@ class Solver:
         if not np.array_equal(self._factor.perm_r, self._factor.perm_c):
             return None
         # L D L^T without row exchanges: by Sylvester's law the signs of D are those of the eigenvalues
-        return bool((self._factor.U.diagonal() > _SINGULAR * self._b.diagonal().max()).all())
+        return bool((self._factor.U.diagonal() > SINGULAR_PIVOT * self._b.diagonal().max()).all())
 
     def largest(self, count: int, start: np.ndarray, known: np.ndarray) -> np.ndarray:
         """See :mod:`pfem_petsc.modes.eigen`."""

@@ -99,18 +99,18 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 def thinned(items: list[pytest.Item], ranks: int) -> list[pytest.Item]:
     """Return all tests except the thorough ones, with some of their sets of parameters.
 
-    Tests with more than three sets run with every second, fourth or sixth on 1, 2 and more ranks, slow tests with a
-    quarter of these. The selection depends on the number of ranks.
+    Tests with more than three, two or one sets run with every third, fifth or eighth of them on 1, 2 and more ranks, slow
+    tests with a quarter of these. The selection depends on the number of ranks.
     """
     sets: dict[tuple[Path, str], list[pytest.Item]] = {}
     for item in items:
         if item.get_closest_marker("thorough") is None:
             sets.setdefault((item.path, getattr(item, "originalname", item.name)), []).append(item)
-    stride = {1: 2, 2: 4}.get(ranks, 6)
+    most, stride = {1: (3, 3), 2: (2, 5)}.get(ranks, (1, 8))
     chosen: set[pytest.Item] = set()
     for group in sets.values():
         slow = group[0].get_closest_marker("slow") is not None
-        if slow or len(group) > 3:
+        if slow or len(group) > most:
             every = 4 * stride if slow else stride
             group = group[(ranks - 1) % min(every, len(group)) :: every]
         chosen |= set(group)

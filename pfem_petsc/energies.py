@@ -42,6 +42,7 @@ ENERGIES = (
     Energy("external_work", "supplied", "ledger"),
     Energy("contact_work", "supplied", "ledger"),
     Energy("thermal_work", "supplied", "ledger"),
+    Energy("prestress_work", "supplied", "ledger"),
     Energy("numerical_dissipation", "lost", "ledger"),
 )
 

@@ -6,6 +6,7 @@ name of the key, before any work is done. Imports pydantic only.
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
@@ -24,6 +25,7 @@ __all__ = [
     "Vector3",
     "WallParameters",
     "listed",
+    "number_or_rows",
 ]
 
 
@@ -45,6 +47,20 @@ def _tuple_from_list(value: Any) -> Any:
 
 listed = BeforeValidator(_tuple_from_list)
 """Annotation of a tuple type that accepts TOML lists: ``Annotated[tuple[float, float], listed]``."""
+
+
+def number_or_rows(value: Any) -> float | tuple[tuple[float, float], ...]:
+    """Return a finite number, or rows of two, of a key that takes both; for validators."""
+    expected = "expected a number in SI units, without quotes and unit, or rows [t, value]"
+    rows = value if isinstance(value, list | tuple) else [[0.0, value]]
+    if not all(isinstance(row, list | tuple) and len(row) == 2 for row in rows):
+        raise ValueError(expected)
+    for number in (number for row in rows for number in row):
+        if isinstance(number, bool) or not isinstance(number, int | float) or not math.isfinite(number):
+            raise ValueError(expected)
+    if rows is value:
+        return tuple((float(t), float(number)) for t, number in rows)
+    return float(value)
 
 
 def _no_path_of_its_own(name: str) -> str:

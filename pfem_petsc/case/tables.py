@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, InstanceOf, field_validator, model_validator
+from pydantic import Field, InstanceOf, ValidationInfo, field_validator, model_validator
 
 from .base import (
     Finite,
@@ -17,6 +17,7 @@ from .base import (
     StrictModel,
     Vector3,
     listed,
+    number_or_rows,
 )
 
 __all__ = [
@@ -27,6 +28,7 @@ __all__ = [
     "Mesh",
     "MeshKeys",
     "NodeSet",
+    "PRESTRESSES",
     "Section",
     "Support",
     "Temperature",
@@ -37,6 +39,10 @@ Row4 = Annotated[tuple[Finite, Finite, Finite, Finite], listed]
 Table2 = Annotated[tuple[Row2, ...], listed]
 Table4 = Annotated[tuple[Row4, ...], listed]
 Indices = Annotated[tuple[NonNegativeInt, ...], listed]
+
+
+PRESTRESSES = ("pretension", "prestress", "rest_length")
+"""Keys of a section that prescribe rest lengths."""
 
 
 def _increasing(rows: Sequence[Sequence[float]] | None) -> None:
@@ -124,6 +130,36 @@ class Section(StrictModel):
     """name of a material"""
     bars: str | None = None
     """bar group of the mesh; default: all bars that no other section names"""
+    pretension: Any = None
+    """axial force in the mesh [N], or rows [t, force] [s, N]: linear between rows, constant outside"""
+    prestress: Any = None
+    """stress in the mesh [Pa], or rows [t, stress] [s, Pa]"""
+    rest_length: Any = None
+    """rest length over the length in the mesh, or rows [t, factor] [s, -]"""
+
+    @field_validator("pretension", "prestress", "rest_length")
+    @classmethod
+    def _number_or_rows(cls, value: Any, info: ValidationInfo) -> Any:
+        if value is None:
+            return None
+        value = number_or_rows(value)
+        rows = ((0.0, value),) if isinstance(value, float) else value
+        _increasing(rows)
+        if info.field_name == "rest_length" and not all(1e-3 < row[1] < 1e3 for row in rows):
+            raise ValueError("expected a factor on the length in the mesh, like 0.99, or rows [t, factor]")
+        return value
+
+    @model_validator(mode="after")
+    def _one_prestress(self) -> Section:
+        given = [key for key in PRESTRESSES if getattr(self, key) is not None]
+        if len(given) > 1:
+            raise ValueError(f"expected at most one of the keys {', '.join(PRESTRESSES)}; got {' and '.join(given)}")
+        return self
+
+    @property
+    def prestressed(self) -> str | None:
+        """The key that prescribes rest lengths, None without one."""
+        return next((key for key in PRESTRESSES if getattr(self, key) is not None), None)
 
 
 class Initial(StrictModel):

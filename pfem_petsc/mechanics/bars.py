@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, NamedTuple
@@ -60,6 +60,7 @@ class BarBlock:
     damping: float
     thermal_expansion: float
     law: Law
+    measure: Callable
     parameters: tuple[float, ...]
     modulus: float
     history: np.ndarray
@@ -109,7 +110,9 @@ class Bars:
     ----------
     ends : (b, 2) int32, local node indices of each bar
     far : (b,) uint32, the end of each bar with the larger index
-    rest : (b,) float64, rest lengths [m]
+    mesh_lengths : (b,) float64, lengths in the mesh [m], which determine mass and damping
+    rest : (b,) float64, rest lengths [m]: the same array where no section prescribes them
+    rest_at_start : (b,) the same at the start of the step, or (0,) if they are constant
     heat : (2, b) thermal strains and temperatures [K], or (2, 0) without temperatures
     heat_at_start : the same at the start of the step, if they vary
     step : time from the start of the step to the evaluated positions [s]; 0 at the start of a run
@@ -121,8 +124,10 @@ class Bars:
     def __init__(self, mesh: DistributedMesh, case: Case) -> None:
         self.mesh = mesh
         self.ends = mesh.bars
-        self.rest = np.empty(len(mesh.bars))
-        _lengths(mesh.points, mesh.bars, self.rest)
+        self.mesh_lengths = np.empty(len(mesh.bars))
+        _lengths(mesh.points, mesh.bars, self.mesh_lengths)
+        self.rest = self.mesh_lengths
+        self.rest_at_start = np.empty(0)
         self.heat = np.empty((2, 0))
         self.heat_at_start = self.heat
         self.step = 0.0
@@ -149,6 +154,7 @@ class Bars:
                     damping=material.damping,
                     thermal_expansion=material.thermal_expansion,
                     law=law,
+                    measure=measure,
                     parameters=material.pack(),
                     modulus=material.largest_modulus(),
                     history=np.zeros((len(law.rows), block.stop - block.start)),
@@ -178,6 +184,12 @@ class Bars:
                 failed = at
         return StrainEnergy(tuple(energies.tolist()), failed, shortened)
 
+    def keep_start(self) -> None:
+        """Store temperatures and rest lengths as those of the start of the next step."""
+        self.heat_at_start[:] = self.heat
+        if len(self.rest_at_start):
+            self.rest_at_start[:] = self.rest
+
     def first_inverted(self, x: np.ndarray, before: np.ndarray) -> int:
         """Return the first local bar that passed through zero length from positions ``before`` to ``x``, or -1.
 
@@ -191,7 +203,15 @@ class Bars:
         """Add ``weight`` K_t(x) and the consistent inertia (a coefficient per block) to the values of a matrix."""
         for block, m in zip(self.blocks, inertia, strict=True):
             block.kernels.tangents(
-                *self._arguments(x, block), block.start, block.stop, m, weight, pattern.ptr, pattern.slots, values
+                *self._arguments(x, block),
+                block.start,
+                block.stop,
+                m,
+                self.mesh_lengths,
+                weight,
+                pattern.ptr,
+                pattern.slots,
+                values,
             )
 
     def linearise(self, x: np.ndarray, weight: float, stored: np.ndarray) -> None:
@@ -204,7 +224,7 @@ class Bars:
         f[:] = 0.0
         for block in self.blocks:
             arguments = self._arguments(x, block)
-            block.conserving.forces(x0, self.heat_at_start, *arguments, block.start, block.stop, f)
+            block.conserving.forces(x0, self.heat_at_start, self.rest_at_start, *arguments, block.start, block.stop, f)
 
     def step_tangents(
         self,
@@ -217,8 +237,9 @@ class Bars:
     ) -> None:
         """As :meth:`tangents`, for :meth:`step_forces`."""
         for block, m in zip(self.blocks, inertia, strict=True):
-            arguments = (x0, self.heat_at_start, *self._arguments(x, block), block.start, block.stop)
-            block.conserving.tangents(*arguments, m, weight, pattern.ptr, pattern.slots, values)
+            start = (x0, self.heat_at_start, self.rest_at_start)
+            arguments = (*start, *self._arguments(x, block), block.start, block.stop)
+            block.conserving.tangents(*arguments, m, self.mesh_lengths, weight, pattern.ptr, pattern.slots, values)
 
     def product(self, x: np.ndarray, u: np.ndarray, out: np.ndarray) -> None:
         """Compute ``out`` = K_t(x) u for local arrays (nodes, 3); valid for owned nodes."""
@@ -243,6 +264,13 @@ class Bars:
             for name, _, values in block.variables():
                 if name in out:
                     out[name][block.start : block.stop] = values
+        return out
+
+    def densities(self, x: np.ndarray) -> np.ndarray:
+        """Return stored and dissipated energy per rest volume (b,) [J/m3] at the end of the last step."""
+        out = np.zeros(len(self.ends))
+        for block in self.blocks:
+            block.kernels.densities(*self._arguments(x, block), block.start, block.stop, out)
         return out
 
     def history(self) -> np.ndarray:

@@ -8,7 +8,8 @@ ln(l1/l0)/((l1^2 - l0^2)/2).
 
 The material law defines S (``mean_stress`` of :class:`~pfem_petsc.mechanics.materials.base.Law`): (s0 + s1)/2 for an
 elastic bar, so that the work equals the change of its energy. If the temperature changes, e is the strain minus the
-thermal strain.
+thermal strain. If the rest length changes, e0 and e1 are the strains with the rest lengths at either end of the step,
+and l0 and R are those of their mean.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ _RATIOS = {engineering: _engineering_ratio, green: _green_ratio, logarithmic: _l
 def make_conserving_kernels(law: Law, measure: Callable) -> SimpleNamespace:
     """Make the kernels ``forces`` and ``tangents`` of a material law; arguments as in
     :mod:`~pfem_petsc.mechanics.kernels`, with positions, thermal strains and temperatures at the start (``x0``,
-    ``cold``) and end (``x``, ``heat``) of the step."""
+    ``cold``) and end (``x``, ``heat``) of the step; ``rest0`` (b,): rest lengths at the start, (0,) if constant."""
     response, mean_stress, like, by_rate, last = (
         law.response,
         law.mean_stress,
@@ -73,15 +74,21 @@ def make_conserving_kernels(law: Law, measure: Callable) -> SimpleNamespace:
     ratio = _RATIOS[measure]
 
     @register_jitable
-    def pair(ox, oy, oz, dx, dy, dz, rest, shift0, shift, warmth0, warmth, p, area, step, kept, q):
+    def pair(ox, oy, oz, dx, dy, dz, rest0, rest1, shift0, shift, warmth0, warmth, p, area, step, kept, q):
         """Return the coefficient c = A l0 S R [N/m], dc/dl1 [N/m2] and 1/l1; c is NaN for a collapsed bar."""
         length = math.sqrt(dx * dx + dy * dy + dz * dz)
-        s0 = math.sqrt(ox * ox + oy * oy + oz * oz) / rest
+        length0 = math.sqrt(ox * ox + oy * oy + oz * oz)
+        rest = 0.5 * (rest0 + rest1)
+        s0 = length0 / rest
         s1 = length / rest
         if not (s1 > COLLAPSED_STRETCH):
             return math.nan, 0.0, 0.0
         e0, _, _ = measure(s0)
         e1, slope, _ = measure(s1)
+        if rest0 != rest1:
+            e0, _, _ = measure(length0 / rest0)
+            e1, slope, _ = measure(length / rest1)
+            slope *= rest / rest1
         rate = 0.0
         if by_rate:
             stress0 = kept
@@ -96,9 +103,10 @@ def make_conserving_kernels(law: Law, measure: Callable) -> SimpleNamespace:
         return c, dc, 1.0 / length
 
     @kernel
-    def forces(x0, cold, x, bars, rest, heat, p, area, step, history, start, stop, f):
+    def forces(x0, cold, rest0, x, bars, rest, heat, p, area, step, history, start, stop, f):
         """Add the step's internal forces to ``f``."""
         has_thermal = heat.shape[1] > 0
+        changes = len(rest0) > 0
         for k in range(start, stop):
             a = bars[k, 0]
             b = bars[k, 1]
@@ -114,7 +122,10 @@ def make_conserving_kernels(law: Law, measure: Callable) -> SimpleNamespace:
             dx = x[b, 0] - x[a, 0]
             dy = x[b, 1] - x[a, 1]
             dz = x[b, 2] - x[a, 2]
-            c, _, _ = pair(ox, oy, oz, dx, dy, dz, rest[k], shift0, shift, warmth0, warmth, p, area, step, kept, q)
+            first = rest0[k] if changes else rest[k]
+            c, _, _ = pair(
+                ox, oy, oz, dx, dy, dz, first, rest[k], shift0, shift, warmth0, warmth, p, area, step, kept, q
+            )
             dx, dy, dz = 0.5 * (ox + dx), 0.5 * (oy + dy), 0.5 * (oz + dz)
             f[a, 0] -= c * dx
             f[a, 1] -= c * dy
@@ -125,10 +136,29 @@ def make_conserving_kernels(law: Law, measure: Callable) -> SimpleNamespace:
 
     @kernel
     def tangents(
-        x0, cold, x, bars, rest, heat, p, area, step, history, start, stop, inertia, weight, ptr, slots, values
+        x0,
+        cold,
+        rest0,
+        x,
+        bars,
+        rest,
+        heat,
+        p,
+        area,
+        step,
+        history,
+        start,
+        stop,
+        inertia,
+        lengths,
+        weight,
+        ptr,
+        slots,
+        values,
     ):
         """Add ``weight`` df/dx1 = c/2 I + dc/dl1 d n1^T (not symmetric) and the consistent inertia."""
         has_thermal = heat.shape[1] > 0
+        changes = len(rest0) > 0
         for k in range(start, stop):
             a = bars[k, 0]
             b = bars[k, 1]
@@ -144,12 +174,13 @@ def make_conserving_kernels(law: Law, measure: Callable) -> SimpleNamespace:
             dx = x[b, 0] - x[a, 0]
             dy = x[b, 1] - x[a, 1]
             dz = x[b, 2] - x[a, 2]
+            first = rest0[k] if changes else rest[k]
             c, dc, inverse = pair(
-                ox, oy, oz, dx, dy, dz, rest[k], shift0, shift, warmth0, warmth, p, area, step, kept, q
+                ox, oy, oz, dx, dy, dz, first, rest[k], shift0, shift, warmth0, warmth, p, area, step, kept, q
             )
             d = (0.5 * (ox + dx), 0.5 * (oy + dy), 0.5 * (oz + dz))
             n = (dx * inverse, dy * inverse, dz * inverse)
-            mass = inertia * rest[k]
+            mass = inertia * lengths[k]
             for side in range(4):
                 slot = slots[k, side]
                 if slot < 0:

@@ -39,7 +39,8 @@ def last_row(law: Law) -> int:
 
 @cache
 def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
-    """Make the kernels of a law and strain measure: ``forces``, ``tangents``, ``product``, ``linearise``, ``fields``.
+    """Make the kernels of a law and strain measure: ``forces``, ``tangents``, ``product``, ``linearise``, ``fields``,
+    ``densities``.
 
     Common arguments: ``x`` (local nodes, 3) [m]; ``bars`` (b, 2) local ends; ``rest`` (b,) rest lengths [m]; ``heat``
     (2, b) thermal strains and temperatures [K], or (2, 0) for none; ``p`` the law's parameters; ``area`` [m2]; ``step``
@@ -172,8 +173,11 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
         return axial, area * stress * slope / length, 1.0 / length
 
     @kernel
-    def tangents(x, bars, rest, heat, p, area, step, history, start, stop, inertia, weight, ptr, slots, values):
-        """Add ``weight`` K_t, and ``inertia`` l0 (2 on the diagonal, 1 off it), to the block rows of owned nodes.
+    def tangents(
+        x, bars, rest, heat, p, area, step, history, start, stop, inertia, lengths, weight, ptr, slots, values
+    ):
+        """Add ``weight`` K_t, and ``inertia`` times ``lengths`` (b,) in the mesh (2 on the diagonal, 1 off it), to the
+        block rows of owned nodes.
 
         ``slots`` (b, 4): index among all blocks of (a, a), (a, b), (b, b), (b, a), -1 if the row is not owned;
         ``ptr`` (owned + 1,) first block of each row; ``values``: the matrix in scalar compressed rows.
@@ -195,7 +199,7 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
             nz *= inverse
             axial = weight * (axial - geometric)
             geometric = weight * geometric
-            mass = inertia * rest[k]
+            mass = inertia * lengths[k]
             for side in range(4):
                 slot = slots[k, side]
                 if slot < 0:
@@ -294,6 +298,30 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
             stress_out[k] = stress
             force_out[k] = area * stress * slope
 
+    @kernel
+    def densities(x, bars, rest, heat, p, area, step, history, start, stop, out):
+        """Write stored and dissipated energy per rest volume [J/m3] of each bar, for laws without rate."""
+        has_thermal = heat.shape[1] > 0
+        for k in range(start, stop):
+            a = bars[k, 0]
+            b = bars[k, 1]
+            dx = x[b, 0] - x[a, 0]
+            dy = x[b, 1] - x[a, 1]
+            dz = x[b, 2] - x[a, 2]
+            strain, _, _ = measure(math.sqrt(dx * dx + dy * dy + dz * dz) / rest[k])
+            shift = heat[0, k] if has_thermal else 0.0
+            warmth = heat[1, k] if has_thermal else 0.0
+            q = take(history, k - start, like)
+            _, _, _, found = response(strain - shift, 0.0, 0.0, warmth, p, q)
+            for density in found:
+                out[k] += density
+
     return SimpleNamespace(
-        forces=forces, sweep_forces=sweep_forces, tangents=tangents, product=product, linearise=linearise, fields=fields
+        forces=forces,
+        sweep_forces=sweep_forces,
+        tangents=tangents,
+        product=product,
+        linearise=linearise,
+        fields=fields,
+        densities=densities,
     )

@@ -21,20 +21,20 @@ __all__ = ["Inertia", "consistent_product"]
 
 
 @kernel
-def _lump(bars, rest, start, stop, density, out):
+def _lump(bars, lengths, start, stop, density, out):
     for k in range(start, stop):
-        half = 0.5 * density * rest[k]
+        half = 0.5 * density * lengths[k]
         out[bars[k, 0]] += half
         out[bars[k, 1]] += half
 
 
 @kernel
-def consistent_product(bars, rest, start, stop, density, u, out):
+def consistent_product(bars, lengths, start, stop, density, u, out):
     """Add the consistent mass matrix of a line density [kg/m] times ``u`` to ``out``, both (local nodes, 3)."""
     for k in range(start, stop):
         a = bars[k, 0]
         b = bars[k, 1]
-        m = density * rest[k] / 6.0
+        m = density * lengths[k] / 6.0
         for i in range(3):
             out[a, i] += m * (2.0 * u[a, i] + u[b, i])
             out[b, i] += m * (u[a, i] + 2.0 * u[b, i])
@@ -58,9 +58,9 @@ class Inertia:
         mass = np.zeros(mesh.n_local)
         damping = np.zeros(mesh.n_local)
         for block in bars.blocks:
-            _lump(bars.ends, bars.rest, block.start, block.stop, block.density * block.area, mass)
+            _lump(bars.ends, bars.mesh_lengths, block.start, block.stop, block.density * block.area, mass)
             if block.damping:
-                _lump(bars.ends, bars.rest, block.start, block.stop, block.damping * block.area, damping)
+                _lump(bars.ends, bars.mesh_lengths, block.start, block.stop, block.damping * block.area, damping)
         self.mass = mass[: mesh.n_owned].copy()
         self.damping = damping[: mesh.n_owned].copy()
         self.damped = bool(mesh.comm.allreduce(float(damping.sum())) > 0.0)
@@ -104,7 +104,9 @@ class Inertia:
         self._out[:] = 0.0
         for block in self.bars.blocks:
             coefficient = density(block) * block.area
-            consistent_product(self.bars.ends, self.bars.rest, block.start, block.stop, coefficient, self._u, self._out)
+            consistent_product(
+                self.bars.ends, self.bars.mesh_lengths, block.start, block.stop, coefficient, self._u, self._out
+            )
         out[:] = self._out[:owned]
         return out
 

@@ -84,19 +84,20 @@ def buckling_bars(model: Model, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     bars, points = model.bars, model.mesh.points
     lengths = bars.lengths(x)
     force = bar_stiffness(model, x)[:, 4] * lengths
-    history, heat = bars.history(), bars.heat
+    history, heat, rest = bars.history(), bars.heat, bars.rest
     step, bars.step = bars.step, 0.0
     try:
         bars.put_history(np.zeros_like(history))
-        bars.heat = np.zeros_like(heat)
+        bars.heat, bars.rest = np.zeros_like(heat), bars.mesh_lengths
         unloaded = _linearised(model, points)
     finally:
         bars.put_history(history)
-        bars.heat, bars.step = heat, step
+        bars.heat, bars.rest, bars.step = heat, rest, step
+    unloaded[:, 3:] *= (bars.mesh_lengths / rest)[:, None]  # dN/dl of bars that are stress-free at their rest lengths
     geometric = unloaded.copy()
     unloaded[:, 3] += unloaded[:, 4]
     unloaded[:, 4] = 0.0
-    geometric[:, 4] = force / bars.rest
+    geometric[:, 4] = force / bars.mesh_lengths
     geometric[:, 3] = -geometric[:, 4]
     return unloaded, geometric
 

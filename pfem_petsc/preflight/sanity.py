@@ -59,7 +59,7 @@ def _slender(case: Case, model: Model) -> Iterator[str]:
     mesh = model.mesh
     longest = np.zeros(len(case.section))
     for block in mesh.blocks:
-        rest = model.bars.rest[block.start : block.counted]
+        rest = model.bars.mesh_lengths[block.start : block.counted]
         longest[block.section] = max(longest[block.section], float(rest.max(initial=0.0)))
     longest = np.max(model.comm.allgather(longest), axis=0)
     for (name, section), length in zip(case.section.items(), longest.tolist(), strict=True):
@@ -75,7 +75,7 @@ def far_points(case: Case, model: Model) -> dict[str, str]:
     """Label and text of node sets whose nearest node is far from the point. Collective."""
     mesh, comm = model.mesh, model.comm
     points = mesh.points[: mesh.n_owned]
-    longest = max(comm.allgather(float(model.bars.rest.max(initial=0.0))))
+    longest = max(comm.allgather(float(model.bars.mesh_lengths.max(initial=0.0))))
     found = {}
     for name, node_set in case.node_set.items():
         if node_set.nearest is None:
@@ -94,7 +94,7 @@ def far_points(case: Case, model: Model) -> dict[str, str]:
 
 def _mesh(case: Case, model: Model) -> Iterator[str]:
     mesh, comm = model.mesh, model.comm
-    rest = model.bars.rest
+    rest = model.bars.mesh_lengths
     longest = max(comm.allgather(float(rest.max(initial=0.0))))
     shortest = min(comm.allgather(float(rest.min(initial=np.inf))))
     if longest > 1e5 or shortest < 1e-9:

@@ -1,10 +1,10 @@
 """Everything that determines the future of a run, as arrays and numbers of a checkpoint.
 
 Nodal arrays are those of the state, of the scheme's memory and of the stepper. Bar arrays are the data that material
-laws keep, each variable under its name, and the thermal strains. Internal forces and energies are saved rather than
-recomputed, because for a yielding bar a second evaluation may differ in the last digit. Sums of each rank (works,
-energies, wall forces) are saved rank by rank and restored on the same number of ranks; on another number, rank 0 gets
-the totals.
+laws keep, each variable under its name, thermal strains and prescribed rest lengths. Internal forces and energies are
+saved rather than recomputed, because for a yielding bar a second evaluation may differ in the last digit. Sums of each
+rank (works, energies, wall forces) are saved rank by rank and restored on the same number of ranks; on another number,
+rank 0 gets the totals.
 
 Where the data are stored:
 
@@ -12,7 +12,7 @@ Where the data are stored:
   changes by a treatment of impact).
 - Arrays of the stepper: contacts with walls, nodes in contact in the last step, positions of the lagged preconditioner.
 - Numbers of the stepper: level of bisection, part and smallest part of the step, counts of the lagged preconditioner.
-- Arrays of the bars: data of the laws, thermal strains, history of the lagged preconditioner.
+- Arrays of the bars: data of the laws, thermal strains, rest lengths, history of the lagged preconditioner.
 - ``free_walls``: walls with mass, including their last increment. Forces of constraints: arrays of their rows. Forces
   of pairs and which of them are closed: arrays at their second nodes.
 - ``ranks``: works and energies. Recorder: energy at the start, largest energy, iterations since the last row.
@@ -210,6 +210,8 @@ class RunState:
             found |= {_LAW + name: values for name, values in zip(bars.kept_names, bars.history().T, strict=True)}
         if self.model.temperatures.any:
             found |= {"thermal_strain": bars.heat[0], "temperature": self.model.temperatures.values}
+        if self.model.rest_lengths.any:
+            found["rest_length"] = bars.rest
         kept = {_KEPT + name: getattr(self.stepper, name) for name in self.stepper.kept_bars}
         return found | {name: array for name, array in kept.items() if array.shape[1]}
 
@@ -226,8 +228,8 @@ class RunState:
             elif name.startswith(_KEPT):
                 setattr(self.stepper, name.removeprefix(_KEPT), values)
             else:
-                target = bars.heat[0] if name == "thermal_strain" else self.model.temperatures.values
-                target[:] = values
+                own = {"thermal_strain": bars.heat[:1], "temperature": bars.heat[1:], "rest_length": bars.rest}
+                own[name][:] = values
         bars.put_history(history)
         self.model.temperatures.hold(bars.heat)
 

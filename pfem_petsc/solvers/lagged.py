@@ -37,9 +37,9 @@ _PREFIX = "pfem_assembled_"
 class LaggedPreconditioner:
     """The preconditioner and the decision when to set it up again.
 
-    It is kept during the Newton iterations of a problem, and from step to step as long as temperatures are constant and
-    the unknowns are nodal displacements (no oblique walls, no links in contact). After a restart it can then be set up
-    again from the positions and the bars' history at its last set-up, which checkpoints contain.
+    It is kept during the Newton iterations of a problem, and from step to step as long as temperatures and rest lengths
+    are constant and the unknowns are nodal displacements (no oblique walls, no links in contact). After a restart it
+    can then be set up again from the positions and the bars' history at its last set-up, which checkpoints contain.
 
     Options: prefix ``pfem_assembled_``.
 
@@ -72,7 +72,7 @@ class LaggedPreconditioner:
         self.matrix = HessianMatrix(mesh, model.supports.fixed, model.supports.any, symmetric)
         self.bars = model.bars
         self.remembers = len(model.bars.kept_names) > 0
-        self.outlasts = not model.temperatures.varying
+        self.outlasts = not model.bars_vary
         self.place = np.zeros((mesh.n_owned, 0))
         self.history = np.zeros((len(mesh.bars), 0))
         self.count = [0.0] * 6

@@ -239,7 +239,7 @@ class MatrixFreeHessian:
             out[:] = 0.0
             coefficients = inertia.coefficients(problem.balance.alpha, problem.balance.eta)
             for block, coefficient in zip(bars.blocks, coefficients, strict=True):
-                consistent_product(bars.ends, bars.rest, block.start, block.stop, 6.0 * coefficient, u, out)
+                consistent_product(bars.ends, bars.mesh_lengths, block.start, block.stop, 6.0 * coefficient, u, out)
         else:
             np.multiply(problem.nodal[:, None], u[:owned], out=out[:owned])
             out[owned:] = 0.0

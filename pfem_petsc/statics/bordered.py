@@ -107,8 +107,8 @@ class BorderedSystem:
 
     def imbalance(self, u: np.ndarray, load_factor: float, g: np.ndarray) -> None:
         """g = f_int - f_ext (owned, 3) [N], reactions of supports included. Collective."""
-        if self.model.temperatures.varying:
-            self.model.temperatures.apply(load_factor)
+        if self.model.bars_vary:
+            self.model.change_bars(load_factor)
         self.problem.known = -self.external(load_factor)
         self.problem.imbalance(u, g)
 
@@ -122,7 +122,7 @@ class BorderedSystem:
         """-dg/d(load factor) (owned, 3) [N] at free components, by central differences. Collective."""
         h = _SHARE * max(abs(load_factor), self._unit)
         model = self.model
-        if not (model.temperatures.varying or model.supports.moving):
+        if not (model.bars_vary or model.supports.moving):
             q = (self.external(load_factor + h) - self.external(load_factor - h)) / (2.0 * h)
             q[model.supports.fixed] = 0.0
             return q
@@ -132,8 +132,8 @@ class BorderedSystem:
             self.prescribe(there, end)
             self.residual(there, end, g)
             ends.append(g)
-        if model.temperatures.varying:
-            model.temperatures.apply(load_factor)
+        if model.bars_vary:
+            model.change_bars(load_factor)
         return (ends[1] - ends[0]) / (2.0 * h)
 
     def linearise(self, u: np.ndarray) -> None:

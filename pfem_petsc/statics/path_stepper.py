@@ -152,7 +152,7 @@ class PathStepper(StaticStepper):
                 point, events, reached = self._next(size)
                 break
             except NotConverged as failure:
-                self._restore_temperatures()
+                self._restore_bars()
                 if 0.5 * size < self.keys.smallest:
                     raise self._no_path(failure) from failure
                 size *= 0.5
@@ -341,10 +341,10 @@ class PathStepper(StaticStepper):
         self.mode = choices[chosen - 1]
         return True
 
-    def _restore_temperatures(self) -> None:
-        if self.model.temperatures.varying:
-            # the failed solve has heated the bars
-            self.model.temperatures.apply(self.state.time)
+    def _restore_bars(self) -> None:
+        if self.model.bars_vary:
+            # the failed solve has changed the bars
+            self.model.change_bars(self.state.time)
 
     def _no_path(self, failure: NotConverged) -> SimulationFailure:
         """What to tell of a path that cannot go on."""
@@ -365,7 +365,7 @@ def _check(model: Model, keys: PathKeys) -> None:
             f'{case.source}: static.method = "{case.static.method}" follows paths without contact; remove walls, '
             'contact pairs and constraints, or take static.method = "newton"'
         )
-    if not (model.external.active or model.supports.moving or model.temperatures.varying):
+    if not (model.external.active or model.supports.moving or model.bars_vary):
         raise InputError(f"{case.source}: static: nothing depends on the load factor; give a [[load]] or a table")
     if keys.node_set is not None and not model.comm.allreduce(len(model.nodes[keys.node_set])):
         raise InputError(f"{case.source}: static.node_set = {keys.node_set!r} has no nodes")

@@ -80,8 +80,8 @@ class RelaxationStepper(StaticStepper):
     def solve(self, balance: Balance) -> Solution:
         """See :meth:`~pfem_petsc.stepping.stepper.Stepper.solve`."""
         model, motion, parameters = self.model, self.motion, self.parameters
-        if model.temperatures.varying:
-            model.temperatures.apply(balance.time)
+        if model.bars_vary:
+            model.change_bars(balance.time)
         motion.begin(self.state, balance.time, self.state.external)
         stages = [share for share in self._handovers if share > parameters.tolerance]
         for share in (*stages, parameters.tolerance):

@@ -115,9 +115,9 @@ class StaticStepper(ImplicitStepper):
                 self._make_part(end)
                 break
             except NotConverged as failure:
-                if self.model.temperatures.varying:
-                    # the failed solve has applied the temperatures of its end
-                    self.model.temperatures.apply(state.time)
+                if self.model.bars_vary:
+                    # the failed solve has applied the temperatures and rest lengths of its end
+                    self.model.change_bars(state.time)
                 if 0.5 * size < self.limits.smallest:
                     raise self._no_further(failure) from failure
                 size *= 0.5

@@ -98,9 +98,9 @@ class ImplicitStepper(Stepper):
             except NotConverged as failure:
                 if size == 1:
                     raise NotConverged(f"{failure} (the step was bisected {_HALVINGS} times)") from failure
-                if self.model.temperatures.varying:
-                    # the failed solve has applied the temperatures of its end
-                    self.model.temperatures.apply(self.state.time)
+                if self.model.bars_vary:
+                    # the failed solve has applied the temperatures and rest lengths of its end
+                    self.model.change_bars(self.state.time)
                 size //= 2
                 self.level += 1
                 self.message(f"{failure}; bisecting the step, to {self.h * size / ticks:.4g} s")
@@ -213,8 +213,8 @@ class ImplicitStepper(Stepper):
 
     def _solve(self, balance: Balance, guess: np.ndarray) -> Solution:
         model, state = self.model, self.state
-        if model.temperatures.varying:
-            model.temperatures.apply(balance.time)
+        if model.bars_vary:
+            model.change_bars(balance.time)
         tolerance = self.accuracy * residual_tolerance(model, state, balance, self.part)
         active_set = ActiveSet(model, self.state, balance, self.held, self.links)
         candidates, links = self._candidates(active_set, balance), active_set.links

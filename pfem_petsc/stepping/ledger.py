@@ -3,10 +3,11 @@
 For a scheme whose balance holds at the ends of steps (``balance_at_endpoints``), works follow the trapezoidal rule.
 With dx = x1 - x0, the external work is (e0 + e1) dx/2 and the contact work (r0 + r1) dx/2. The numerical dissipation is
 the work of inertia and internal forces in excess of the change of their energies:
-(M a0 + M a1) dx/2 - dT + (f0 + f1) dx/2 - dU - dD + dH, with the work dH of changing temperatures. For other schemes
-the forces of the single balance act over the whole step. Damping dissipates C dx . dx/h, which is never negative, and
-(C v0 + C v1) dx/2 with explicit schemes whose balance holds at the ends. The sum of all changes is then the work of the
-residual, which is zero up to the tolerance of the solver.
+(M a0 + M a1) dx/2 - dT + (f0 + f1) dx/2 - dU - dD + dH, with the work dH of changing temperatures and rest lengths
+(:mod:`~pfem_petsc.stepping.bar_changes`). For other schemes the forces of the single balance act over the whole step.
+Damping dissipates C dx . dx/h, which is never negative, and (C v0 + C v1) dx/2 with explicit schemes whose balance
+holds at the ends. The sum of all changes is then the work of the residual, which is zero up to the tolerance of the
+solver.
 
 The work of contact is split by formulas that are the same for all schemes and treatments. ``contact_work`` is the work
 of moving walls, F . dX by the rule above and J . V for jumps J of momentum. ``friction_dissipation`` is the work of
@@ -25,7 +26,7 @@ import numpy as np
 from ..contact.impact import Impacts
 from ..energies import ENERGIES
 from ..output.sums import HEAD
-from .heating import Heating
+from .bar_changes import BarChanges
 from .impulses import Impulses, NoImpulses, wall_shares
 from .moment import Moment, balanced, moment_of
 from .node_loops import WORKS, book_nodes
@@ -66,7 +67,7 @@ class Ledger:
         self._totals = np.zeros((6, 3))
         self._before = moment_of(self.stepper)
         self._book(self._before, self._before, self._before, self.stepper.state.position)
-        self._heating = Heating(stepper)
+        self._changes = BarChanges(stepper)
         self._walls_before()
         self.impacts = Impacts(stepper)
         self.impulses = (Impulses if stepper.scheme.inertial else NoImpulses)(stepper)
@@ -101,7 +102,7 @@ class Ledger:
         if jump is not None:
             friction += jump.friction
         stored = present.kinetic - jumped - before.kinetic + present.energy.total - before.energy.total
-        heating = self._heating.work()
+        heating, stressing = self._changes.works()
         work, given, weight, lost = self._work_of_walls(before)
         # velocities at the ends of explicit steps are those of the steps beside
         follows = stepper.scheme.explicit and stepper.scheme.balance_at_endpoints
@@ -111,6 +112,8 @@ class Ledger:
             self._works[of] = self._works[of] + self._works[by] - damping
             self._works[by] = damping
         add_works(self.sums, self._works, stored, heating, impact, friction, work, given, weight, lost, jumped)
+        self.sums[_AT["prestress_work"]] += stressing
+        self.sums[_AT["numerical_dissipation"]] += stressing
 
     def _damped(self) -> float:
         """Return the damping dissipation of the last step, C dx . dx / h [J]; never negative.

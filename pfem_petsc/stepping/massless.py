@@ -33,7 +33,7 @@ class MasslessNodes:
     def settle(self, x: np.ndarray, time: float, now: float) -> float:
         """Move nodes of ``x`` (local, 3), in place, along their normals into equilibrium or onto the wall.
 
-        Forces, walls and temperatures are those of ``time``; afterwards temperatures are reset to ``now`` [s]. Returns
+        Forces, walls and bars are those of ``time``; afterwards bars are reset to ``now`` [s]. Returns
         the largest of the last moves, which is rounding of the model's length unless no equilibrium was found.
         Collective.
         """
@@ -42,8 +42,8 @@ class MasslessNodes:
         external = np.zeros((owned, 3))
         if model.external.active:
             model.external.at(time, external)
-        if model.temperatures.varying:
-            model.temperatures.apply(time)
+        if model.bars_vary:
+            model.change_bars(time)
         elastic, farthest = self._stiffness(x)
         stiffness, force, step = elastic, np.full(len(nodes), np.nan), np.zeros(len(nodes))
         part, largest = np.ones(len(nodes)), 0.0
@@ -68,8 +68,8 @@ class MasslessNodes:
             if largest <= ROUNDING * model.length:
                 break
         model.mesh.update_ghosts(x)
-        if model.temperatures.varying:
-            model.temperatures.apply(now)
+        if model.bars_vary:
+            model.change_bars(now)
         return largest
 
     def gaps(self, x: np.ndarray, time: float) -> np.ndarray:

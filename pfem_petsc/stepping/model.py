@@ -15,6 +15,7 @@ from ..mechanics.bars import Bars
 from ..mechanics.compiled import kernel
 from ..mechanics.loads import ExternalForce
 from ..mechanics.mass import Inertia
+from ..mechanics.rest_lengths import RestLengths
 from ..mechanics.sections import section_of_bars
 from ..mechanics.supports import Supports
 from ..mechanics.temperature import Temperatures
@@ -43,7 +44,7 @@ class Model:
 
     Attributes
     ----------
-    mesh, nodes, bars, inertia, external, supports, temperatures, contact
+    mesh, nodes, bars, inertia, external, supports, temperatures, rest_lengths, contact
     length : largest extent of the mesh [m]
     reach : largest coordinate magnitude [m], which sets the rounding of positions
     nodal_stiffness : (owned,) sum of E A/l0 of a node's bars [N/m]
@@ -70,6 +71,7 @@ class Model:
         with agreed(comm):
             self.supports = Supports(case, self.nodes, mesh)
             self.temperatures = Temperatures(case, mesh, self.bars)
+            self.rest_lengths = RestLengths(case, self.bars)
         self.contact = Contact(case, self.nodes, mesh, self.supports.fixed)
         self.links, self.pairs = make_links(case, self.nodes, mesh, self.supports.fixed, self.contact)
         self.can_touch = self.contact.any or bool(self.links)
@@ -125,9 +127,21 @@ class Model:
             self.contact.motion.held = np.array(start.walls).reshape(-1, 3)
 
     @property
+    def bars_vary(self) -> bool:
+        """Whether temperatures or rest lengths of bars change over time."""
+        return self.temperatures.varying or self.rest_lengths.varying
+
+    def change_bars(self, time: float) -> None:
+        """Set the temperatures and rest lengths of bars at a time [s], or at a load factor."""
+        if self.temperatures.varying:
+            self.temperatures.apply(time)
+        if self.rest_lengths.varying:
+            self.rest_lengths.apply(time)
+
+    @property
     def steady(self) -> bool:
         """Whether the model is constant in time, and the fused loop supports its bars and contact."""
-        moving = self.supports.moving or self.temperatures.varying or bool(self.links)
+        moving = self.supports.moving or self.bars_vary or bool(self.links)
         return not moving and len(self.bars.blocks) == 1 and self.external.steady and self.contact.steady
 
     def initial_velocity(self) -> np.ndarray:

@@ -107,6 +107,10 @@ def make_plan(model: Model, recorded: Mapping[str, Any] | None = None) -> Plan:
     _check_laws(case, scheme)
     if recorded is None:
         frequency = highest_frequency(model, model.mesh.points)
+        if model.rest_lengths.varying:
+            with model.rest_lengths.shortest():
+                other = highest_frequency(model, model.mesh.points)
+            frequency = Frequency(min(frequency.lower, other.lower), max(frequency.upper, other.upper))
     else:
         frequency = Frequency(*recorded["frequency"])
     if not np.isfinite(frequency.upper):

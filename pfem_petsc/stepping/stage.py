@@ -87,6 +87,7 @@ def hand_over(old: Stepper, new: Stepper) -> None:
         state.support, state.contact = before.support.copy(), before.contact.copy()
     new.model.bars.put_history(old.model.bars.history())
     new.model.temperatures.hold(old.model.bars.heat)
+    new.model.rest_lengths.hold(old.model.bars.rest)
     _hand_over_links(old.model, new.model)
     _hand_over_contact(old, new)
 

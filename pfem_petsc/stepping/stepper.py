@@ -219,8 +219,8 @@ class Stepper(ABC):
     def _make_part(self, end: float) -> None:
         """Advance by ``part`` to the time ``end`` [s]."""
         state, carried = self.state, self._carried
-        if self.model.temperatures.varying:
-            self.model.bars.heat_at_start[:] = self.model.bars.heat
+        if self.model.bars_vary:
+            self.model.bars.keep_start()
         places = carried.places(state.position, state.time) if carried.of else {}
         if self.treatment is not None:
             self.treatment.before()
@@ -247,8 +247,8 @@ class Stepper(ABC):
     def _arrive(self, end: float) -> None:
         self.model.bars.step = self.part
         self.state.time = end
-        if self.model.temperatures.varying:
-            self.model.temperatures.apply(end)
+        if self.model.bars_vary:
+            self.model.change_bars(end)
         self.evaluate(commit=True)
 
     def _solve_and_finish(self, end: float) -> None:

@@ -64,7 +64,26 @@ def draw_case(seed: int) -> dict[str, Any]:
     case["time"] = time
     case["output"] = _output(chance, motion, case["node_set"])
     case |= _solver(chance, time)
+    _prestress(random.Random(f"prestress {seed}"), case, motion.end)
     return _plain(case)
+
+
+def _prestress(chance: random.Random, case: dict[str, Any], end: float) -> None:
+    """Prescribe rest lengths of a section, drawn on its own so that cases without them stay as they are."""
+    if chance.random() > 0.12:
+        return
+    section = case["section"][chance.choice(sorted(case["section"]))]
+    material = case["material"][section["material"]]
+    young = material["young_modulus"]
+    most = min(3e-3, 0.9 * material.get("yield_stress", young) / young)
+    key = chance.choice(("pretension", "prestress", "rest_length"))
+
+    def value() -> float:
+        strain = most * chance.uniform(-1.0, 1.0)
+        return {"pretension": young * strain * section["area"], "prestress": young * strain}.get(key, 1.0 - strain)
+
+    rows = sorted(chance.random() for _ in range(chance.randint(1, 4)))
+    section[key] = value() if chance.random() < 0.4 else [[row * end, value()] for row in rows]
 
 
 def _time(chance: random.Random, body: Body) -> dict[str, Any]:

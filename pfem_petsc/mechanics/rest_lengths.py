@@ -1,0 +1,183 @@
+"""Rest lengths of bars that sections prescribe, as a factor or by the force or stress in the mesh, also over time.
+
+At the stretch s = 1/r the bar has the axial force N(s) = A s(e(s)) de/ds of its law and strain measure, where r is the
+rest length over the length in the mesh. A section with ``pretension`` N or ``prestress`` S has the r for which N(1/r)
+or the stress is the given one, at the reference temperature and with virgin material. For an elastic bar with
+engineering strain 1/r = 1 + N/(E A). Mass and damping are those of the lengths in the mesh, whatever the rest lengths.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..errors import InputError
+from .kernels import COLLAPSED_STRETCH, no_variables
+from .loads import Table
+from .strain import MEASURES
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from ..case.schema import Case
+    from .bars import BarBlock, Bars
+    from .materials.base import Law
+
+__all__ = ["RestLengths", "stretch_of"]
+
+_ITERATIONS = 100
+_LARGEST = 1e3  # stretch
+
+
+class RestLengths:
+    """Rest lengths that follow from the sections of a case.
+
+    Attributes
+    ----------
+    any : whether a section prescribes them
+    varying : whether any of them changes over time
+    """
+
+    def __init__(self, case: Case, bars: Bars) -> None:
+        given = {name: section.prestressed for name, section in case.section.items()}
+        self.any = any(key is not None for key in given.values())
+        self._bars, self._held = bars, case.number > 0
+        self._entries: list[_Entry] = []
+        if not self.any:
+            self.varying = False
+            return
+        bars.rest = bars.mesh_lengths.copy()
+        tables = False
+        for name, key in given.items():
+            if key is None:
+                continue
+            section = case.section[name]
+            measure = MEASURES[case.material[section.material].strain]
+            where = f"{case.source}: section.{name}.{key}"
+            value = getattr(section, key)
+            table = None if isinstance(value, float) else Table(value)
+            tables |= table is not None
+            blocks = [block for block in bars.blocks if block.section == name]
+            if table is not None and blocks and blocks[0].law.rate:
+                raise InputError(
+                    f"{where}: the material {section.material!r} depends on the strain rate, which a rest length that "
+                    "changes over time does not support; give one value"
+                )
+            for each in table.values[:, 0].tolist() if table is not None else [value]:
+                for block in blocks:  # refuses what the law cannot bear
+                    _stretches(block, measure, key, each, where)
+            self._entries += [_Entry(block, measure, key, value, table, where) for block in blocks]
+        # in later stages they stay as they are
+        self.varying = tables and not self._held
+        self.apply(math.inf if self._held else 0.0)
+        if self.varying:
+            bars.rest_at_start = bars.rest.copy()
+
+    def hold(self, rest: np.ndarray) -> None:
+        """Take the rest lengths (b,) [m] of the stage before, where they stay."""
+        if self.any and self._held:
+            self._bars.rest[:] = rest
+
+    def apply(self, time: float) -> None:
+        """Set the rest lengths at a time [s], or at a load factor."""
+        for entry in self._entries:
+            entry.apply(self._bars, time)
+
+    @contextmanager
+    def shortest(self) -> Iterator[None]:
+        """Give all bars the smallest rest lengths that they have at any time, which make them stiffest."""
+        kept = self._bars.rest.copy()
+        for entry in self._entries:
+            part = slice(entry.block.start, entry.block.stop)
+            self._bars.rest[part] = self._bars.mesh_lengths[part] / entry.largest()
+        try:
+            yield
+        finally:
+            self._bars.rest[:] = kept
+
+
+class _Entry:
+    """The bars of a block, with their value or table of values."""
+
+    def __init__(
+        self, block: BarBlock, measure: Callable, key: str, value: float, table: Table | None, where: str
+    ) -> None:
+        self.block, self.measure, self.key, self.where = block, measure, key, where
+        self.value, self.table = value, table
+        self._found: tuple[float, np.ndarray | float] | None = None  # the last value and its stretch
+
+    def _stretch(self, value: float) -> np.ndarray | float:
+        if self._found is None or self._found[0] != value:
+            self._found = value, _stretches(self.block, self.measure, self.key, value, self.where)
+        return self._found[1]
+
+    def apply(self, bars: Bars, time: float) -> None:
+        """Set the rest lengths of the bars at a time [s], or at a load factor."""
+        value = self.value if self.table is None else float(self.table(time)[0])
+        part = slice(self.block.start, self.block.stop)
+        bars.rest[part] = bars.mesh_lengths[part] / self._stretch(value)
+
+    def largest(self) -> np.ndarray | float:
+        """Return the largest stretch in the mesh at any time."""
+        values = [self.value] if self.table is None else self.table.values[:, 0].tolist()
+        return functools.reduce(np.maximum, map(self._stretch, values))
+
+
+def _stretches(block: BarBlock, measure: Callable, key: str, value: float, where: str) -> np.ndarray | float:
+    """Return the stretch in the mesh of the bars of a block."""
+    if key == "rest_length":
+        return 1.0 / value
+    try:
+        if key == "prestress":
+            return stretch_of(block.law, measure, block.parameters, value, as_force=False)
+        return stretch_of(block.law, measure, block.parameters, value / block.area, as_force=True)
+    except ValueError as error:
+        unit = "N" if key == "pretension" else "Pa"
+        raise InputError(f"{where} = {value:g} {unit}: {error}") from error
+
+
+def stretch_of(law: Law, measure: Callable, parameters: tuple[float, ...], target: float, as_force: bool) -> float:
+    """Return the stretch of a virgin bar at a stress, or at an axial force over area [Pa], by Newton's method.
+
+    Raises
+    ------
+    ValueError
+        If the law does not reach it, or only by changing its internal variables, as by yielding.
+    """
+    if target == 0.0:
+        return 1.0
+    response, virgin = law.response, no_variables(law)
+    stretch = kept = 1.0
+    best = miss = math.inf
+    for _ in range(_ITERATIONS):
+        strain, slope, curvature = measure(stretch)
+        stress, modulus, _, _ = response(strain, 0.0, 0.0, 0.0, parameters, virgin)
+        found, tangent = stress, modulus * slope
+        if as_force:
+            found, tangent = stress * slope, modulus * slope**2 + stress * curvature
+        miss = target - found
+        if abs(miss) >= best or miss == 0.0:  # rounding
+            break
+        best = abs(miss)
+        kept = stretch
+        if not tangent > 0.0:
+            break
+        stretch = min(max(stretch + miss / tangent, 0.5 * stretch), 2.0 * stretch)
+        if not COLLAPSED_STRETCH < stretch < _LARGEST:
+            break
+    if miss != 0.0:
+        stretch = kept
+    if not best <= 1e-9 * abs(target) and miss != 0.0:
+        raise ValueError("the material law does not reach it at any length; give a smaller one")
+    strain, _, _ = measure(stretch)
+    _, _, _, densities = response(strain, 0.0, 0.0, 0.0, parameters, virgin)
+    energies = dict(zip(law.energies, densities, strict=True))
+    elastic = energies.pop("elastic_energy", 0.0)
+    if any(abs(density) > 1e-12 * abs(elastic) for density in energies.values()):
+        raise ValueError("the material yields or is damaged before it is reached; give a smaller one")
+    return stretch

@@ -1,0 +1,89 @@
+"""Works of changing temperatures and rest lengths of bars, for the energy ledger.
+
+In a step in which the strain less the thermal strain of a bar goes from e0 to e1 on a path with the mean stress S, and
+its rest volume from V0 to V1, the energy W per volume, dissipation included, changes by S (e1 - e0) with the S of
+:mod:`~pfem_petsc.mechanics.conserving`, so that of the bar by V S (e1 - e0) + W (V1 - V0), V and W being means of
+both ends. Of this -V S (change of thermal strain) is the work of heating, V S (change of strain with the mean rest
+length) that of the bar's ends, and the remainder the work of the changing rest length: that of what pulls the bar
+tight, less the energy of the material that it takes out.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..mechanics.strain import MEASURES
+
+if TYPE_CHECKING:
+    from ..mechanics.bars import BarBlock
+    from .stepper import Stepper
+
+__all__ = ["BarChanges"]
+
+_STRAINS = {  # of arrays of stretches
+    MEASURES["engineering"]: lambda s: s - 1.0,
+    MEASURES["green"]: lambda s: 0.5 * (s * s - 1.0),
+    MEASURES["logarithmic"]: np.log,
+}
+
+
+class BarChanges:
+    """Stores the state of the bars before a step and computes the works in it."""
+
+    def __init__(self, stepper: Stepper) -> None:
+        self.stepper, self.model = stepper, stepper.model
+        self.keep()
+
+    def keep(self) -> None:
+        """Store the current stresses, internal variables, thermal strains, and with them lengths and energies."""
+        if not self.model.bars_vary:
+            return
+        bars, x = self.model.bars, self.stepper.state.x
+        self._stress = bars.fields(x)["stress"]
+        self._variables = [block.history[: len(block.law.internal)].copy() for block in bars.blocks]
+        self._thermal = bars.heat[0].copy()
+        if self.model.rest_lengths.varying:
+            self._rest, self._lengths, self._densities = bars.rest.copy(), bars.lengths(x), bars.densities(x)
+
+    def works(self) -> tuple[float, float]:
+        """Return the works of changing temperatures and of changing rest lengths on the counted bars in the last step
+        [J]."""
+        model = self.model
+        if not model.bars_vary:
+            return 0.0, 0.0
+        before = dict(vars(self))
+        self.keep()
+        heating = stressing = 0.0
+        for k, block in enumerate(model.bars.blocks):
+            part = slice(block.start, block.counted)
+            mean = self._mean_stress(before, k, block)
+            rest = model.bars.rest[part]
+            if model.rest_lengths.varying:
+                rest = 0.5 * (before["_rest"][part] + rest)
+                stressing += self._stressing(before, block, mean, rest)
+            if model.temperatures.varying:
+                change = self._thermal[part] - before["_thermal"][part]
+                heating -= float((block.area * rest * mean * change).sum())
+        return heating, stressing
+
+    def _mean_stress(self, before: dict, k: int, block: BarBlock) -> np.ndarray:
+        """Return the mean stress of the counted bars of a block in the step [Pa]."""
+        part, counted = slice(block.start, block.counted), slice(block.counted - block.start)
+        first, last = before["_stress"][part], self._stress[part]
+        mean = 0.5 * (first + last)
+        if block.law.mean_correction is not None:
+            variables = before["_variables"][k][:, counted], self._variables[k][:, counted]
+            mean += block.law.mean_correction(block.parameters, last - first, *variables)
+        return mean
+
+    def _stressing(self, before: dict, block: BarBlock, mean: np.ndarray, rest: np.ndarray) -> float:
+        """Return the work of changing rest lengths on the counted bars of a block [J]; ``rest``: their means [m]."""
+        part, strain = slice(block.start, block.counted), _STRAINS[block.measure]
+        first, last = before["_lengths"][part], self._lengths[part]
+        rest0, rest1 = before["_rest"][part], self._rest[part]
+        whole = strain(last / rest1) - strain(first / rest0)
+        moved = strain(last / rest) - strain(first / rest)
+        density = 0.5 * (before["_densities"][part] + self._densities[part])
+        return float((block.area * (rest * mean * (whole - moved) + density * (rest1 - rest0))).sum())

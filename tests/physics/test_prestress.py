@@ -1,0 +1,243 @@
+"""Prescribed rest lengths of bars: force in the mesh, mass, gradual stressing in time and statics, and its work."""
+
+import numpy as np
+import pytest
+from helpers.kills import differences
+from helpers.mesh_files import case_of
+from helpers.runs import run
+from helpers.stages import check_balances
+from helpers.stopped import everywhere
+
+from pfem_petsc import Case, Simulation, open_result
+from pfem_petsc.errors import InputError
+
+YOUNG, AREA, DENSITY, LENGTH = 2e9, 1e-4, 1000.0, 2.0
+STRAINS = ["engineering", "green", "logarithmic"]
+INTEGRATORS = [
+    *("central_differences", "chung_lee", "energy_momentum", "generalized_alpha", "houbolt", "hulbert_chung"),
+    *("newmark", "souza_moura", "wilson"),
+]
+RAMP = [[0.0, 0.0], [1e-3, 1500.0]]
+
+
+def rod(section, material=(), ends=("start", "end"), time=(), **tables):
+    """A rod of two bars along x: ends held along x, all nodes across."""
+    data = {
+        "mesh": {"generator": "rod", "length": LENGTH, "elements": 2},
+        "node_set": {"start": {"group": "start"}, "end": {"group": "end"}, "all": {"all": True}},
+        "material": {"m": {"young_modulus": YOUNG, "density": DENSITY, **dict(material)}},
+        "section": {"s": {"area": AREA, "material": "m", **section}},
+        "support": [{"node_set": "all", "fix": "yz"}, *({"node_set": end, "fix": "x"} for end in ends)],
+        "output": {"probe": [{"name": "all", "node_set": "all"}]},
+    } | tables
+    if "static" not in data and "stage" not in data:
+        data["time"] = {"integrator": "newmark", "step": 1e-4, "end": 2e-4, **dict(time)}
+    return Case.from_dict(data)
+
+
+def cell(folder, comm, name, snapshot=0):
+    """A cell field, the same on all ranks."""
+    return comm.bcast(open_result(folder).field(name, snapshot) if comm.rank == 0 else None)
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("strain", STRAINS)
+@pytest.mark.parametrize("section", [{"pretension": 4e3}, {"pretension": -4e3}, {"prestress": 4e7}])
+def test_force_in_the_mesh(section, strain, shared_tmp_path, comm):
+    """2 % of strain: the force, or the stress, is the given one, and the mass that of the mesh."""
+    history = run(rod(section, {"strain": strain}), shared_tmp_path)
+    key, name = ("prestress", "stress") if "prestress" in section else ("pretension", "axial_force")
+    assert cell(shared_tmp_path, comm, name) == pytest.approx([section[key]] * 2, rel=1e-13)
+    assert np.abs(history["kinetic_energy"]).max() < 1e-20
+    force = cell(shared_tmp_path, comm, "axial_force")
+    assert history["probe/all/reaction"][-1, :, 0] == pytest.approx([-force[0], 0.0, force[0]], rel=1e-12, abs=1e-8)
+    with Simulation(rod(section), comm, output=shared_tmp_path / "mass", quiet=True) as simulation:
+        assert simulation.model.total_mass == pytest.approx(DENSITY * AREA * LENGTH, rel=1e-14)
+
+
+@pytest.mark.parametrize("strain", STRAINS)
+def test_rest_length_is_that_of_a_mesh_with_this_length(strain, tmp_path):
+    """A mesh of the rest length, stretched by its supports, has the same force and energy."""
+    factor = 0.96
+    rest = run(rod({"rest_length": factor}, {"strain": strain}), tmp_path / "rest")
+    pull = {"node_set": "end", "fix": "x", "motion": [[0.0, 0.0, 0.0, 0.0], [1.0, LENGTH * (1.0 - factor), 0.0, 0.0]]}
+    supports = [{"node_set": "all", "fix": "yz"}, {"node_set": "start", "fix": "x"}, pull]
+    mesh = {"generator": "rod", "length": factor * LENGTH, "elements": 2}
+    stretched = rod({}, {"strain": strain}, mesh=mesh, support=supports, static={"step": 0.5})
+    pulled = run(stretched, tmp_path / "pulled")
+    for name in ("axial_force", "stress", "strain"):
+        found = [open_result(tmp_path / folder).field(name, at) for folder, at in (("rest", 0), ("pulled", -1))]
+        np.testing.assert_allclose(*found, rtol=1e-12, err_msg=name)
+    assert pulled["elastic_energy"][-1] == pytest.approx(rest["elastic_energy"][0], rel=1e-12)
+
+
+@pytest.mark.parametrize("integrator", ["central_differences", "newmark"])
+def test_equals_a_thermal_strain(integrator, tmp_path):
+    """E (l/(f L) - 1) with f = 1 + a is (E/f) (l/L - 1 - a): the modulus of a heated bar refers to the mesh."""
+    change, time = -0.01, {"integrator": integrator, "step": 1e-4, "end": 4e-3}
+    heated = {"young_modulus": YOUNG / (1.0 + change), "thermal_expansion": 1e-4}
+    other = {"temperature": [{"value": change / 1e-4}], "time": time}
+    first = run(rod({"rest_length": 1.0 + change}, ends=("start",), time=time), tmp_path / "rest")
+    second = run(rod({}, heated, ends=("start",), **other), tmp_path / "heated")
+    x = [history["probe/all/position"][:, :, 0] for history in (first, second)]
+    assert np.ptp(x[0][:, 2]) > 0.01
+    np.testing.assert_allclose(*x, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("mass", ["lumped", "consistent"])
+def test_frequency_of_a_mass_between_two_pretensioned_bars(mass, shared_tmp_path, comm):
+    """Across: k = 2 N/l; along: k = 2 (E A/l0), with the rest length l0 = l/(1 + N/(E A))."""
+    force, half = 2500.0, LENGTH / 2.0
+    ends = [{"node_set": end, "fix": "xyz"} for end in ("start", "end")]
+    case = rod({"pretension": force}, support=ends, modes={"count": 3, "mass": mass}, static={"step": 1.0})
+    run(case, shared_tmp_path)
+    inertia = DENSITY * AREA * half * (1.0 if mass == "lumped" else 2.0 / 3.0)
+    along = 2.0 * YOUNG * AREA * (1.0 + force / (YOUNG * AREA)) / half
+    expected = np.sqrt(np.array([2.0 * force / half, 2.0 * force / half, along]) / inertia) / (2.0 * np.pi)
+    assert open_result(shared_tmp_path).modes.frequency == pytest.approx(expected, rel=1e-10)
+
+
+def fan(folder, comm, value, key="pretension", **tables):
+    """A node held by three cables, one of them stressed; loaded down."""
+    points = [[0.0, 0.0, 0.0], [-1.0, 0.0, 1.0], [1.0, 0.5, 1.0], [0.3, -1.0, 1.0], [0.2, 0.3, -1.0]]
+    bars = [[0, 1], [0, 2], [0, 3], [0, 4]]
+    tables = {
+        "node_set": {"anchors": {"indices": [1, 2, 3, 4]}, "knot": {"indices": [0]}},
+        "material": {"steel": {"young_modulus": YOUNG, "density": DENSITY}},
+        "section": {"default": {"area": AREA, "material": "steel", key: value}},
+        "support": [{"node_set": "anchors", "fix": "xyz"}],
+        "output": {"probe": [{"name": "knot", "node_set": "knot"}]},
+    } | tables
+    return case_of(folder, comm, points, bars, **tables)
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("method", ["newton", "relaxation", "arc_length"])
+def test_gradual_stressing_ends_where_sudden_stressing_does(method, shared_tmp_path, comm):
+    rows = [[0.0, 0.0], [1.0, 3000.0]]
+    newton = {"static": {"step": 1.0}}
+    whole = run(fan(shared_tmp_path, comm, 3000.0, **newton), shared_tmp_path / "whole")
+    keys = {"end": 1.0, "max_points": 60} if method == "arc_length" else {}
+    gradual = fan(shared_tmp_path, comm, rows, static={"method": method, "step": 0.25, **keys})
+    history = run(gradual, shared_tmp_path / "gradual")
+    found = [each["probe/knot/position"][-1, 0] for each in (whole, history)]
+    assert np.linalg.norm(found[0]) > 1e-3
+    np.testing.assert_allclose(*found, atol=1e-9)
+    assert history["elastic_energy"][-1] == pytest.approx(whole["elastic_energy"][-1], rel=1e-8)
+    assert history["elastic_energy"][0] == 0.0
+    assert history["prestress_work"][-1] == pytest.approx(history["elastic_energy"][-1], rel=0.05)
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("strain", STRAINS)
+def test_work_of_stressing_a_restrained_bar(integrator, strain, tmp_path):
+    """Nothing moves, so that all of the elastic energy is the work of stressing."""
+    time = {"integrator": integrator, "end": 1e-3}
+    history = run(rod({"pretension": RAMP}, {"strain": strain}, time=time), tmp_path)
+    energy = history["elastic_energy"]
+    assert energy[-1] == pytest.approx(0.5 * 1500.0**2 / (YOUNG * AREA) * LENGTH, rel=0.02)
+    np.testing.assert_allclose(history["prestress_work"], energy, rtol=1e-11, atol=1e-12 * energy[-1])
+    assert np.abs(history["energy_imbalance"]).max() < 1e-12 * energy[-1]
+    assert open_result(tmp_path).field("axial_force", -1) == pytest.approx([1500.0] * 2, rel=1e-12)
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_balance_while_stressing_moves_nodes(integrator, shared_tmp_path, comm):
+    time = {"integrator": integrator, "end": 4e-3, "step": 1e-4}
+    case = rod({"pretension": RAMP}, {"damping": 2e4}, ends=("start",), time=time)
+    history = run(case, shared_tmp_path)
+    scale = history["prestress_work"][-1]
+    assert history["kinetic_energy"].max() > 0.05 * scale > 0.0
+    assert np.abs(history["energy_imbalance"]).max() < 1e-10 * scale
+
+
+@pytest.mark.parametrize("strain", STRAINS)
+@pytest.mark.parametrize("plastic", [False, True])
+def test_energy_momentum_conserves_energy_while_stressing(strain, plastic, tmp_path):
+    material = {"strain": strain, "thermal_expansion": 1e-5}
+    if plastic:
+        material |= {"yield_stress": 8e6, "kinematic_hardening": 2e8, "isotropic_hardening": 1e8}
+    time = {"integrator": "energy_momentum", "end": 4e-3, "step": 1e-4}
+    heat = [{"table": [[0.0, 0.0], [1e-3, -200.0]]}]
+    support = [{"node_set": "all", "fix": "yz"}, {"node_set": "start", "fix": "x"}]
+    load = [{"node_set": "end", "force": [900.0, 0.0, 0.0]}]
+    case = rod({"pretension": RAMP}, material, time=time, temperature=heat, support=support, load=load)
+    history = run(case, tmp_path)
+    scale = max(history["elastic_energy"].max(), history["kinetic_energy"].max())
+    assert history["kinetic_energy"].max() > 0.1 * scale
+    assert (history["plastic_dissipation"][-1] > 0.01 * scale) == plastic
+    assert np.abs(history["numerical_dissipation"]).max() < 1e-11 * scale
+    assert np.abs(history["energy_imbalance"]).max() < 1e-11 * scale
+
+
+@pytest.mark.parallel
+def test_restart_while_stressing_is_bitwise(shared_tmp_path, comm):
+    """The table comes back to the value of its start, and the rest lengths are those of the checkpoint."""
+    rows = [[0.0, 500.0], [1e-3, 1500.0], [2e-3, 500.0], [2.5e-3, 0.0]]
+    for integrator in ("energy_momentum", "central_differences"):
+        folders = [shared_tmp_path / f"{integrator}{k}" for k in range(2)]
+        for folder, ends in zip(folders, ((3e-3,), (1e-3, 2e-3, 3e-3)), strict=True):
+            for end in ends:
+                time = {"integrator": integrator, "end": end}
+                output = {"checkpoint_every": 5, "probe": [{"name": "all", "node_set": "all"}]}
+                case = rod({"pretension": rows}, ends=("start",), time=time, output=output)
+                assert Simulation(case, comm, output=folder, quiet=True, restart=end != ends[0]).run() == 0
+        assert everywhere(comm, differences, *(folder / "result.vtkhdf" for folder in folders)) == {}
+
+
+@pytest.mark.parallel
+def test_stages_keep_what_is_stressed(shared_tmp_path, comm):
+    """Stressed in the first stage, a bar stays so; let go in the second, it moves from there."""
+    held = [{"node_set": "all", "fix": "yz"}, {"node_set": "start", "fix": "x"}]
+    stages = [
+        {"name": "stress", "static": {"step": 0.25}, "support": [*held, {"node_set": "end", "fix": "x"}]},
+        {"name": "fly", "support": held, "time": {"integrator": "newmark", "beta": 0.25, "gamma": 0.5, "step": 1e-5}},
+    ]
+    stages[1]["time"]["end"] = 1e-3
+    output = {"probe": [{"name": "all", "node_set": "all"}], "checkpoint_every": 30, "fields_every": 4}
+    case = rod({"pretension": [[0.0, 0.0], [1.0, 4000.0]]}, stage=stages, output=output)
+    history = run(case, shared_tmp_path / "whole")
+    check_balances(history)
+    assert cell(shared_tmp_path / "whole", comm, "axial_force", 1) == pytest.approx([4000.0] * 2, rel=1e-9)
+    x = history["probe/all/position"][4:, 2, 0]
+    assert x[0] == LENGTH and x.min() < LENGTH / (1.0 + 4000.0 / (YOUNG * AREA))
+    energy = history["elastic_energy"] + history["kinetic_energy"]
+    np.testing.assert_allclose(energy[4:], energy[4], rtol=1e-3)
+    with Simulation(case, comm, output=shared_tmp_path / "stopped", quiet=True) as simulation:
+        simulation.start()
+        while simulation.analysis.number < 60:
+            simulation._advance()
+    with Simulation(case, comm, output=shared_tmp_path / "stopped", quiet=True, restart=True) as simulation:
+        assert simulation.run() == 0
+    folders = shared_tmp_path / "whole", shared_tmp_path / "stopped"
+    assert everywhere(comm, differences, *(folder / "result.vtkhdf" for folder in folders)) == {}
+
+
+YIELDING = {"yield_stress": 1e7, "isotropic_hardening": 1e8}
+
+
+@pytest.mark.parametrize(
+    ("section", "material", "text"),
+    [
+        ({"pretension": 1001.0}, YIELDING, "pretension = 1001 N: the material yields"),
+        ({"prestress": [[0.0, 0.0], [1.0, -1.1e7]]}, YIELDING, "prestress = -1.1e+07 Pa: the material yields"),
+        ({"pretension": 1e6}, {"strain": "logarithmic"}, "does not reach it at any length"),
+        ({"pretension": -3e5}, {}, "does not reach it at any length"),
+        ({"pretension": 1.0, "prestress": 1.0}, {}, "at most one of the keys"),
+        ({"rest_length": 0.0}, {}, "expected a factor on the length in the mesh"),
+        ({"rest_length": [[0.0, 1.0], [0.0, 0.9]]}, {}, "times must increase"),
+        ({"pretension": "1 kN"}, {}, "expected a number in SI units"),
+        ({"pretension": [[0.0, 1.0, 2.0]]}, {}, "or rows"),
+        ({"pretension": float("nan")}, {}, "expected a number in SI units"),
+    ],
+)
+def test_refused(section, material, text, tmp_path):
+    with pytest.raises(InputError, match="section.s") as error:
+        Simulation(rod(section, material), output=tmp_path / "out", quiet=True)
+    assert text in str(error.value)
+
+
+def test_pretension_up_to_yield_is_accepted(tmp_path):
+    history = run(rod({"pretension": 999.999}, YIELDING), tmp_path)
+    assert history["plastic_dissipation"][-1] == 0.0

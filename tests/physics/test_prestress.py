@@ -114,7 +114,7 @@ def fan(folder, comm, value, key="pretension", **tables):
 @pytest.mark.parallel
 @pytest.mark.parametrize("method", ["newton", "relaxation", "arc_length"])
 def test_gradual_stressing_ends_where_sudden_stressing_does(method, shared_tmp_path, comm):
-    rows = [[0.0, 0.0], [1.0, 3000.0]]
+    rows = [[0.0, 0.0], [2.0, 6000.0]]  # beyond the end: a path needs a load that changes there
     newton = {"static": {"step": 1.0}}
     whole = run(fan(shared_tmp_path, comm, 3000.0, **newton), shared_tmp_path / "whole")
     keys = {"end": 1.0, "max_points": 60} if method == "arc_length" else {}
@@ -135,7 +135,7 @@ def test_work_of_stressing_a_restrained_bar(integrator, strain, tmp_path):
     time = {"integrator": integrator, "end": 1e-3}
     history = run(rod({"pretension": RAMP}, {"strain": strain}, time=time), tmp_path)
     energy = history["elastic_energy"]
-    assert energy[-1] == pytest.approx(0.5 * 1500.0**2 / (YOUNG * AREA) * LENGTH, rel=0.02)
+    assert energy[-1] == pytest.approx(0.5 * 1500.0**2 / (YOUNG * AREA) * LENGTH, rel=0.03)
     np.testing.assert_allclose(history["prestress_work"], energy, rtol=1e-11, atol=1e-12 * energy[-1])
     assert np.abs(history["energy_imbalance"]).max() < 1e-12 * energy[-1]
     assert open_result(tmp_path).field("axial_force", -1) == pytest.approx([1500.0] * 2, rel=1e-12)
@@ -157,15 +157,17 @@ def test_balance_while_stressing_moves_nodes(integrator, shared_tmp_path, comm):
 def test_energy_momentum_conserves_energy_while_stressing(strain, plastic, tmp_path):
     material = {"strain": strain, "thermal_expansion": 1e-5}
     if plastic:
-        material |= {"yield_stress": 8e6, "kinematic_hardening": 2e8, "isotropic_hardening": 1e8}
+        material |= {"yield_stress": 1.6e7, "kinematic_hardening": 2e8, "isotropic_hardening": 1e8}
     time = {"integrator": "energy_momentum", "end": 4e-3, "step": 1e-4}
     heat = [{"table": [[0.0, 0.0], [1e-3, -200.0]]}]
     support = [{"node_set": "all", "fix": "yz"}, {"node_set": "start", "fix": "x"}]
-    load = [{"node_set": "end", "force": [900.0, 0.0, 0.0]}]
-    case = rod({"pretension": RAMP}, material, time=time, temperature=heat, support=support, load=load)
+    load = [{"node_set": "end", "force": [1200.0, 0.0, 0.0]}]
+    case = rod(
+        {"pretension": RAMP}, material, time=time, temperature=heat, support=support, load=load, solver={"rtol": 1e-13}
+    )
     history = run(case, tmp_path)
     scale = max(history["elastic_energy"].max(), history["kinetic_energy"].max())
-    assert history["kinetic_energy"].max() > 0.1 * scale
+    assert history["kinetic_energy"].max() > 0.05 * scale
     assert (history["plastic_dissipation"][-1] > 0.01 * scale) == plastic
     assert np.abs(history["numerical_dissipation"]).max() < 1e-11 * scale
     assert np.abs(history["energy_imbalance"]).max() < 1e-11 * scale
@@ -192,9 +194,9 @@ def test_stages_keep_what_is_stressed(shared_tmp_path, comm):
     held = [{"node_set": "all", "fix": "yz"}, {"node_set": "start", "fix": "x"}]
     stages = [
         {"name": "stress", "static": {"step": 0.25}, "support": [*held, {"node_set": "end", "fix": "x"}]},
-        {"name": "fly", "support": held, "time": {"integrator": "newmark", "beta": 0.25, "gamma": 0.5, "step": 1e-5}},
+        {"name": "fly", "support": held, "time": {"integrator": "newmark", "beta": 0.25, "gamma": 0.5, "step": 2e-5}},
     ]
-    stages[1]["time"]["end"] = 1e-3
+    stages[1]["time"]["end"] = 2e-3
     output = {"probe": [{"name": "all", "node_set": "all"}], "checkpoint_every": 30, "fields_every": 4}
     case = rod({"pretension": [[0.0, 0.0], [1.0, 4000.0]]}, stage=stages, output=output)
     history = run(case, shared_tmp_path / "whole")
@@ -205,9 +207,9 @@ def test_stages_keep_what_is_stressed(shared_tmp_path, comm):
     energy = history["elastic_energy"] + history["kinetic_energy"]
     np.testing.assert_allclose(energy[4:], energy[4], rtol=1e-3)
     with Simulation(case, comm, output=shared_tmp_path / "stopped", quiet=True) as simulation:
-        simulation.start()
-        while simulation.analysis.number < 60:
-            simulation._advance()
+        for step in simulation:
+            if step.step == 60:
+                break
     with Simulation(case, comm, output=shared_tmp_path / "stopped", quiet=True, restart=True) as simulation:
         assert simulation.run() == 0
     folders = shared_tmp_path / "whole", shared_tmp_path / "stopped"

@@ -36,6 +36,7 @@ ENERGIES = (
     Energy("plastic_dissipation", "lost", "derived", parts=("plastic_heat", "hardening_energy")),
     Energy("plastic_heat", "part", "bars"),
     Energy("hardening_energy", "part", "bars"),
+    Energy("damage_dissipation", "lost", "bars"),
     Energy("damping_dissipation", "lost", "ledger"),
     Energy("friction_dissipation", "lost", "ledger"),
     Energy("impact_dissipation", "lost", "ledger"),

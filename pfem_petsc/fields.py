@@ -10,7 +10,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-__all__ = ["FIELDS", "Field", "cell_fields", "point_fields"]
+__all__ = ["FIELDS", "STATUS", "Field", "cell_fields", "point_fields"]
+
+STATUS = ("intact", "broken", "slack")
+"""Meaning of the numbers 0, 1, 2 of the field ``status``."""
 
 
 def _always(model: Any) -> bool:
@@ -46,6 +49,7 @@ FIELDS = [
     Field("axial_force", "bars", "N", lambda now: now.bars["axial_force"]),
     Field("plastic_strain", "bars", "", lambda now: now.bars["plastic_strain"]),
     Field("temperature", "bars", "K", lambda now: now.temperature(), lambda model: model.temperatures.any),
+    Field("status", "bars", "", lambda now: now.model.bars.status(), lambda model: model.bars.slackens),
 ]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -130,6 +131,14 @@ class Section(StrictModel):
     """name of a material"""
     bars: str | None = None
     """bar group of the mesh; default: all bars that no other section names"""
+    shape: Literal["round", "tube"] | None = None
+    """shape of the cross-section: a solid circle or a tube of this area"""
+    thickness: PositiveFloat | None = None
+    """wall thickness of a tube [m]"""
+    second_moment: PositiveFloat | None = None
+    """second moment of area about the axis of buckling [m4], instead of a shape"""
+    effective_length: PositiveFloat = 1.0
+    """effective length factor K: a bar buckles over K times its length"""
     pretension: Any = None
     """axial force in the mesh [N], or rows [t, force] [s, N]: linear between rows, constant outside"""
     prestress: Any = None
@@ -160,6 +169,19 @@ class Section(StrictModel):
     def prestressed(self) -> str | None:
         """The key that prescribes rest lengths, None without one."""
         return next((key for key in PRESTRESSES if getattr(self, key) is not None), None)
+
+    @model_validator(mode="after")
+    def _one_shape(self) -> Section:
+        if (self.shape == "tube") != (self.thickness is not None):
+            raise ValueError('shape = "tube" and thickness [m] need each other')
+        if self.shape is not None and self.second_moment is not None:
+            raise ValueError("second_moment follows from the shape: give one of the two")
+        if self.thickness is not None and math.pi * self.thickness**2 > self.area:
+            raise ValueError(
+                f"thickness = {self.thickness!r} m is too much for a tube of area = {self.area!r} m2: a solid bar of "
+                f"this area has a radius of {math.sqrt(self.area / math.pi):.6g} m"
+            )
+        return self
 
 
 class Initial(StrictModel):

@@ -11,10 +11,13 @@ import numpy as np
 
 from ..case.materials import internal_variables, law_of
 from ..energies import BAR_ENERGIES
+from ..errors import InputError
+from ..fields import STATUS
 from .compiled import kernel
 from .conserving import make_conserving_kernels
 from .kernels import make_kernels
-from .materials.base import Law
+from .materials.base import Law, UnsuitableBarError
+from .sections import bar_shapes
 from .strain import MEASURES
 from .sweep import Sweep, make_sweep
 
@@ -48,7 +51,8 @@ class StrainEnergy(NamedTuple):
 class BarBlock:
     """Local bars [start, stop) of one section, of which [start, counted) are counted on this rank.
 
-    ``modulus`` is the largest tangent modulus of the law [Pa]; ``history`` (rows, stop - start) holds ``law.rows``.
+    ``modulus`` is the largest tangent modulus of the law [Pa]; ``history`` (rows, stop - start) holds ``law.rows``
+    and, after them, ``law.bar_data``.
     """
 
     section: str
@@ -70,7 +74,7 @@ class BarBlock:
 
     def variables(self) -> Iterator[tuple[str, str, np.ndarray]]:
         """Yield name, unit and values (stop - start,) of all data kept from step to step."""
-        for (name, unit), values in zip(self.law.rows, self.history, strict=True):
+        for (name, unit), values in zip(self.law.rows, self.history, strict=False):
             yield name, unit, values
 
 
@@ -122,7 +126,7 @@ class Bars:
     """
 
     def __init__(self, mesh: DistributedMesh, case: Case) -> None:
-        self.mesh = mesh
+        self.mesh, self.case = mesh, case
         self.ends = mesh.bars
         self.mesh_lengths = np.empty(len(mesh.bars))
         _lengths(mesh.points, mesh.bars, self.mesh_lengths)
@@ -157,12 +161,55 @@ class Bars:
                     measure=measure,
                     parameters=material.pack(),
                     modulus=material.largest_modulus(),
-                    history=np.zeros((len(law.rows), block.stop - block.start)),
+                    history=np.zeros((len(law.rows) + len(law.bar_data), block.stop - block.start)),
                     sweep=make_sweep(mesh.bars, block.start, block.counted, block.stop),
                     kernels=make_kernels(law, measure),
                     conserving=None if law.mean_stress is None else make_conserving_kernels(law, measure),
                 )
             )
+        self.fill_bar_data()
+
+    def fill_bar_data(self) -> None:
+        """Give laws what they read of each bar, with its length in the mesh; to be repeated when areas have changed.
+
+        Raises
+        ------
+        InputError
+            On this rank, if a law cannot describe one of its bars.
+        """
+        for block in self.blocks:
+            if not block.law.bar_data:
+                continue
+            section, part = self.case.section[block.section], slice(block.start, block.stop)
+            shapes = bar_shapes(section, self.mesh_lengths[part], np.broadcast_to(block.area, block.stop - block.start))
+            try:
+                data = self.case.material[section.material].pack_bars(shapes)
+            except UnsuitableBarError as error:
+                bar = self.mesh.bar_ids[block.start + error.bar]
+                raise InputError(
+                    f"{self.case.source}: section.{block.section} with material.{section.material}: bar {bar}: "
+                    f"{error.reason}"
+                ) from error
+            block.history[len(block.law.rows) :] = data
+
+    @property
+    def slackens(self) -> bool:
+        """Whether bars of the case can be slack, the same on all ranks."""
+        return "slack" in self.internal
+
+    def slack_count(self) -> int:
+        """Return the number of counted bars that are slack."""
+        rows = ((b, b.law.slack_row) for b in self.blocks)
+        return sum(int(np.count_nonzero(b.history[row, : b.counted - b.start])) for b, row in rows if row >= 0)
+
+    def status(self) -> np.ndarray:
+        """Return the status (b,) of each local bar, of :data:`~pfem_petsc.fields.STATUS`."""
+        status = np.full(len(self.ends), float(STATUS.index("intact")))
+        for block in self.blocks:
+            if block.law.slack_row >= 0:
+                slack = block.history[block.law.slack_row] != 0.0
+                status[block.start : block.stop][slack] = STATUS.index("slack")
+        return status
 
     def _arguments(self, x: np.ndarray, block: BarBlock) -> tuple:
         law = (block.parameters, block.area, self.step, block.history)

@@ -22,9 +22,9 @@ from types import SimpleNamespace
 from numba.extending import register_jitable
 
 from .compiled import kernel
-from .kernels import COLLAPSED_STRETCH, last_row, no_variables
+from .kernels import COLLAPSED_STRETCH, last_row, no_bar_data, no_variables
 from .materials.base import Law
-from .rows import take
+from .rows import extend, take
 from .strain import engineering, green, logarithmic
 
 __all__ = ["make_conserving_kernels"]
@@ -71,7 +71,7 @@ def make_conserving_kernels(law: Law, measure: Callable) -> SimpleNamespace:
         law.rate,
         last_row(law),
     )
-    ratio = _RATIOS[measure]
+    ratio, of_bar, n_rows = _RATIOS[measure], no_bar_data(law), len(law.rows)
 
     @register_jitable
     def pair(ox, oy, oz, dx, dy, dz, rest0, rest1, shift0, shift, warmth0, warmth, p, area, step, kept, q):
@@ -116,6 +116,7 @@ def make_conserving_kernels(law: Law, measure: Callable) -> SimpleNamespace:
             warmth = heat[1, k] if has_thermal else 0.0
             q = take(history, k - start, like)
             kept = history[last + 1, k - start] if by_rate else 0.0
+            given = extend(p, history, n_rows, k - start, of_bar)
             ox = x0[b, 0] - x0[a, 0]
             oy = x0[b, 1] - x0[a, 1]
             oz = x0[b, 2] - x0[a, 2]
@@ -124,7 +125,7 @@ def make_conserving_kernels(law: Law, measure: Callable) -> SimpleNamespace:
             dz = x[b, 2] - x[a, 2]
             first = rest0[k] if changes else rest[k]
             c, _, _ = pair(
-                ox, oy, oz, dx, dy, dz, first, rest[k], shift0, shift, warmth0, warmth, p, area, step, kept, q
+                ox, oy, oz, dx, dy, dz, first, rest[k], shift0, shift, warmth0, warmth, given, area, step, kept, q
             )
             dx, dy, dz = 0.5 * (ox + dx), 0.5 * (oy + dy), 0.5 * (oz + dz)
             f[a, 0] -= c * dx
@@ -168,6 +169,7 @@ def make_conserving_kernels(law: Law, measure: Callable) -> SimpleNamespace:
             warmth = heat[1, k] if has_thermal else 0.0
             q = take(history, k - start, like)
             kept = history[last + 1, k - start] if by_rate else 0.0
+            given = extend(p, history, n_rows, k - start, of_bar)
             ox = x0[b, 0] - x0[a, 0]
             oy = x0[b, 1] - x0[a, 1]
             oz = x0[b, 2] - x0[a, 2]
@@ -176,7 +178,7 @@ def make_conserving_kernels(law: Law, measure: Callable) -> SimpleNamespace:
             dz = x[b, 2] - x[a, 2]
             first = rest0[k] if changes else rest[k]
             c, dc, inverse = pair(
-                ox, oy, oz, dx, dy, dz, first, rest[k], shift0, shift, warmth0, warmth, p, area, step, kept, q
+                ox, oy, oz, dx, dy, dz, first, rest[k], shift0, shift, warmth0, warmth, given, area, step, kept, q
             )
             d = (0.5 * (ox + dx), 0.5 * (oy + dy), 0.5 * (oz + dz))
             n = (dx * inverse, dy * inverse, dz * inverse)

@@ -18,10 +18,10 @@ from numba.extending import register_jitable
 from ..energies import BAR_ENERGIES
 from .compiled import inlined, kernel
 from .materials.base import Law
-from .rows import accumulate, differ, put, take
+from .rows import accumulate, differ, extend, put, take
 from .sweep import CHUNK
 
-__all__ = ["COLLAPSED_STRETCH", "SHORTENED_STRETCH", "last_row", "make_kernels", "no_variables"]
+__all__ = ["COLLAPSED_STRETCH", "SHORTENED_STRETCH", "last_row", "make_kernels", "no_bar_data", "no_variables"]
 
 COLLAPSED_STRETCH = 1e-3  # below this fraction of its rest length a bar is crushed, and no truss model applies
 SHORTENED_STRETCH = math.sqrt(0.8)  # only bars shorter than this are checked for passing through zero length
@@ -30,6 +30,11 @@ SHORTENED_STRETCH = math.sqrt(0.8)  # only bars shorter than this are checked fo
 def no_variables(law: Law) -> tuple[float, ...]:
     """Return a tuple of zeros, one for each internal variable of a law."""
     return (0.0,) * len(law.internal)
+
+
+def no_bar_data(law: Law) -> tuple[float, ...]:
+    """Return a tuple of zeros, one for each number that a law reads of a bar."""
+    return (0.0,) * len(law.bar_data)
 
 
 def last_row(law: Law) -> int:
@@ -45,9 +50,11 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
     Common arguments: ``x`` (local nodes, 3) [m]; ``bars`` (b, 2) local ends; ``rest`` (b,) rest lengths [m]; ``heat``
     (2, b) thermal strains and temperatures [K], or (2, 0) for none; ``p`` the law's parameters; ``area`` [m2]; ``step``
     from the start of the step to ``x`` [s]; ``history`` (rows, n) of the bars of this block: ``law.rows`` of bar ``k``
-    in column ``k - start``. No array is passed to an inner function: reference counting would cost more than the bar.
+    in column ``k - start``, and after them its ``law.bar_data``, which no loop writes. No array is passed to an inner
+    function: reference counting would cost more than the bar.
     """
     response, like, by_rate, last, n_rows = law.response, no_variables(law), law.rate, last_row(law), len(law.rows)
+    of_bar = no_bar_data(law)
     places = tuple(BAR_ENERGIES.index(name) for name in law.energies)
     n_energies = len(places)
     first_new = 4 + n_energies
@@ -108,7 +115,8 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
                 rate = 0.0
                 if by_rate and step > 0.0:
                     rate = (strain - history[last, begin + i]) / step
-                stress, _, new, densities = response(strain, rate, step, warmth, p, q)
+                given = extend(p, history, n_rows, begin + i, of_bar)
+                stress, _, new, densities = response(strain, rate, step, warmth, given, q)
                 accumulate(work, 4, i, area * rests[i], densities)
                 if n_rows > 0:
                     put(work, first_new, i, new)
@@ -193,7 +201,8 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
             nz = x[b, 2] - x[a, 2]
             q = take(history, k - start, like)
             before = history[last, k - start] if by_rate else 0.0
-            axial, geometric, inverse = stiffness(nx, ny, nz, rest[k], shift, warmth, p, area, step, before, q)
+            given = extend(p, history, n_rows, k - start, of_bar)
+            axial, geometric, inverse = stiffness(nx, ny, nz, rest[k], shift, warmth, given, area, step, before, q)
             nx *= inverse
             ny *= inverse
             nz *= inverse
@@ -237,7 +246,8 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
             nz = x[b, 2] - x[a, 2]
             q = take(history, k - start, like)
             before = history[last, k - start] if by_rate else 0.0
-            axial, geometric, inverse = stiffness(nx, ny, nz, rest[k], shift, warmth, p, area, step, before, q)
+            given = extend(p, history, n_rows, k - start, of_bar)
+            axial, geometric, inverse = stiffness(nx, ny, nz, rest[k], shift, warmth, given, area, step, before, q)
             nx *= inverse
             ny *= inverse
             nz *= inverse
@@ -269,7 +279,8 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
             dz = x[b, 2] - x[a, 2]
             q = take(history, k - start, like)
             before = history[last, k - start] if by_rate else 0.0
-            axial, geometric, inverse = stiffness(dx, dy, dz, rest[k], shift, warmth, p, area, step, before, q)
+            given = extend(p, history, n_rows, k - start, of_bar)
+            axial, geometric, inverse = stiffness(dx, dy, dz, rest[k], shift, warmth, given, area, step, before, q)
             stored[k, 0] = dx * inverse
             stored[k, 1] = dy * inverse
             stored[k, 2] = dz * inverse
@@ -293,7 +304,8 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
             if by_rate:
                 stress = history[last + 1, k - start]
             else:
-                stress, _, _, _ = response(strain - shift, 0.0, 0.0, warmth, p, q)
+                given = extend(p, history, n_rows, k - start, of_bar)
+                stress, _, _, _ = response(strain - shift, 0.0, 0.0, warmth, given, q)
             strain_out[k] = strain
             stress_out[k] = stress
             force_out[k] = area * stress * slope

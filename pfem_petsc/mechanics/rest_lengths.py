@@ -132,10 +132,14 @@ def _stretches(block: BarBlock, measure: Callable, key: str, value: float, where
     """Return the stretch in the mesh of the bars of a block."""
     if key == "rest_length":
         return 1.0 / value
+    as_force = key == "pretension"
+    target = value / block.area if as_force else value
     try:
-        if key == "prestress":
-            return stretch_of(block.law, measure, block.parameters, value, as_force=False)
-        return stretch_of(block.law, measure, block.parameters, value / block.area, as_force=True)
+        if not block.law.bar_data:
+            return stretch_of(block.law, measure, block.parameters, target, as_force)
+        kinds, which = np.unique(block.history[len(block.law.rows) :], axis=1, return_inverse=True)
+        each = [(*block.parameters, *data) for data in kinds.T.tolist()]
+        return np.array([stretch_of(block.law, measure, p, target, as_force) for p in each])[np.ravel(which)]
     except ValueError as error:
         unit = "N" if key == "pretension" else "Pa"
         raise InputError(f"{where} = {value:g} {unit}: {error}") from error

@@ -9,9 +9,10 @@ from __future__ import annotations
 from typing import Any
 
 from numba.core import cgutils, types
+from numba.core.imputils import impl_ret_borrowed
 from numba.extending import intrinsic
 
-__all__ = ["accumulate", "differ", "put", "take"]
+__all__ = ["accumulate", "differ", "extend", "put", "take"]
 
 
 def _places(context: Any, builder: Any, signature: Any, args: Any, first: int, column: int, count: int) -> list[Any]:
@@ -36,6 +37,25 @@ def take(typingctx, rows, column, like):  # noqa: ANN001, ANN201 - Numba's types
         return context.make_tuple(builder, signature.return_type, [builder.load(place) for place in places])
 
     return like(rows, column, like), generate
+
+
+@intrinsic
+def extend(typingctx, values, rows, first, column, like):  # noqa: ANN001, ANN201
+    """Return a tuple with ``rows[first, column]``, ``rows[first + 1, column]``, ... added at its end, as many as
+    ``like`` has; if it is empty, this is the tuple itself, and no code."""
+    count = len(like)
+    extended = types.BaseTuple.from_types((*values, *like)) if count else values
+
+    def generate(context, builder, signature, args):  # noqa: ANN001, ANN202
+        if count == 0:
+            return impl_ret_borrowed(context, builder, signature.return_type, args[0])
+        places = _places(context, builder, types.void(*signature.args[1:]), args[1:], 1, 2, count)
+        parts = [builder.extract_value(args[0], j) for j in range(len(values))]
+        parts += [builder.load(place) for place in places]
+        made = context.make_tuple(builder, signature.return_type, parts)
+        return impl_ret_borrowed(context, builder, signature.return_type, made)
+
+    return extended(values, rows, first, column, like), generate
 
 
 @intrinsic

@@ -1,4 +1,11 @@
-"""The section of each bar of a mesh."""
+"""The section of each bar of a mesh, and the shape of the bars of a section.
+
+A solid circle of radius R has the area pi R^2, the second moment pi R^4/4 and the plastic modulus 4 R^3/3. A tube of
+thickness t and area A has the outer radius R = A/(2 pi t) + t/2, and with the inner radius r = R - t the second moment
+pi (R^4 - r^4)/4 and the plastic modulus 4 (R^3 - r^3)/3. A given second moment I stands for the tube of this area and
+second moment, R^2 + r^2 = 4 I/A and R^2 - r^2 = A/pi; where there is none because I is less than that of a solid
+circle, for the rectangle of thickness h = (12 I/A)^(1/2), which has the plastic modulus A h/4.
+"""
 
 from __future__ import annotations
 
@@ -8,12 +15,35 @@ import numpy as np
 
 from ..errors import InputError
 from ..mesh.node_sets import group_hint
+from .materials.base import BarShapes
 
 if TYPE_CHECKING:
     from ..case.schema import Case
+    from ..case.tables import Section
     from ..mesh.slab import MeshSlab
 
-__all__ = ["section_of_bars"]
+__all__ = ["bar_shapes", "section_of_bars"]
+
+
+def bar_shapes(section: Section, length: np.ndarray, area: np.ndarray) -> BarShapes:
+    """Return the shapes of bars of a section from their lengths [m] and areas [m2], both (b,)."""
+    nothing = np.zeros_like(length)
+    outer, inner, moment, modulus = np.sqrt(area / np.pi), nothing, nothing, nothing
+    if section.thickness is not None:
+        outer = area / (2.0 * np.pi * section.thickness) + 0.5 * section.thickness
+        inner = np.maximum(outer - section.thickness, 0.0)
+    if section.second_moment is not None:
+        moment = np.full_like(length, section.second_moment)
+        squares, difference = 4.0 * moment / area, area / np.pi
+        hollow = squares >= difference
+        outer = np.where(hollow, np.sqrt(0.5 * (squares + difference)), outer)
+        inner = np.where(hollow, np.sqrt(0.5 * np.maximum(squares - difference, 0.0)), 0.0)
+        flat = 0.25 * area * np.sqrt(3.0 * squares)
+        modulus = np.where(hollow, 4.0 / 3.0 * (outer**3 - inner**3), flat)
+    elif section.shape is not None:
+        moment = 0.25 * np.pi * (outer**4 - inner**4)
+        modulus = 4.0 / 3.0 * (outer**3 - inner**3)
+    return BarShapes(length, area, moment, modulus, outer, section.effective_length * length)
 
 
 def section_of_bars(case: Case, slab: MeshSlab) -> np.ndarray:

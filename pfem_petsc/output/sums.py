@@ -49,10 +49,12 @@ HEAD = Places(
         *((energy.name, 1) for energy in ENERGIES if energy.source != "derived"),
         *((name, 3) for name in (*_VECTORS, *_IMPULSES)),
         ("active_contacts", 1),
+        ("slack_bars", 1),
         ("alarm", 1),
     ]
 )
-"""Sums of all cases; ``centre_of_mass`` holds the sum of mass times position."""
+"""Sums of all cases; ``centre_of_mass`` holds the sum of mass times position. ``slack_bars`` is a column of the history
+for cases with laws whose bars can be slack."""
 
 WALL = Places(
     [

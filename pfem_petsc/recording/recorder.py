@@ -53,11 +53,12 @@ class Recorder:
         case, mesh, comm = self.model.case, self.model.mesh, self.model.comm
         self.columns: dict[str, tuple[int, ...]] = {"time": (), "step": (), "step_size": ()}
         self.columns |= dict.fromkeys(stepper.columns, ())
-        self.columns |= {name: () for name in ("newton_iterations", "linear_iterations", "active_contacts")}
+        counts = ("active_contacts", "slack_bars") if self.model.bars.slackens else ("active_contacts",)
+        self.columns |= dict.fromkeys(("newton_iterations", "linear_iterations", *counts), ())
         self.columns |= {energy.name: () for energy in ENERGIES} | {"energy_imbalance": ()}
         self.columns |= {name: (3,) for name, size in HEAD.sizes.items() if size == 3}
         self.types: dict[str, Any] = dict.fromkeys(
-            ("step", "newton_iterations", "linear_iterations", "active_contacts"), np.int64
+            ("step", "newton_iterations", "linear_iterations", *counts), np.int64
         )
         self.columns |= {name: shape for name, shape, _ in contact_columns(self.model.contact)}
         self.types |= {name: kind for name, _, kind in contact_columns(self.model.contact) if kind is not float}
@@ -82,8 +83,9 @@ class Recorder:
         self._starts = np.cumsum([HEAD.width, self._contact.size, links, probed])
         self._sums = np.zeros(self._starts[-1])
         # indices of the numbers of the head in a row, and where walls, links and probes begin there
-        self._from = np.array([k for name in HEAD.sizes if name != "alarm" for k in range(HEAD.width)[HEAD[name]]])
-        places = [self.layout.places[name][:2] for name in HEAD.sizes if name != "alarm"]
+        recorded = [name for name in HEAD.sizes if name in self.columns]
+        self._from = np.array([k for name in recorded for k in range(HEAD.width)[HEAD[name]]])
+        places = [self.layout.places[name][:2] for name in recorded]
         self._to = np.concatenate([np.arange(*place) for place in places])
         self._at = {name: place[0] for name, place in self.layout.places.items()}
         head = sum(int(np.prod(shape)) for name, shape in self.columns.items() if "/" not in name)
@@ -132,6 +134,8 @@ class Recorder:
         for term in _STATE:
             sums[HEAD.first(term.name)] = term.value(stepper)
         sums[HEAD.first("active_contacts")], sums[HEAD.first("alarm")] = solution.contacts, alarm
+        if self.model.bars.slackens:
+            sums[HEAD.first("slack_bars")] = self.model.bars.slack_count()
         walls, links, at, _ = self._starts
         if self._contact.size:
             self._contact.fill(sums[walls:links], solution.walls, ledger.impulses)

@@ -10,7 +10,8 @@ __all__ = ["BarArrays", "Buffers", "ImpulseArrays", "NodeArrays", "ProbeArrays",
 
 
 class BarArrays(NamedTuple):
-    """Arguments of the bar loop of a law; see :mod:`~pfem_petsc.mechanics.kernels`."""
+    """Arguments of the bar loop of a law; see :mod:`~pfem_petsc.mechanics.kernels`. ``slack``: row of the history with
+    the variable of this name, or -1."""
 
     ends: np.ndarray
     sweep: tuple
@@ -20,6 +21,7 @@ class BarArrays(NamedTuple):
     parameters: tuple
     area: float
     history: np.ndarray
+    slack: int
 
 
 class NodeArrays(NamedTuple):

@@ -27,6 +27,7 @@ __all__ = ["make_fused_loop"]
 
 _HEAD, _KINETIC = HEAD.width, HEAD.first("kinetic_energy")  # constants of the machine code
 _CONTACTS, _ALARM = HEAD.first("active_contacts"), HEAD.first("alarm")
+_SLACK = HEAD.first("slack_bars")
 
 
 @cache
@@ -233,6 +234,11 @@ def make_fused_loop(forces: Callable, drift: Callable, kick: Callable) -> Callab
             row[:_HEAD] = ledger
             fill_bars(row, energies)
             row[_CONTACTS], row[_ALARM] = len(near), 0.0
+            if bars.slack >= 0:
+                slack = 0.0
+                for k in range(bars.history.shape[1]):
+                    slack += bars.history[bars.slack, k]
+                row[_SLACK] = slack
             at = _HEAD
             if n_walls > 0:
                 row[at] = changes

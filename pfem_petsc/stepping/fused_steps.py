@@ -51,7 +51,7 @@ class Batch:
         self._fused_loop = make_fused_loop(block.kernels.sweep_forces, *stepper.scheme.loops)
         bars = model.bars
         law = (bars.far, bars.rest, bars.heat, block.parameters, block.area, block.history)
-        self._bars = BarArrays(bars.ends, tuple(block.sweep), *law)
+        self._bars = BarArrays(bars.ends, tuple(block.sweep), *law, block.law.slack_row)
         supports, inertia, contact = model.supports, model.inertia, model.contact
         nothing = np.empty((0, 3))
         external = stepper.state.external if model.external.active else nothing

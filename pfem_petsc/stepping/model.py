@@ -65,7 +65,8 @@ class Model:
         adjusted = adjust_start(case, self.nodes, mesh) if case.number == 0 else 0
         if adjusted:
             self.warnings.append(f"{adjusted} node{'s' * (adjusted > 1)} that started beyond walls moved onto them")
-        self.bars = Bars(mesh, case)
+        with agreed(comm):
+            self.bars = Bars(mesh, case)
         self.inertia = Inertia(mesh, self.bars, case.mass == "consistent")
         self.external = ExternalForce(case, self.nodes, self.inertia)
         with agreed(comm):

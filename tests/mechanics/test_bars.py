@@ -72,7 +72,8 @@ def test_forces_and_energies(law, truss):
     assert np.abs(whole(model, f) - expected).max() < 1e-12 * np.abs(expected).max()
     bar = twin.response(x)
     volume = AREA * twin.rest
-    elastic, heat, hardening = (model.comm.allreduce(part) for part in energy.energies)
+    names = ("elastic_energy", "plastic_heat", "hardening_energy")
+    elastic, heat, hardening = (model.comm.allreduce(energy.of(name)) for name in names)
     assert elastic == pytest.approx(volume @ (0.5 * bar["stress"] ** 2 / law.young_modulus), rel=1e-12)
     if law.yield_stress is not None:
         accumulated, plastic = bar["accumulated"], bar["plastic_strain"]

@@ -9,14 +9,36 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
 from ...case.base import Finite, NonNegativeFloat, PositiveFloat, StrictModel
 from ...energies import BAR_ENERGIES
 
-__all__ = ["Law", "MaterialKeys"]
+__all__ = ["BarShapes", "Law", "MaterialKeys", "UnsuitableBarError"]
+
+
+class BarShapes(NamedTuple):
+    """Bars of one section, for laws that depend on their shape; arrays (b,), in SI units.
+
+    ``second_moment`` and ``plastic_modulus`` are zero if the section has neither a shape nor a second moment.
+    """
+
+    length: np.ndarray
+    area: np.ndarray
+    second_moment: np.ndarray
+    plastic_modulus: np.ndarray
+    radius: np.ndarray
+    effective_length: np.ndarray
+
+
+class UnsuitableBarError(ValueError):
+    """A law cannot describe a bar: its index in :class:`BarShapes`, and why, with the remedy."""
+
+    def __init__(self, bar: int, reason: str) -> None:
+        super().__init__(bar, reason)
+        self.bar, self.reason = int(bar), reason
 
 
 class MaterialKeys(StrictModel):
@@ -38,6 +60,16 @@ class MaterialKeys(StrictModel):
     def pack(self) -> tuple[float, ...]:
         """Return the numbers that the response of the law reads as ``p``; at least one."""
         return (float(self.young_modulus),)
+
+    def pack_bars(self, bars: BarShapes) -> tuple[np.ndarray, ...]:
+        """Return the ``bar_data`` of the law: arrays (b,), which the response reads after the numbers of :meth:`pack`.
+
+        Raises
+        ------
+        UnsuitableBarError
+            If the law cannot describe one of the bars.
+        """
+        return ()
 
     def largest_modulus(self) -> float:
         """Largest tangent modulus of a bar [Pa], for wave speeds and the rounding of forces."""
@@ -62,26 +94,32 @@ class Law:
     ----------
     response : compiled (``register_jitable``) function of (strain, rate, step, temperature, p, q): strain minus the
         thermal strain; its rate over the step [1/s]; the step [s], 0 at the start of a run; temperature above reference
-        [K]; the packed parameters; and the internal variables at the start of the step, a tuple. It returns (stress
-        [Pa], tangent [Pa], internal variables at the end of the step, energy densities [J/m3]). The tangent is the
-        total derivative of the stress with respect to the strain at the end, including that of the rate (1/step)
+        [K]; the packed parameters, with the data of the bar; and the internal variables at the start of the step, a
+        tuple. It returns (stress [Pa], tangent [Pa], internal variables at the end of the step, energy densities
+        [J/m3]). The tangent is the total derivative of the stress with respect to the strain at the end, including that
+        of the rate (1/step)
     internal : name and unit of each internal variable of a bar, zero at the start; the unit ``""`` is a pure number.
-        They are fields of the snapshots if a case selects them, and arrays of the checkpoints
+        They are fields of the snapshots if a case selects them, and arrays of the checkpoints. A variable named
+        ``slack`` is 1 while the bar is slack: it is counted in the history and seen in the field ``status``
     energies : names of the energy densities, of :data:`~pfem_petsc.energies.BAR_ENERGIES`: functions of strain and
         internal variables. If the dissipation is no such function, the law keeps it as another internal variable
+    bar_data : names of the numbers that differ from bar to bar and that ``Parameters.pack_bars`` gives; the response
+        reads them after the packed parameters, ``p = (*pack(), *pack_bars())``
     rate : whether the law depends on the rate or on the step; strain and stress at the end of the last step are then
         kept as well. Otherwise rate and step are zero
     smooth : whether the tangent is constant
     mean_stress : compiled function of (stress0, strain0, strain, rate, step, temperature, p, q): returns the mean
         stress [Pa] over the step from stress0 and strain0 to strain, whose work is the change of energies, and its
         derivative with respect to strain. The energy-momentum scheme requires it; None: the law is refused there
-    mean_correction : ``mean_stress`` minus the mean of both ends [Pa], as a function of p, the change of stress and the
-        internal variables before and after, (variables, bars), for the work of changing temperatures; None for zero
+    mean_correction : ``mean_stress`` minus the mean of both ends [Pa], as a function of p without data of bars, the
+        change of stress and the internal variables before and after, (variables, bars), for the work of changing
+        temperatures; None for zero
     """
 
     response: Callable[..., Any]
     internal: tuple[tuple[str, str], ...] = ()
     energies: tuple[str, ...] = ("elastic_energy",)
+    bar_data: tuple[str, ...] = ()
     rate: bool = False
     smooth: bool = False
     mean_stress: Callable[..., Any] | None = None
@@ -96,6 +134,12 @@ class Law:
     def rows(self) -> tuple[tuple[str, str], ...]:
         """Name and unit of all data kept from step to step, internal variables first."""
         return (*self.internal, ("last_strain", ""), ("last_stress", "Pa")) if self.rate else self.internal
+
+    @property
+    def slack_row(self) -> int:
+        """Row of the internal variable ``slack``, -1 for laws whose bars cannot be slack."""
+        names = [name for name, _ in self.internal]
+        return names.index("slack") if "slack" in names else -1
 
     def refuses(self, scheme: Any) -> str | None:
         """Return why a :class:`~pfem_petsc.integrators.base.Scheme` cannot use the law, None if it can."""

@@ -1,0 +1,231 @@
+"""Statics of trusses with cables that become slack and struts that buckle."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from helpers.cables import funicular
+from helpers.mesh_files import case_of
+from helpers.strut_twin import Strut, solid
+
+from pfem_petsc import Case, Simulation, open_result
+from pfem_petsc.errors import InputError, SimulationFailure
+
+pytestmark = pytest.mark.parallel
+
+SQUARE = [[0, 0, 0], [0, 0, 1], [1, 0, 1], [1, 0, 0]]
+CABLE = {"law": "cable", "young_modulus": 2e11, "density": 7850.0}
+FEET = np.array([[0, 0, 0], [20, 0, -5.56], [30, 0, -5], [45, 0, 5.83], [60, 0, 20.0]])
+
+
+def run(case, comm, folder):
+    """Run a case; its history and the fields of its last snapshot, the same on all ranks."""
+    with Simulation(case, comm, output=folder, quiet=True) as simulation:
+        assert simulation.run() == 0
+    found = None
+    if comm.rank == 0:
+        result = open_result(folder)
+        history = {name: np.asarray(result.history[name]) for name in result.history}
+        found = history, {name: result.field(name, -1) for name in result.cell_fields}
+    return comm.bcast(found)
+
+
+@pytest.mark.parametrize("method", [{"step": 0.5}, {"method": "relaxation"}])
+def test_slack_members(comm, shared_tmp_path, method):
+    """SSNL105 of code_aster: a square of bars with two cables as diagonals, pushed sideways."""
+    bars = [[0, 1], [1, 2], [2, 3], [3, 0], [0, 2], [1, 3]]
+    if comm.rank == 0:
+        import h5py
+
+        with h5py.File(shared_tmp_path / "mesh.h5", "w") as file:
+            file["points"], file["bars"] = np.array(SQUARE, dtype=float), np.array(bars)
+            file["bar_groups/cables"] = np.array([4, 5])
+    comm.Barrier()
+    case = Case.from_dict(
+        {
+            "mesh": {"file": "mesh.h5"},
+            "node_set": {"feet": {"indices": [0, 3]}, "all": {"all": True}, "pushed": {"indices": [2]}},
+            "material": {"cable": CABLE, "bar": {"young_modulus": 2e11, "density": 7850.0}},
+            "section": {
+                "bars": {"area": 1e-3, "material": "bar"},
+                "cables": {"area": 1e-3, "material": "cable", "bars": "cables"},
+            },
+            "support": [{"node_set": "feet", "fix": "xyz"}, {"node_set": "all", "fix": "y"}],
+            "load": [{"node_set": "pushed", "force": [1000.0, 0.0, 0.0]}],
+            "static": method,
+        },
+        folder=shared_tmp_path,
+    )
+    history, fields = run(case, comm, shared_tmp_path / "out")
+    expected = [0.0, 0.0, -1000.0, 0.0, 1000.0 * math.sqrt(2.0), 0.0]
+    assert fields["axial_force"] == pytest.approx(expected, rel=1e-4, abs=0.1)
+    assert fields["status"].tolist() == [0.0, 0.0, 0.0, 0.0, 0.0, 2.0]
+    assert history["slack_bars"][-1] == 1
+
+
+@pytest.mark.parametrize("method", [{"step": 0.5}, {"method": "relaxation"}])
+def test_hanging_cable_with_three_weights(comm, shared_tmp_path, method):
+    """VM31 of Ansys, in feet and pounds, with cables for bars."""
+    loads = (6e3, 12e3, 4e3)
+    case = case_of(
+        shared_tmp_path,
+        comm,
+        FEET,
+        [[k, k + 1] for k in range(4)],
+        node_set={"ends": {"indices": [0, 4]}, "all": {"all": True}} | {f"at{k}": {"indices": [k]} for k in (1, 2, 3)},
+        material={"m": {"law": "cable", "young_modulus": 20e9, "density": 1.0}},
+        section={"s": {"area": 0.1, "material": "m"}},
+        support=[{"node_set": "ends", "fix": "xyz"}],
+        load=[{"node_set": f"at{k}", "force": [0.0, 0.0, -force]} for k, force in enumerate(loads, start=1)],
+        static=method,
+    )
+    if method == {"step": 0.5}:
+        simulation = Simulation(case, comm, output=shared_tmp_path / "out", quiet=True)
+        with simulation, pytest.raises(SimulationFailure):  # without tension the chain is a mechanism
+            simulation.run()
+        return
+    history, fields = run(case, comm, shared_tmp_path / "out")
+    rest = np.linalg.norm(np.diff(FEET, axis=0), axis=1)
+    tension, _ = funicular(60.0, 20.0, rest, 2e9, np.array(loads))
+    assert fields["axial_force"] == pytest.approx(tension, rel=1e-7)
+    assert tension.max() == pytest.approx(24762.0, rel=3e-4)
+    assert history["slack_bars"][-1] == 0
+
+
+def test_cable_longer_than_its_span_is_slack_until_it_is_pulled(comm, shared_tmp_path):
+    """One bar whose end is moved: slack up to its plastic elongation, on the way back as well."""
+    case = Case.from_dict(
+        {
+            "mesh": {"generator": "rod", "length": 1.0, "elements": 1},
+            "node_set": {"foot": {"indices": [0]}, "tip": {"indices": [1]}},
+            "material": {"m": {**CABLE, "yield_stress": 2e8, "isotropic_hardening": 1e9}},
+            "section": {"s": {"area": 1e-4, "material": "m"}},
+            "support": [
+                {"node_set": "foot", "fix": "xyz"},
+                {
+                    "node_set": "tip",
+                    "fix": "xyz",
+                    "motion": [[0, 0, 0, 0], [1, 3e-3, 0, 0], [2, -1e-3, 0, 0], [3, 3e-3, 0, 0]],
+                    "interpolation": "linear",
+                },
+            ],
+            "static": {"step": 0.25, "end": 3.0},
+            "output": {"probe": [{"name": "tip", "node_set": "tip"}]},
+        }
+    )
+    history, fields = run(case, comm, shared_tmp_path / "out")
+    flow = (2e11 * 3e-3 - 2e8) / (2e11 + 1e9)
+    way = history["probe/tip/position"][:, 0, 0] - 1.0
+    force = history["probe/tip/reaction"][:, 0, 0]
+    after = history["load_factor"] > 1.0
+    expected = np.where(after, np.maximum(2e7 * (way - flow), 0.0), np.minimum(2e7 * way, np.inf))
+    yields = ~after & (way > 1e-3)
+    expected[yields] = 1e-4 * (2e8 + 1e9 * (2e11 * way[yields] - 2e8) / (2e11 + 1e9))
+    assert force == pytest.approx(expected, rel=1e-9, abs=1e-6)
+    assert history["slack_bars"].tolist() == (after & (way < flow)).astype(int).tolist()
+    assert fields["status"].tolist() == [0.0]
+
+
+def strut_case(bar, static, force=-1.0, **more):
+    material, section = solid(bar)
+    return Case.from_dict(
+        {
+            "mesh": {"generator": "rod", "length": bar.length, "elements": 1},
+            "node_set": {"foot": {"indices": [0]}, "tip": {"indices": [1]}},
+            "material": {"m": {**material, **more}},
+            "section": {"s": {**section, "material": "m"}},
+            "support": [{"node_set": "foot", "fix": "xyz"}, {"node_set": "tip", "fix": "yz"}],
+            "load": [{"node_set": "tip", "force": [force, 0.0, 0.0], "table": [[0.0, 0.0], [1.0, 1.0]]}],
+            "static": static,
+            "output": {"fields_every": 0, "probe": [{"name": "tip", "node_set": "tip"}]},
+        }
+    )
+
+
+@pytest.mark.parametrize("method", ["displacement", "arc_length"])
+@pytest.mark.parametrize("slenderness", [40.0, 200.0])
+def test_path_control_follows_the_softening_of_a_strut(comm, shared_tmp_path, method, slenderness):
+    """The load over the shortening, beyond Euler's load or the yield force, is the strut's."""
+    bar = Strut(200e9, 200e6, slenderness, 1e-3)
+    peak = min(bar.euler, bar.yields) * bar.area
+    static = {"method": method, "node_set": "tip", "direction": [-1.0, 0.0, 0.0], "displacement": 4e-3 * bar.length}
+    static |= {"max_points": 600, "step": 0.05}
+    history, _ = run(strut_case(bar, static, force=-peak), comm, shared_tmp_path / "out")
+    assert history["newton_iterations"].max() <= 12
+    strain = history["probe/tip/position"][:, 0, 0] / bar.length - 1.0
+    state, expected = bar.start(), [0.0]
+    for each in strain[1:].tolist():
+        stress, state, _ = bar.step(each, state)
+        expected.append(-stress * bar.area / peak)
+    assert strain[-1] <= -4e-3 * (1.0 - 1e-9)
+    assert history["load_factor"] == pytest.approx(expected, abs=1e-6)
+    assert max(expected) > 0.85 and expected[-1] < 0.8 * max(expected)
+
+
+def test_load_control_ends_at_the_peak(comm, shared_tmp_path):
+    bar = Strut(200e9, 200e6, 200.0)
+    case = strut_case(bar, {"step": 0.125, "min_step": 1e-2}, force=-1.5 * bar.euler * bar.area)
+    with Simulation(case, comm, output=shared_tmp_path / "out", quiet=True) as simulation:
+        with pytest.raises(SimulationFailure):
+            simulation.run()
+        assert 0.6 < simulation.state.time < 1.0 / 1.5
+
+
+@pytest.mark.slow
+def test_strength_of_an_octet_cell_follows_yield_and_euler(comm, shared_tmp_path):
+    """Areas over 16 to 1: with the area where struts yield, with its square where they buckle."""
+
+    def strength(area):
+        case = Case.from_dict(
+            {
+                "mesh": {"generator": "lattice", "kind": "octet", "cells": [1, 1, 1], "pitch": 0.01},
+                "node_set": {
+                    "bottom": {"group": "bottom"},
+                    "top": {"group": "top"},
+                    "corner": {"nearest": [0.0, 0.0, 0.0]},
+                    "beside": {"nearest": [0.01, 0.0, 0.0]},
+                },
+                "material": {"m": {"law": "strut", "young_modulus": 70e9, "density": 2700.0, "yield_stress": 200e6}},
+                "section": {"s": {"area": area, "material": "m", "shape": "round"}},
+                "support": [
+                    {"node_set": "bottom", "fix": "z"},
+                    {"node_set": "corner", "fix": "xy"},
+                    {"node_set": "beside", "fix": "y"},
+                    {
+                        "node_set": "top",
+                        "fix": "z",
+                        "motion": [[0, 0, 0, 0], [1, 0, 0, -1.2e-4]],
+                        "interpolation": "linear",
+                    },
+                ],
+                "static": {"step": 0.05},
+                "output": {"fields_every": 0, "probe": [{"name": "top", "node_set": "top"}]},
+            }
+        )
+        history, _ = run(case, comm, shared_tmp_path / "out")
+        return -history["probe/top/reaction"][:, :, 2].sum(axis=1).min()
+
+    areas = 4.5e-8 * 4.0 ** np.arange(3)  # slendernesses of 118, 59 and 30; 58.8 is that of both
+    forces = np.array([strength(area) for area in areas])
+    slopes = np.diff(np.log(forces)) / np.log(4.0)
+    assert slopes == pytest.approx([2.0, 1.0], abs=0.02)
+    length = 0.01 / math.sqrt(2.0)
+    euler = 0.25 * math.pi * 70e9 * areas[0] ** 2 / length**2
+    # in both, the same multiple of the strength of a bar
+    assert forces[0] / euler == pytest.approx(forces[2] / (200e6 * areas[2]), rel=0.03)
+
+
+def test_unsuitable_bars_are_refused(comm, shared_tmp_path):
+    case = strut_case(Strut(200e9, 200e6, 200.0), {"step": 0.5})
+    data = case.to_dict()
+    del data["section"]["s"]["shape"]
+    with pytest.raises(InputError, match=r"section\.s with material\.m: bar 0: a strut buckles: give the section"):
+        Simulation(Case.from_dict(data), comm, output=shared_tmp_path / "out", quiet=True).start()
+    wrong = {**data, "section": {"s": {"area": 1e-4, "material": "m", "shape": "tube"}}}
+    with pytest.raises(InputError, match=r'shape = "tube" and thickness \[m\] need each other'):
+        Case.from_dict(wrong)
+    wrong["section"]["s"] |= {"thickness": 6e-3}
+    with pytest.raises(InputError, match=r"too much for a tube"):
+        Case.from_dict(wrong)

@@ -18,7 +18,7 @@ import numpy as np
 
 from ..errors import InputError
 from .kernels import COLLAPSED_STRETCH, no_variables
-from .loads import Table
+from .time_tables import Table
 from .strain import MEASURES
 
 if TYPE_CHECKING:

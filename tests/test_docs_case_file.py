@@ -9,7 +9,7 @@ import pytest
 from mpi4py import MPI
 
 from pfem_petsc import Simulation, open_result
-from pfem_petsc.case import settings, tables
+from pfem_petsc.case import settings, table_files, tables
 from pfem_petsc.case.materials import LAWS
 from pfem_petsc.case.schema import Case
 from pfem_petsc.case.stages import ANALYSES, TABLES
@@ -21,7 +21,8 @@ TEXT = (DOCS / "case_file.md").read_text()
 MODELS = [
     *(tables.MeshKeys, tables.NodeSet, tables.Section, tables.Initial, tables.Support, tables.Load),
     *(
-        tables.Gravity,
+        tables.LoadFile,
+        tables.VaryingGravity,
         tables.Temperature,
         settings.TimeKeys,
         settings.StaticKeys,
@@ -43,6 +44,10 @@ def named(text: str) -> set[str]:
 @pytest.mark.parametrize("model", MODELS, ids=lambda model: f"{model.__module__}.{model.__name__}")
 def test_every_key_is_named(model):
     assert set(model.model_fields) <= named(TEXT)
+
+
+def test_every_key_of_files_is_named():
+    assert set(table_files.TableFile.model_fields) <= named((DOCS / "loads.md").read_text())
 
 
 def test_every_key_of_walls_is_named():

@@ -16,7 +16,7 @@ from ..registry import nearest
 from .base import StrictModel
 from .toml import value_text
 
-__all__ = ["Path", "Problems", "key_text"]
+__all__ = ["Path", "Problems", "key_text", "table_list"]
 
 Path = tuple[str | int, ...]
 """Path of a value in the case: keys of tables and indices of lists."""
@@ -211,3 +211,13 @@ def _expected(kind: str, value: Any, context: Mapping[str, Any], field: FieldInf
     if kind in ("tuple_type", "list_type"):
         return f"expected {_shape(field)}" + (", in SI units without quotes and unit" if isinstance(value, str) else "")
     return f"refused ({kind.replace('_', ' ')})"
+
+
+def table_list(data: Any, path: Path, problems: Problems) -> Sequence[Any]:
+    """Return the items of an optional list of tables."""
+    if data is None:
+        return ()
+    if not isinstance(data, list | tuple):
+        problems.add(path, f"expected a list of tables, each under a heading [[{'.'.join(map(str, path))}]]", data)
+        return ()
+    return data

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -13,10 +13,12 @@ from ..registry import choices, lookup, nearest
 from . import settings as s
 from . import tables as t
 from .base import StrictModel
+from .load_reading import read_gravity, read_loads, read_tabled
 from .materials import read_materials
 from .problems import Path as KeyPath
-from .problems import Problems
-from .record import read_record
+from .problems import Problems, table_list
+from .table_files import TableFiles
+from .toml import cut_rows, put_rows_back
 
 __all__ = ["KEYS", "parse_toml", "read_tables"]
 
@@ -48,11 +50,16 @@ def parse_toml(text: str, source: str) -> dict[str, Any]:
     InputError
         On a syntax error; the message names line and column.
     """
+    short, rows = cut_rows(text)
+    if rows:
+        try:
+            data = tomllib.loads(_checked_keys(short, source))
+        except ValueError:
+            data = {}  # the whole text is read below, for the message
+        if put_rows_back(data, rows):
+            return data
     try:
-        if (found := _LONG_KEY.search(text)) is not None:
-            line = text.count("\n", 0, found.start()) + 1
-            raise InputError(f"{source}: line {line}: this is not a case: a key of more than {DEEPEST} parts")
-        return tomllib.loads(text)
+        return tomllib.loads(_checked_keys(text, source))
     except tomllib.TOMLDecodeError as error:
         raise InputError(f"{source}: this is not valid TOML: {error}") from error
     except ValueError as error:
@@ -60,6 +67,13 @@ def parse_toml(text: str, source: str) -> dict[str, Any]:
         raise InputError(f"{source}: this is not a case: it has an integer of more than 4,300 digits") from error
     except RecursionError as error:
         raise InputError(f"{source}: this is not a case: its lists or tables are nested too deep") from error
+
+
+def _checked_keys(text: str, source: str) -> str:
+    if (found := _LONG_KEY.search(text)) is not None:
+        line = text.count("\n", 0, found.start()) + 1
+        raise InputError(f"{source}: line {line}: this is not a case: a key of more than {DEEPEST} parts")
+    return text
 
 
 def read_tables(data: Mapping[str, Any], folder: Path, problems: Problems) -> dict[str, Any]:
@@ -78,6 +92,7 @@ def read_tables(data: Mapping[str, Any], folder: Path, problems: Problems) -> di
     for key in data:
         if key not in KEYS:
             problems.add((key,), f"unknown key{nearest(key, KEYS)}")
+    files = TableFiles(folder)
     title = data.get("title")
     if title is not None and not isinstance(title, str):
         problems.add(("title",), "expected a text in quotes", title)
@@ -88,11 +103,11 @@ def read_tables(data: Mapping[str, Any], folder: Path, problems: Problems) -> di
         "material": read_materials(data, problems),
         "section": _named(t.Section, data, "section", problems),
         "initial": _initial(data, problems),
-        "support": _supports(data.get("support"), folder, problems),
-        "load": _listed(t.Load, data.get("load"), ("load",), problems),
-        "gravity": problems.read(t.Gravity, data["gravity"], ("gravity",)) if "gravity" in data else None,
-        "temperature": _listed(t.Temperature, data.get("temperature"), ("temperature",), problems),
-        "wall": _kinds(data.get("wall"), "wall", "type", WALLS, "a wall of type", problems),
+        "support": read_tabled(t.Support, data, "support", files, problems, ("motion", "acceleration"), ("velocity",)),
+        "load": read_loads(data, folder, files, problems),
+        "gravity": read_gravity(data["gravity"], files, problems) if "gravity" in data else None,
+        "temperature": read_tabled(t.Temperature, data, "temperature", files, problems, ("table",), ("value",)),
+        "wall": _kinds(data.get("wall"), "wall", "type", WALLS, "a wall of type", problems, files),
         "contact_pair": _pairs(data.get("contact_pair"), problems),
         "constraint": _kinds(
             data.get("constraint"), "constraint", "kind", CONSTRAINTS, "a constraint of kind", problems
@@ -104,18 +119,8 @@ def read_tables(data: Mapping[str, Any], folder: Path, problems: Problems) -> di
     }
 
 
-def _rows(data: Any, path: KeyPath, problems: Problems) -> Sequence[Any]:
-    """Return the items of an optional list of tables."""
-    if data is None:
-        return ()
-    if not isinstance(data, list | tuple):
-        problems.add(path, f"expected a list of tables, each under a heading [[{'.'.join(map(str, path))}]]", data)
-        return ()
-    return data
-
-
 def _listed(model: type[M], data: Any, path: KeyPath, problems: Problems) -> list[M]:
-    read = [problems.read(model, row, (*path, i)) for i, row in enumerate(_rows(data, path, problems))]
+    read = [problems.read(model, row, (*path, i)) for i, row in enumerate(table_list(data, path, problems))]
     return [row for row in read if row is not None]
 
 
@@ -195,7 +200,7 @@ def _initial(data: Mapping[str, Any], problems: Problems) -> list[t.Initial]:
         problems.add(("initial", "node_set"), "a node set's own velocity goes under a heading [[initial.on]]")
     elif everywhere:
         entries.append(problems.read(t.Initial, everywhere, ("initial",), known=["on"]))
-    for i, row in enumerate(_rows(table.get("on"), ("initial", "on"), problems)):
+    for i, row in enumerate(table_list(table.get("on"), ("initial", "on"), problems)):
         entry = problems.read(t.Initial, row, ("initial", "on", i))
         if entry is not None and entry.node_set is None:
             problems.add(("initial", "on", i, "node_set"), "this key is missing: name of a node set")
@@ -203,11 +208,20 @@ def _initial(data: Mapping[str, Any], problems: Problems) -> list[t.Initial]:
     return [entry for entry in entries if entry is not None]
 
 
-def _kinds(data: Any, table: str, key: str, package: str, what: str, problems: Problems) -> list[StrictModel]:
-    """Read a list of tables in which one key names the module that defines the other keys."""
+def _kinds(
+    data: Any, table: str, key: str, package: str, what: str, problems: Problems, files: TableFiles | None = None
+) -> list[StrictModel]:
+    """Read a list of tables in which one key names the module that defines the other keys.
+
+    With ``files`` their ``motion`` may be given by a file.
+    """
     found = []
-    for i, row in enumerate(_rows(data, (table,), problems)):
+    for i, row in enumerate(table_list(data, (table,), problems)):
         path: KeyPath = (table, i)
+        if files is not None:
+            row = files.resolved(row, path, problems, ("motion",), ("velocity", "mass"))
+            if row is None:
+                continue
         if not isinstance(row, Mapping):
             problems.add(path, "expected a table", row)
             continue
@@ -222,29 +236,8 @@ def _kinds(data: Any, table: str, key: str, package: str, what: str, problems: P
     return [each for each in found if each is not None]
 
 
-def _supports(data: Any, folder: Path, problems: Problems) -> list[t.Support]:
-    """Read supports; an ``acceleration_file`` is replaced by its rows, so that a resolved case is self-contained."""
-    supports = []
-    for i, row in enumerate(_rows(data, ("support",), problems)):
-        path: KeyPath = ("support", i)
-        name = row.get("acceleration_file") if isinstance(row, Mapping) else None
-        if isinstance(name, str) and name:
-            taken = [key for key in ("motion", "velocity", "acceleration") if key in row]
-            if taken:
-                problems.add(path, f"expected at most one of the keys acceleration_file, {', '.join(taken)}")
-                continue
-            try:
-                rows = read_record(folder / name)
-            except InputError as error:
-                problems.add((*path, "acceleration_file"), str(error), name)
-                continue
-            row = {key: value for key, value in row.items() if key != "acceleration_file"} | {"acceleration": rows}
-        supports.append(problems.read(t.Support, row, path))
-    return [support for support in supports if support is not None]
-
-
 def _pairs(data: Any, problems: Problems) -> list[t.ContactPair]:
-    rows = _rows(data, ("contact_pair",), problems)
+    rows = table_list(data, ("contact_pair",), problems)
     named = [{"name": f"pair{i + 1}", **row} if isinstance(row, Mapping) else row for i, row in enumerate(rows)]
     return _listed(t.ContactPair, named, ("contact_pair",), problems)
 

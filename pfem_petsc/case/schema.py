@@ -152,7 +152,8 @@ class Case:
                 "Case.from_toml its text"
             )
         try:
-            data, overrides = plain(dict(data)), tuple(overrides)
+            overrides = tuple(overrides)
+            data = plain(dict(data), copied=bool(overrides))
         except RecursionError as error:
             raise InputError(f"{source}: this is not a case: its lists or tables are nested too deep") from error
         problems = Problems(source, apply_overrides(data, overrides))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -20,12 +19,15 @@ from .base import (
     listed,
     number_or_rows,
 )
+from .load_tables import Gravity, Load, LoadFile, Temperature, VaryingGravity
+from .rows import FileName, Table4, increasing
 
 __all__ = [
     "ContactPair",
     "Gravity",
     "Initial",
     "Load",
+    "LoadFile",
     "Mesh",
     "MeshKeys",
     "NodeSet",
@@ -33,28 +35,14 @@ __all__ = [
     "Section",
     "Support",
     "Temperature",
+    "VaryingGravity",
 ]
 
-Row2 = Annotated[tuple[Finite, Finite], listed]
-Row4 = Annotated[tuple[Finite, Finite, Finite, Finite], listed]
-Table2 = Annotated[tuple[Row2, ...], listed]
-Table4 = Annotated[tuple[Row4, ...], listed]
 Indices = Annotated[tuple[NonNegativeInt, ...], listed]
 
 
 PRESTRESSES = ("pretension", "prestress", "rest_length")
 """Keys of a section that prescribe rest lengths."""
-
-
-def _increasing(rows: Sequence[Sequence[float]] | None) -> None:
-    """Refuse a time table that is empty or whose times do not increase."""
-    if rows is None:
-        return
-    if not rows:
-        raise ValueError("expected at least one row")
-    for k in range(1, len(rows)):
-        if rows[k][0] <= rows[k - 1][0]:
-            raise ValueError(f"times must increase, but row {k} has t = {rows[k][0]!r} after {rows[k - 1][0]!r}")
 
 
 class MeshKeys(StrictModel):
@@ -153,7 +141,7 @@ class Section(StrictModel):
             return None
         value = number_or_rows(value)
         rows = ((0.0, value),) if isinstance(value, float) else value
-        _increasing(rows)
+        increasing(rows)
         if info.field_name == "rest_length" and not all(1e-3 < row[1] < 1e3 for row in rows):
             raise ValueError("expected a factor on the length in the mesh, like 0.99, or rows [t, factor]")
         return value
@@ -216,8 +204,10 @@ class Support(StrictModel):
     """constant velocity of the fixed components [m/s]"""
     acceleration: Table4 | None = None
     """rows [t, ax, ay, az] [s, m/s2]: linear between rows, zero outside; the fixed components start from rest"""
-    acceleration_file: Annotated[str, Field(min_length=1)] | None = None
-    """the same as a CSV file with columns t, ax, ay, az, relative to the case file"""
+    motion_file: FileName | None = None
+    """the rows of ``motion`` from the columns of a CSV or NPZ file: its name, or a table of :class:`TableFile`"""
+    acceleration_file: FileName | None = None
+    """the rows of ``acceleration`` from a file in the same way"""
     interpolation: Literal["smooth", "linear"] = "smooth"
     """interpolation of ``motion`` between its rows: a cubic spline, or straight lines with velocity jumps at rows"""
 
@@ -231,7 +221,7 @@ class Support(StrictModel):
     @field_validator("motion", "acceleration")
     @classmethod
     def _motion_times(cls, rows: tuple[Any, ...] | None) -> tuple[Any, ...] | None:
-        _increasing(rows)
+        increasing(rows)
         return rows
 
     @model_validator(mode="after")
@@ -273,50 +263,3 @@ class ContactPair(StrictModel):
         if not 1e-100 < max(map(abs, value)) < 1e100:
             raise ValueError("has components out of range (1e-100 to 1e100); give a vector of about length 1")
         return value
-
-
-class Load(StrictModel):
-    """Force on each node of a node set."""
-
-    node_set: str
-    """name of a node set"""
-    force: Vector3
-    """force on each node of the set [N]"""
-    table: Table2 | None = None
-    """rows [t, factor] [s, -]: linear between rows, constant outside; default: factor 1"""
-
-    @field_validator("table")
-    @classmethod
-    def _table_times(cls, table: tuple[Any, ...] | None) -> tuple[Any, ...] | None:
-        _increasing(table)
-        return table
-
-
-class Gravity(StrictModel):
-    """Uniform acceleration of every mass."""
-
-    acceleration: Vector3
-    """acceleration [m/s2]"""
-
-
-class Temperature(StrictModel):
-    """Temperature above reference of bars."""
-
-    bars: str | None = None
-    """bar group of the mesh; default: all bars"""
-    value: Finite | None = None
-    """temperature above reference [K]"""
-    table: Table2 | None = None
-    """rows [t, temperature above reference] [s, K]: linear between rows, constant outside"""
-
-    @field_validator("table")
-    @classmethod
-    def _table_times(cls, table: tuple[Any, ...] | None) -> tuple[Any, ...] | None:
-        _increasing(table)
-        return table
-
-    @model_validator(mode="after")
-    def _exactly_one(self) -> Temperature:
-        if (self.value is None) == (self.table is None):
-            raise ValueError("expected exactly one of the keys value, table")
-        return self

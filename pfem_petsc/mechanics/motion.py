@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from ..case.tables import Support
     from ..contact.walls.base import WallKeys
 
-__all__ = ["Motion", "motion_of"]
+__all__ = ["Motion", "motion_of", "spline_slopes"]
 
 _ROUNDING = 1e-14  # relative tolerance of times: a step reaches a row up to rounding
 
@@ -103,7 +103,7 @@ def _smooth(times: np.ndarray, values: np.ndarray) -> Motion:
     coefficients[:, 0] = values
     width = np.diff(times)[:, None]
     if len(times) > 1:
-        slopes = np.column_stack([_slopes(times, column) for column in values.T])
+        slopes = np.column_stack([spline_slopes(times, column) for column in values.T])
         rate = np.diff(values, axis=0) / width
         coefficients[:-1, 1] = slopes[:-1]
         coefficients[:-1, 2] = (3.0 * rate - 2.0 * slopes[:-1] - slopes[1:]) / width
@@ -111,7 +111,7 @@ def _smooth(times: np.ndarray, values: np.ndarray) -> Motion:
     return Motion(times, coefficients)
 
 
-def _slopes(times: np.ndarray, values: np.ndarray) -> np.ndarray:
+def spline_slopes(times: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Return the slopes (n,) of the cubic spline through values (n,), zero at both ends and at intervals of rest."""
     width = np.diff(times)
     rate = np.diff(values) / width

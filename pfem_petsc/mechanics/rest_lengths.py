@@ -18,8 +18,8 @@ import numpy as np
 
 from ..errors import InputError
 from .kernels import COLLAPSED_STRETCH, no_variables
-from .loads import Table
 from .strain import MEASURES
+from .time_tables import Table
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..mesh.node_sets import group_hint
-from .loads import Table
+from .time_tables import Table
 
 if TYPE_CHECKING:
     from ..case.schema import Case
@@ -42,7 +42,8 @@ class Temperatures:
                         f"{case.source}: temperature[{index}].bars = {entry.bars!r}: no such group of bars{hint}"
                     )
                 members = mesh.bar_groups[entry.bars]
-            self._entries.append((members, entry.value, Table(entry.table) if entry.table is not None else None))
+            table = Table(entry.table, entry.interpolation == "smooth") if entry.table is not None else None
+            self._entries.append((members, entry.value, table))
         self._holds = case.holds("temperature")
         if self._holds:
             self.varying = False

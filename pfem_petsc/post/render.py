@@ -231,7 +231,7 @@ class _Film:
     def _upward(self) -> tuple[float, float, float]:
         gravity = getattr(self.result.case, "gravity", None)
         if gravity is not None:
-            pull = np.asarray(gravity.acceleration, dtype=float)
+            pull = np.asarray(gravity.mean, dtype=float)
             axis = int(np.argmax(np.abs(pull)))
             if np.count_nonzero(pull) == 1 and axis == 1:
                 return (0.0, -float(np.sign(pull[1])), 0.0)

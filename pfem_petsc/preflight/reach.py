@@ -35,7 +35,7 @@ def bars_larger_than_walls(case: Case, model: Model) -> list[str]:
     length = np.linalg.norm(ends - starts, axis=1)
     v = model.initial_velocity()
     drift = model.comm.allreduce(model.inertia.mass @ v) / model.total_mass
-    gravity = np.zeros(3) if case.gravity is None else np.array(case.gravity.acceleration)
+    gravity = np.zeros(3) if case.gravity is None else np.array(case.gravity.mean)
     times = np.linspace(0.0, case.end, _SAMPLES)
     told = []
     for k in small:

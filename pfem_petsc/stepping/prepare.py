@@ -262,6 +262,11 @@ def _check_walls(model: Model, plan: Plan, treatment: type[Treatment] | None) ->
                 f'{model.case.source}: wall.mass needs contact.treatment = "scheme": other '
                 "treatments change velocities by jumps"
             )
+        if model.external.gravity_varies and any(wall.gravity for wall in walls):
+            raise InputError(
+                f"{model.case.source}: gravity.acceleration: walls with gravity = true need a constant gravity, "
+                "not rows over time"
+            )
         model.contact.motion.bodies = FreeWalls(walls, plan.scheme, model.comm, tuple(model.external.gravity))
     model.links.check(model, plan.linear is None)
     for k, name in enumerate(model.contact.names):

@@ -58,6 +58,14 @@ def slab_from(
     )
 
 
+def every_node(model, values: np.ndarray) -> np.ndarray:
+    """Return values of owned nodes (owned, 3) for all nodes in the numbering of the mesh, on every rank."""
+    mesh = model.mesh
+    found = np.zeros((mesh.n_nodes, 3))
+    found[mesh.node_ids[: mesh.n_owned]] = values
+    return model.comm.allreduce(found)
+
+
 def stiffness_modes(points: np.ndarray, bars: np.ndarray) -> int:
     """Return the number of motions that stretch no bar: 6 for a braced, unsupported space truss."""
     direction = points[bars[:, 1]] - points[bars[:, 0]]

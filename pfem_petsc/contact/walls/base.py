@@ -26,6 +26,8 @@ class WallKeys(WallParameters):
     """true: gravity acts on a wall with mass, as on the truss"""
     motion: Annotated[tuple[Row4, ...], listed] | None = None
     """rows [t, dx, dy, dz]: displacement of the wall [s, m], at rest before the first and after the last"""
+    motion_file: Annotated[str, Field(min_length=1)] | None = None
+    """the rows of ``motion`` from the columns of a CSV or NPZ file: its name, or a table"""
     interpolation: Literal["smooth", "linear"] = "smooth"
     """interpolation of ``motion`` between its rows: a cubic spline, or straight lines with velocity jumps at rows"""
     adjust: bool = False

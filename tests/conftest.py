@@ -99,8 +99,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 def thinned(items: list[pytest.Item], ranks: int) -> list[pytest.Item]:
     """Return all tests except the thorough ones, with some of their sets of parameters.
 
-    Tests with more than three, two or one sets run with every third, fifth or eighth of them on 1, 2 and more ranks, slow
-    tests with a quarter of these. The selection depends on the number of ranks.
+    Tests with more than three, two or one sets run with every third, fifth or eighth of them on 1, 2 and more ranks,
+    slow tests with a quarter of these. The selection depends on the number of ranks.
     """
     sets: dict[tuple[Path, str], list[pytest.Item]] = {}
     for item in items:

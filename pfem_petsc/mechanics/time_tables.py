@@ -120,11 +120,17 @@ def grouped(tables: Sequence[tuple[np.ndarray, bool]]) -> tuple[list[Group], np.
 
 
 class Table:
-    """A function of time by rows (t, value, ...)."""
+    """A function of time by rows (t, value, ...).
+
+    Attributes
+    ----------
+    values : (n, k) of its rows
+    """
 
     def __init__(self, rows: Sequence[Sequence[float]], smooth: bool = False) -> None:
         rows = np.array(rows, dtype=np.float64)
-        self._tables = TimeTables([Group(rows[:, 0].copy(), rows[:, 1:].copy(), smooth)])
+        self.values = rows[:, 1:].copy()
+        self._tables = TimeTables([Group(rows[:, 0].copy(), self.values, smooth)])
 
     def __call__(self, time: float) -> np.ndarray:
         """Return the values at a time, one per column."""

@@ -15,6 +15,7 @@ from .case.schema import Case
 from .contact.start import check_start
 from .errors import EarlyStop, InputError, PfemError
 from .integrators.base import State
+from .mechanics.state_forces import ForceState
 from .output.lock import FolderLock
 from .parallel.agreement import on_root
 from .parallel.petsc_log import instrument, staged
@@ -210,6 +211,29 @@ class Simulation:
         if not isinstance(every, int | np.integer) or isinstance(every, bool) or every < 1:
             raise InputError(f"on_step: every = {every!r}: give a positive whole number of steps")
         self.outputs.call(function, int(every))
+
+    def external_force(self, function: Callable[[float, ForceState], Any]) -> None:
+        """Register a function that gives external forces; call it on all ranks, before the run.
+
+        It is called on each rank as ``function(t, state)`` with a time [s] and a
+        :class:`~pfem_petsc.mechanics.state_forces.ForceState`, and returns forces (owned, 3) [N] on this rank's nodes,
+        which are added to the loads. ``state`` has their positions, velocities and mesh numbers, predicted for this
+        time from the last state. The function may be called several times in a step, and again with a bisected one, so
+        that it must depend on its arguments alone. Its work is part of ``external_work``. It acts where motion is
+        computed: in a case with stages t is counted from the start of the stage, and static stages are without it.
+        Functions are not in checkpoints: give them again before a restarted run.
+
+        Raises
+        ------
+        InputError
+            If the run has started, or computes no motion.
+        """
+        self._usable()
+        if not callable(function):
+            raise InputError(f"external_force: {function!r:.80} is not a function of time and state")
+        if self._started:
+            raise InputError("external_force: the run has started; register forces before the first step")
+        self._stages.call(function)
 
     @staged
     def start(self) -> None:

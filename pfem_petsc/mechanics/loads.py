@@ -1,13 +1,15 @@
-"""External forces: gravity, and nodal loads multiplied by time tables."""
+"""External forces: gravity, nodal loads multiplied by time tables, and forces that depend on the motion."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..case.tables import VaryingGravity
 from .nodal_loads import NodalLoads
+from .state_forces import ForceState, FunctionForce, StateForce
 from .time_tables import Table
 
 if TYPE_CHECKING:
@@ -24,15 +26,18 @@ class ExternalForce:
     ----------
     ramped : whether gravity and loads without a table are multiplied by the time, which is a load factor then
     active : whether there are any forces (on any rank, at any time)
-    steady : whether the forces are constant
     gravity : (3,) constant gravity [m/s2], zero if it varies
     held : (owned, 3) forces of loads at the start of a stage [N], None for none; held constant where the stage gives no
         loads, else taken away, at once over time and in proportion with a load factor
     held_gravity : (3,) the same of gravity [m/s2]
+    state_forces : that depend on the motion, which :meth:`follow` gives
     """
 
     def __init__(self, case: Case, nodes: dict[str, np.ndarray], inertia: Inertia) -> None:
         self.inertia = inertia
+        self._nodes = nodes
+        self.state_forces: list[StateForce] = []
+        self._state: ForceState | None = None
         self._keeps = case.holds("load"), case.holds("gravity")
         self._loads = None if self._keeps[0] else NodalLoads(case, nodes, inertia.mesh)
         varies = isinstance(case.gravity, VaryingGravity)
@@ -46,7 +51,32 @@ class ExternalForce:
         self.held: np.ndarray | None = None
         self.held_gravity = np.zeros(3)
         changes = (self._loads is not None and not self._loads.steady) or (varies and not self._keeps[1])
-        self.steady = not self.ramped and not changes
+        self._steady = not self.ramped and not changes
+
+    @property
+    def steady(self) -> bool:
+        """Whether the forces are constant."""
+        return self._steady and not self.state_forces
+
+    def call(self, function: Callable[[float, ForceState], Any]) -> None:
+        """Add the forces that a function returns."""
+        self.state_forces.append(FunctionForce(function, self.inertia.mesh))
+        self.active = True
+
+    @property
+    def functions(self) -> int:
+        """Number of functions that return forces."""
+        return sum(isinstance(force, FunctionForce) for force in self.state_forces)
+
+    def follow(self, position: np.ndarray, v: np.ndarray) -> None:
+        """Take positions [m] and velocities [m/s] (owned, 3), at which forces depend on the motion from here on."""
+        mesh = self.inertia.mesh
+        self._state = ForceState(position, v, mesh.node_ids[: mesh.n_owned], self._nodes)
+
+    @property
+    def failure(self) -> str | None:
+        """Why a force could not be evaluated on this rank, None if all could."""
+        return next((force.failure for force in self.state_forces if force.failure is not None), None)
 
     @property
     def gravity_varies(self) -> bool:
@@ -56,7 +86,10 @@ class ExternalForce:
     def at(self, time: float, out: np.ndarray) -> np.ndarray:
         """``out`` (owned, 3) [N] at a time [s], or at a load factor."""
         np.multiply(self.inertia.mass[:, None], self.gravity_at(time), out=out)
-        return self._add_loads(time, out)
+        self._add_loads(time, out)
+        for force in self.state_forces:
+            force.add(time, self._state, out)
+        return out
 
     def gravity_at(self, time: float) -> np.ndarray:
         """Acceleration (3,) [m/s2] at a time [s], or at a load factor."""

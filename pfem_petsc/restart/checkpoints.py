@@ -85,6 +85,7 @@ class Checkpoints:
             "case": self.case.to_dict(),
             "plan": self.plan.record(),
             "mesh_mark": self._mark,
+            "external_functions": self.state.model.external.functions,
         }
         write_checkpoint(self.path, self.comm, self.state.arrays(), scalars, attributes)
         self.last_step = scalars["step"]

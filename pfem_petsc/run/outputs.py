@@ -127,6 +127,12 @@ class Outputs:
             changes = f"; changed: {'; '.join(restart.changed)}" if restart.changed else ""
             place = f"step {start[0]}, {plan.axis.place(start[1])}"
             self.progress.message(f"restart from {restart.path}: {place}{changes}")
+            before, now = int(restart.attributes.get("external_functions", 0)), model.external.functions
+            if before != now:
+                self.progress.warning(
+                    f"{restart.path}: the run had {before} function{'s' * (before != 1)} for forces, and this one has "
+                    f"{now}: functions are not in checkpoints; give them by Simulation.external_force before the run"
+                )
         if restart is not None:
             remove_modes(folder, model.comm)
         events = self._stages.events

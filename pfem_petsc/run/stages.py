@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -110,6 +110,7 @@ class Stages:
     ----------
     analysis : of the present stage
     plan : of the whole run
+    functions : that give forces in the present stage and in those after it, see :meth:`call`
     columns : of the history, None for a case without stages
     fields : names of the fields to write (of nodes, of bars), None for a case without stages
     events : columns of events
@@ -123,6 +124,7 @@ class Stages:
     def __init__(self, case: Case, comm: MPI.Comm, recorded: Mapping[str, Any] | None, number: int = 0) -> None:
         self.case, self.comm = case, comm
         self._cases = case.stages
+        self.functions: list[Callable[..., Any]] = []
         self.analysis: Analysis
         self.columns: StageColumns | None = None
         self.fields: tuple[list[str], list[str]] | None = None
@@ -170,6 +172,23 @@ class Stages:
         """Whether no stage comes after the present one."""
         return self.number == len(self._cases) - 1
 
+    def call(self, function: Callable[..., Any]) -> None:
+        """Add the forces that a function returns in stages that compute motion.
+
+        Raises
+        ------
+        InputError
+            If there is no such stage.
+        """
+        if not any(stage.time is not None for stage in self._cases):
+            raise InputError(
+                f"{self.case.source}: external_force: forces by a function act in motion, and this case has no [time]; "
+                "use [[load]]"
+            )
+        self.functions.append(function)
+        if self.model.case.time is not None:
+            self.model.external.call(function)
+
     def advance(self) -> tuple[float, np.ndarray]:
         """Begin the next stage where the present one has ended. Collective.
 
@@ -189,6 +208,8 @@ class Stages:
         try:
             model = Model(stage, self.comm, old.model.mesh)
             model.begin_stage(end_of_stage(old.stepper))
+            for function in self.functions if stage.time is not None else ():
+                model.external.call(function)
             check_start(model.contact, old.state.position, model.length)
             analysis = make_analysis(model, self.plan.plans[number].record())
         except InputError as error:

@@ -26,7 +26,7 @@ def law_name(keys: Mapping[str, Any]) -> Any:
 
 def law_of(material: StrictModel) -> Any:
     """Return the :class:`~pfem_petsc.mechanics.materials.base.Law` of a material of a case."""
-    return lookup(LAWS, law_name(dict(material)), "material.law").LAW
+    return material.choose(lookup(LAWS, law_name(dict(material)), "material.law").LAW)
 
 
 def internal_variables(materials: Mapping[str, StrictModel]) -> dict[str, str]:
@@ -58,15 +58,18 @@ def _read(table: Any, name: str, problems: Problems) -> StrictModel | None:
             # the other keys are validated nevertheless
             law, table = "elastoplastic", {**table, "yield_stress": 1.0}
     try:
-        model = lookup(LAWS, law, "").Parameters
+        module = lookup(LAWS, law, "")
     except InputError as error:
         problems.add(
             (*path, "law"), str(error).partition(": ")[2].replace(f"unknown value {law!r}", "unknown value"), law
         )
         return None
-    material = problems.read(model, table, path, taker=f"the law {law}", siblings=_siblings)
+    material = problems.read(module.Parameters, table, path, taker=f"the law {law}", siblings=_siblings)
     if material is not None and hardening:
         problems.add(path, f"{hardening[0]} = {table[hardening[0]]!r} needs a yield_stress [Pa]")
+        return None
+    if material is not None and material.softening is not None and module.LAW.softening is None:
+        problems.add((*path, "softening"), f"the law {law} does not soften by a table; remove the key")
         return None
     return material
 

@@ -119,7 +119,8 @@ class Bars:
     rest_at_start : (b,) the same at the start of the step, or (0,) if they are constant
     heat : (2, b) thermal strains and temperatures [K], or (2, 0) without temperatures
     heat_at_start : the same at the start of the step, if they vary
-    step : time from the start of the step to the evaluated positions [s]; 0 at the start of a run
+    step : time from the start of the step to the evaluated positions [s]; 0 at the start of a run, infinite in static
+        analyses
     internal : name and unit of the internal variables of all laws of the case
     kept_names : names of all data that laws keep from step to step, the same on all ranks
     blocks : bars by section
@@ -159,8 +160,8 @@ class Bars:
                     thermal_expansion=material.thermal_expansion,
                     law=law,
                     measure=measure,
-                    parameters=material.pack(),
-                    modulus=material.largest_modulus(),
+                    parameters=material.numbers(),
+                    modulus=material.upper_modulus(),
                     history=np.zeros((len(law.rows) + len(law.bar_data), block.stop - block.start)),
                     sweep=make_sweep(mesh.bars, block.start, block.counted, block.stop),
                     kernels=make_kernels(law, measure),

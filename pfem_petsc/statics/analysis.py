@@ -129,7 +129,8 @@ def _check(model: Model) -> None:
                 "a motion"
             )
     for name, material in case.material.items():
-        if law_of(material).rate:
+        law = law_of(material)
+        if law.rate and not law.static_limit:
             raise InputError(
                 f'{source}: material.{name}.law = "{law_name(dict(material))}" depends on the rate of strain, and a '
                 "static analysis has no time; take another law"

@@ -61,6 +61,7 @@ class StaticStepper(ImplicitStepper):
         model.inertia.damp(viscosity)  # that of materials has no meaning without time
         lack = viscosity / model.inertia.mass if stabilise else None
         super().__init__(model, Equilibrium(lack), limits.step, choice)
+        model.bars.step = np.inf  # laws that depend on the rate are at their limit of slow loading
         self.prescribed = NoRates(self)
         self.stabilise, self.dissipated = stabilise, 0.0
         self.limits, self.increment, self.end = limits, limits.step, limits.end
@@ -84,7 +85,9 @@ class StaticStepper(ImplicitStepper):
     def start(self) -> None:
         """Initialise the state at load factor zero; the first increment is equilibrated. Collective."""
         state, model = self.state, self.model
+        model.bars.step = 0.0
         self.start_without_motion()
+        model.bars.step = np.inf
         # the force that the state lacks to equilibrium (heat, a stage before) does work in the first increment, which
         # the ledger books as that of inertia
         lack = state.external - state.f[: model.mesh.n_owned] + state.contact + state.support

@@ -5,7 +5,8 @@ its rest volume from V0 to V1, the energy W per volume, dissipation included, ch
 :mod:`~pfem_petsc.mechanics.conserving`, so that of the bar by V S (e1 - e0) + W (V1 - V0), V and W being means of
 both ends. Of this -V S (change of thermal strain) is the work of heating, V S (change of strain with the mean rest
 length) that of the bar's ends, and the remainder the work of the changing rest length: that of what pulls the bar
-tight, less the energy of the material that it takes out.
+tight, less the energy of the material that it takes out. Where a temperature changes the modulus of the elastic strain
+from E0 to E1, s0 s1 (1/E0 - 1/E1)/2 per volume is work of heating too.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ class BarChanges:
         bars, x = self.model.bars, self.stepper.state.x
         self._stress = bars.fields(x)["stress"]
         self._variables = [block.history[: len(block.law.internal)].copy() for block in bars.blocks]
-        self._thermal = bars.heat[0].copy()
+        self._thermal, self._warmth = bars.heat[0].copy(), bars.heat[1].copy()
         if self.model.rest_lengths.varying:
             self._rest, self._lengths, self._densities = bars.rest.copy(), bars.lengths(x), bars.densities(x)
 
@@ -66,6 +67,12 @@ class BarChanges:
             if model.temperatures.varying:
                 change = self._thermal[part] - before["_thermal"][part]
                 heating -= float((block.area * rest * mean * change).sum())
+                if block.law.modulus is not None:
+                    first, last = (
+                        block.law.modulus(block.parameters, at[part]) for at in (before["_warmth"], self._warmth)
+                    )
+                    energy = 0.5 * before["_stress"][part] * self._stress[part] * (1.0 / first - 1.0 / last)
+                    heating += float((block.area * rest * energy).sum())
         return heating, stressing
 
     def _mean_stress(self, before: dict, k: int, block: BarBlock) -> np.ndarray:

@@ -93,7 +93,7 @@ class Model:
             squares = comm.allreduce(float((self.nodal_stiffness**2).sum()))
         self.rounding = 4.0 * np.finfo(float).eps * self.reach * np.sqrt(squares)
         self.total_mass = comm.allreduce(float(self.inertia.mass.sum()))
-        speeds = [np.sqrt(m.largest_modulus() / m.density) for m in case.material.values()]
+        speeds = [np.sqrt(m.upper_modulus() / m.density) for m in case.material.values()]
         self.wave_speed = max(speeds)
 
     def _load_mesh(self) -> DistributedMesh:

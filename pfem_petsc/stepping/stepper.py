@@ -245,7 +245,8 @@ class Stepper(ABC):
             self.fault = SimulationFailure(crossing) if crossing else None
 
     def _arrive(self, end: float) -> None:
-        self.model.bars.step = self.part
+        if self.scheme.inertial:  # static steps are infinitely long for material laws
+            self.model.bars.step = self.part
         self.state.time = end
         if self.model.bars_vary:
             self.model.change_bars(end)
@@ -258,7 +259,8 @@ class Stepper(ABC):
             self.prescribed.prescribe(self.balance)
         self.model.contact.motion.begin(state.time, self.part)
         state.external = self._load(self.balance)
-        self.model.bars.step = self.balance.time - state.time
+        if self.scheme.inertial:
+            self.model.bars.step = self.balance.time - state.time
         self.solution = self.solve(self.balance)
         fresh = self.model.contact.record(self.solution.walls, self.balance.time, self.part)
         if not self.scheme.solves_next_position:

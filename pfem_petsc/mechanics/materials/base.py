@@ -9,12 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
+from pydantic import Field, field_validator
 
-from ...case.base import Finite, NonNegativeFloat, PositiveFloat, StrictModel
+from ...case.base import Finite, NonNegativeFloat, PositiveFloat, StrictModel, listed
 from ...energies import BAR_ENERGIES
+from ._softening import Softening, softened
 
 __all__ = ["BarShapes", "Law", "MaterialKeys", "UnsuitableBarError"]
 
@@ -41,6 +43,9 @@ class UnsuitableBarError(ValueError):
         self.bar, self.reason = int(bar), reason
 
 
+SofteningRow = Annotated[tuple[Finite, PositiveFloat, PositiveFloat], listed]
+
+
 class MaterialKeys(StrictModel):
     """Keys that all materials share."""
 
@@ -56,6 +61,17 @@ class MaterialKeys(StrictModel):
     """damping c_m proportional to mass density [kg/(m3 s)]"""
     strain: Literal["engineering", "green", "logarithmic"] = "engineering"
     """strain measure"""
+    softening: Annotated[tuple[SofteningRow, ...], listed, Field(min_length=1)] | None = None
+    """rows [temperature above reference, factor of the modulus, factor of the yield stress and hardening] [K, -, -]:
+    linear between rows, constant outside; elastic laws ignore the last factor"""
+
+    @field_validator("softening")
+    @classmethod
+    def _warmer_from_row_to_row(cls, rows: tuple[Any, ...] | None) -> tuple[Any, ...] | None:
+        for k in range(1, len(rows or ())):
+            if not rows[k][0] > rows[k - 1][0]:
+                raise ValueError(f"row {k}: the temperature must increase from row to row")
+        return rows
 
     def pack(self) -> tuple[float, ...]:
         """Return the numbers that the response of the law reads as ``p``; at least one."""
@@ -74,6 +90,20 @@ class MaterialKeys(StrictModel):
     def largest_modulus(self) -> float:
         """Largest tangent modulus of a bar [Pa], for wave speeds and the rounding of forces."""
         return float(self.young_modulus)
+
+    def numbers(self) -> tuple[Any, ...]:
+        """Return what the response of :meth:`choose` reads as ``p``."""
+        if self.softening is None:
+            return self.pack()
+        return self.pack(), np.array(self.softening, dtype=float)
+
+    def choose(self, law: Law) -> Law:
+        """Return the variant of the law that the keys ask for: the law itself, or softened by temperature."""
+        return law if self.softening is None else softened(law)
+
+    def upper_modulus(self) -> float:
+        """:meth:`largest_modulus` at any temperature [Pa]."""
+        return self.largest_modulus() * max((1.0, *(row[1] for row in self.softening or ())))
 
     def suspicions(self, key: str, hint: str) -> list[str]:
         """Return messages about suspicious values, for the check before a run.
@@ -114,6 +144,12 @@ class Law:
     mean_correction : ``mean_stress`` minus the mean of both ends [Pa], as a function of p without data of bars, the
         change of stress and the internal variables before and after, (variables, bars), for the work of changing
         temperatures; None for zero
+    static_limit : for a law with ``rate``: whether it has a limit at the rate zero, which static analyses take; the
+        step is then infinite
+    softening : how the law softens by the key ``softening``; None: the key is refused
+    modulus : function of p and temperatures (bars,) that returns the modulus of the elastic strain (bars,) [Pa], if it
+        depends on the temperature
+    no_mean_stress : why there is no ``mean_stress``, for the message
     """
 
     response: Callable[..., Any]
@@ -124,6 +160,10 @@ class Law:
     smooth: bool = False
     mean_stress: Callable[..., Any] | None = None
     mean_correction: Callable[[tuple[float, ...], np.ndarray, np.ndarray, np.ndarray], np.ndarray] | None = None
+    static_limit: bool = False
+    softening: Softening | None = None
+    modulus: Callable[[tuple[Any, ...], np.ndarray], np.ndarray] | None = None
+    no_mean_stress: str = ""
 
     def __post_init__(self) -> None:
         for name in self.energies:
@@ -144,5 +184,5 @@ class Law:
     def refuses(self, scheme: Any) -> str | None:
         """Return why a :class:`~pfem_petsc.integrators.base.Scheme` cannot use the law, None if it can."""
         if scheme.discrete_gradient and self.mean_stress is None:
-            return "it has no mean stress over a step (mean_stress), which this scheme needs"
+            return self.no_mean_stress or "it has no mean stress over a step (mean_stress), which this scheme needs"
         return None

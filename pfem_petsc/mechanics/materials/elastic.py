@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from numba.extending import register_jitable
 
+from ._softening import Softening
 from .base import Law
 from .base import MaterialKeys as Parameters
 
@@ -23,4 +24,10 @@ def mean_stress(stress0, strain0, strain, rate, step, temperature, p, q):
     return 0.5 * (stress0 + p[0] * strain), 0.5 * p[0]
 
 
-LAW = Law(response, smooth=True, mean_stress=mean_stress)
+@register_jitable
+def scale(p, modulus, strength):
+    """Return the parameters at a temperature."""
+    return (modulus * p[0],)
+
+
+LAW = Law(response, smooth=True, mean_stress=mean_stress, softening=Softening(scale))

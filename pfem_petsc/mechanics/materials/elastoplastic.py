@@ -20,6 +20,7 @@ import numpy as np
 from numba.extending import register_jitable
 
 from ...case.base import NonNegativeFloat, PositiveFloat
+from ._softening import Softening
 from .base import Law, MaterialKeys
 
 __all__ = ["LAW", "Parameters", "mean_correction", "response"]
@@ -107,10 +108,24 @@ def mean_correction(p: tuple[float, ...], stress: np.ndarray, before: np.ndarray
     return 0.5 * young * flow * (1.0 - np.clip(np.nan_to_num(q, nan=1.0, posinf=1.0, neginf=1.0), 0.0, 1.0))
 
 
+@register_jitable
+def scale(p, modulus, strength):
+    """Return the parameters at a temperature."""
+    young, isotropic, kinematic = modulus * p[0], strength * p[2], strength * p[3]
+    return young, strength * p[1], isotropic, kinematic, 1.0 / (young + kinematic + isotropic)
+
+
+@register_jitable
+def dissipated(p, q):
+    """Return the densities of heat and hardening energy [J/m3]."""
+    return p[1] * q[1], 0.5 * (p[2] * q[1] * q[1] + p[3] * q[0] * q[0])
+
+
 LAW = Law(
     response,
     internal=(("plastic_strain", ""), ("accumulated_plastic_strain", "")),
     energies=("elastic_energy", "plastic_heat", "hardening_energy"),
     mean_stress=mean_stress,
     mean_correction=mean_correction,
+    softening=Softening(scale, dissipated),
 )

@@ -1,0 +1,159 @@
+"""Plastic bars whose yield stress R is any function of the accumulated plastic strain a, made from this function.
+
+The yield function is f = |s - H e_p| - R(a) with the linear kinematic hardening H. The return mapping over a strain
+increment solves f(a + x) = |s_trial - H e_p| - (E + H) x - R(a + x) = 0 for the plastic strain x of the step, to
+rounding; the tangent on the yield surface is E (H + R')/(E + H + R') (Simo and Hughes, Computational Inelasticity,
+1998, section 1.5).
+
+The plastic work int(R da) + H e_p^2/2 is a function of state. In a step that yields, the stress follows the line of
+modulus E from s0 to the yield stress s_y, and the curve from there. The elastic strains of both parts and the plastic
+strain are shares w of the strain increment, with the mean stresses (s0 + s_y)/2, (s_y + s1)/2 and m, that of the yield
+stress over the plastic strain. Their mean S = sum of w times mean has the work of the path, which is the change of
+elastic energy and plastic work; dS/de1 = (s1 - S)/(e1 - e0).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from ...case.base import NonNegativeFloat, PositiveFloat
+from ..compiled import inlined, kernel
+from ._softening import Softening
+from ._solver import NOISE, make_solver
+from .base import Law, MaterialKeys
+
+__all__ = ["ENERGIES", "VARIABLES", "PlasticKeys", "isotropic_law", "yield_texts"]
+
+VARIABLES = (("plastic_strain", ""), ("accumulated_plastic_strain", ""))
+ENERGIES = ("elastic_energy", "plastic_heat", "hardening_energy")
+
+_ROUNDING = 1e-8  # E (e1 - e0)/s1, below which the derivative of the mean stress would be rounding
+
+
+def yield_texts(key: str, hint: str, name: str, stress: float, young: float) -> list[str]:
+    """Return a message about a yield stress that is reached at an unrealistic strain, if it is."""
+    if stress <= 0.2 * young:
+        return []
+    return [f"{key}.{name} = {stress:g} Pa is reached at a strain of {stress / young:.3g}; {hint}"]
+
+
+class PlasticKeys(MaterialKeys):
+    """Keys of materials with an initial yield stress and hardening."""
+
+    yield_stress: PositiveFloat
+    """initial yield stress s_Y [Pa]"""
+    kinematic_hardening: NonNegativeFloat = 0.0
+    """kinematic hardening modulus H [Pa]"""
+
+    def suspicions(self, key: str, hint: str) -> list[str]:
+        """Return a message about an unrealistic strain at yield."""
+        return yield_texts(key, hint, "yield_stress", self.yield_stress, self.young_modulus)
+
+
+def isotropic_law(curve: Callable, mean: Callable, scale: Callable, find: Callable | None = None) -> Law:
+    """Make a rate-independent law.
+
+    Parameters
+    ----------
+    curve : compiled function of (a, p) that returns R [Pa], dR/da [Pa], and the densities of heat and of energy stored
+        by isotropic hardening [J/m3], whose sum is the integral of R from 0 to a. p[0] = E, p[1] = H [Pa]
+    mean : compiled function of (a, x, p): mean of R between a and a + x [Pa]
+    scale : compiled function of (p, factor of modulus, factor of yield stress) that returns p at a temperature
+    find : compiled function of (|s_trial - H e_p|, excess over R(a), E + H, a, p) that returns the plastic strain x of
+        a step; None: by Newton's method, with a curve whose slope does not increase
+    """
+
+    def residual_of(x, data):
+        size, stiffness, accumulated, p = data
+        strength, slope, _, _ = curve(accumulated + x, p)
+        return size - stiffness * x - strength, -stiffness - slope
+
+    solve = make_solver(inlined(residual_of))
+
+    @inlined
+    def by_newton(size, excess, stiffness, accumulated, p):
+        limit = excess / stiffness
+        return solve(limit, limit, NOISE * size, (size, stiffness, accumulated, p))
+
+    flow_of = by_newton if find is None else find
+
+    @inlined
+    def response(strain, rate, step, temperature, p, q):
+        """See :class:`~pfem_petsc.mechanics.materials.base.Law`; q = (plastic strain, accumulated plastic strain)."""
+        young, kinematic = p[0], p[1]
+        plastic, accumulated = q
+        stress = young * (strain - plastic)
+        tangent = young
+        relative = stress - kinematic * plastic
+        strength, slope, heat, stored = curve(accumulated, p)
+        size = abs(relative)
+        excess = size - strength
+        if excess > 0.0:
+            stiffness = young + kinematic
+            flow = flow_of(size, excess, stiffness, accumulated, p)
+            accumulated += flow
+            strength, slope, heat, stored = curve(accumulated, p)
+            tangent = young * (1.0 - young / (stiffness + slope))
+            if relative < 0.0:
+                flow = -flow
+            plastic += flow
+            stress -= young * flow
+        elastic = 0.5 * stress * (strain - plastic)
+        return stress, tangent, (plastic, accumulated), (elastic, heat, stored + 0.5 * kinematic * plastic * plastic)
+
+    @inlined
+    def beyond(stress0, stress, change, before, after, p):
+        """Return S - s1 of a step that yields; ``change`` of strain, internal variables ``before`` and ``after``."""
+        young, kinematic = p[0], p[1]
+        flow = after[0] - before[0]
+        sign = 1.0 if flow > 0.0 else -1.0
+        strength, _, _, _ = curve(before[1], p)
+        yielding = kinematic * before[0] + sign * strength
+        plastic = sign * mean(before[1], after[1] - before[1], p) + 0.5 * kinematic * (before[0] + after[0])
+        found = (yielding - stress0) * (0.5 * (stress0 + yielding) - stress)
+        found += 0.5 * (stress - yielding) * (yielding - stress)
+        return (found / young + flow * (plastic - stress)) / change
+
+    @inlined
+    def mean_stress(stress0, strain0, strain, rate, step, temperature, p, q):
+        """Return the mean stress of the step and its derivative; see the module."""
+        stress, modulus, new, _ = response(strain, rate, step, temperature, p, q)
+        change = strain - strain0
+        if new[1] == q[1] or abs(change) * p[0] <= _ROUNDING * abs(stress):
+            return 0.5 * (stress0 + stress), 0.5 * modulus
+        part = beyond(stress0, stress, change, q, new, p)
+        return stress + part, -part / change
+
+    @kernel
+    def correct(p, change, before, after, out):
+        for k in range(len(change)):
+            old, new = (before[0, k], before[1, k]), (after[0, k], after[1, k])
+            if new[1] != old[1]:
+                strength, _, _, _ = curve(new[1], p)
+                stress = p[1] * new[0] + (strength if new[0] > old[0] else -strength)
+                strain = change[k] / p[0] + new[0] - old[0]
+                if abs(strain) * p[0] > _ROUNDING * abs(stress):
+                    out[k] = beyond(stress - change[k], stress, strain, old, new, p) + 0.5 * change[k]
+
+    def mean_correction(p: tuple, stress: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+        """Return S - (s0 + s1)/2 [Pa] of each bar; see :class:`~pfem_petsc.mechanics.materials.base.Law`."""
+        out = np.zeros(len(stress))
+        correct(p, stress, np.ascontiguousarray(before), np.ascontiguousarray(after), out)
+        return out
+
+    @inlined
+    def dissipated(p, q):
+        """Return the densities of heat and hardening energy [J/m3]."""
+        _, _, heat, stored = curve(q[1], p)
+        return heat, stored + 0.5 * p[1] * q[0] * q[0]
+
+    return Law(
+        response,
+        internal=VARIABLES,
+        energies=ENERGIES,
+        mean_stress=mean_stress,
+        mean_correction=mean_correction,
+        softening=Softening(scale, dissipated),
+    )

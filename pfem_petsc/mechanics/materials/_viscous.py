@@ -1,0 +1,154 @@
+"""Plastic bars whose flow stress Y depends on accumulated plastic strain, its rate and the temperature, made from Y.
+
+The plastic strain x of a step h is found by backward Euler:
+
+    |s_trial - H e_p| - (E + H) x = Y(a + x, x/h, T + r),
+
+with the linear kinematic hardening H and the rise r of temperature by plastic work at the end. A bar is elastic below
+the flow stress at the rate zero, Y(a, 0, T), and while no time passes. In a step of infinite length the rate is zero:
+static analyses take this limit.
+
+The stress goes from s0 along the line of modulus E to s_y, where flow begins, during the share 1 - q of the step, and
+then along a straight line to s1; a bar that flows at the start has s_y = s0. The work on this path,
+
+    S (e1 - e0) = ((1 - q) (s0 + s_y)/2 + q (s_y + s1)/2) (e1 - e0),
+
+is exactly the change of elastic energy plus (s_y + s1)/2 de_p, since s_y and s1 are E times elastic strains. The
+dissipation is defined by this product, which is positive; internal variables accumulate it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from ..compiled import inlined
+from ._isotropic import ENERGIES, VARIABLES
+from ._softening import DENSITIES, Softening
+from ._solver import NOISE, make_solver
+from .base import Law
+
+__all__ = ["viscous_law"]
+
+
+def viscous_law(
+    flow_stress: Callable, stored: Callable, scale: Callable | None, heating: Callable | None = None
+) -> Law:
+    """Make a rate-dependent law.
+
+    Parameters
+    ----------
+    flow_stress : compiled function of (a, rate, temperature, p) that returns Y [Pa], dY/da [Pa], rate dY/d(rate) [Pa]
+        and dY/dT [Pa/K]. p[0] = E, p[1] = H [Pa]
+    stored : compiled function of (a before, a after, p, work) that returns how much of the ``work`` of the isotropic
+        part of the stress on the plastic strain of a step is stored [J/m3]
+    scale : see :class:`~pfem_petsc.mechanics.materials._softening.Softening`; None: no softening by a table
+    heating : compiled function of p that returns the rise of temperature over the work of the isotropic part of the
+        stress [K m3/J], for a law with the internal variable ``temperature_rise``
+    """
+    heats = heating is not None
+    warming = heating if heats else no_heating
+
+    def residual_of(x, data):
+        size, stiffness, accumulated, step, start, warmth, rise, p = data
+        strength, by_strain, by_rate, by_warmth = flow_stress(
+            accumulated + x, x / step, warmth + rise * 0.5 * (start + size - stiffness * x) * x, p
+        )
+        slope = -stiffness - by_strain - by_rate / x
+        slope -= by_warmth * rise * 0.5 * (start + size - 2.0 * stiffness * x)
+        return size - stiffness * x - strength, slope
+
+    residual = inlined(residual_of)
+    solve = make_solver(residual)
+
+    @inlined
+    def onset(strain0, temperature, sign, p, q):
+        """Return the stress relative to H e_p at which flow of a sign begins from ``strain0``, times the sign."""
+        warmth = temperature + q[4] if heats else temperature
+        static, _, _, _ = flow_stress(q[1], 0.0, warmth, p)
+        return max(static, sign * (p[0] * (strain0 - q[0]) - p[1] * q[0]))
+
+    @inlined
+    def respond(strain, rate, step, temperature, p, q):
+        young, kinematic = p[0], p[1]
+        plastic, accumulated, heat, kept = q[0], q[1], q[2], q[3]
+        tangent, work = young, 0.0
+        trial = young * (strain - plastic) - kinematic * plastic
+        size = abs(trial)
+        sign = 1.0 if trial > 0.0 else -1.0
+        warmth = temperature + q[4] if heats else temperature
+        static, _, _, _ = flow_stress(accumulated, 0.0, warmth, p)
+        excess = size - static
+        if excess > 0.0 and step > 0.0:
+            start = static
+            if step < math.inf:
+                start = onset(strain - rate * step, temperature, sign, p, q)
+            stiffness = young + kinematic
+            rise = warming(p)
+            data = (size, stiffness, accumulated, step, start, warmth, rise, p)
+            flow = solve(excess / stiffness, size / stiffness, NOISE * size, data)
+            if flow > 0.0:
+                _, slope = residual(flow, data)
+                _, _, _, by_warmth = flow_stress(
+                    accumulated + flow, flow / step, warmth + rise * 0.5 * (start + size - stiffness * flow) * flow, p
+                )
+                tangent = young * (1.0 + young * (1.0 - 0.5 * by_warmth * rise * flow) / slope)
+                work = 0.5 * (start + size - stiffness * flow) * flow
+                hardening = stored(accumulated, accumulated + flow, p, work)
+                heat += work - hardening
+                change = sign * flow
+                kept += hardening + kinematic * (plastic + 0.5 * change) * change
+                accumulated += flow
+                plastic += change
+        elastic = strain - plastic
+        stress = young * elastic
+        return stress, tangent, (plastic, accumulated, heat, kept), 0.5 * stress * elastic, work
+
+    if heats:
+
+        @inlined
+        def response(strain, rate, step, temperature, p, q):
+            """See :class:`~pfem_petsc.mechanics.materials.base.Law`; q = (e_p, a, densities, rise of temperature)."""
+            stress, tangent, new, elastic, work = respond(strain, rate, step, temperature, p, q)
+            rise = q[4] + warming(p) * work
+            return stress, tangent, (new[0], new[1], new[2], new[3], rise), (elastic, new[2], new[3])
+
+    else:
+
+        @inlined
+        def response(strain, rate, step, temperature, p, q):
+            """See :class:`~pfem_petsc.mechanics.materials.base.Law`; q = (e_p, a, densities of heat and hardening)."""
+            stress, tangent, new, elastic, _ = respond(strain, rate, step, temperature, p, q)
+            return stress, tangent, new, (elastic, new[2], new[3])
+
+    @inlined
+    def mean_stress(stress0, strain0, strain, rate, step, temperature, p, q):
+        """Return the mean stress of the step and its derivative; see the module."""
+        stress, modulus, new, _ = response(strain, rate, step, temperature, p, q)
+        mean, change = 0.5 * (stress0 + stress), strain - strain0
+        modulus *= 0.5
+        if new[1] != q[1] and change != 0.0:
+            sign = 1.0 if new[0] > q[0] else -1.0
+            begin = p[1] * q[0] + sign * onset(strain0, temperature, sign, p, q)
+            early = min(max((begin - stress0) / (p[0] * change), 0.0), 1.0)  # clips rounding only
+            # (1 - q)(s0 + s_y)/2 + q (s_y + s1)/2 = (s0 + s1)/2 + (s_y - s0) q/2 - (s1 - s_y)(1 - q)/2
+            mean += 0.5 * ((begin - stress0) * (1.0 - early) - (stress - begin) * early)
+            modulus = (1.0 - early) * modulus + 0.5 * (stress - stress0) * early / change
+        return mean, modulus
+
+    rise = (("temperature_rise", "K"),) if heats else ()
+    return Law(
+        response,
+        internal=(*VARIABLES, *DENSITIES, *rise),
+        energies=ENERGIES,
+        rate=True,
+        static_limit=True,
+        mean_stress=mean_stress,
+        softening=None if scale is None else Softening(scale),
+    )
+
+
+@inlined
+def no_heating(p):
+    """Return zero."""
+    return 0.0

@@ -1,0 +1,292 @@
+"""Laws with nonlinear hardening, rates and softening in explicit, implicit and static runs."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+from helpers.laws import DENSITY, KEYS, SOFTENING, YOUNG, Twin, integrated
+from helpers.runs import run
+
+from pfem_petsc import Case, Simulation, open_result
+from pfem_petsc.cli.main import main
+from pfem_petsc.errors import InputError
+
+AREA, STEP, STEPS = 1e-4, 1e-5, 100
+MASS = 0.5 * DENSITY * AREA  # of a node of the bar of 1 m
+SETS = [
+    ("johnson_cook", "green"), ("voce", "engineering"), ("multilinear", "green"), ("cowper_symonds", "logarithmic"),
+    ("ludwik", "green"), ("perzyna", "engineering"), ("ramberg_osgood", "logarithmic"), ("voce", "logarithmic"),
+]  # fmt: skip
+PARAMETERS = {"newmark": {"beta": 0.25, "gamma": 0.5}}  # the trapezoidal rule
+
+
+def one_bar(law, integrator, measure="engineering", speed=70.0, steps=STEPS, elements=1, solver=None, **keys):
+    """A bar of 1 m along x: its foot is held, its tip is thrown."""
+    material = {"law": law, "young_modulus": YOUNG, "density": DENSITY, "strain": measure, **KEYS.get(law, {}), **keys}
+    table = {
+        "mesh": {"generator": "rod", "length": 1.0, "elements": elements},
+        "node_set": {"foot": {"nearest": [0.0, 0.0, 0.0]}, "tip": {"nearest": [1.0, 0.0, 0.0]}},
+        "material": {"it": material},
+        "section": {"it": {"area": AREA, "material": "it"}},
+        "initial": {"on": [{"node_set": "tip", "velocity": [speed, 0.0, 0.0]}]},
+        "support": [{"node_set": "foot", "fix": "xyz"}],
+        "time": {"integrator": integrator, "step": STEP, "end": STEP * steps, **PARAMETERS.get(integrator, {})},
+        "solver": {"rtol": 1e-13, **(solver or {})},
+        "output": {"fields_every": steps, "fields": ["stress"], "probe": [{"name": "tip", "node_set": "tip"}]},
+    }
+    return table
+
+
+def force_of(measure, x):
+    """Strain, and axial force over area and stress, of the bar whose tip moved by x."""
+    stretch = 1.0 + x
+    if measure == "green":
+        return 0.5 * (stretch * stretch - 1.0), stretch
+    return (math.log(stretch), 1.0 / stretch) if measure == "logarithmic" else (x, 1.0)
+
+
+def thrown(law, measure, integrator):
+    """Displacements of the tip, and the bar at the end, by the scheme's formulas."""
+    bar, x, v, a = Twin(law, KEYS[law]), 0.0, 70.0, 0.0
+    half, found = 70.0, [0.0]
+    for _ in range(STEPS):
+        if integrator == "central_differences":
+            x += STEP * half
+            strain, slope = force_of(measure, x)
+            bar = bar.step(strain, STEP)
+            half -= STEP * AREA / MASS * bar.stress * slope
+        else:
+            predictor, end, a1 = x + STEP * v + 0.25 * STEP**2 * a, x + STEP * v, a
+            for _ in range(60):  # a contraction by (w h)^2/4
+                strain, slope = force_of(measure, end)
+                trial = bar.step(strain, STEP)
+                a1 = -AREA / MASS * trial.stress * slope
+                last, end = end, predictor + 0.25 * STEP**2 * a1
+                if end == last:
+                    break
+            v += 0.5 * STEP * (a + a1)
+            bar, x, a = trial, end, a1
+        found.append(x)
+    return np.array(found), bar
+
+
+@pytest.mark.slow
+@pytest.mark.parallel
+@pytest.mark.parametrize(("law", "measure"), SETS)
+def test_thrown_bar_is_integrated_as_by_scipy(law, measure, comm, shared_tmp_path):
+    """Explicit steps, and implicit ones with and without a matrix; the energy-momentum scheme loses nothing."""
+    free = {"operator": "matrix_free", "linear": "cg"}
+    for name, integrator, solver in (
+        ("explicit", "central_differences", {}), ("implicit", "newmark", {}), ("free", "newmark", free),
+    ):  # fmt: skip
+        folder = shared_tmp_path / name
+        case = one_bar(law, integrator, measure, solver=solver)
+        case["output"]["fields"] = ["stress", "accumulated_plastic_strain"]
+        history = run(Case.from_dict(case), folder)
+        expected, bar = thrown(law, measure, integrator)
+        moved = np.asarray(history["probe/tip/position"])[:, 0, 0] - 1.0
+        assert np.abs(moved - expected).max() < 1e-10 * np.abs(expected).max(), name
+        if comm.rank == 0:
+            result = open_result(folder)
+            assert result.field("stress", -1)[0] == pytest.approx(bar.stress, rel=1e-9)
+            assert result.field("accumulated_plastic_strain", -1)[0] == pytest.approx(bar.a, rel=1e-9)
+        assert abs(history["energy_imbalance"]).max() < 1e-10 * history["kinetic_energy"][0]
+    case = one_bar(law, "energy_momentum", measure, elements=3)
+    history = run(Case.from_dict(case), shared_tmp_path / "conserving")
+    assert abs(history["numerical_dissipation"]).max() < 1e-11 * history["kinetic_energy"][0]
+    assert history["plastic_dissipation"][-1] > 0.3 * history["kinetic_energy"][0]
+    assert (np.diff(history["plastic_heat"]) > -1e-9).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("law", ["johnson_cook", "multilinear", "voce"])
+def test_laws_in_the_fused_loop(law, tmp_path):
+    """Many steps in one call are the single steps to the last bit."""
+    case, found = Case.from_dict(one_bar(law, "central_differences", elements=3)), []
+    for together in (False, True):
+        with Simulation(case, output=tmp_path / str(together), quiet=True) as simulation:
+            count = len(list(simulation.batches(min_steps=1) if together else simulation))
+            found.append((count, simulation.state.x.tobytes(), simulation.model.bars.history().tobytes()))
+    assert found[0][0] == STEPS and found[0] == (STEPS, *found[1][1:]) and found[1][0] < STEPS
+
+
+@pytest.mark.slow
+@pytest.mark.parallel
+@pytest.mark.parametrize(
+    ("law", "integrator"), [("johnson_cook", "newmark"), ("voce", "central_differences"), ("perzyna", "chung_lee")]
+)
+def test_restart_is_bitwise(law, integrator, comm, shared_tmp_path):
+    """A chain that flows while its temperature changes and, where the law takes a table, softens."""
+    keys = {} if law == "johnson_cook" else {"softening": SOFTENING}
+    case = one_bar(law, integrator, elements=6, steps=60, thermal_expansion=1.2e-5, **keys)
+    case["temperature"] = [{"table": [[0.0, 20.0], [6e-4, 500.0]]}]
+    fields = ("stress", "plastic_strain", *(["temperature_rise"] if law == "johnson_cook" else []))
+    case["output"] |= {"checkpoint_every": 15, "fields": list(fields)}
+    whole, parts = shared_tmp_path / "whole", shared_tmp_path / "parts"
+    run(Case.from_dict(case), whole)
+    run(Case.from_dict(case, overrides=["time.end=2.4e-4"]), parts)
+    with Simulation(Case.from_dict(case), comm, output=parts, quiet=True, restart=True) as simulation:
+        simulation.run()
+    comm.Barrier()
+    first, second = open_result(whole), open_result(parts)
+    for name in first.history:
+        assert np.asarray(first.history[name]).tobytes() == np.asarray(second.history[name]).tobytes(), name
+    for name in fields:
+        assert first.field(name, -1).tobytes() == second.field(name, -1).tobytes(), name
+        assert np.abs(first.field(name, -1)).max() > 0.0, name
+
+
+def pulled(law, strain, method="newton", **keys):
+    """A bar whose tip is moved, in a static analysis."""
+    case = one_bar(law, "newmark", **keys)
+    for key in ("time", "initial"):
+        del case[key]
+    case["static"] = {"method": method, "step": 0.2}
+    case["node_set"]["all"] = {"all": True}
+    moved = {"node_set": "tip", "fix": "x", "motion": [[0.0, 0.0, 0.0, 0.0], [1.0, strain, 0.0, 0.0]]}
+    case["support"] = [{"node_set": "foot", "fix": "x"}, {"node_set": "all", "fix": "yz"}, moved]
+    return case
+
+
+@pytest.mark.slow
+@pytest.mark.parallel
+@pytest.mark.parametrize("method", ["newton", "relaxation"])
+@pytest.mark.parametrize("law", ["cowper_symonds", "voce"])
+def test_static_analyses_take_the_static_curve(law, method, comm, shared_tmp_path):
+    case = pulled(law, 0.01, method, elements=3)
+    history = run(Case.from_dict(case), shared_tmp_path / "out")
+    stress = integrated("voce", [0.01], [1.0], **{key: KEYS[law][key] for key in KEYS["voce"]})[0, 0]
+    assert history["probe/tip/reaction"][-1, 0, 0] == pytest.approx(stress * AREA, rel=1e-8)
+    stored = history["elastic_energy"][-1] + history["plastic_dissipation"][-1]
+    assert stored == pytest.approx(history["external_work"][-1] - history["numerical_dissipation"][-1], rel=1e-9)
+
+
+@pytest.mark.slow
+def test_overstress_relaxes_in_a_static_stage(tmp_path):
+    """A bar pulled fast, then held: its stress falls to the static curve."""
+    case = one_bar("perzyna", "newmark")
+    case["support"].append({"node_set": "tip", "fix": "xyz", "velocity": [50.0, 0.0, 0.0]})
+    del case["initial"]
+    time, held = case.pop("time") | {"end": 2e-4}, dict(case["support"][1])
+    del held["velocity"]
+    case["stage"] = [
+        {"name": "fast", "time": time},
+        {"name": "still", "static": {"step": 1.0}, "support": [case["support"][0], held]},
+    ]
+    case["output"]["fields_every"] = 1
+    history = run(Case.from_dict(case), tmp_path / "out")
+    reaction = np.asarray(history["probe/tip/reaction"])[:, 0, 0] / AREA
+    static = integrated("perzyna", [0.01], [1e300])[0, 0]
+    assert reaction[20] > 1.3 * static
+    assert reaction[-1] == pytest.approx(static, rel=1e-2)  # a is larger by the plastic strain of the overstress
+
+
+@pytest.mark.parallel
+def test_softened_elastic_bar_keeps_its_energy_while_heated(comm, shared_tmp_path):
+    """Heat supplies what softening and expansion take; nothing is lost, in steps of a tenth of a period."""
+    case = one_bar("elastic", "energy_momentum", steps=80, elements=2, softening=SOFTENING, thermal_expansion=1.2e-5)
+    case["temperature"] = [{"table": [[0.0, 0.0], [8e-4, 400.0]]}]
+    case["time"] |= {"step": 1e-5}
+    history = run(Case.from_dict(case), shared_tmp_path / "out")
+    start = history["kinetic_energy"][0]
+    assert abs(history["numerical_dissipation"]).max() < 1e-12 * start
+    assert abs(history["thermal_work"]).max() > 1e-2 * start
+    total = history["kinetic_energy"] + history["elastic_energy"] - history["thermal_work"]
+    assert np.ptp(total) < 1e-12 * start
+
+
+def test_restrained_bar_that_softens(tmp_path):
+    """Held at both ends: the stress follows -E(T) alpha T until it yields at s_Y(T)."""
+    for law, keys in (("elastic", {}), ("elastoplastic", {"yield_stress": 250e6})):
+        case = pulled(law, 0.0, softening=SOFTENING, thermal_expansion=1.2e-5, **keys)
+        case["temperature"] = [{"table": [[0.0, 0.0], [1.0, 250.0]]}]
+        history = run(Case.from_dict(case), tmp_path / law)
+        stress = -0.75 * YOUNG * 1.2e-5 * 250.0
+        stress = max(stress, -0.55 * 250e6) if keys else stress
+        assert history["probe/tip/reaction"][-1, 0, 0] == pytest.approx(stress * AREA, rel=1e-9)
+
+
+@pytest.mark.slow
+def test_thermal_work_of_laws_that_yield_while_heated(tmp_path):
+    """What is no heat, energy of the bars or thermal work vanishes with the square of the step."""
+    left = []
+    for parts in (1, 2, 4):
+        case = one_bar("voce", "newmark", steps=60 * parts, softening=SOFTENING, thermal_expansion=1.2e-5)
+        case["temperature"] = [{"table": [[0.0, 0.0], [6e-4, 300.0]]}]
+        case["time"] |= {"step": STEP / parts}
+        case["time"]["end"] = 6e-4
+        history = run(Case.from_dict(case), tmp_path / str(parts))
+        left.append(abs(history["numerical_dissipation"][-1]) / history["kinetic_energy"][0])
+    assert left[2] < 1e-3 and left[2] < 0.6 * left[0]
+
+
+def rod(law, speed, **keys):
+    """The rod of 5.2 of the paper against a wall, for the time in which its force is constant."""
+    young, density, yield_stress = 200e9, 7844.0, 68.95e6
+    case = Case.from_dict(
+        {
+            "mesh": {"generator": "rod", "length": 0.254, "elements": 100},
+            "node_set": {"all": {"all": True}},
+            "material": {
+                "it": {"law": law, "young_modulus": young, "density": density, "yield_stress": yield_stress, **keys}
+            },
+            "section": {"it": {"area": 6.45e-4, "material": "it"}},
+            "support": [{"node_set": "all", "fix": "yz"}],
+            "initial": {"velocity": [speed, 0.0, 0.0]},
+            "wall": [{"name": "w", "type": "plane", "point": [0.254, 0.0, 0.0], "normal": [-1.0, 0.0, 0.0]}],
+            "time": {"integrator": "central_differences", "step": 2e-7, "end": 8e-5},
+            "output": {"fields_every": 0},
+        }
+    )
+    return case
+
+
+@pytest.mark.slow
+def test_waves_of_a_rod_with_voce(tmp_path):
+    """Impact force s_Y + rho c_p (v - v_Y) of linear hardening; Voce with a small b and Q b = K is that to b a/2."""
+    young, density, yield_stress, hardening, speed = 200e9, 7844.0, 68.95e6, 6.9e9, 5.0
+    tangent = young * hardening / (young + hardening)
+    elastic, plastic = math.sqrt(young / density), math.sqrt(tangent / density)
+    force = 6.45e-4 * (yield_stress + density * plastic * (speed - yield_stress / (density * elastic)))
+    found = {}
+    for name, law, keys in (
+        ("line", "elastoplastic", {"isotropic_hardening": hardening}),
+        ("curve", "voce", {"saturation_stress": hardening * 1e5, "saturation_rate": 1e-5}),
+        ("saturated", "voce", {"saturation_stress": 10e6, "saturation_rate": 690.0}),
+    ):
+        history = run(rod(law, speed, **keys), tmp_path / name)
+        found[name] = -np.asarray(history["wall/w/force"])[:, 0]
+    assert np.abs(found["line"] - found["curve"]).max() < 1e-6 * found["line"].max()
+    late = slice(150, 400)
+    assert abs(found["line"][late]).mean() == pytest.approx(force, rel=1e-2)
+    assert abs(found["saturated"][late]).mean() < 0.95 * force
+
+
+def test_refusals(tmp_path, capsys):
+    case = one_bar("voce", "energy_momentum", softening=SOFTENING)
+    path = tmp_path / "bar.toml"
+    path.write_text(Case.from_dict(case).to_toml())
+    assert main(["run", str(path), "-o", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr().err
+    assert 'material.it.law = "voce" is not compatible with time.integrator = "energy_momentum"' in said
+    assert "softening" in said
+    for law, keys, words in (
+        ("johnson_cook", {"softening": SOFTENING}, ["material.it.softening", "does not soften by a table"]),
+        ("voce", {"softening": [[0.0, 1.0, 1.0], [0.0, 0.5, 0.5]]}, ["row 1", "must increase"]),
+        ("voce", {"softening": [[0.0, 1.0, 0.0]]}, ["material.it.softening", "> 0"]),
+        ("multilinear", {"curve": [[0.01, 250e6]]}, ["material.it", "end of the elastic line"]),
+        ("ludwik", {"hardening_exponent": 1.5}, ["material.it.hardening_exponent", "1"]),
+    ):
+        with pytest.raises(InputError) as error:
+            Case.from_dict(one_bar(law, "newmark", **keys))
+        assert all(word in str(error.value) for word in words), str(error.value)
+
+
+def test_case_with_tables_is_written_and_read(tmp_path):
+    """Tables of materials go to results and back as they are."""
+    for law, keys in (("multilinear", {"softening": SOFTENING}), ("elastic", {"softening": SOFTENING})):
+        case = Case.from_dict(one_bar(law, "newmark", **keys))
+        again = Case.from_toml(case.to_toml())
+        assert again.material == case.material
+        assert json.loads(json.dumps(case.to_dict()))["material"]["it"]["softening"] == SOFTENING

@@ -65,12 +65,13 @@ def isotropic_law(curve: Callable, mean: Callable, scale: Callable, find: Callab
         a step; None: by Newton's method, with a curve whose slope does not increase
     """
 
-    def residual_of(x, data):
+    @inlined
+    def residual(x, data):
         size, stiffness, accumulated, p = data
         strength, slope, _, _ = curve(accumulated + x, p)
         return size - stiffness * x - strength, -stiffness - slope
 
-    solve = make_solver(inlined(residual_of))
+    solve = make_solver(residual)
 
     @inlined
     def by_newton(size, excess, stiffness, accumulated, p):

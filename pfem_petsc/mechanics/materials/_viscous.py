@@ -49,7 +49,8 @@ def viscous_law(
     heats = heating is not None
     warming = heating if heats else no_heating
 
-    def residual_of(x, data):
+    @inlined
+    def residual(x, data):
         size, stiffness, accumulated, step, start, warmth, rise, p = data
         strength, by_strain, by_rate, by_warmth = flow_stress(
             accumulated + x, x / step, warmth + rise * 0.5 * (start + size - stiffness * x) * x, p
@@ -58,7 +59,6 @@ def viscous_law(
         slope -= by_warmth * rise * 0.5 * (start + size - 2.0 * stiffness * x)
         return size - stiffness * x - strength, slope
 
-    residual = inlined(residual_of)
     solve = make_solver(residual)
 
     @inlined

@@ -1,0 +1,197 @@
+"""Cables, struts, damage and compaction in motion: integrators, fused steps, restarts, ranks, strain measures."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.kills import differences
+from helpers.stopped import everywhere
+
+from pfem_petsc import Case, Simulation, open_result
+
+YOUNG = 1e7
+MATERIALS = {
+    "cable": {"yield_stress": 1e5, "isotropic_hardening": 1e5},
+    "strut": {"yield_stress": 1e5, "imperfection": 1e-3},
+    "damage": {"tensile_strength": 1e5, "fracture_energy": 3e3},
+    "compaction": {
+        "yield_stress": 1e5,
+        "kinematic_hardening": 1e5,
+        "compaction_strain": 0.02,
+        "compaction_modulus": 3e7,
+    },
+}
+POINTS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.2, 0.3, 1.1], [1.1, 0.9, 1.0], [0.5, 0.4, 2.1]])
+BARS = [[0, 1], [1, 2], [2, 0], [0, 3], [1, 3], [2, 3], [1, 4], [2, 4], [3, 4], [3, 5], [4, 5], [2, 5], [1, 5]]
+PARAMETERS = {"newmark": {"beta": 0.25, "gamma": 0.5}}  # the trapezoidal rule
+GROUPS = {"cable": [7, 11, 12], "strut": [3, 4, 9], "damage": [5, 6], "compaction": [8, 10]}
+
+
+def material(law, **more):
+    return {"law": law, "young_modulus": YOUNG, "density": 1000.0, **MATERIALS[law], **more}
+
+
+@pytest.fixture
+def tower(comm, shared_tmp_path):
+    """A tower of bars of all laws and elastic ones, which is thrown; gives its case."""
+    if comm.rank == 0:
+        import h5py
+
+        with h5py.File(shared_tmp_path / "mesh.h5", "w") as file:
+            file["points"], file["bars"] = POINTS, np.array(BARS)
+            for name, members in GROUPS.items():
+                file[f"bar_groups/{name}"] = np.array(members)
+    comm.Barrier()
+
+    def case(integrator="newmark", step=2e-3, steps=150, strain="engineering", output=None, **solver):
+        return Case.from_dict(
+            {
+                "mesh": {"file": "mesh.h5"},
+                "node_set": {"feet": {"indices": [0, 1, 2]}, "top": {"indices": [3, 4, 5]}},
+                "material": {"elastic": {"young_modulus": YOUNG, "density": 1000.0}}
+                | {law: material(law, strain=strain) for law in MATERIALS},
+                "section": {"rest": {"area": 1e-3, "material": "elastic"}}
+                | {law: {"area": 1e-3, "material": law, "bars": law} for law in MATERIALS}
+                | {"strut": {"area": 1e-3, "material": "strut", "bars": "strut", "shape": "tube", "thickness": 5e-3}},
+                "initial": {"on": [{"node_set": "top", "velocity": [3.0, 1.0, -4.0]}]},
+                "support": [{"node_set": "feet", "fix": "xyz"}],
+                "time": {"integrator": integrator, "step": step, "end": step * steps, **PARAMETERS.get(integrator, {})},
+                "solver": solver,
+                "output": {"fields_every": 50, "checkpoint_every": 30, **(output or {})},
+            },
+            folder=shared_tmp_path,
+        )
+
+    return case
+
+
+def run(case, comm, folder, **options):
+    with Simulation(case, comm, output=folder, quiet=True, **options) as simulation:
+        assert simulation.run() == 0
+    found = None
+    if comm.rank == 0:
+        history = open_result(folder).history
+        found = {name: np.asarray(history[name]) for name in history}
+    return comm.bcast(found)
+
+
+SCHEMES = {
+    "central_differences": {},
+    "chung_lee": {},
+    "newmark": {},
+    "generalized_alpha": {},
+    "energy_momentum": {},
+    "matrix-free": {"integrator": "newmark", "operator": "matrix_free", "linear": "cg"},
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parallel
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_tower_of_all_laws(scheme, tower, comm, shared_tmp_path):
+    """Energies balance, everything happens, and the fine solution is the same."""
+    keys = {"integrator": scheme} | SCHEMES[scheme]
+    history = run(tower(**keys), comm, shared_tmp_path / "out")
+    energy = history["kinetic_energy"][0]
+    assert np.abs(history["energy_imbalance"]).max() < 1e-7 * energy
+    if scheme == "energy_momentum":
+        assert np.abs(history["numerical_dissipation"]).max() < 1e-7 * energy  # the solver's tolerance
+    for name in ("plastic_heat", "damage_dissipation"):
+        assert (np.diff(history[name]) >= -1e-12 * energy).all() and history[name][-1] > 1e-3 * energy
+    assert history["slack_bars"].max() >= 2 and history["slack_bars"].min() == 0
+    reference = run(tower("central_differences", 2e-4, 1500), comm, shared_tmp_path / "fine")
+    assert history["plastic_heat"][-1] == pytest.approx(reference["plastic_heat"][-1], rel=0.1)
+    assert history["damage_dissipation"][-1] == pytest.approx(reference["damage_dissipation"][-1], rel=0.1)
+
+
+@pytest.mark.slow
+@pytest.mark.parallel
+@pytest.mark.parametrize("integrator", ["central_differences", "newmark", "energy_momentum"])
+def test_restart_is_bitwise(integrator, tower, comm, shared_tmp_path):
+    solver = {} if integrator == "central_differences" else {"linear": "cg"}
+    whole, stopped = shared_tmp_path / "whole", shared_tmp_path / "stopped"
+    run(tower(integrator, **solver), comm, whole)
+    run(tower(integrator, steps=100, **solver), comm, stopped)
+    run(tower(integrator, **solver), comm, stopped, restart=True)
+    assert everywhere(comm, differences, whole / "result.vtkhdf", stopped / "result.vtkhdf") == {}
+
+
+@pytest.mark.slow
+@pytest.mark.parallel
+def test_ranks_agree(tower, comm, shared_tmp_path):
+    from mpi4py import MPI
+
+    keys = {"output": {"fields_every": 50, "fields": ["stress", "status", "hinge_rotation", "damage"]}}
+    together = run(tower("central_differences", **keys), comm, shared_tmp_path / "together")
+    if comm.rank == 0:
+        alone = run(tower("central_differences", **keys), MPI.COMM_SELF, shared_tmp_path / "alone")
+        assert (alone["slack_bars"] == together["slack_bars"]).all()
+        for name in ("kinetic_energy", "elastic_energy", "plastic_heat", "damage_dissipation"):
+            assert together[name] == pytest.approx(alone[name], rel=1e-9, abs=1e-9 * alone["kinetic_energy"][0])
+        results = [open_result(shared_tmp_path / name) for name in ("alone", "together")]
+        for name in keys["output"]["fields"]:
+            one, other = (result.field(name, -1) for result in results)
+            assert other == pytest.approx(one, rel=1e-8, abs=1e-8 * np.abs(one).max())
+            assert np.abs(one).max() > 0.0, name
+
+
+def one_bar(law, strain, velocity, steps=200):
+    return Case.from_dict(
+        {
+            "mesh": {"generator": "rod", "length": 1.0, "elements": 1},
+            "node_set": {"foot": {"indices": [0]}, "tip": {"indices": [1]}},
+            "material": {"it": material(law, strain=strain)},
+            "section": {"it": {"area": 1e-3, "material": "it", "shape": "round"}},
+            "initial": {"on": [{"node_set": "tip", "velocity": [velocity, 0.0, 0.0]}]},
+            "support": [{"node_set": "foot", "fix": "xyz"}, {"node_set": "tip", "fix": "yz"}],
+            "time": {"integrator": "central_differences", "step": 1e-3, "end": 1e-3 * steps},
+            "output": {"fields_every": 0},
+        }
+    )
+
+
+THROWN = {("cable", "engineering"): 3.0, ("strut", "green"): -3.0, ("damage", "logarithmic"): 3.0}
+THROWN |= {("compaction", "engineering"): -4.0}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("law", "strain"), THROWN)
+def test_fused_steps_are_single_steps(law, strain, tmp_path):
+    found = []
+    for together in (False, True):
+        case = one_bar(law, strain, THROWN[law, strain])
+        with Simulation(case, output=tmp_path / str(together), quiet=True) as simulation:
+            for _ in simulation.batches(min_steps=1) if together else simulation:
+                pass
+            assert simulation.state.step == 200
+            found.append((simulation.state.x.copy(), simulation.model.bars.history()))
+    assert np.array_equal(found[0][0], found[1][0]) and np.array_equal(found[0][1], found[1][1])
+    assert np.abs(found[0][1]).max() > 1e-3
+    assert differences(*(tmp_path / str(name) / "result.vtkhdf" for name in (False, True))) == {}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("strain", ["engineering", "green", "logarithmic"])
+@pytest.mark.parametrize("law", MATERIALS)
+def test_products_are_derivatives_of_forces(law, strain, tower, comm, shared_tmp_path):
+    """K_t u against differences of forces, at positions at which bars yield, buckle, soften and are slack."""
+    case = tower(strain=strain)
+    with Simulation(case, comm, output=shared_tmp_path / "out", quiet=True) as simulation:
+        simulation.start()
+        bars, mesh = simulation.model.bars, simulation.model.mesh
+        random = np.random.default_rng(7)
+        block = next(block for block in bars.blocks if block.section == law)
+        bars.blocks = [block]
+        checked = 0
+        for size in (5e-3, 2e-2, 5e-2):
+            x = mesh.points + size * random.uniform(-1.0, 1.0, mesh.points.shape)
+            u = random.uniform(-1.0, 1.0, x.shape)
+            out, h = np.zeros_like(x), 1e-7
+            bars.product(x, u, out)
+            ends = [np.zeros_like(x), np.zeros_like(x)]
+            for f, sign in zip(ends, (1.0, -1.0), strict=True):
+                bars.forces(x + sign * h * u, f, commit=False)
+            difference = (ends[0] - ends[1]) / (2.0 * h)
+            assert out == pytest.approx(difference, abs=3e-6 * YOUNG * 1e-3)
+            checked += np.abs(out).max() > 1e-3 * YOUNG * 1e-3
+        assert checked >= 2

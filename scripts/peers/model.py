@@ -43,7 +43,7 @@ def lattice(cells: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def middle(cells: int) -> int:
-    """Number of the node at half the height of the edge x = y = 0, whose displacement along x is reported in statics."""
+    """Number of the node in the middle of the edge x = y = 0, whose displacement along x static runs report."""
     return cells // 2
 
 
@@ -75,6 +75,6 @@ def report(times: dict[str, float], bars: int, top: float, **further: float) -> 
 
 
 def arguments() -> tuple[int, str, int, str]:
-    """Cells, mode (explicit, explicit_contact, implicit, implicit_contact, static), steps and solver of the command line."""
+    """Cells, mode (explicit, implicit, either with _contact, or static), steps and solver of the command line."""
     cells, mode, steps = int(sys.argv[1]), sys.argv[2], int(sys.argv[3])
     return cells, mode, steps, sys.argv[4] if len(sys.argv) > 4 else ""

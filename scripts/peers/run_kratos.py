@@ -77,7 +77,7 @@ def main() -> None:
     pressed = [node for node in part.Nodes if static and node.Z0 == height]
     for node in part.Nodes:
         if static:
-            if node.Z0 in (0.0, height):
+            if abs(node.Z0 - 0.5 * height) == 0.5 * height:
                 for component in (Kratos.DISPLACEMENT_X, Kratos.DISPLACEMENT_Y, Kratos.DISPLACEMENT_Z):
                     node.Fix(component)
             continue

@@ -74,10 +74,10 @@ def main() -> None:
     solver.PrepareModelPart()
     solver.AddDofs()
     height = points[-1, 2]
-    pressed = [node for node in part.Nodes if static and node.Z0 == height]
+    pressed = [node for node in part.Nodes if static and node.Z0 in (height,)]
     for node in part.Nodes:
         if static:
-            if abs(node.Z0 - 0.5 * height) == 0.5 * height:
+            if node.Z0 in (0.0, height):
                 for component in (Kratos.DISPLACEMENT_X, Kratos.DISPLACEMENT_Y, Kratos.DISPLACEMENT_Z):
                     node.Fix(component)
             continue

@@ -50,12 +50,15 @@ OPENSEES = Code("OpenSeesPy", "openseespy", "run_openseespy.py")
 MUMPS = Code("OpenSeesPy, MUMPS", "openseespy", "run_openseespy.py", "Mumps", 200_000)
 UMFPACK = Code("OpenSeesPy, UmfPack", "openseespy", "run_openseespy.py", "UmfPack", 20_000)
 KRATOS = Code("Kratos", "kratos", "run_kratos.py")
+GAMG = Code("pfem_petsc, multigrid", "ours", "run_ours.py", "gamg", 60_000)  # auto takes it for more
+DIRECT = Code("pfem_petsc, MUMPS", "ours", "run_ours.py", "mumps", 200_000)
 AMGCL = Code("Kratos, AMGCL", "kratos", "run_kratos.py")
 
 MODES = {
     "explicit": ("explicit, elastic, foot held", (OURS, BARE, KRATOS, OPENSEES)),
     "explicit_contact": ("explicit, elastoplastic, wall", (OURS, BARE, OPENSEES)),
     "implicit": ("implicit at 2 l/c, elastic, foot held", (OURS, FREE, ASSEMBLED, AMGCL, MUMPS, UMFPACK)),
+    "static": ("static increments between plates, elastic", (OURS, GAMG, DIRECT, AMGCL)),
     "implicit_contact": ("implicit at 2 l/c, elastoplastic, wall", (OURS, MUMPS, UMFPACK)),
 }
 TIME_LIMIT = 1200.0  # [s] for one run
@@ -119,6 +122,8 @@ def install(name: str, folder: Path) -> str | None:
 
 def steps_of(mode: str, bars: int) -> int:
     """Return the number of timed steps: enough for the clock, few enough for the slowest code."""
+    if mode == "static":
+        return 5 if bars < 50_000 else 3 if bars < 500_000 else 1
     if mode.startswith("implicit"):
         return 5 if bars < 50_000 else 3
     return 200 if bars < 50_000 else 40 if bars < 500_000 else 8

@@ -90,6 +90,7 @@ class ActiveSet:
     balance : of the step
     held : (owned,) bool, nodes in contact with walls in the last step
     links : coordinates of all links of the case
+    remedy : what the user can do against steps that are too large
 
     Attributes
     ----------
@@ -97,9 +98,15 @@ class ActiveSet:
     """
 
     def __init__(
-        self, model: Model, state: State, balance: Balance, held: np.ndarray, links: Sequence[LinkCoordinates] = ()
+        self,
+        model: Model,
+        state: State,
+        balance: Balance,
+        held: np.ndarray,
+        links: Sequence[LinkCoordinates] = (),
+        remedy: str = "reduce time.step",
     ) -> None:
-        self.contact = model.contact
+        self.contact, self._remedy = model.contact, remedy
         self.model = model
         self.state = state
         self.balance = balance
@@ -223,15 +230,11 @@ class ActiveSet:
         if self.model.comm.allreduce(int(unsettled or len(left) > 0), op=MPI.MAX):
             self._iterations += 1
             if self._iterations >= _ITERATIONS:
-                raise NotConverged(f"{self._when()}: {self._why(left, x)}")
+                raise NotConverged(self._why(left, x))
             rank = PROJECTED * self.model.length
             candidates = candidates.join(contact, self._displacements, joined, broken, x, normal_forces, rank)
             settled = False
         return Outcome(settled, candidates, links, trial, normal_forces, pull)
-
-    def _when(self) -> str:
-        step, time = self.model.first_step + self.state.step + 1, self.model.origin + self.balance.time
-        return f"step {step}, t = {time:.6g} s"
 
     def _why(self, left: np.ndarray, x: np.ndarray) -> str:
         """Return why the solves of nodes (k,) at (owned, 3) do not converge, and the remedy. Collective."""
@@ -243,7 +246,7 @@ class ActiveSet:
         shown = ", ".join(str(node) for part in names for node in part)
         return (
             f"the active set of the walls did not converge in {_ITERATIONS} solves"
-            f"{f' (nodes {shown})' if shown else ''}; reduce time.step"
+            f"{f' (nodes {shown})' if shown else ''}; {self._remedy}"
         )
 
     def _check_links(
@@ -263,15 +266,10 @@ class ActiveSet:
                 continue
             link.solve_forces(w, turned, bounds.arrays[0], noise)
             link.push(g, -1.0)
-            try:
-                kept &= link.kept(x, slack)
-            except NotConverged as failure:
-                raise NotConverged(f"{self._when()}: {failure}") from failure
+            kept &= link.kept(x, slack)
         self._link_iterations += not kept
         if self._link_iterations >= _ITERATIONS:
-            raise NotConverged(
-                f"{self._when()}: constraints and positions did not agree in {_ITERATIONS} solves; reduce time.step"
-            )
+            raise NotConverged(f"constraints and positions did not agree in {_ITERATIONS} solves; {self._remedy}")
         links = tuple(link for link in self._all_links if link in met)
         return kept and len(links) == len(trial.links), links, g
 

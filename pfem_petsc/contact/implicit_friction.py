@@ -32,6 +32,10 @@ __all__ = ["StepFriction"]
 # Weight of the known direction relative to the one solved for, multiplied by ten after each failure. 0.01 saves a fifth
 # of the solves at first, but fails if nodes slip by micrometres.
 _FIRM = 0.1
+# The error of directions falls by about the weight from solve to solve. Once they are all that changes, the weight
+# falls as well, from this number of solves on.
+_STEADY = 2
+_SOFTER, _LEAST = 0.1, 1e-4
 
 
 class StepFriction:
@@ -65,6 +69,7 @@ class StepFriction:
         self._slips = np.zeros(owned, dtype=bool)  # known to slip along their direction
         self._forces = np.zeros((owned, 3))  # friction force on each node in its last local solution
         self._firmness = _FIRM
+        self._steady = 0  # solves in which no node has begun or ceased to stick or to slip
         self._lagged = False  # friction is treated as a known force
         self._failed = np.zeros(owned, dtype=bool)  # found not to stick
         self.drag = np.zeros((0, walls, 3))
@@ -122,6 +127,7 @@ class StepFriction:
         slipping = self._sticks[nodes[at]] < 0
         moved, normal_forces, drag, stiffness = self._local(frames, at, x[at], reaction[at], slipping)
         self._forces[nodes[at]] = drag.sum(axis=1)
+        before = self._sticks.copy(), self._slips.copy()
         apart = stiffness * np.linalg.norm(moved - x[at], axis=1)
         # rounding of positions, and of the frames' coordinates on the way to them
         floor = 2e-14 * stiffness * (np.abs(x[at]).sum(axis=1) + contact.length)
@@ -134,10 +140,18 @@ class StepFriction:
         trying = may.any(axis=1)
         self._sticks[nodes[at[trying]]] = may[trying].argmax(axis=1)
         self.unsettled = nodes[np.union1d(at[wrong], at[trying])]
+        self._soften(before)
         none = normal_forces <= noise
         normal_forces[none], drag[none] = 0.0, 0.0
         strengths[at], self.drag[at] = normal_forces, drag
         return strengths
+
+    def _soften(self, before: tuple[np.ndarray, np.ndarray]) -> None:
+        """Reduce the weight of known directions if statuses, ``before`` and now, are the same. Collective."""
+        changed = any((now != was).any() for now, was in zip((self._sticks, self._slips), before, strict=True))
+        self._steady = 0 if self.model.comm.allreduce(int(changed)) else self._steady + 1
+        if self._steady >= _STEADY:
+            self._firmness = max(_SOFTER * self._firmness, _LEAST)
 
     def relax(self) -> bool:
         """Simplify the next solve after a failure; return whether it could be simplified. Collective.
@@ -148,6 +162,7 @@ class StepFriction:
         turning, moving = self.model.comm.allreduce(np.array([slips, moves], dtype=np.int64)) > 0
         self._slips[:] = False
         self._firmness *= 10.0
+        self._steady = 0
         if turning:
             return True
         lagged, self._lagged = self._lagged, True

@@ -62,7 +62,7 @@ class ModeFrames:
         self._shapes = shapes * (_LARGEST * extent / largest)[:, None, None]
         # walls are where they are at the end
         self.times = np.full(period * len(self._numbers), result.times[-1])
-        self.history: Mapping[str, np.ndarray] = {"time": self.times}
+        self.history: Mapping[str, np.ndarray] = result.history
 
     def positions(self, i: int) -> np.ndarray:
         """Positions (nodes, 3) [m] of frame i."""

@@ -17,7 +17,7 @@ from ..output.units import prefix_for
 from .camera import VIEWS, Camera, aim
 from .fields import ColourField, ColourScale
 from .headless import require_rendering
-from .walls import Surface, wall_shifts, wall_surfaces
+from .walls import Surface, wall_shifts, wall_surfaces, walls_present
 
 __all__ = ["render"]
 
@@ -184,11 +184,16 @@ class _Film:
         self.time_factor, self.time_unit = prefix_for(float(np.abs(times).max()), self.result.axis.unit)
 
     def _moved(self, walls: Sequence[Any]) -> dict[int, list[Surface]]:
-        """Return, by frame, the surfaces of the walls at that time; a wall at rest has the same one in all frames."""
-        displacements = dict(
-            zip(self.frames, wall_shifts(self.result, self.result.times[list(self.frames)]), strict=True)
-        )
+        """Return, by frame, the surfaces of the walls at that time; a wall at rest has the same one in all frames.
+
+        ``self.shown`` says which of them are there: those that a stage does not have are not drawn.
+        """
+        times = self.result.times[list(self.frames)]
+        displacements = dict(zip(self.frames, wall_shifts(self.result, times), strict=True))
+        present = dict(zip(self.frames, walls_present(self.result, times), strict=True))
         still = {surface.name: surface for surface in wall_surfaces(walls, self.bounds, self.note)}
+        drawn = [wall.name in still for wall in walls]
+        self.shown = {frame: present[frame][drawn].tolist() for frame in self.frames}
         surfaces: dict[int, list[Surface]] = {frame: [] for frame in self.frames}
         for k, wall in enumerate(walls):
             if wall.name not in still:
@@ -203,8 +208,14 @@ class _Film:
 
     @property
     def places(self) -> Iterator[np.ndarray]:
-        """Yield the points (n, 3) [m] of all distinct wall surfaces."""
-        for surface in {id(s): s for surfaces in self.surfaces.values() for s in surfaces}.values():
+        """Yield the points (n, 3) [m] of all distinct wall surfaces that are drawn."""
+        drawn = (
+            surface
+            for frame, surfaces in self.surfaces.items()
+            for surface, shown in zip(surfaces, self.shown[frame], strict=True)
+            if shown
+        )
+        for surface in {id(surface): surface for surface in drawn}.values():
             yield surface.points
 
     def positions(self, frame: int) -> np.ndarray:
@@ -244,7 +255,7 @@ class _Film:
 
     def draw(self, scene: Any, frame: int) -> np.ndarray:
         colours = self.colours.colours(self.colour.values(frame))
-        return scene.draw(self.positions(frame), colours, self.colour.on_nodes, self.surfaces[frame])
+        return scene.draw(self.positions(frame), colours, self.colour.on_nodes, self.surfaces[frame], self.shown[frame])
 
 
 def _draw_frames(film: _Film, folder: Path, size: tuple[int, int], title: str, style: dict[str, Any]) -> list[Path]:

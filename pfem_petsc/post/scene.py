@@ -92,7 +92,12 @@ class Scene:
         camera.apply(plotter.camera)
 
     def draw(
-        self, points: np.ndarray, colours: np.ndarray, on_nodes: bool, surfaces: Sequence[Surface] | None = None
+        self,
+        points: np.ndarray,
+        colours: np.ndarray,
+        on_nodes: bool,
+        surfaces: Sequence[Surface] | None = None,
+        shown: Sequence[bool] | None = None,
     ) -> np.ndarray:
         """Draw a frame.
 
@@ -102,6 +107,7 @@ class Scene:
         colours : (n, 3) uint8 of nodes or (b, 3) of bars
         on_nodes : whether the colours are those of nodes
         surfaces : the walls at their current positions; None: unchanged
+        shown : which of them are drawn; None: unchanged
 
         Returns
         -------
@@ -109,8 +115,12 @@ class Scene:
         """
         if surfaces is not None:
             for surface, meshes in zip(surfaces, self._walls, strict=True):
-                for mesh in meshes:
+                for mesh, _ in meshes:
                     mesh.points = self._behind(surface.points)
+        if shown is not None:
+            for visible, meshes in zip(shown, self._walls, strict=True):
+                for _, actor in meshes:
+                    actor.SetVisibility(visible)
         moved = (points - self._origin).astype(np.float32)
         self._lines.points = moved
         if self._balls is not None:
@@ -169,8 +179,8 @@ class Scene:
             points = points - 3.0 * self._camera.half_height * self._camera.towards
         return points
 
-    def _add_wall(self, surface: Surface) -> list[Any]:
-        """Draw a wall; return its meshes, whose points move with it."""
+    def _add_wall(self, surface: Surface) -> list[tuple[Any, Any]]:
+        """Draw a wall; return its meshes, whose points move with it, with their actors."""
         import pyvista
 
         points = self._behind(surface.points)
@@ -185,16 +195,16 @@ class Scene:
         rgba[:, :3] = WALL_COLOUR
         rgba[:, 3] = strength * (1.0 - np.clip(surface.depth, 0.0, 1.0))
         body.point_data["colour"] = rgba
-        self._plotter.add_mesh(body, scalars="colour", rgb=True, lighting=False, reset_camera=False)
-        meshes = [body]
+        meshes = [(body, self._plotter.add_mesh(body, scalars="colour", rgb=True, lighting=False, reset_camera=False))]
         if len(surface.edge):
             lines = np.column_stack([np.full(len(surface.edge), 2), surface.edge]).ravel()
-            meshes.append(pyvista.PolyData(points, lines=lines))
-            self._plotter.add_mesh(
-                meshes[-1],
+            outline = pyvista.PolyData(points, lines=lines)
+            actor = self._plotter.add_mesh(
+                outline,
                 color=EDGE_COLOUR,
                 line_width=2.0 * self._factor,
                 lighting=False,
                 reset_camera=False,
             )
+            meshes.append((outline, actor))
         return meshes

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from ..contact.surfaces import Surface, slab
 from ..errors import InputError
 from ..registry import lookup
 
-__all__ = ["plane", "wall_shifts", "wall_surfaces"]
+__all__ = ["plane", "wall_shifts", "wall_surfaces", "walls_present"]
 
 
 def plane(wall: Any, bounds: np.ndarray) -> Surface:
@@ -81,7 +81,7 @@ def wall_shifts(result: Any, times: Sequence[float]) -> np.ndarray:
     """Return displacements (times, walls, 3) [m] of a result's walls from their initial positions.
 
     Positions of walls with mass are interpolated linearly between rows of the history; others follow from the case.
-    A wall that a stage no longer has stays where it was.
+    A wall that a stage no longer has stays where it was; :func:`walls_present` says which are there.
     """
     walls = result.case.every_wall
     if result.case.stage:
@@ -97,18 +97,40 @@ def wall_shifts(result: Any, times: Sequence[float]) -> np.ndarray:
     return displacements
 
 
+def walls_present(result: Any, times: Sequence[float]) -> np.ndarray:
+    """Return which of a result's walls are there (times, walls) bool: with stages, those of the stage at that time."""
+    walls = result.case.every_wall
+    if not result.case.stage:
+        return np.ones((len(times), len(walls)), dtype=bool)
+    present = np.zeros((len(times), len(walls)), dtype=bool)
+    for row, time in enumerate(times):
+        *_, (stage, _, _) = _stages_until(result, time)
+        names = [wall.name for wall in stage.wall]
+        present[row] = [wall.name in names for wall in walls]
+    return present
+
+
+def _stages_until(result: Any, time: float) -> Iterator[tuple[Any, float, float]]:
+    """Yield the stages that have begun before a time, each with its beginning and its end, at most this time.
+
+    The end of a stage belongs to it, and not to the next one.
+    """
+    times, numbers = np.asarray(result.history["time"]), np.asarray(result.history["stage"])
+    for stage in result.case.stage:
+        rows = times[numbers == stage.number]
+        begin = times[numbers < stage.number].max(initial=0.0)
+        if stage.number and (not len(rows) or begin >= time):
+            return
+        yield stage, begin, min(time, rows[-1]) if len(rows) else begin
+
+
 def _shifts_in_stages(result: Any, time: float) -> np.ndarray:
     """Displacements (walls, 3) [m] at a time, from the place where a wall is first given."""
     walls = result.case.every_wall
     times, numbers = np.asarray(result.history["time"]), np.asarray(result.history["stage"])
     shifts = np.zeros((len(walls), 3))
-    for stage in result.case.stage:
-        rows = times[numbers == stage.number]
-        begin = times[numbers < stage.number].max(initial=0.0)
-        if not len(rows) or (begin >= time and stage.number):
-            break
-        own = min(time, rows[-1]) - begin
-        for wall, moved in zip(stage.wall, WallMotion(stage.wall).displacements(own), strict=True):
+    for stage, begin, end in _stages_until(result, time):
+        for wall, moved in zip(stage.wall, WallMotion(stage.wall).displacements(end - begin), strict=True):
             k = [each.name for each in walls].index(wall.name)
             if wall.mass is not None:
                 places = np.asarray(result.history[f"wall/{wall.name}/position"])

@@ -1,10 +1,10 @@
 """Equilibrium and its derivatives as functions of displacements and load factor, and the linear solves of a path.
 
-Along a path displacement u and load factor are unknowns of f_int(u) - f_ext(load factor) = 0 and one further equation.
-Newton's method eliminates it: with the tangent stiffness K it takes two solves, K r = -g for the residual g and
-K v = -dg/d(load factor) for the response to the load, and the further equation gives the change of the load factor
-(Batoz and Dhatt 1979; Riks 1979). K alone is factorised, which is singular at critical points only, so that any linear
-solver serves.
+The unknowns of a point are the displacement u and the load factor. The equations are f_int(u) - f_ext(load factor) = 0
+and a constraint. An iteration of Newton's method makes two solves with the tangent stiffness K, K r = -g for the
+residual g and K v = -dg/d(load factor) for the response to the load; the constraint gives the change of the load factor
+(Batoz and Dhatt 1979; Riks 1979). Only K is factorised, which is singular at critical points only, so that any linear
+solver can be used.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ if TYPE_CHECKING:
 __all__ = ["BorderedSystem"]
 
 _PREFIX = "pfem_path_"
-_RTOL = 1e-8  # of iterative solves: tangents, which tell where the load factor turns, have no further correction
-_USABLE = 1e-4  # of the right-hand side: residual of an iterative solve that did not get to the end
-_SHARE = 1e-5  # of the load factor, for differences in it: those of loads that are linear in it are exact
+_RTOL = 1e-8  # of iterative solves: tangents locate limit points and are not corrected afterwards
+_USABLE = 1e-4  # relative residual at which an iterative solve that has not converged is accepted
+_SHARE = 1e-5  # step of differences by the load factor, relative to it; exact for loads that are linear in it
 
 
 class BorderedSystem:
-    """Residual, response to the load, and solves with the tangent stiffness. Made once for a run.
+    """Residual, response to the load, and solves with the tangent stiffness. Created once for a run.
 
     Options: prefix ``pfem_path_``.
 
@@ -49,14 +49,14 @@ class BorderedSystem:
     model : Model
     hessian : of the stepper, assembled or matrix-free
     choice : of the linear solver
-    lagged : preconditioner that is kept over steps, None where PETSc makes one from the matrix
-    scheme : gives the balance
-    unit : a load factor that is not small, for differences
+    lagged : preconditioner that is reused over steps, None if PETSc builds one from the matrix
+    scheme : defines the balance
+    unit : lower bound of the load factor in the step of differences
 
     Attributes
     ----------
     problem : StepProblem at the start of the present step
-    linear : iterations of the linear solver so far
+    linear : number of iterations of the linear solver
     """
 
     def __init__(
@@ -90,36 +90,36 @@ class BorderedSystem:
         self.problem: StepProblem | None = None
 
     def begin(self, state: State) -> None:
-        """Take displacements from the positions of a state on. Collective."""
+        """Start a step: displacements are relative to the positions of a state. Collective."""
         balance = self.scheme.balance(state, 0.0)
         self.problem = StepProblem(self.model, state, balance, state.external, self._transform)
 
     def external(self, load_factor: float) -> np.ndarray:
-        """External forces (owned, 3) [N]."""
+        """Return the external forces (owned, 3) [N]."""
         out = np.zeros_like(self.problem.u)
         return self.model.external.at(load_factor, out) if self.model.external.active else out
 
     def prescribe(self, u: np.ndarray, load_factor: float) -> None:
-        """Put prescribed components of displacements (owned, 3) in place."""
+        """Set the prescribed components of displacements (owned, 3)."""
         supports = self.model.supports
         if supports.any:
             u[supports.at] = supports.positions(load_factor) - self.problem.balance.predictor[supports.at]
 
     def imbalance(self, u: np.ndarray, load_factor: float, g: np.ndarray) -> None:
-        """g = f_int - f_ext (owned, 3) [N], reactions of supports included. Collective."""
+        """Compute g = f_int - f_ext (owned, 3) [N], including reactions of supports. Collective."""
         if self.model.bars_vary:
             self.model.change_bars(load_factor)
         self.problem.known = -self.external(load_factor)
         self.problem.imbalance(u, g)
 
     def residual(self, u: np.ndarray, load_factor: float, g: np.ndarray) -> None:
-        """As :meth:`imbalance`, zero where supports prescribe the position. Collective."""
+        """Compute :meth:`imbalance` with zeros at prescribed components. Collective."""
         self.imbalance(u, load_factor, g)
         if self.model.supports.any:
             g[self.model.supports.fixed] = 0.0
 
     def rate(self, u: np.ndarray, load_factor: float) -> np.ndarray:
-        """-dg/d(load factor) (owned, 3) [N] at free components, by central differences. Collective."""
+        """Return -dg/d(load factor) (owned, 3) [N] at free components, by central differences. Collective."""
         h = _SHARE * max(abs(load_factor), self._unit)
         model = self.model
         if not (model.bars_vary or model.supports.moving):
@@ -137,17 +137,17 @@ class BorderedSystem:
         return (ends[1] - ends[0]) / (2.0 * h)
 
     def linearise(self, u: np.ndarray) -> None:
-        """Take the tangent stiffness at a displacement. Collective."""
+        """Evaluate the tangent stiffness at a displacement (owned, 3). Collective."""
         self.hessian.update(self.problem, u)
         self._ksp.setOperators(self.hessian.mat, self.hessian.mat)
 
     def solve(self, b: np.ndarray) -> np.ndarray:
-        """K^-1 b (owned, 3), zero at prescribed components. Collective.
+        """Return K^-1 b (owned, 3), zero at prescribed components. Collective.
 
         Raises
         ------
         NotConverged
-            On all ranks: K is singular, or the linear solver does not converge.
+            On all ranks, if K is singular or the linear solver does not converge.
         """
         self._b.array[:] = b.ravel()
         if self.model.supports.any:
@@ -165,7 +165,7 @@ class BorderedSystem:
         return x
 
     def response(self, u: np.ndarray, load_factor: float) -> np.ndarray:
-        """Displacement per load factor v (owned, 3) of the stiffness last taken, supports included. Collective."""
+        """Return du/d(load factor) (owned, 3) with the last stiffness, including moving supports. Collective."""
         v = self.solve(self.rate(u, load_factor))
         supports = self.model.supports
         if supports.moving:
@@ -178,7 +178,7 @@ class BorderedSystem:
         self.linear += self._ksp.getIterationNumber()
         reason = self._ksp.getConvergedReason()
         if reason < 0 and not self.direct and self._ksp.getResidualNorm() <= _USABLE * self._b.norm():
-            return 1  # next to a critical point more is not to be had, and Newton's method corrects it
+            return 1  # close to a critical point the residual stagnates; Newton's method corrects the error
         return reason
 
     def destroy(self) -> None:
@@ -188,7 +188,7 @@ class BorderedSystem:
 
 
 def _let_go(reference: weakref.ref) -> None:
-    """Take what is written in Python from a solver that is still there when Python ends: PETSc would call it later."""
+    """Detach Python objects from a solver that outlives the interpreter, because PETSc would call them."""
     ksp = reference()
     if ksp:
         ksp.getPC().setType("none")
@@ -198,17 +198,17 @@ def _let_go(reference: weakref.ref) -> None:
 
 
 class _Preconditioning:
-    """What PETSc calls of the preconditioner that is kept over steps."""
+    """Callbacks of PETSc for the preconditioner that is reused over steps."""
 
     def __init__(self, system: BorderedSystem) -> None:
         self._system = weakref.ref(system)
 
     def setUp(self, pc: PETSc.PC) -> None:  # noqa: N802 - PETSc's name
-        """The stiffness has changed; called by PETSc."""
+        """Update the preconditioner after a change of the stiffness; called by PETSc."""
         system = self._system()
         if system.problem is not None:
             system.lagged.renew(system.problem, None)
 
     def apply(self, pc: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """Y = P x; called by PETSc."""
+        """Compute y = P x; called by PETSc."""
         self._system().lagged.apply(x, y)

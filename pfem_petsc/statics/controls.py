@@ -1,6 +1,6 @@
-"""How points of a path are given: by a length of arc, or by a displacement along a direction.
+"""Definition of the points of a path: by an arc length, or by a displacement along a direction.
 
-Each control has a measure s of points, from the last one on, in units of the load factor.
+Each control has a measure s of points, relative to the last one, in units of the load factor.
 """
 
 from __future__ import annotations
@@ -14,30 +14,30 @@ from .path_constraints import Arc, Component, Constraint, Direction, Metric
 
 __all__ = ["ByArc", "ByComponent", "Control"]
 
-_LEAST = 1e-9  # displacement along the direction per length of the path, below which it turns back
+_LEAST = 1e-9  # displacement along the direction per length of the path, below which it decreases
 
 
 class Control(Protocol):
-    """A measure of points; displacements (owned, 3) [m] and changes of the load factor are from the last point."""
+    """A measure of points; displacements (owned, 3) [m] and changes of the load factor are those from the last one."""
 
     scale: float
-    """Of displacements along the direction [m], zero before the path has begun or where there is none."""
+    """Scale of displacements along the direction [m]; zero before the first point, or if there is no direction."""
 
     def constraint(self, size: float) -> Constraint:
-        """Of the point at a measure."""
+        """Return the constraint of the point at a measure."""
 
     def measure(self, u: np.ndarray, change: float) -> float:
-        """Of a point. Collective."""
+        """Return the measure of a point. Collective."""
 
     def rate(self, u: np.ndarray, change: float, tangent: np.ndarray, slope: float) -> float:
-        """Derivative of the measure along the tangent at a point. Collective."""
+        """Return the derivative of the measure along the tangent at a point. Collective."""
 
     def advance(self, tangent: np.ndarray, size: float) -> float:
-        """Length along the tangent at the last point that comes to a measure. Collective."""
+        """Return the length along the tangent at the last point that reaches a measure. Collective."""
 
 
 class ByArc:
-    """By the distance from the last point in a metric: the chord of the arc."""
+    """Points at a distance from the last one in a metric: the chord of the arc."""
 
     scale = 0.0
 
@@ -63,7 +63,7 @@ class ByArc:
 
 
 class ByComponent:
-    """By the displacement along a direction, over that of the first response to a unit of load."""
+    """Points at a displacement along a direction, relative to that of the first response to a unit of load."""
 
     def __init__(self, direction: Direction) -> None:
         self._direction = direction
@@ -87,7 +87,7 @@ class ByComponent:
         Raises
         ------
         NotConverged
-            On all ranks, where the displacement does not increase along the path.
+            On all ranks, if the displacement does not increase along the path.
         """
         along = self._direction.of(tangent) / self.scale
         if not along > _LEAST:

@@ -1,8 +1,8 @@
 """Critical points between two points of a path: limit points of the load factor, and bifurcations.
 
-A limit point is where the slope of the load factor changes sign. The number of negative eigenvalues of the tangent
-stiffness changes by one there; where it changes otherwise, paths cross. Both are located by regula falsi with
-bisection on the length from the last point, each trial being a point of the path of its own.
+At a limit point the slope of the load factor changes sign, and the number of negative eigenvalues of the tangent
+stiffness changes by one. Where this number changes without a change of sign, paths cross: a bifurcation. Both are
+located by regula falsi with bisection over the length from the last point; each trial is a point of the path.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ EVENTS: dict[str, Any] = {
 
 _TRIALS = 60
 _LOCATED = 1e-8  # last change of the length, over the step
-_NARROW = 1e-3  # interval, over the step, whose last trial will do where no further one converges
+_NARROW = 1e-3  # interval, over the step, in which the last trial is accepted if no further one converges
 _FLAT = 1e-9  # slope of the load factor at a limit point, over that of the first response
-_BESIDE = 4e-3  # length beside a bifurcation, over the step, at which the path is well determined
-_DEPTH = 8  # bisections to tell critical points of a step apart
+_BESIDE = 4e-3  # distance from a bifurcation, over the step, at which the path is well determined
+_DEPTH = 8  # bisections to separate the critical points of a step
 
 
 @dataclass(frozen=True)
@@ -48,9 +48,9 @@ class Event:
     ----------
     kind : ``limit`` or ``bifurcation``
     load_factor : there
-    step : number of the first point at it or beyond
-    displacement : along ``static.direction`` [m]; NaN without
-    multiplicity : eigenvalues that pass zero there
+    step : number of the first point at it or beyond it
+    displacement : along ``static.direction`` [m]; NaN if there is none
+    multiplicity : number of eigenvalues that change sign
     """
 
     kind: str
@@ -60,7 +60,7 @@ class Event:
     multiplicity: int
 
     def row(self) -> dict[str, Any]:
-        """Values by column."""
+        """Return the values by column."""
         return {**self.__dict__, "kind": KINDS[self.kind]}
 
     def __str__(self) -> str:
@@ -71,7 +71,7 @@ class Event:
 
 
 class _End(NamedTuple):
-    """One end of an interval: length, slope and negative eigenvalues there."""
+    """An end of an interval: length, slope, and number of negative eigenvalues."""
 
     size: float
     slope: float
@@ -89,18 +89,18 @@ class _Interval(NamedTuple):
 
     @property
     def change(self) -> int:
-        """Of the number of negative eigenvalues."""
+        """Change of the number of negative eigenvalues."""
         known = self.first.negatives >= 0 and self.second.negatives >= 0
         return self.second.negatives - self.first.negatives if known else 0
 
 
 def find_critical(stepper: PathStepper, last: Point) -> tuple[list[Event], Point | None]:
-    """Critical points up to a point, in their order, and the one at which the path is to turn. Collective.
+    """Return the critical points up to a point, in order, and the one at which the path branches off. Collective.
 
     Raises
     ------
     NotConverged
-        On all ranks, where one is not found between state and point: the point may lie on another path.
+        On all ranks, if one cannot be located between state and point: the point may lie on another path.
     """
     return _Search(stepper, last).run()
 
@@ -125,13 +125,13 @@ class _Search:
         return self.events, self.turn
 
     def _look(self, interval: _Interval, depth: int) -> None:
-        """Find what lies in an interval, from its first end on."""
+        """Find the critical points of an interval, starting from its first end."""
         if self.turn is not None or not (interval.turned or interval.change):
             return
         first, second = interval
         limit = abs(interval.change) == 1 or first.negatives < 0
         if interval.turned and (limit or depth == _DEPTH):
-            # where the load factor of a branch turns and no other eigenvalue passes zero, another path is left or met
+            # the load factor turns without a change of sign of an eigenvalue where two paths meet
             point = self._locate(interval, lambda point: point.slope, _FLAT)
             self._note("limit" if limit else "bifurcation", point, max(abs(interval.change), 1))
             return
@@ -158,10 +158,10 @@ class _Search:
             self._look(_Interval(end, second), depth + 1)
 
     def _between(self, interval: _Interval, value: Callable[[Point], float], tried: list[tuple[float, float]]) -> float:
-        """Where a value is zero, by inverse interpolation of trials (length, value).
+        """Return the zero of a value by inverse interpolation of trials (length, value).
 
-        Next to a bifurcation equations nearly lose their solution, and Newton's method takes too many iterations; the
-        value beside it is well known.
+        At a bifurcation the equations are singular, and Newton's method needs too many iterations; beside it the value
+        is accurate.
         """
         before = [trial for trial in tried if trial[1] > 0.0]
         beyond = [trial for trial in tried if trial[1] <= 0.0]
@@ -182,10 +182,9 @@ class _Search:
         return float(np.dot(weights, sizes))
 
     def _crossing(self, size: float, beyond: Point) -> Point:
-        """The point at a bifurcation, between points on both sides of it.
+        """Return the point at a bifurcation, interpolated between points on both sides of it.
 
-        At the point itself equilibrium hardly tells how far it is off along the mode, nor the response to the load how
-        the path goes on.
+        At the bifurcation itself, neither the position along the mode nor the tangent of the path is well determined.
         """
         low = size - _BESIDE * self.size
         before = self._at(low) if low > _BESIDE * self.size else self._start
@@ -209,9 +208,9 @@ class _Search:
         return _End(self.stepper.measure(point), point.slope, point.negatives)
 
     def _at(self, size: float) -> Point:
-        """The point at a length, guessed by the cubic through both ends with their tangents.
+        """Return the point at a length; the guess is the cubic through both ends with their tangents.
 
-        Trials in between would be closer, but next to a bifurcation their tangents are lost in rounding.
+        Trials in between are closer, but near a bifurcation rounding destroys their tangents.
         """
         stepper = self.stepper
         u, load_factor, _, _ = self._cubic(self._start, 0.0, self.last, self.size, size)
@@ -220,7 +219,7 @@ class _Search:
     def _cubic(
         self, first: Point, low: float, second: Point, high: float, size: float
     ) -> tuple[np.ndarray, float, np.ndarray, float]:
-        """Displacement, load factor and their derivatives at a length, by the cubic through two points and tangents."""
+        """Return displacement, load factor and their derivatives at a length, by cubic interpolation of two points."""
         h = high - low
         t = (size - low) / h
         values = (
@@ -230,7 +229,7 @@ class _Search:
             t * t * (t - 1.0) * h,
         )
         rates = 6.0 * t * (t - 1.0) / h, 6.0 * t * (1.0 - t) / h, (1.0 - t) * (1.0 - 3.0 * t), t * (3.0 * t - 2.0)
-        # lengths are not those along the path: that of an arc is a chord
+        # lengths are not measured along the path: that of an arc is a chord
         speeds = [self.stepper.rate(point) for point in (first, second)]
         u = np.stack([first.u, second.u, first.tangent / speeds[0], second.tangent / speeds[1]])
         slopes = [first.slope / speeds[0], second.slope / speeds[1]]
@@ -245,9 +244,9 @@ class _Search:
         zero: float,
         tried: list[tuple[float, float]] | None = None,
     ) -> Point:
-        """Where a value changes sign: regula falsi (Illinois), with bisection where that is slow.
+        """Return the point where a value changes sign: regula falsi (Illinois), with bisection where that is slow.
 
-        ``tried`` takes length and value of trials.
+        ``tried`` receives length and value of the trials.
         """
         a, b = interval.first.size, interval.second.size
         fa = fb = None
@@ -258,7 +257,7 @@ class _Search:
             except NotConverged:
                 if point is None or b - a > _NARROW * self.size:
                     raise
-                break  # as close as the linear solver gets
+                break  # the linear solver gets no closer
             f = value(point)
             size = self.stepper.measure(point)
             if tried is not None:
@@ -284,13 +283,13 @@ class _Search:
 
     @staticmethod
     def _on_first_side(interval: _Interval, point: Point, f: float) -> bool:
-        """Whether a trial lies before what is located."""
+        """Return whether a trial lies before the critical point."""
         if interval.turned:
             return f * interval.first.slope > 0.0
         return f > 0.0
 
     def _tried(self, size: float, a: float, b: float) -> Point:
-        """The point at a length, or close by where the stiffness is singular to the last digit."""
+        """Return the point at a length, or close to it where the stiffness is singular to rounding."""
         for share in (0.0, 1e-3, 0.05, -0.05):
             try:
                 return self._at(min(max(size + share * (b - a), a), b) if share else size)

@@ -1,8 +1,8 @@
-"""How a path is measured, and the further equation of each of its points.
+"""The metric of a path, and the constraint that defines each of its points.
 
-Displacements u and changes of the load factor are measured from the last point. Lengths are in units of the load
-factor: the first response of the truss to a unit of load has length one, so that a first length is an increment of the
-load factor.
+Displacements u and changes of the load factor are relative to the last point. Lengths are in units of the load factor:
+the first response of the truss to a unit of load has length one, so the first length is an increment of the load
+factor.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ __all__ = ["Along", "Arc", "Component", "Constraint", "Direction", "LoadFactor",
 
 
 def dot(comm: MPI.Comm, a: np.ndarray, b: np.ndarray) -> float:
-    """Sum over ranks of the products of owned numbers. Collective."""
+    """Return the sum over all ranks of the products of owned numbers. Collective."""
     return comm.allreduce(float((a * b).sum()))
 
 
@@ -34,12 +34,12 @@ class Terms(NamedTuple):
 
 
 class Constraint(Protocol):
-    """The further equation of a point; ``size`` is the length against which its value counts."""
+    """The constraint of a point; its value is small or large compared with the length ``size``."""
 
     size: float
 
     def terms(self, u: np.ndarray, change: float) -> Terms:
-        """Value and derivatives. Collective."""
+        """Return value and derivatives. Collective."""
 
 
 @dataclass
@@ -58,12 +58,12 @@ class Metric:
     weight: float = 1.0
 
     def product(self, u: np.ndarray, change: float, other: np.ndarray, other_change: float) -> float:
-        """Inner product of two displacements (owned, 3) with changes of the load factor. Collective."""
+        """Return the inner product of two displacements (owned, 3) with changes of the load factor. Collective."""
         by_u = self.weight * dot(self.comm, u, other)
         return 0.5 * (by_u + change * other_change) if self.spherical else by_u
 
     def length(self, u: np.ndarray, change: float) -> float:
-        """Length of a displacement with a change of the load factor. Collective."""
+        """Return the length of a displacement with a change of the load factor. Collective."""
         return float(np.sqrt(self.product(u, change, u, change)))
 
 
@@ -91,19 +91,20 @@ class Direction:
 
     def __init__(self, model: Model, node_set: str, direction: tuple[float, float, float]) -> None:
         self.comm = model.comm
-        self._points = model.mesh.points[: model.mesh.n_owned]
+        begun = model.start
+        self._start = model.mesh.points[: model.mesh.n_owned] if begun is None else begun.position
         nodes = model.nodes[node_set]
         self.weights = np.zeros((model.mesh.n_owned, 3))
         count = model.comm.allreduce(len(nodes))
         self.weights[nodes] = np.array(direction) / (np.linalg.norm(direction) * count)
 
     def of(self, u: np.ndarray) -> float:
-        """Of displacements (owned, 3). Collective."""
+        """Return the mean of displacements (owned, 3) along the direction. Collective."""
         return dot(self.comm, self.weights, u)
 
     def at(self, position: np.ndarray) -> float:
-        """Of positions (owned, 3), from those of the mesh. Collective."""
-        return self.of(position - self._points)
+        """Return that of positions (owned, 3) relative to the mesh or to the start of the stage. Collective."""
+        return self.of(position - self._start)
 
 
 class Component:

@@ -13,10 +13,10 @@ __all__ = ["PathEquilibrium"]
 
 
 class PathEquilibrium(Equilibrium):
-    """As :class:`~.scheme.Equilibrium`; displacement and load factor of a step were found before it is made.
+    """The balance of :class:`~.scheme.Equilibrium` for steps whose displacement and load factor are known in advance.
 
-    ``reached`` is the load factor of the point that the next step goes to.
-    The state's memory holds ``tangent``: the displacement part of the path's unit tangent at the state.
+    ``reached`` is the load factor of the next point.
+    The state's memory has ``tangent``: the displacement part of the unit tangent of the path at the state.
     """
 
     remembers = ("tangent",)
@@ -26,7 +26,7 @@ class PathEquilibrium(Equilibrium):
         self.reached = 0.0
 
     def balance(self, state: State, h: float) -> Balance:
-        """The balance at the load factor reached; ``h`` is a length, not an increment of it."""
+        """Return the balance at the load factor reached; ``h`` is a length, not an increment of the load factor."""
         return replace(super().balance(state, 0.0), time=self.reached, loads=((1.0, self.reached),))
 
     def start(self, state: State, h: float) -> None:

@@ -1,4 +1,4 @@
-"""Points along the path of equilibria, on which the load factor may rise and fall."""
+"""Points along a path of equilibria, on which the load factor may increase and decrease."""
 
 from __future__ import annotations
 
@@ -6,17 +6,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..errors import InputError, NotConverged, SimulationFailure
+from ..errors import NotConverged, SimulationFailure
 from ..integrators.base import Balance
 from ..solvers.linear import LinearChoice
 from ..stepping.solution import Solution
-from ..tolerances import TIME
 from .bordered import BorderedSystem
 from .controls import ByArc, ByComponent, Control
 from .critical import EVENTS, Event, find_critical
 from .free_motions import free_motions
-from .path_constraints import Along, Component, Direction, LoadFactor, Metric, dot
+from .path_constraints import Along, Direction, Metric
+from .path_limits import end_at_limit
 from .path_scheme import PathEquilibrium
+from .path_start import check_path, first_point
 from .points import Point, PointSolver
 from .stepper import StaticStepper
 
@@ -27,8 +28,8 @@ if TYPE_CHECKING:
 __all__ = ["PathStepper"]
 
 _FACTORS = 0.5, 1.5  # of the length from point to point
-_UNRESOLVED = 2.0**-6  # of the length first tried, down to which a step is halved for a critical point not located
-_TURN = 0.5  # cosine between tangents of successive points, below which the step is halved while it can be
+_UNRESOLVED = 2.0**-6  # of the first length, down to which a step is halved if a critical point is not located
+_TURN = 0.5  # cosine between tangents of successive points, below which the step is halved if possible
 
 
 class PathStepper(StaticStepper):
@@ -39,13 +40,13 @@ class PathStepper(StaticStepper):
     model : Model
     choice : LinearChoice
     keys : of the method
-    component : whether points are given by a displacement, instead of a length of arc
+    component : whether points are defined by a displacement instead of an arc length
 
     Attributes
     ----------
-    arc : length that is tried next, in units of the load factor
-    slope : of the load factor over the length, at the state
-    negatives : number of negative eigenvalues at the state, -1 unknown
+    arc : next length, in units of the load factor
+    slope : derivative of the load factor with respect to the length at the state
+    negatives : number of negative eigenvalues at the state, -1 if unknown
     events : found with the last point and not recorded yet
     outcome : why the path ended; empty before
     """
@@ -67,7 +68,7 @@ class PathStepper(StaticStepper):
     remedy = "reduce static.max_step or static.step; if such jumps are intended, set solver.guard = false"
 
     def __init__(self, model: Model, choice: LinearChoice, keys: PathKeys, component: bool) -> None:
-        _check(model, keys)
+        check_path(model, keys)
         super().__init__(model, choice, keys)
         self.keys = keys
         self.scheme = PathEquilibrium()
@@ -76,6 +77,7 @@ class PathStepper(StaticStepper):
         self.direction = None
         if keys.node_set is not None:
             self.direction = Direction(model, keys.node_set, keys.direction)
+        self.by_component = component
         self.control: Control = ByComponent(self.direction) if component else ByArc(self.metric)
         self.system = BorderedSystem(model, self.hessian, choice, self.lagged, self.scheme, keys.step)
         self.points = PointSolver(model, self.state, self.system, self.metric, keys.critical_points)
@@ -93,12 +95,12 @@ class PathStepper(StaticStepper):
 
     @property
     def clock(self) -> float:
-        """Number of the point: the load factor need not increase."""
+        """Number of the point, as the load factor need not increase."""
         return float(self.state.step)
 
     @property
     def scale(self) -> float:
-        """Of the displacement that is prescribed [m]; zero with lengths of arc."""
+        """Scale of the prescribed displacement [m]; zero with arc lengths."""
         return self.control.scale
 
     @scale.setter
@@ -107,20 +109,20 @@ class PathStepper(StaticStepper):
             self.control.scale = value
 
     def measure(self, point: Point) -> float:
-        """The measure of a point. Collective."""
+        """Return the measure of a point. Collective."""
         return self.control.measure(point.u, point.load_factor - self.state.time)
 
     def rate(self, point: Point) -> float:
-        """Derivative of the measure along the tangent at a point. Collective."""
+        """Return the derivative of the measure along the tangent at a point. Collective."""
         return self.control.rate(point.u, point.load_factor - self.state.time, point.tangent, point.slope)
 
     @property
     def done(self) -> bool:
-        """Whether the path has reached one of its limits."""
+        """Whether the path has reached a limit."""
         return bool(self.ended)
 
     def remarks(self) -> list[str]:
-        """Where the path ended, and why."""
+        """Return where and why the path ended."""
         state = self.state
         reached = self.outcome or "stopped"
         text = f"the path ended at point {state.step}, load factor {state.time:.9g}"
@@ -139,7 +141,7 @@ class PathStepper(StaticStepper):
         Raises
         ------
         SimulationFailure
-            On all ranks, where the path cannot go on.
+            On all ranks, if the path cannot be continued.
         """
         self.metric.weight = self.weight
         self.system.begin(self.state)
@@ -175,7 +177,7 @@ class PathStepper(StaticStepper):
         self.points.destroy()
 
     def solve(self, balance: Balance) -> Solution:
-        """The point found, as the solution of the step that goes there."""
+        """Return the point found as the solution of the step."""
         point, fixed = self._point, self.model.supports.fixed
         g = np.empty_like(point.u)
         self.system.imbalance(point.u, point.load_factor, g)
@@ -185,51 +187,19 @@ class PathStepper(StaticStepper):
         return Solution(point.u, self.system.problem.f, walls, point.newton, self.system.linear)
 
     def _begin_path(self) -> bool:
-        """Tangent and metric at the start; whether a point was made, as the start was not in equilibrium."""
-        state, u = self.state, np.zeros_like(self.zero)
+        """Take the first point; return whether a step was made, because the start was not in equilibrium."""
         try:
-            g = np.empty_like(u)
-            self.system.residual(u, state.time, g)
-            moved = float(np.sqrt(dot(self.model.comm, g, g))) > self.points.tolerance(u, state.time, 0.0)
-            newton = 0
-            if moved:
-                at_rest = LoadFactor(0.0, self.keys.step)
-                u, _, newton = self.points.newton(at_rest, u, state.time)
-            self.system.linearise(u)
-            response = self.system.response(u, state.time)
+            point, moved = first_point(self)
         except NotConverged as failure:
             raise self._no_path(failure) from failure
-        size = float(np.sqrt(dot(self.model.comm, response, response)))
-        if not size > 0.0 or not np.isfinite(size):
-            raise SimulationFailure(
-                f"{self.model.case.source}: static: the load factor moves no node at the start of the path: loads act "
-                "on supports alone, or tables are constant there"
-            )
-        self.weight = self.metric.weight = 1.0 / size**2
-        sign = self._begin_component(response, size) if isinstance(self.control, ByComponent) else 1.0
-        length = self.metric.length(response, 1.0)
-        tangent, slope = sign * response / length, sign / length
-        negatives, nearest = self.points.spectrum(u)
-        point = Point(u, state.time, tangent, slope, negatives, nearest, newton)
         if moved:
             self._accept(point, self.keys.step)
         else:
             self._keep(point)
         return moved
 
-    def _begin_component(self, response: np.ndarray, size: float) -> float:
-        """Scale of the displacement that is prescribed; the sign of load factors that increase it. Collective."""
-        along = self.direction.of(response)
-        if not abs(along) > 1e-12 * size:
-            raise SimulationFailure(
-                "static.direction: the load does not move the nodes of static.node_set along it at the start of "
-                'the path; take another direction, or static.method = "arc_length"'
-            )
-        self.scale = abs(along)
-        return float(np.sign(along))
-
     def _next(self, size: float) -> tuple[Point, list[Event], str]:
-        """The point at a length, or the limit that comes before it; critical points on the way; and the limit reached.
+        """Return the point at a length or at a limit before it, the critical points on the way, and the limit reached.
 
         Raises
         ------
@@ -249,13 +219,13 @@ class PathStepper(StaticStepper):
         self._suspect(point, guess)
         if not self.turning:
             self._refuse_turn(point, size)
-        point, reached = self._limited(point)
+        point, reached = end_at_limit(self, point)
         if self.turning or self.points.stability is None:
             return point, [], reached
         try:
             events, turn = find_critical(self, point)
         except NotConverged as failure:
-            # beside an imperfect bifurcation a step may have come to a path that does not lead there
+            # close to an imperfect bifurcation the point may lie on a path that does not pass through it
             if size > _UNRESOLVED * self.arc and 0.5 * size >= self.keys.smallest:
                 raise
             self.message(f"a critical point was not located: {failure}")
@@ -265,7 +235,13 @@ class PathStepper(StaticStepper):
         return point, events, reached
 
     def _refuse_turn(self, point: Point, size: float) -> None:
-        """A tangent that has turned too much is that of another path, or of a corner that the step has cut."""
+        """Refuse a tangent that has turned too far: it belongs to another path, or the step has cut a corner.
+
+        Raises
+        ------
+        NotConverged
+            On all ranks.
+        """
         cosine = self.metric.product(point.tangent, point.slope, self.state.memory["tangent"], self.slope)
         if cosine < _TURN and 0.5 * size >= self.keys.smallest:
             raise NotConverged(
@@ -277,30 +253,14 @@ class PathStepper(StaticStepper):
                 '"arc_length" follows the path'
             )
 
-    def _limited(self, point: Point) -> tuple[Point, str]:
-        """The point, or the one at the first limit that is exceeded, and that limit."""
-        state, keys = self.state, self.keys
-        limits = []
-        if keys.end is not None and point.load_factor >= keys.end * (1.0 - TIME):
-            share = (keys.end - state.time) / (point.load_factor - state.time)
-            constraint = LoadFactor(keys.end - state.time, abs(point.load_factor - state.time))
-            limits.append((share, constraint, f"static.end = {keys.end:g}"))
-        if keys.displacement is not None:
-            start, way = self.direction.at(state.position), self.direction.of(point.u)
-            if start + way >= keys.displacement * (1.0 - TIME):
-                scale = self.control.scale or abs(way)
-                constraint = Component(self.direction, keys.displacement - start, scale)
-                limits.append(
-                    ((keys.displacement - start) / way, constraint, f"static.displacement = {keys.displacement:g} m")
-                )
-        if not limits:
-            return point, ""
-        share, constraint, reached = min(limits, key=lambda limit: limit[0])
-        change = share * (point.load_factor - state.time)
-        return self.points.find(constraint, share * point.u, state.time + change), reached
-
     def _suspect(self, point: Point, guess: np.ndarray) -> None:
-        """Refuse a point that has nothing to do with the last one. Collective."""
+        """Refuse a point that is unrelated to the last one.
+
+        Raises
+        ------
+        NotConverged
+            On all ranks.
+        """
         if self.guard is None:
             return
         state, model = self.state, self.model
@@ -313,7 +273,7 @@ class PathStepper(StaticStepper):
             raise NotConverged(f"{self.points.place}: {reason}; {self.remedy}")
 
     def _accept(self, point: Point, size: float) -> None:
-        """Make the step to a point. Collective."""
+        """Advance the state to a point. Collective."""
         self._point, self.part = point, size
         self.smallest = size
         self.scheme.reached = point.load_factor
@@ -327,7 +287,7 @@ class PathStepper(StaticStepper):
         self.slope, self.negatives = float(point.slope), int(point.negatives)
 
     def turns_at(self, number: int, point: Point, multiplicity: int) -> bool:
-        """Whether the path is to leave at a bifurcation, counted from 1; its mode is kept then. Collective."""
+        """Return whether the path branches off at a bifurcation, counted from 1, and store the mode. Collective."""
         wanted = [turn for turn in self.keys.branch_at if abs(turn) == number]
         if not wanted:
             return False
@@ -347,7 +307,7 @@ class PathStepper(StaticStepper):
             self.model.change_bars(self.state.time)
 
     def _no_path(self, failure: NotConverged) -> SimulationFailure:
-        """What to tell of a path that cannot go on."""
+        """Return the message about a path that cannot be continued."""
         hint = ""
         if self.control.scale:
             hint = '; where the displacement along static.direction turns back, static.method = "arc_length" goes on'
@@ -355,17 +315,3 @@ class PathStepper(StaticStepper):
             f"the path cannot be followed beyond point {self.state.step} at load factor {self.state.time:.6g} with "
             f"steps down to {self.keys.smallest:.3g}: {failure}{hint}{free_motions(self.model, self.state)}"
         )
-
-
-def _check(model: Model, keys: PathKeys) -> None:
-    """Refuse what a path cannot have."""
-    case = model.case
-    if model.can_touch:
-        raise InputError(
-            f'{case.source}: static.method = "{case.static.method}" follows paths without contact; remove walls, '
-            'contact pairs and constraints, or take static.method = "newton"'
-        )
-    if not (model.external.active or model.supports.moving or model.bars_vary):
-        raise InputError(f"{case.source}: static: nothing depends on the load factor; give a [[load]] or a table")
-    if keys.node_set is not None and not model.comm.allreduce(len(model.nodes[keys.node_set])):
-        raise InputError(f"{case.source}: static.node_set = {keys.node_set!r} has no nodes")

@@ -1,4 +1,4 @@
-"""Points of a path: Newton's method with a constraint, and the tangent and stiffness there."""
+"""Points of a path: Newton's method with a constraint, and the tangent and the stiffness at the solution."""
 
 from __future__ import annotations
 
@@ -28,17 +28,16 @@ _STAGNATION = 100.0  # as in the other solves: a residual within this many round
 
 @dataclass
 class Point:
-    """A point of the path, from the last one.
+    """A point of the path.
 
     Attributes
     ----------
     u : (owned, 3) displacement from the last point [m]
-    load_factor : there
-    tangent, slope : the path's tangent of unit length there: displacement part (owned, 3) [m] and change of the load
-        factor
-    negatives : number of negative eigenvalues of the stiffness, -1 where it is not looked for
+    load_factor : at the point
+    tangent, slope : unit tangent of the path: displacement part (owned, 3) [m] and change of the load factor
+    negatives : number of negative eigenvalues of the stiffness, -1 if not computed
     nearest : magnitude of the eigenvalue nearest to zero [N/m]
-    newton : iterations
+    newton : number of iterations
     """
 
     u: np.ndarray
@@ -51,7 +50,7 @@ class Point:
 
 
 class PointSolver:
-    """Finds points from the present state on. Methods are collective.
+    """Solves for points beyond the present state. Methods are collective.
 
     Parameters
     ----------
@@ -77,7 +76,7 @@ class PointSolver:
 
     @property
     def place(self) -> str:
-        """Where points are looked for, for messages."""
+        """The point that is solved for, for messages."""
         return f"point {self.state.step + 1}, beyond load factor {self.state.time:.6g}"
 
     def destroy(self) -> None:
@@ -87,7 +86,7 @@ class PointSolver:
                 thing.destroy()
 
     def find(self, constraint: Constraint, u: np.ndarray, load_factor: float) -> Point:
-        """The point with a constraint, from a guess, with its tangent. Collective.
+        """Return the point that satisfies a constraint, with its tangent, from a guess. Collective.
 
         Raises
         ------
@@ -140,7 +139,7 @@ class PointSolver:
         )
 
     def tolerance(self, u: np.ndarray, load_factor: float, size: float) -> float:
-        """Of the residual's 2-norm [N], as elsewhere: ``solver.rtol`` of external and internal forces."""
+        """Return the tolerance of the residual's 2-norm [N]: ``solver.rtol`` of external and internal forces."""
         solver, state = self.model.case.solver, self.state
         external, internal = self.system.external(load_factor), state.f[: len(u)]
         change = self.system.external(load_factor + size) - external
@@ -149,14 +148,14 @@ class PointSolver:
         return max(solver.rtol * scale, solver.atol or 0.0, self.model.rounding)
 
     def tangent(self, u: np.ndarray, load_factor: float) -> tuple[np.ndarray, float]:
-        """Unit tangent at an equilibrium, along which the load factor rises."""
+        """Return the unit tangent at an equilibrium along which the load factor increases."""
         self.system.linearise(u)
         v = self.system.response(u, load_factor)
         length = self.metric.length(v, 1.0)
         return v / length, 1.0 / length
 
     def spectrum(self, u: np.ndarray) -> tuple[int, float]:
-        """Negative eigenvalues of the stiffness last taken, and the one nearest to zero; -1 where not looked for."""
+        """Return the number of negative eigenvalues of the last stiffness, or -1, and the one nearest to zero."""
         if self.stability is None or self.stability.refusal is not None:
             return -1, np.inf
         if self._own is not None:
@@ -164,9 +163,9 @@ class PointSolver:
         return self.stability.look()
 
     def modes(self, point: Point, count: int) -> list[np.ndarray]:
-        """Critical modes (owned, 3) of unit length at a point, across the path; then sums and differences of pairs.
+        """Return critical modes (owned, 3) of unit length at a point, then sums and differences of pairs. Collective.
 
-        Paths of symmetric trusses leave along either. Collective.
+        They are orthogonal to the path. Paths of symmetric trusses branch off along either.
         """
         (self._own or self.system.hessian).update(self.system.problem, point.u)
         found = []

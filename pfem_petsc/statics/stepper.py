@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
+from mpi4py import MPI
 
 from ..errors import NotConverged, SimulationFailure
 from ..integrators.base import Balance
 from ..solvers.linear import LinearChoice
 from ..stepping.implicit import ImplicitStepper
 from ..stepping.prescribed import NoRates
+from ..stepping.solution import Solution
 from ..tolerances import TIME
 from .free_motions import free_motions
 from .scheme import Equilibrium
@@ -22,6 +25,7 @@ __all__ = ["StaticStepper"]
 
 _FEW = 5  # maximum number of Newton iterations after which the next increment is larger
 _GROWTH = 1.5
+_RESISTANCE = 1e-3  # viscosity over stiffness with which a truss that nothing holds yet is moved against walls
 
 
 class Increments(Protocol):
@@ -134,6 +138,31 @@ class StaticStepper(ImplicitStepper):
                 self._release()
         state.step += 1
 
+    def _solve(self, balance: Balance, guess: np.ndarray) -> Solution:
+        """Solve; a truss that nothing holds before contact forces act is first moved against walls and links.
+
+        Their forces, and whether nodes stick, are not known before the first contact, and the stiffness may be
+        singular without them. A viscous force makes it regular; its solution is the guess.
+        """
+        try:
+            return super()._solve(balance, guess)
+        except NotConverged:
+            if balance.eta or not self._untouched():
+                raise
+        inertia = self.model.inertia
+        damping = inertia.damping
+        inertia.damp(_RESISTANCE * self.model.nodal_stiffness)
+        try:
+            approach = super()._solve(replace(balance, eta=1.0), guess)
+        finally:
+            inertia.damp(damping)
+        return super()._solve(balance, approach.u)
+
+    def _untouched(self) -> bool:
+        """Return whether contact is possible and nothing is in contact at the start of the increment. Collective."""
+        model = self.model
+        return model.can_touch and not model.comm.allreduce(int(self.state.contact.any()), op=MPI.MAX)
+
     def _count_dissipation(self, size: float) -> None:
         u = self.solution.u
         local = float((self.model.inertia.damping[:, None] * u * u).sum()) / size
@@ -176,11 +205,21 @@ class StaticStepper(ImplicitStepper):
 
     def _no_further(self, failure: NotConverged) -> SimulationFailure:
         """Return the message about the load factor beyond which no equilibrium was found."""
+        slips = ""
+        others = (
+            'static.method = "arc_length" follows the path beyond a limit point, "relaxation" finds the equilibrium of '
+            "slack structures"
+        )
+        if self.model.can_touch:
+            others = "static.stabilise, or supports that move the truss instead of loads, lead beyond a limit point"
+            if self.model.contact.any and self.model.contact.symmetric:
+                others = f"walls without friction do not hold nodes along them: give supports; {others}"
+            elif self.model.contact.any:
+                slips = ", or the friction of walls does not hold it"
         return SimulationFailure(
             f"no equilibrium found beyond load factor {self.state.time:.6g} with increments down to "
-            f"{self.limits.smallest:.3g}: it is a limit point, or part of the truss is a mechanism; static.method = "
-            f'"arc_length" follows the path beyond a limit point, "relaxation" finds the equilibrium of slack '
-            f"structures. The last attempt: {failure}{free_motions(self.model, self.state)}"
+            f"{self.limits.smallest:.3g}: it is a limit point, or part of the truss is a mechanism{slips}; "
+            f"{others}. The last attempt: {failure}{free_motions(self.model, self.state)}"
         )
 
     def _guess(self, balance: Balance) -> np.ndarray:

@@ -216,7 +216,7 @@ class ImplicitStepper(Stepper):
         if model.bars_vary:
             model.change_bars(balance.time)
         tolerance = self.accuracy * residual_tolerance(model, state, balance, self.part)
-        active_set = ActiveSet(model, self.state, balance, self.held, self.links)
+        active_set = ActiveSet(model, self.state, balance, self.held, self.links, self.remedy)
         candidates, links = self._candidates(active_set, balance), active_set.links
         newton = linear = 0
         while True:
@@ -245,7 +245,10 @@ class ImplicitStepper(Stepper):
             u = problem.increment(w).copy()
             g = np.empty_like(u)
             problem.imbalance(u, g)
-            outcome = active_set.check(trial, bounds, w, u, g, report.norm, tolerance)
+            try:
+                outcome = active_set.check(trial, bounds, w, u, g, report.norm, tolerance)
+            except NotConverged as failure:
+                raise NotConverged(f"{self.when(balance)}: {failure}") from failure
             if outcome.settled:
                 break
             candidates, links, guess = outcome.candidates, outcome.links, u

@@ -15,6 +15,7 @@ import numpy as np
 
 YOUNG_MODULUS, DENSITY, AREA, PITCH = 110e9, 4500.0, 1e-6, 0.01
 SPEED = -20.0  # [m/s] along z
+PRESSED = 0.005  # share of its height by which a lattice is pressed in static increments
 YIELD_STRESS, HARDENING_RATIO = 900e6, 0.01  # [Pa]; tangent over Young's modulus beyond yield
 WAVE_SPEED = (YOUNG_MODULUS / DENSITY) ** 0.5
 EXPLICIT_STEP = 0.1 * PITCH / WAVE_SPEED  # [s]
@@ -41,6 +42,11 @@ def lattice(cells: int) -> tuple[np.ndarray, np.ndarray]:
     return points, np.concatenate(bars)
 
 
+def middle(cells: int) -> int:
+    """Number of the node in the middle of the edge x = y = 0, whose displacement along x static runs report."""
+    return cells // 2
+
+
 def lumped_mass(points: np.ndarray, bars: np.ndarray) -> np.ndarray:
     """Mass (nodes,) [kg]: half of each bar at each end."""
     length = np.linalg.norm(points[bars[:, 1]] - points[bars[:, 0]], axis=1)
@@ -60,12 +66,15 @@ def time_steps(step: Callable[[], float], steps: int) -> dict[str, float]:
 
 
 def report(times: dict[str, float], bars: int, top: float, **further: float) -> None:
-    """Print the result as one line of JSON: ``top`` is the displacement of the last node along z [m]."""
+    """Print the result as one line of JSON: ``top`` is the displacement of the last node along z [m].
+
+    In static increments it is that of :func:`middle` along x.
+    """
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     print("RESULT " + json.dumps({**times, "bars": bars, "top": top, "memory": peak, **further}), flush=True)
 
 
 def arguments() -> tuple[int, str, int, str]:
-    """Cells, mode (explicit, explicit_contact, implicit, implicit_contact), steps and solver of the command line."""
+    """Cells, mode (explicit, implicit, either with _contact, or static), steps and solver of the command line."""
     cells, mode, steps = int(sys.argv[1]), sys.argv[2], int(sys.argv[3])
     return cells, mode, steps, sys.argv[4] if len(sys.argv) > 4 else ""

@@ -1,4 +1,7 @@
-"""Kratos on the lattice: elastic trusses, the foot held along z; usage: run_kratos.py CELLS explicit|implicit STEPS."""
+"""Kratos on the lattice: elastic trusses; usage: run_kratos.py CELLS explicit|implicit|static STEPS.
+
+The foot is held along z; in static increments the foot is held and the top is pressed down.
+"""
 
 from __future__ import annotations
 
@@ -12,10 +15,10 @@ from KratosMultiphysics.StructuralMechanicsApplication import python_solvers_wra
 PART = "lattice"
 
 
-def settings(explicit: bool, h: float) -> Kratos.Parameters:
+def settings(mode: str, h: float) -> Kratos.Parameters:
     """Of the structural solver."""
     values = {
-        "solver_type": "dynamic",
+        "solver_type": "static" if mode == "static" else "dynamic",
         "model_part_name": PART,
         "domain_size": 3,
         "echo_level": 0,
@@ -24,7 +27,7 @@ def settings(explicit: bool, h: float) -> Kratos.Parameters:
         "material_import_settings": {"materials_filename": ""},
         "time_stepping": {"time_step": h},
     }
-    if explicit:
+    if mode == "explicit":
         values |= {
             "time_integration_method": "explicit",
             "scheme_type": "central_differences",
@@ -32,9 +35,9 @@ def settings(explicit: bool, h: float) -> Kratos.Parameters:
             "max_delta_time": h,
         }
     else:
+        if mode == "implicit":
+            values |= {"time_integration_method": "implicit", "scheme_type": "newmark"}
         values |= {
-            "time_integration_method": "implicit",
-            "scheme_type": "newmark",
             "analysis_type": "non_linear",
             "convergence_criterion": "residual_criterion",
             "residual_relative_tolerance": 1e-6,
@@ -47,11 +50,11 @@ def settings(explicit: bool, h: float) -> Kratos.Parameters:
 def main() -> None:
     """Run and report."""
     cells, mode, steps, _ = m.arguments()
-    explicit = mode == "explicit"
-    h = m.EXPLICIT_STEP if explicit else m.IMPLICIT_STEP
+    explicit, static = mode == "explicit", mode == "static"
+    h = {"explicit": m.EXPLICIT_STEP, "implicit": m.IMPLICIT_STEP, "static": 1.0 / (steps + 1)}[mode]
     Kratos.Logger.GetDefaultOutput().SetSeverity(Kratos.Logger.Severity.WARNING)
     points, bars = m.lattice(cells)
-    solver = solvers.CreateSolverByParameters(Kratos.Model(), settings(explicit, h), "OpenMP")
+    solver = solvers.CreateSolverByParameters(Kratos.Model(), settings(mode, h), "OpenMP")
     solver.AddVariables()
     part = solver.main_model_part
     for node, point in enumerate(points.tolist(), start=1):
@@ -70,7 +73,14 @@ def main() -> None:
     solver.ImportModelPart()
     solver.PrepareModelPart()
     solver.AddDofs()
+    height = points[-1, 2]
+    pressed = [node for node in part.Nodes if static and node.Z0 in (height,)]
     for node in part.Nodes:
+        if static:
+            if node.Z0 in (0.0, height):
+                for component in (Kratos.DISPLACEMENT_X, Kratos.DISPLACEMENT_Y, Kratos.DISPLACEMENT_Z):
+                    node.Fix(component)
+            continue
         if node.Z0 == 0.0:
             node.Fix(Kratos.DISPLACEMENT_Z)
             continue
@@ -83,6 +93,8 @@ def main() -> None:
     def step() -> float:
         nonlocal time
         time = solver.AdvanceInTime(time)
+        for node in pressed:
+            node.SetSolutionStepValue(Kratos.DISPLACEMENT_Z, -m.PRESSED * height * time)
         solver.InitializeSolutionStep()
         solver.Predict()
         converged = solver.SolveSolutionStep()
@@ -92,7 +104,9 @@ def main() -> None:
         return 0.0 if explicit else float(part.ProcessInfo[Kratos.NL_ITERATION_NUMBER])
 
     times = m.time_steps(step, steps)
-    top = part.Nodes[len(points)].GetSolutionStepValue(Kratos.DISPLACEMENT_Z)
+    # in static increments the top is prescribed: the node in the middle of the block's edge sags instead
+    watched = m.middle(cells) + 1 if static else len(points)
+    top = part.Nodes[watched].GetSolutionStepValue(Kratos.DISPLACEMENT_X if static else Kratos.DISPLACEMENT_Z)
     m.report(times, len(bars), top, threads=float(Kratos.ParallelUtilities.GetNumThreads()))
 
 

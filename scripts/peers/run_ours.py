@@ -1,7 +1,7 @@
 """This program on the lattice, with a row of history every step; usage: run_ours.py CELLS MODE STEPS [OPERATOR].
 
 With contact the bars are elastoplastic (kinematic hardening) and the wall is rigid. Without, bars are elastic and the
-foot is held along z.
+foot is held along z. In static increments bars are elastic, the foot is held, and the top is pressed down.
 """
 
 from __future__ import annotations
@@ -24,6 +24,8 @@ def table(cells: int, mode: str, steps: int, operator: str) -> dict:
         hardening = m.YOUNG_MODULUS * m.HARDENING_RATIO / (1.0 - m.HARDENING_RATIO)
         material |= {"yield_stress": m.YIELD_STRESS, "kinematic_hardening": hardening}
     h = m.EXPLICIT_STEP if explicit else m.IMPLICIT_STEP
+    if mode == "static":
+        return pressed(cells, material, steps, operator)
     if explicit:
         scheme = {"integrator": "central_differences"}
     else:
@@ -44,6 +46,26 @@ def table(cells: int, mode: str, steps: int, operator: str) -> dict:
     else:
         case["support"] = [{"node_set": "foot", "fix": "z"}]
     return case
+
+
+def pressed(cells: int, material: dict, steps: int, linear: str) -> dict:
+    """The case of static increments; ``linear`` is the solver."""
+    height = cells * m.PITCH
+    motion = [[0.0, 0.0, 0.0, 0.0], [1.0, 0.0, 0.0, -m.PRESSED * height]]
+    return {
+        "title": "peers",
+        "mesh": {"generator": "lattice", "kind": "cubic", "cells": [cells] * 3, "pitch": m.PITCH},
+        "node_set": {"foot": {"group": "bottom"}, "head": {"group": "top"}, "top": {"indices": [m.middle(cells)]}},
+        "material": {"strut": material},
+        "section": {"strut": {"area": m.AREA, "material": "strut"}},
+        "support": [
+            {"node_set": "foot", "fix": "xyz"},
+            {"node_set": "head", "fix": "xyz", "motion": motion, "interpolation": "linear"},
+        ],
+        "static": {"step": 1.0 / (steps + 1)},
+        "output": {"fields_every": 0, "fields": [], "probe": [{"name": "top", "node_set": "top"}]},
+        "solver": {"linear": linear or "auto"},
+    }
 
 
 def run(cells: int, mode: str, steps: int, operator: str, folder: str) -> tuple[Simulation, dict[str, float], int]:
@@ -70,7 +92,8 @@ def main() -> None:
         if mode.startswith("explicit"):
             run(1, mode, 1000, operator, folder + "/first")  # all loops are compiled and loaded
         simulation, times, linear = run(cells, mode, steps, operator, folder + "/timed")
-        top = simulation.row["probe/top/position"][0, 2] - cells * m.PITCH
+        top = simulation.row["probe/top/position"][0]
+        top = top[0] if mode == "static" else top[2] - cells * m.PITCH
         m.report(times, simulation.mesh.n_bars, float(top), linear=linear / (steps + 1))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from helpers.mesh_files import case_of
 from pfem_petsc import Case, Simulation
 from pfem_petsc.output.result import open_result
 
@@ -86,3 +87,21 @@ def run(data, comm, folder):
         result = open_result(folder)
         found = {name: values[-1] for name, values in result.history.items()}, result.positions(-1)
     return comm.bcast(found)
+
+
+def chain(folder, comm, points, forces=(), fixed=(0, -1), gravity=None, **tables):
+    """A chain of bars through points, with forces [N] down at the inner ones."""
+    n = len(points)
+    ends = [k % n for k in fixed]
+    loads = {k + 1: force for k, force in enumerate(forces) if force}
+    tables = {
+        "node_set": {"ends": {"indices": ends}, "all": {"all": True}} | {f"at{k}": {"indices": [k]} for k in range(n)},
+        "material": {"m": {"young_modulus": 1e9, "density": 1000.0}},
+        "section": {"s": {"area": 1e-4, "material": "m"}},
+        "support": [{"node_set": "ends", "fix": "xyz"}],
+        "load": [{"node_set": f"at{k}", "force": [0.0, 0.0, -force]} for k, force in loads.items()],
+        "static": {"method": "relaxation"},
+        "output": {"probe": [{"name": "ends", "node_set": "ends"}, {"name": "all", "node_set": "all"}]},
+        **({"gravity": {"acceleration": [0.0, 0.0, gravity]}} if gravity else {}),
+    } | tables
+    return case_of(folder, comm, points, [[k, k + 1] for k in range(n - 1)], **tables)

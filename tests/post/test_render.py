@@ -13,11 +13,14 @@ import pytest
 from helpers.synthetic import AT_REST, WALL, SyntheticResult, lattice, ring, rod, write_result
 from PIL import Image
 
+from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.contact.walls.plane import Parameters
 from pfem_petsc.errors import InputError
 from pfem_petsc.post import headless
+from pfem_petsc.post.modes import render_modes
 from pfem_petsc.post.page import Page
 from pfem_petsc.post.render import render
+from pfem_petsc.post.walls import walls_present
 
 SMALL = (480, 270)
 
@@ -113,6 +116,34 @@ def test_wall_is_drawn_where_it_is_then(moves, tmp_path):
     faces = [int(np.argmin(picture[picture.shape[0] // 22, :, 0])) for picture in (first, last)]
     start = inked(first)[1].min()  # of the ring at x = -1; the wall is at 1.2
     assert faces[1] - faces[0] == pytest.approx(0.4 / 2.2 * (faces[0] - start), abs=2.0)
+
+
+def test_walls_are_drawn_in_the_stages_that_have_them(tmp_path):
+    """Pressed by a plate, then let go: the plate is gone from the next stage on, also in pictures of modes."""
+    plate = {"name": "plate", "type": "plane", "point": [1.0, 0.0, 0.0], "normal": [-1.0, 0.0, 0.0]}
+    data = {
+        "mesh": {"generator": "rod", "length": 1.0, "elements": 2},
+        "node_set": {"all": {"all": True}, "base": {"nearest": [0.0, 0.0, 0.0]}},
+        "material": {"m": {"young_modulus": 1e6, "density": 1000.0}},
+        "section": {"s": {"area": 1e-2, "material": "m"}},
+        "support": [{"node_set": "all", "fix": "yz"}, {"node_set": "base", "fix": "x"}],
+        "output": {"fields_every": 1},
+        "modes": {"count": 1},
+        "stage": [
+            {"name": "press", "wall": [{**plate, "motion": [[0, 0, 0, 0], [1, -0.01, 0, 0]]}], "static": {"step": 0.5}},
+            {"name": "release", "wall": [], "static": {"step": 0.5}},
+        ],
+    }
+    with Simulation(Case.from_dict(data), output=tmp_path / "result", quiet=True) as simulation:
+        simulation.run()
+    result = open_result(tmp_path / "result")
+    assert walls_present(result, result.times).ravel().tolist() == [True] * 3 + [False] * 2
+    files = render(tmp_path / "result", tmp_path / "frames", size=SMALL, video="none", poster=False, note=silent)
+    inks = [len(inked(drawing(file))[0]) for file in files]
+    assert min(inks[:3]) > 1.5 * max(inks[3:])
+    quiet = {"size": SMALL, "video": "none", "poster": False, "note": silent}
+    (mode, *_) = render_modes(tmp_path / "result", tmp_path / "modes", period=4, **quiet)
+    assert len(inked(drawing(mode))[0]) < 1.5 * max(inks[3:])
 
 
 def test_unknown_wall_is_left_out_with_a_note(tmp_path):

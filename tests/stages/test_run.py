@@ -110,3 +110,14 @@ def test_modes_are_those_of_the_end_of_the_last_stage(tmp_path):
     run({**data, "stage": [weight, short]}, MPI.COMM_SELF, tmp_path / "two")
     one, two = (open_result(tmp_path / name).modes.frequency for name in ("one", "two"))
     np.testing.assert_allclose(two, one, rtol=1e-9)
+
+
+def test_the_displacement_of_a_path_counts_from_the_start_of_its_stage(tmp_path):
+    path = {**DOME["stage"][0]["static"], "displacement": 1e-3}
+    stages = [{**DOME["stage"][0], "name": name, "static": path} for name in ("once", "again")]
+    probe = {"output": {"fields_every": 0, "probe": [{"name": "apex", "node_set": "apex"}]}}
+    run({**DOME, **probe, "stage": stages}, MPI.COMM_SELF, tmp_path / "out")
+    history = open_result(tmp_path / "out").history
+    z = history["probe/apex/position"][:, 0, 2]
+    ends = [int(np.flatnonzero(history["stage"] == stage)[-1]) for stage in (0, 1)]
+    np.testing.assert_allclose([z[0] - z[ends[0]], z[ends[0]] - z[ends[1]]], 1e-3, rtol=1e-9)

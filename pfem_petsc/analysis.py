@@ -65,6 +65,7 @@ class Analysis:
             On all ranks.
         """
         self.stepper.start()
+        self.stepper.leave()
 
     def advance(self) -> Step:
         """Make one step; its ``row`` is None, because rows are made by recording.

@@ -37,6 +37,7 @@ ENERGIES = (
     Energy("plastic_heat", "part", "bars"),
     Energy("hardening_energy", "part", "bars"),
     Energy("damage_dissipation", "lost", "bars"),
+    Energy("rupture_dissipation", "lost", "bars"),
     Energy("damping_dissipation", "lost", "ledger"),
     Energy("friction_dissipation", "lost", "ledger"),
     Energy("impact_dissipation", "lost", "ledger"),

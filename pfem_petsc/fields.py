@@ -49,7 +49,7 @@ FIELDS = [
     Field("axial_force", "bars", "N", lambda now: now.bars["axial_force"]),
     Field("plastic_strain", "bars", "", lambda now: now.bars["plastic_strain"]),
     Field("temperature", "bars", "K", lambda now: now.temperature(), lambda model: model.temperatures.any),
-    Field("status", "bars", "", lambda now: now.model.bars.status(), lambda model: model.bars.slackens),
+    Field("status", "bars", "", lambda now: now.model.bars.status(), lambda model: model.bars.has_status),
 ]
 
 

@@ -12,6 +12,7 @@ from mpi4py import MPI
 from pfem_petsc import Simulation, open_result
 from pfem_petsc.case import settings, table_files, tables
 from pfem_petsc.case.materials import LAWS
+from pfem_petsc.case.rupture import Rupture
 from pfem_petsc.case.schema import Case
 from pfem_petsc.case.stages import ANALYSES, TABLES
 from pfem_petsc.mesh.readers.gmsh import read
@@ -25,6 +26,7 @@ MODELS = [
         tables.LoadFile,
         tables.VaryingGravity,
         tables.Temperature,
+        tables.Remove,
         settings.TimeKeys,
         settings.StaticKeys,
         settings.Modes,
@@ -62,6 +64,10 @@ def test_keys_of_laws_are_those_of_their_parameters():
     assert {"elastic", "elastoplastic", "voce", "johnson_cook"} <= set(documented)
     for law in ("", *documented):
         assert text_of(law) in made, f"{law or 'every material'}: run scripts/document_laws.py"
+
+
+def test_every_limit_of_rupture_is_named():
+    assert set(Rupture.model_fields) <= named((DOCS / "rupture.md").read_text())
 
 
 def test_every_key_of_walls_is_named():

@@ -7,7 +7,7 @@ from typing import Any
 
 from ..fields import cell_fields, point_fields
 from ..registry import nearest
-from .materials import internal_variables
+from .materials import internal_variables, law_name, law_of
 from .problems import Problems
 
 __all__ = ["check_names"]
@@ -42,6 +42,8 @@ def check_names(case: Mapping[str, Any], data: Mapping[str, Any], problems: Prob
     for i, entry in enumerate(on):
         _node_set(("initial", "on", i), entry, node_sets, problems)
     _distinct(("wall",), case["wall"], "wall", problems)
+    _ruptures(case, problems)
+    _removals(case, problems)
     for table, what in (("contact_pair", "contact pair"), ("constraint", "constraint")):
         for i, entry in enumerate(case[table]):
             _node_sets((table, i), entry, node_sets, problems)
@@ -59,6 +61,33 @@ def check_names(case: Mapping[str, Any], data: Mapping[str, Any], problems: Prob
                 problems.add(("output", "fields", i), f"there is no field of this name{nearest(name, known)}", name)
             elif name in output.fields[:i]:
                 problems.add(("output", "fields", i), "this field is listed twice", name)
+
+
+def _ruptures(case: Mapping[str, Any], problems: Problems) -> None:
+    """Check that laws have the variables that limits of rupture compare."""
+    for name, material in case["material"].items():
+        variables = [variable for variable, _ in law_of(material).internal]
+        for limit in ("plastic_strain", "damage"):
+            value = getattr(material.rupture, limit, None)
+            if value is not None and not any(variable.endswith(limit) for variable in variables):
+                law = law_name(dict(material))
+                message = f"the law {law} has no {limit.replace('_', ' ')}; use another limit or law"
+                problems.add(("material", name, "rupture", limit), message, value)
+
+
+def _removals(case: Mapping[str, Any], problems: Problems) -> None:
+    """Check that supports have distinct names, and that removals refer to them."""
+    named = [entry.name for entry in case["support"]]
+    for i, name in enumerate(named):
+        if name is not None and name in named[:i]:
+            problems.add(("support", i, "name"), "another support has this name", name)
+    supports = [name for name in named if name is not None]
+    for i, entry in enumerate(case["remove"]):
+        if entry.supports is not None:
+            problems.refer(("remove", i, "supports"), entry.supports, supports, "support")
+        target = (entry.bars, entry.supports)
+        if target in [(other.bars, other.supports) for other in case["remove"][:i]]:
+            problems.add(("remove", i), f"{entry.bars or entry.supports!r} is removed by an earlier table already")
 
 
 def _names(data: Mapping[str, Any], key: str) -> list[str]:

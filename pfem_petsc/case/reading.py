@@ -36,7 +36,7 @@ _LONG_KEY = re.compile(r"""(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*)""" +
 
 KEYS = [
     *("title", "mesh", "node_set", "material", "section", "initial", "support"),
-    *("load", "gravity", "temperature", "wall", "contact_pair", "constraint", "contact"),
+    *("load", "gravity", "temperature", "wall", "contact_pair", "constraint", "remove", "contact"),
     *("time", "static", "stage", "modes", "output", "solver"),
 ]
 """Top-level keys of a case file."""
@@ -112,6 +112,7 @@ def read_tables(data: Mapping[str, Any], folder: Path, problems: Problems) -> di
         "constraint": _kinds(
             data.get("constraint"), "constraint", "kind", CONSTRAINTS, "a constraint of kind", problems
         ),
+        "remove": _listed(t.Remove, data.get("remove"), ("remove",), problems),
         "contact": problems.read(s.ContactSettings, data.get("contact", {}), ("contact",)),
         **_analyses(data, problems),
         "output": _output(data.get("output", {}), problems),

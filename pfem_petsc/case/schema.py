@@ -33,7 +33,7 @@ class Case:
     overrides : texts ``KEY=VALUE`` that override its values
     mesh : :class:`~pfem_petsc.case.tables.Mesh`: generator with parameters, or file
     node_set, material, section : tables by name, in file order
-    initial, support, load, temperature, wall, contact_pair, constraint : lists of tables
+    initial, support, load, temperature, wall, contact_pair, constraint, remove : lists of tables
     gravity : :class:`~pfem_petsc.case.tables.Gravity` or None
     contact, output, solver : tables of :mod:`~pfem_petsc.case.settings`
     time, static, modes : what is computed, None for what is not; ``time`` and ``static`` exclude each other
@@ -41,6 +41,7 @@ class Case:
     stages : the same, or the case itself
     number : of a stage among those of its case, from 0
     given : tables that a stage gives itself, and does not have from the stages before
+    removes_bars : whether bars are removed, in this or another stage
 
     Notes
     -----
@@ -51,6 +52,7 @@ class Case:
         for key in KEYS:
             self.__dict__[key] = attributes.get(key, ()) if key == "stage" else attributes[key]
         self.__dict__.update(name=name, source=source, folder=Path(folder), overrides=(), number=0, given=())
+        self.__dict__["removes_bars"] = any(entry.bars is not None for entry in self.remove)
 
     def __setattr__(self, key: str, value: Any) -> None:
         raise AttributeError(
@@ -175,6 +177,9 @@ class Case:
             made.append(each)
             each.__dict__.update(title=attributes["title"], number=k, given=stage.given, overrides=overrides)
         case.__dict__["stage"] = tuple(made)
+        removes = any(each.removes_bars for each in (case, *made))
+        for each in (case, *made):
+            each.__dict__["removes_bars"] = removes
         return case
 
     def to_dict(self) -> dict[str, Any]:
@@ -212,6 +217,7 @@ class Case:
             "wall": [_table(entry) for entry in self.wall],
             "contact_pair": [_table(entry) for entry in self.contact_pair],
             "constraint": [_table(entry) for entry in self.constraint],
+            "remove": [_table(entry) for entry in self.remove],
             "contact": _table(self.contact),
             "time": {**_table(self.time), **_table(self.time.scheme)} if self.time is not None else {},
             "static": {**_table(self.static), **_table(self.static.parameters)} if self.static is not None else {},

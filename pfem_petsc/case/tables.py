@@ -12,6 +12,7 @@ from .base import (
     Finite,
     Name,
     NodeSetName,
+    NonNegativeFloat,
     NonNegativeInt,
     PositiveFloat,
     StrictModel,
@@ -32,6 +33,7 @@ __all__ = [
     "MeshKeys",
     "NodeSet",
     "PRESTRESSES",
+    "Remove",
     "Section",
     "Support",
     "Temperature",
@@ -194,6 +196,8 @@ class Initial(StrictModel):
 class Support(StrictModel):
     """Fixed or prescribed position components of a node set."""
 
+    name: Name | None = None
+    """name, by which [[remove]] refers to the support; unique"""
     node_set: str
     """name of a node set"""
     fix: str
@@ -263,3 +267,22 @@ class ContactPair(StrictModel):
         if not 1e-100 < max(map(abs, value)) < 1e100:
             raise ValueError("has components out of range (1e-100 to 1e100); give a vector of about length 1")
         return value
+
+
+class Remove(StrictModel):
+    """Bars or supports that are removed, at once or gradually."""
+
+    bars: str | None = None
+    """bar group of the mesh"""
+    supports: str | None = None
+    """name of a support"""
+    time: NonNegativeFloat
+    """time [s], or load factor, at which the removal begins"""
+    duration: NonNegativeFloat = 0.0
+    """time [s], or change of the load factor, over which the force is reduced to zero linearly; 0: at once"""
+
+    @model_validator(mode="after")
+    def _exactly_one(self) -> Remove:
+        if (self.bars is None) == (self.supports is None):
+            raise ValueError("expected exactly one of the keys bars, supports")
+        return self

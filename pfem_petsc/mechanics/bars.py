@@ -17,6 +17,7 @@ from .compiled import kernel
 from .conserving import make_conserving_kernels
 from .kernels import make_kernels
 from .materials.base import Law, UnsuitableBarError
+from .rupture import breakable, limit_values, make_release
 from .sections import bar_shapes
 from .strain import MEASURES
 from .sweep import Sweep, make_sweep
@@ -31,11 +32,13 @@ __all__ = ["BarBlock", "Bars", "StrainEnergy", "first_inverted"]
 
 class StrainEnergy(NamedTuple):
     """Sums over the bars counted on this rank, in the order of :data:`~pfem_petsc.energies.BAR_ENERGIES` [J], the first
-    collapsed bar (local index, -1: none), and whether any bar is so short that it may be inverted."""
+    collapsed bar (local index, -1: none), whether any bar is so short that it may be inverted, and how many local bars
+    have changed their state of rupture."""
 
     energies: tuple[float, ...] = (0.0,) * len(BAR_ENERGIES)
     failed: int = -1
     shortened: bool = False
+    changed: int = 0
 
     def of(self, name: str) -> float:
         """Return the energy of a name [J]."""
@@ -52,7 +55,7 @@ class BarBlock:
     """Local bars [start, stop) of one section, of which [start, counted) are counted on this rank.
 
     ``modulus`` is the largest tangent modulus of the law [Pa]; ``history`` (rows, stop - start) holds ``law.rows``
-    and, after them, ``law.bar_data``.
+    and, after them, ``law.bar_data``; ``release`` removes bars, if they can leave the model.
     """
 
     section: str
@@ -71,6 +74,7 @@ class BarBlock:
     sweep: Sweep
     kernels: SimpleNamespace
     conserving: SimpleNamespace | None
+    release: Callable | None
 
     def variables(self) -> Iterator[tuple[str, str, np.ndarray]]:
         """Yield name, unit and values (stop - start,) of all data kept from step to step."""
@@ -91,7 +95,7 @@ def _lengths(points, bars, rest):
 
 @kernel
 def first_inverted(x, before, bars, rest):
-    """Return the first shortened bar whose direction has reversed, or -1."""
+    """Return the first shortened bar whose direction has reversed, or -1; those with zero ``rest`` are not checked."""
     for k in range(len(bars)):
         a = bars[k, 0]
         b = bars[k, 1]
@@ -119,6 +123,7 @@ class Bars:
     rest_at_start : (b,) the same at the start of the step, or (0,) if they are constant
     heat : (2, b) thermal strains and temperatures [K], or (2, 0) without temperatures
     heat_at_start : the same at the start of the step, if they vary
+    can_break : whether bars of the case can leave the model
     step : time from the start of the step to the evaluated positions [s]; 0 at the start of a run, infinite in static
         analyses
     internal : name and unit of the internal variables of all laws of the case
@@ -138,6 +143,12 @@ class Bars:
         self.step = 0.0
         self.internal = internal_variables(case.material)
         laws = {section.material: law_of(case.material[section.material]) for section in case.section.values()}
+        intact = dict(laws)
+        for name in laws:
+            if case.material[name].rupture is not None or case.removes_bars:
+                laws[name] = breakable(laws[name])
+        self.can_break = any(law.rupture >= 0 for law in laws.values())
+        self._watched = np.empty(len(mesh.bars) if self.can_break else 0)
         self.kept_names = list(dict.fromkeys(name for law in laws.values() for name, _ in law.rows))
         self.far = np.maximum(
             mesh.bars[:, 0], mesh.bars[:, 1], out=np.empty(len(mesh.bars), dtype=np.uint32), casting="unsafe"
@@ -160,12 +171,13 @@ class Bars:
                     thermal_expansion=material.thermal_expansion,
                     law=law,
                     measure=measure,
-                    parameters=material.numbers(),
+                    parameters=(*(limit_values(material.rupture) if law.rupture >= 0 else ()), *material.numbers()),
                     modulus=material.upper_modulus(),
                     history=np.zeros((len(law.rows) + len(law.bar_data), block.stop - block.start)),
                     sweep=make_sweep(mesh.bars, block.start, block.counted, block.stop),
                     kernels=make_kernels(law, measure),
                     conserving=None if law.mean_stress is None else make_conserving_kernels(law, measure),
+                    release=make_release(intact[section.material], measure) if law.rupture >= 0 else None,
                 )
             )
         self.fill_bar_data()
@@ -198,10 +210,15 @@ class Bars:
         """Whether bars of the case can be slack, the same on all ranks."""
         return "slack" in self.internal
 
+    @property
+    def has_status(self) -> bool:
+        """Whether bars of the case can have another status than intact, the same on all ranks."""
+        return self.slackens or self.can_break
+
     def slack_count(self) -> int:
         """Return the number of counted bars that are slack."""
-        rows = ((b, b.law.slack_row) for b in self.blocks)
-        return sum(int(np.count_nonzero(b.history[row, : b.counted - b.start])) for b, row in rows if row >= 0)
+        slack = self.status() == STATUS.index("slack")
+        return sum(int(np.count_nonzero(slack[b.start : b.counted])) for b in self.blocks)
 
     def status(self) -> np.ndarray:
         """Return the status (b,) of each local bar, of :data:`~pfem_petsc.fields.STATUS`."""
@@ -210,6 +227,8 @@ class Bars:
             if block.law.slack_row >= 0:
                 slack = block.history[block.law.slack_row] != 0.0
                 status[block.start : block.stop][slack] = STATUS.index("slack")
+        if self.can_break:
+            status[self.rupture() != 0.0] = STATUS.index("broken")
         return status
 
     def _arguments(self, x: np.ndarray, block: BarBlock) -> tuple:
@@ -221,16 +240,19 @@ class Bars:
         variables are updated only if ``commit``."""
         f[:] = 0.0
         energies = np.zeros(len(BAR_ENERGIES))
-        failed, shortened = -1, False
+        failed, shortened, changed = -1, False, 0
         for block in self.blocks:
             law = (block.parameters, block.area, self.step, block.history)
             part = np.zeros(len(BAR_ENERGIES))
-            at, short = block.kernels.forces(x, *block.sweep, self.far, self.rest, self.heat, *law, commit, f, part)
+            at, short, broke = block.kernels.forces(
+                x, *block.sweep, self.far, self.rest, self.heat, *law, commit, f, part
+            )
             energies += part
             shortened |= short
+            changed += broke
             if failed < 0:
                 failed = at
-        return StrainEnergy(tuple(energies.tolist()), failed, shortened)
+        return StrainEnergy(tuple(energies.tolist()), failed, shortened, changed)
 
     def keep_start(self) -> None:
         """Store temperatures and rest lengths as those of the start of the next step."""
@@ -243,7 +265,7 @@ class Bars:
 
         Lengths alone do not show this, because a bar can jump over zero in one step. Stretched bars are not checked.
         """
-        return first_inverted(x, before, self.ends, self.rest)
+        return first_inverted(x, before, self.ends, self.watched)
 
     def tangents(
         self, x: np.ndarray, weight: float, inertia: list[float], pattern: BlockPattern, values: np.ndarray
@@ -329,6 +351,22 @@ class Bars:
             for name, _, values in block.variables():
                 history[block.start : block.stop, self.kept_names.index(name)] = values
         return history
+
+    def rupture(self) -> np.ndarray:
+        """Return the state of rupture (b,) of all local bars, see :mod:`~pfem_petsc.mechanics.rupture`."""
+        state = np.zeros(len(self.ends))
+        for block in self.blocks:
+            if block.law.rupture >= 0:
+                state[block.start : block.stop] = block.history[block.law.rupture]
+        return state
+
+    @property
+    def watched(self) -> np.ndarray:
+        """Rest lengths (b,) [m], zero for bars that have left the model; the same array in each call."""
+        if not self.can_break:
+            return self.rest
+        np.copyto(self._watched, np.where(np.abs(self.rupture()) >= 1.0, 0.0, self.rest))
+        return self._watched
 
     def put_history(self, history: np.ndarray) -> None:
         """Restore the result of :meth:`history`."""

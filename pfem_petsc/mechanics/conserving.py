@@ -72,10 +72,14 @@ def make_conserving_kernels(law: Law, measure: Callable) -> SimpleNamespace:
         last_row(law),
     )
     ratio, of_bar, n_rows = _RATIOS[measure], no_bar_data(law), len(law.rows)
+    can_break, gone = law.rupture >= 0, max(law.rupture, 0)
 
     @register_jitable
     def pair(ox, oy, oz, dx, dy, dz, rest0, rest1, shift0, shift, warmth0, warmth, p, area, step, kept, q):
         """Return the coefficient c = A l0 S R [N/m], dc/dl1 [N/m2] and 1/l1; c is NaN for a collapsed bar."""
+        if can_break:  # noqa: SIM102 - not compiled otherwise
+            if abs(q[gone]) >= 1.0:
+                return 0.0, 0.0, 0.0
         length = math.sqrt(dx * dx + dy * dy + dz * dz)
         length0 = math.sqrt(ox * ox + oy * oy + oz * oz)
         rest = 0.5 * (rest0 + rest1)
@@ -91,7 +95,7 @@ def make_conserving_kernels(law: Law, measure: Callable) -> SimpleNamespace:
             slope *= rest / rest1
         rate = 0.0
         if by_rate:
-            stress0 = kept
+            stress0 = kept * (1.0 - abs(q[gone])) if can_break else kept
             if step > 0.0:
                 rate = ((e1 - shift) - (e0 - shift0)) / step
         else:

@@ -58,18 +58,20 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
     places = tuple(BAR_ENERGIES.index(name) for name in law.energies)
     n_energies = len(places)
     first_new = 4 + n_energies
+    can_break, gone = law.rupture >= 0, max(law.rupture, 0)
 
     @inlined
     def sweep_forces(x, heads, starts, chunks, counted, far, rest, heat, p, area, step, history, commit, f, energies):
         """Add internal forces to ``f``, and sums over counted bars to ``energies``, see
-        :data:`~pfem_petsc.energies.BAR_ENERGIES` [J]; return the first failed bar or -1, and whether any bar is so
-        short that it may be inverted.
+        :data:`~pfem_petsc.energies.BAR_ENERGIES` [J]; return the first failed bar or -1, whether any bar is so short
+        that it may be inverted, and how many bars have changed their state of rupture.
 
         ``heads``, ``starts``, ``chunks``, ``counted``: a :class:`~pfem_petsc.mechanics.sweep.Sweep`; ``far`` (b,) the
         other end of each bar. One sum is kept per position in a chunk, so vector instructions need no reordering.
         """
         failed = -1
         shortened = False
+        broke = 0
         has_thermal = heat.shape[1] > 0
         origin = starts[0]
         # end differences, force over length, energies, new history
@@ -121,9 +123,15 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
                 if n_rows > 0:
                     put(work, first_new, i, new)
                     changed += 1 if by_rate or differ(new, q) else 0
+                    if can_break:
+                        broke += 1 if new[gone] != q[gone] else 0
                 if by_rate:
                     work[first_new + last, i] = strain
-                    work[first_new + last + 1, i] = stress
+                    kept = stress
+                    if can_break:  # the stress of what is left of the bar
+                        left = 1.0 - abs(q[gone])
+                        kept = stress / left if left > 0.0 else 0.0
+                    work[first_new + last + 1, i] = kept
                 work[3, i] = area * stress * slope / length
             if n_rows > 0 and commit and changed > 0:
                 for j in range(n_rows):
@@ -133,6 +141,10 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
                 for i in range(n):
                     length = math.sqrt(work[0, i] ** 2 + work[1, i] ** 2 + work[2, i] ** 2)
                     stretch = length / rests[i]
+                    if can_break:  # noqa: SIM102 - not compiled otherwise
+                        if abs(history[gone, begin + i]) >= 1.0:
+                            work[3, i] = 0.0  # a bar that has left the model may have no length
+                            continue
                     if stretch < SHORTENED_STRETCH:
                         shortened = True
                     if not (stretch > COLLAPSED_STRETCH):  # NaN fails this test too
@@ -164,13 +176,16 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
         if counted == len(chunks) - 1:
             for j in range(n_energies):
                 energies[places[j]] += work[4 + j].sum()
-        return failed, shortened
+        return failed, shortened, broke
 
     forces = kernel(sweep_forces)
 
     @register_jitable
     def stiffness(dx, dy, dz, rest, shift, warmth, p, area, step, before, q):
         """Return dN/dl [N/m], N/l [N/m] and 1/l of one bar."""
+        if can_break:  # noqa: SIM102 - not compiled otherwise
+            if abs(q[gone]) >= 1.0:
+                return 0.0, 0.0, 0.0
         length = math.sqrt(dx * dx + dy * dy + dz * dz)
         strain, slope, curvature = measure(length / rest)
         rate = 0.0
@@ -303,6 +318,8 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
             q = take(history, k - start, like)
             if by_rate:
                 stress = history[last + 1, k - start]
+                if can_break:
+                    stress *= 1.0 - abs(q[gone])
             else:
                 given = extend(p, history, n_rows, k - start, of_bar)
                 stress, _, _, _ = response(strain - shift, 0.0, 0.0, warmth, given, q)

@@ -31,6 +31,7 @@ class ExternalForce:
         loads, else taken away, at once over time and in proportion with a load factor
     held_gravity : (3,) the same of gravity [m/s2]
     state_forces : that depend on the motion, which :meth:`follow` gives
+    reactions : forces (owned, 3) of supports that are removed gradually [N], with begin and duration of the removal
     """
 
     def __init__(self, case: Case, nodes: dict[str, np.ndarray], inertia: Inertia) -> None:
@@ -50,6 +51,7 @@ class ExternalForce:
         self.active = bool(case.load) or bool(self.gravity.any()) or varies
         self.held: np.ndarray | None = None
         self.held_gravity = np.zeros(3)
+        self.reactions: list[tuple[np.ndarray, float, float]] = []
         changes = (self._loads is not None and not self._loads.steady) or (varies and not self._keeps[1])
         self._steady = not self.ramped and not changes
 
@@ -108,6 +110,9 @@ class ExternalForce:
     def _add_loads(self, time: float, out: np.ndarray) -> np.ndarray:
         if self._loads is not None and self._loads.any:
             self._loads.add(time, time if self.ramped else 1.0, out)
+        for force, begin, duration in self.reactions:
+            if time < begin + duration:
+                out += (1.0 - (time - begin) / duration) * force
         if self.held is not None:
             out += self.held if self._keeps[0] else self._left(time) * self.held
         return out

@@ -6,13 +6,14 @@ bar, and a loop over a few rows cannot be vectorised over several bars.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from numba.core import cgutils, types
 from numba.core.imputils import impl_ret_borrowed
 from numba.extending import intrinsic
 
-__all__ = ["accumulate", "differ", "extend", "put", "take"]
+__all__ = ["accumulate", "blend", "differ", "dot", "extend", "put", "sum_with", "take", "times"]
 
 
 def _places(context: Any, builder: Any, signature: Any, args: Any, first: int, column: int, count: int) -> list[Any]:
@@ -98,3 +99,61 @@ def differ(typingctx, one, other):  # noqa: ANN001, ANN201
         return found
 
     return types.boolean(one, other), generate
+
+
+def _part(builder: Any, value: Any, j: int) -> Any:
+    return builder.extract_value(value, j)
+
+
+def _elementwise(combine: Callable[..., Any]) -> Any:
+    """Make the code of an intrinsic whose result is a tuple, computed component by component."""
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        parts = [combine(builder, args, j) for j in range(len(signature.return_type))]
+        return context.make_tuple(builder, signature.return_type, parts)
+
+    return generate
+
+
+@intrinsic
+def blend(typingctx, condition, one, other):  # noqa: ANN001, ANN201
+    """Return the tuple ``one`` if ``condition``, else ``other``, of equal length, without a branch."""
+
+    def combine(builder: Any, args: Any, j: int) -> Any:
+        return builder.select(args[0], _part(builder, args[1], j), _part(builder, args[2], j))
+
+    return one(condition, one, other), _elementwise(combine)
+
+
+@intrinsic
+def sum_with(typingctx, one, factor, other):  # noqa: ANN001, ANN201
+    """Return ``one + factor * other`` for tuples of equal length."""
+
+    def combine(builder: Any, args: Any, j: int) -> Any:
+        return builder.fadd(_part(builder, args[0], j), builder.fmul(args[1], _part(builder, args[2], j)))
+
+    return one(one, factor, other), _elementwise(combine)
+
+
+@intrinsic
+def times(typingctx, one, other):  # noqa: ANN001, ANN201
+    """Return the products of the components of two tuples of equal length."""
+
+    def combine(builder: Any, args: Any, j: int) -> Any:
+        return builder.fmul(_part(builder, args[0], j), _part(builder, args[1], j))
+
+    return one(one, other), _elementwise(combine)
+
+
+@intrinsic
+def dot(typingctx, one, other):  # noqa: ANN001, ANN201
+    """Return the sum of the products of the components of two tuples of equal length."""
+    count = len(one)
+
+    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        total = context.get_constant(types.float64, 0.0)
+        for j in range(count):
+            total = builder.fadd(total, builder.fmul(*(_part(builder, value, j) for value in args)))
+        return total
+
+    return types.float64(one, other), generate

@@ -50,6 +50,7 @@ HEAD = Places(
         *((name, 3) for name in (*_VECTORS, *_IMPULSES)),
         ("active_contacts", 1),
         ("slack_bars", 1),
+        ("broken_bars", 1),
         ("alarm", 1),
     ]
 )

@@ -53,7 +53,7 @@ class Recorder:
         case, mesh, comm = self.model.case, self.model.mesh, self.model.comm
         self.columns: dict[str, tuple[int, ...]] = {"time": (), "step": (), "step_size": ()}
         self.columns |= dict.fromkeys(stepper.columns, ())
-        counts = ("active_contacts", "slack_bars") if self.model.bars.slackens else ("active_contacts",)
+        counts = ("active_contacts", "broken_bars", *(("slack_bars",) if self.model.bars.slackens else ()))
         self.columns |= dict.fromkeys(("newton_iterations", "linear_iterations", *counts), ())
         self.columns |= {energy.name: () for energy in ENERGIES} | {"energy_imbalance": ()}
         self.columns |= {name: (3,) for name, size in HEAD.sizes.items() if size == 3}
@@ -134,6 +134,7 @@ class Recorder:
         for term in _STATE:
             sums[HEAD.first(term.name)] = term.value(stepper)
         sums[HEAD.first("active_contacts")], sums[HEAD.first("alarm")] = solution.contacts, alarm
+        sums[HEAD.first("broken_bars")] = stepper.ruptures.count
         if self.model.bars.slackens:
             sums[HEAD.first("slack_bars")] = self.model.bars.slack_count()
         walls, links, at, _ = self._starts

@@ -170,6 +170,7 @@ class RunState:
         self.model.contact.motion.load_state(scalars["free_walls"])
         self.model.links.load_state(checkpoint.arrays)
         self.model.contact.log.load_state(mine["contact_log"], scalars["contact_times"], stepper.touching)
+        stepper.resume()
 
     def load_sums(self, checkpoint: Checkpoint, ledger: Ledger, recorder: Recorder, blow_up: BlowUp) -> dict[str, Any]:
         """Restore ledger, recorder and divergence check, created after :meth:`load_state`; return the last row."""

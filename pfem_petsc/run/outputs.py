@@ -15,6 +15,7 @@ from ..recording.fields import Fields
 from ..recording.history import History
 from ..recording.observer import Callback, Observer
 from ..recording.report import ProgressReport
+from ..recording.ruptures import RuptureReport
 from ..recording.snapshots import Snapshots
 from ..restart.checkpoints import Checkpoints
 from ..restart.folder import Restart, prepare_folder
@@ -43,7 +44,7 @@ class Outputs:
     Attributes
     ----------
     fields : of the snapshots
-    progress, history, events, snapshots, checkpointing : None before :meth:`open`
+    progress, history, events, ruptures, snapshots, checkpointing : None before :meth:`open`
     """
 
     def __init__(
@@ -62,6 +63,7 @@ class Outputs:
         self.snapshots: Snapshots | None = None
         self.checkpointing: Checkpointing | None = None
         self.events: Events | None = None
+        self.ruptures: RuptureReport | None = None
         self._report: ProgressReport | None = None
         self._callbacks: list[Callback] = []
         self._writer: ResultWriter | None = None
@@ -82,7 +84,7 @@ class Outputs:
 
     @property
     def _recording(self) -> tuple[Observer, ...]:
-        return self.history, self.events, self.snapshots, self.checkpointing
+        return self.history, self.events, self.ruptures, self.snapshots, self.checkpointing
 
     @property
     def _observers(self) -> tuple[Observer, ...]:
@@ -147,6 +149,7 @@ class Outputs:
         if hasattr(stepper, "message"):
             stepper.message = warn
         self.events = Events(stepper, self.progress.message)
+        self.ruptures = RuptureReport(stepper, self.history, self.progress.message)
         self.snapshots = Snapshots(analysis, self.fields, warn)
         self.checkpointing = Checkpointing(checkpoints, self.history, self.snapshots, self._synchroniser)
         self._report = ProgressReport(self.progress, analysis, self.history)
@@ -183,6 +186,7 @@ class Outputs:
     def _complete_stage(self) -> None:
         """The row and the snapshot of the last step of a stage."""
         self.history.complete()
+        self.ruptures.complete()
         self.snapshots.complete()
 
     def record_start(self) -> None:
@@ -257,7 +261,7 @@ class Outputs:
         The checkpoint precedes a row and a snapshot that are off their schedule, so that a run extended to a later end
         continues as if they had not been written.
         """
-        for observer in (self.checkpointing, self.history, self.snapshots):
+        for observer in (self.checkpointing, self.history, self.ruptures, self.snapshots):
             observer.complete()
 
     def record_modes(self) -> None:

@@ -27,6 +27,11 @@ def check_path(model: Model, keys: PathKeys) -> None:
         On all ranks.
     """
     case = model.case
+    if model.bars.can_break or case.remove:
+        raise InputError(
+            f'{case.source}: static.method = "{case.static.method}" follows smooth paths, which end where bars '
+            'break or are removed; remove rupture and [[remove]], or take static.method = "newton"'
+        )
     if model.can_touch:
         raise InputError(
             f'{case.source}: static.method = "{case.static.method}" follows paths without contact; remove walls, '

@@ -64,13 +64,22 @@ class RelaxationStepper(StaticStepper):
         SimulationFailure
             On all ranks, if relaxation does not converge in ``max_iterations`` pseudo-steps.
         """
-        state, left = self.state, self.end - self.state.time
+        state, end = self.state, min(self.end, self.removals.ends())
+        left = end - state.time
         last = left <= self.limits.step * (1.0 + TIME)
         size = left if last else self.limits.step
         self._set_part(size)
         self.smallest = size
-        self._make_part(self.end if last else state.time + size)
+        self._make_part(end if last else state.time + size)
+        self.leave()
         state.step += 1
+
+    def supports_changed(self) -> None:
+        """See :class:`~pfem_petsc.stepping.stepper.Stepper`. Collective."""
+        super().supports_changed()
+        if self.minimum is not None:
+            self.minimum.destroy()
+            self.minimum = MinimumCheck(self.model)
 
     def settle(self) -> None:
         """See :class:`StaticStepper`. Collective."""

@@ -16,6 +16,7 @@ from ..stepping.prescribed import NoRates
 from ..stepping.solution import Solution
 from ..tolerances import TIME
 from .free_motions import free_motions
+from .redistribution import hold_detached, redistribute
 from .scheme import Equilibrium
 
 if TYPE_CHECKING:
@@ -90,6 +91,8 @@ class StaticStepper(ImplicitStepper):
         """Initialise the state at load factor zero; the first increment is equilibrated. Collective."""
         state, model = self.state, self.model
         model.bars.step = 0.0
+        if model.bars.can_break:
+            hold_detached(self)
         self.start_without_motion()
         model.bars.step = np.inf
         # the force that the state lacks to equilibrium (heat, a stage before) does work in the first increment, which
@@ -112,12 +115,13 @@ class StaticStepper(ImplicitStepper):
         NotConverged
             On all ranks, if the smallest increment does not converge.
         """
-        state, left = self.state, self.end - self.state.time
+        state, reached = self.state, min(self.end, self.removals.ends())
+        left = reached - state.time
         size = self.increment if self.increment < left * (1.0 - TIME) else left
         while True:
             self._set_part(size)
             self.smallest = size
-            end = self.end if size == left else state.time + size
+            end = reached if size == left else state.time + size
             try:
                 self._make_part(end)
                 break
@@ -136,6 +140,7 @@ class StaticStepper(ImplicitStepper):
             self._count_dissipation(size)
             if self.done:
                 self._release()
+        self.leave()
         state.step += 1
 
     def _solve(self, balance: Balance, guess: np.ndarray) -> Solution:
@@ -162,6 +167,18 @@ class StaticStepper(ImplicitStepper):
         """Return whether contact is possible and nothing is in contact at the start of the increment. Collective."""
         model = self.model
         return model.can_touch and not model.comm.allreduce(int(self.state.contact.any()), op=MPI.MAX)
+
+    def leave(self) -> None:
+        """See :func:`~pfem_petsc.statics.redistribution.redistribute`. Collective."""
+        redistribute(self)
+
+    def resume(self) -> None:
+        """See :class:`~pfem_petsc.stepping.stepper.Stepper`. Collective."""
+        super().resume()
+        if self.model.bars.can_break:
+            kept = self.lagged_count, self.lagged_place, self.lagged_history
+            hold_detached(self)
+            self.lagged_count, self.lagged_place, self.lagged_history = kept
 
     def _count_dissipation(self, size: float) -> None:
         u = self.solution.u

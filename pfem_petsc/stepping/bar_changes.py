@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..mechanics.broken_bars import state_before_rupture
 from ..mechanics.strain import MEASURES
 
 if TYPE_CHECKING:
@@ -45,6 +46,7 @@ class BarChanges:
         self._stress = bars.fields(x)["stress"]
         self._variables = [block.history[: len(block.law.internal)].copy() for block in bars.blocks]
         self._thermal, self._warmth = bars.heat[0].copy(), bars.heat[1].copy()
+        self._state = bars.rupture() if bars.can_break else np.empty(0)
         if self.model.rest_lengths.varying:
             self._rest, self._lengths, self._densities = bars.rest.copy(), bars.lengths(x), bars.densities(x)
 
@@ -79,11 +81,21 @@ class BarChanges:
         """Return the mean stress of the counted bars of a block in the step [Pa]."""
         part, counted = slice(block.start, block.counted), slice(block.counted - block.start)
         first, last = before["_stress"][part], self._stress[part]
+        if block.law.rupture >= 0:
+            last = self._with_bars(before["_state"][part], part, last)
         mean = 0.5 * (first + last)
         if block.law.mean_correction is not None:
             variables = before["_variables"][k][:, counted], self._variables[k][:, counted]
             mean += block.law.mean_correction(block.parameters, last - first, *variables)
         return mean
+
+    def _with_bars(self, state: np.ndarray, part: slice, stress: np.ndarray) -> np.ndarray:
+        """Return stresses at the end of the step [Pa] of bars that broke there as they were before."""
+        stress = stress.copy()
+        for k in np.flatnonzero(self._state[part] != state):
+            whole = state_before_rupture(self.model.bars, self.stepper.state.x, part.start + int(k))[2]
+            stress[k] = (1.0 - abs(state[k])) * whole
+        return stress
 
     def _stressing(self, before: dict, block: BarBlock, mean: np.ndarray, rest: np.ndarray) -> float:
         """Return the work of changing rest lengths on the counted bars of a block [J]; ``rest``: their means [m]."""

@@ -17,6 +17,7 @@ class BarArrays(NamedTuple):
     sweep: tuple
     far: np.ndarray
     rest: np.ndarray
+    watched: np.ndarray
     heat: np.ndarray
     parameters: tuple
     area: float

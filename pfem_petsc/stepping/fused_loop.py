@@ -39,10 +39,11 @@ def make_fused_loop(forces: Callable, drift: Callable, kick: Callable) -> Callab
     nodes (k,) that have touched walls and not left them; the ledger's sums; its particles; the kinetic energy and the
     energies of the bars [J]; and ``sums`` (count, width), which receives the sums of a history row for each step.
 
-    It returns the number of steps made; for the last step the first bar that collapsed and the first that went through
-    zero length, or -1, and the infeasible node, or -1, with the offsets of its planes; the buffers; the kinetic energy;
-    increments (n, 3); the results of :func:`~pfem_petsc.contact.flat.press_planes` for nodes and walls; and the nodes
-    that touch walls, and those that have touched them.
+    It returns the number of steps made; for the last step, which is the last one too if bars change their state of
+    rupture there, the number of these bars, the first bar that collapsed and the first that went through zero length,
+    or -1, and the infeasible node, or -1, with the offsets of its planes; the buffers; the kinetic energy; increments
+    (n, 3); the results of :func:`~pfem_petsc.contact.flat.press_planes` for nodes and walls; and the nodes that touch
+    walls, and those that have touched them.
     """
 
     @kernel
@@ -90,6 +91,7 @@ def make_fused_loop(forces: Callable, drift: Callable, kick: Callable) -> Callab
         failed = -1
         turned = -1
         infeasible = -1
+        changed = 0
         done = 0
         for step in range(count):
             flat_before[:] = flat_x
@@ -97,7 +99,7 @@ def make_fused_loop(forces: Callable, drift: Callable, kick: Callable) -> Callab
             f, f1 = f1, f
             f[:] = 0.0
             energies1[:] = 0.0
-            failed, shortened = forces(
+            failed, shortened, changed = forces(
                 x,
                 *bars.sweep,
                 bars.far,
@@ -113,7 +115,7 @@ def make_fused_loop(forces: Callable, drift: Callable, kick: Callable) -> Callab
             )
             turned = -1
             if failed < 0 and shortened:
-                turned = first_inverted(x, before, bars.ends, bars.rest)
+                turned = first_inverted(x, before, bars.ends, bars.watched)
             drift(flat_x, h, flat_half, predictor.reshape(-1))
             explicit_increments(nodes.external, f, nodes.mass, nodes.damping, alpha, eta, nothing, rates, stiffness, u)
             if supported:
@@ -246,11 +248,12 @@ def make_fused_loop(forces: Callable, drift: Callable, kick: Callable) -> Callab
             reaction = support if supported else nothing
             fill_probes(row, at, probes.nodes, probes.starts, x, v, a, contact, reaction)
             done += 1
-            if failed >= 0 or turned >= 0 or infeasible >= 0 or not np.isfinite(kinetic + held1):
+            if failed >= 0 or turned >= 0 or infeasible >= 0 or changed > 0 or not np.isfinite(kinetic + held1):
                 break
         after = (f, f1, a, a1, v, v1, support, support1, contact, contact1)
         return (
             done,
+            changed,
             failed,
             turned,
             infeasible,

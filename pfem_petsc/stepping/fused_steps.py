@@ -31,6 +31,7 @@ MOST = 512
 WORTH = 1000
 """Minimum number of steps of a run for which the fused loop is compiled, which takes some seconds once."""
 
+_BROKEN = HEAD.first("broken_bars")
 _FEWEST = 8  # minimum number of steps for one call
 _NODES = 50_000  # beyond this the overhead of Python is below one percent, and memory traffic dominates
 
@@ -50,7 +51,7 @@ class Batch:
         block = model.bars.blocks[0]
         self._fused_loop = make_fused_loop(block.kernels.sweep_forces, *stepper.scheme.loops)
         bars = model.bars
-        law = (bars.far, bars.rest, bars.heat, block.parameters, block.area, block.history)
+        law = (bars.far, bars.rest, bars.watched, bars.heat, block.parameters, block.area, block.history)
         self._bars = BarArrays(bars.ends, tuple(block.sweep), *law, block.law.slack_row)
         supports, inertia, contact = model.supports, model.inertia, model.contact
         nothing = np.empty((0, 3))
@@ -89,8 +90,8 @@ class Batch:
     def make(self, count: int) -> tuple[int, np.ndarray]:
         """Make up to ``count`` steps; return their number and the walls touched in each (steps, walls) bool.
 
-        Fewer steps are made if a bar fails, a node is infeasible or the energy is not finite; the stepper then has a
-        fault.
+        Fewer steps are made if a bar breaks. The same holds if a bar fails, a node is infeasible or the energy is not
+        finite; the stepper then has a fault.
         """
         stepper, ledger, state = self.stepper, self.ledger, self.stepper.state
         log, scheme = self.model.contact.log, stepper.scheme
@@ -108,24 +109,27 @@ class Batch:
         pushed = ledger.impulses.state
         impulses = ImpulseArrays(pushed.memory["half_velocity"], pushed.a, pushed.v)
         ledger.take_pending()
-        done, failed, turned, infeasible, offsets, after, kinetic, u, touched, log.last, met = self._fused_loop(
-            count,
-            stepper.h,
-            state.x,
-            stepper.before,
-            half,
-            self._bars,
-            self._nodes,
-            self._walls,
-            self._probes,
-            buffers,
-            log.last,
-            ledger.impacts.met,
-            ledger.sums,
-            impulses,
-            ledger.kinetic,
-            energies,
-            self.sums,
+        ledger.sums[_BROKEN] = stepper.ruptures.count
+        done, changed, failed, turned, infeasible, offsets, after, kinetic, u, touched, log.last, met = (
+            self._fused_loop(
+                count,
+                stepper.h,
+                state.x,
+                stepper.before,
+                half,
+                self._bars,
+                self._nodes,
+                self._walls,
+                self._probes,
+                buffers,
+                log.last,
+                ledger.impacts.met,
+                ledger.sums,
+                impulses,
+                ledger.kinetic,
+                energies,
+                self.sums,
+            )
         )
         state.f, stepper.other_force, state.a, a_next, state.v, v_next, support, support_next, contact, contact_next = (
             after
@@ -138,6 +142,9 @@ class Batch:
         stepper.solution = Solution(u, state.f, WallForces(*touched) if walls else nothing, contacts=len(touched[3]))
         state.step, state.time = begin + done - 1, (begin + done) * stepper.h
         stepper.balance = scheme.balance(state, stepper.h)
+        if changed:
+            stepper.ruptures.note()
+            self.sums[done - 1, _BROKEN] = stepper.ruptures.count
         if failed >= 0 or turned >= 0:
             stepper.fault = SimulationFailure(stepper.collapse(max(failed, turned)))
         elif infeasible >= 0:
@@ -163,6 +170,7 @@ class Batches:
         self._min_steps = min_steps
         self._batch: Batch | None = None
         self._refused = False
+        self._changes = 0
 
     def anew(self) -> Batches:
         """The same for the next stage."""
@@ -185,11 +193,12 @@ class Batches:
         """
         stepper, state, end = analysis.stepper, analysis.state, analysis.last_step
         begin = state.step
-        count = min(left, end - begin, MOST + 1) - 1
+        count = min(left, end - begin, MOST + 1, stepper.removals.steps_left()) - 1
         # if walls stop nodes immediately, damping in the first step uses velocities other than those of the state
         if self._refused or count < _FEWEST or end < self._min_steps or begin == 0:
             return True
-        if self._batch is None:
+        if self._batch is None or self._changes != stepper.support_changes:
+            self._changes = stepper.support_changes
             self._refused = not Batch.serves(stepper)
             if self._refused:
                 return True

@@ -63,6 +63,8 @@ def _largest_miss(bars, rest, before, after, predicted):
     """Largest change of a bar's vector that is not predicted, over its rest length, and the number of that bar."""
     worst, at = -1.0, 0
     for k in range(len(bars)):
+        if rest[k] == 0.0:  # it has left the model
+            continue
         a, b = bars[k, 0], bars[k, 1]
         changed = missed = 0.0
         for c in range(3):
@@ -127,7 +129,7 @@ class StepGuard:
         mesh, rest = self.model.mesh, self.model.bars.rest
         if len(mesh.bars) == 0:
             return _Worst(0.0)
-        value, k = _largest_miss(mesh.bars, rest, before, after, self._predicted)
+        value, k = _largest_miss(mesh.bars, self.model.bars.watched, before, after, self._predicted)
         a, b = mesh.bars[k]
         start, end = before[b] - before[a], after[b] - after[a]
         lengths = np.linalg.norm(start) * np.linalg.norm(end)

@@ -52,7 +52,19 @@ class ImplicitStepper(Stepper):
     def __init__(self, model: Model, scheme: Scheme, h: float, choice: LinearChoice) -> None:
         super().__init__(model, scheme, h)
         _free_left_over(model.comm)
-        symmetric = scheme.symmetric and model.contact.symmetric
+        self._choice = choice
+        self._make_solvers()
+        self.guard = StepGuard(model) if model.case.solver.guard else None
+        self._after = np.zeros_like(self.state.x)
+        self.level = 0  # the next step is made in 2**level parts
+        self.message: Callable[[str], None] = lambda text: None
+        self.held = np.zeros(model.mesh.n_owned, dtype=bool)  # nodes in contact with walls in the last step
+        self.accuracy = 1.0  # of a solve, as a factor on the tolerance of steps; zero: to rounding
+
+    def _make_solvers(self) -> None:
+        """Create matrices and solvers for the supports as they are. Collective."""
+        model, choice = self.model, self._choice
+        symmetric = self.scheme.symmetric and model.contact.symmetric
         if choice.matrix_free:
             self.hessian = MatrixFreeHessian(model)
         else:
@@ -60,7 +72,7 @@ class ImplicitStepper(Stepper):
         self.lagged = None
         if choice.lagged:
             self.lagged = LaggedPreconditioner(
-                model, choice.preconditioner, symmetric, scheme.symmetric, choice.matrix_free
+                model, choice.preconditioner, symmetric, self.scheme.symmetric, choice.matrix_free
             )
         self.links = [link.coordinates() for link in model.links]
         self.hessian.couple(self.links)
@@ -70,13 +82,19 @@ class ImplicitStepper(Stepper):
         most = model.case.solver.max_newton
         self.newton = NewtonSolver(model.mesh, self.hessian, choice, bounded, most, model.length, self.lagged)
         self.newton.prepare(model.can_touch)
-        self.guard = StepGuard(model) if model.case.solver.guard else None
-        self._after = np.zeros_like(self.state.x)
-        self.level = 0  # the next step is made in 2**level parts
-        self.message: Callable[[str], None] = lambda text: None
-        self.held = np.zeros(model.mesh.n_owned, dtype=bool)  # nodes in contact with walls in the last step
         self._mass: MassSolver | None = None
-        self.accuracy = 1.0  # of a solve, as a factor on the tolerance of steps; zero: to rounding
+
+    def supports_changed(self) -> None:
+        """See :class:`Stepper`. Collective."""
+        super().supports_changed()
+        self._free_solvers()
+        self._make_solvers()
+
+    def resume(self) -> None:
+        """See :class:`Stepper`. Collective."""
+        kept = self.lagged_count, self.lagged_place, self.lagged_history
+        super().resume()
+        self.lagged_count, self.lagged_place, self.lagged_history = kept
 
     def step(self) -> None:
         """Advance by one step; a part that does not converge is bisected, and parts grow again from step to step.
@@ -107,6 +125,7 @@ class ImplicitStepper(Stepper):
                 continue
             done += size
         self.level = max(self.level - 1, 0)
+        self.leave()
         state.step += 1
 
     def _set_part(self, part: float) -> None:
@@ -118,6 +137,9 @@ class ImplicitStepper(Stepper):
         self.smallest = min(self.smallest, part)
 
     def destroy(self) -> None:
+        self._free_solvers()
+
+    def _free_solvers(self) -> None:
         self.newton.destroy()
         for owner in (self.hessian, self.lagged, self._mass):
             if owner is not None:

@@ -86,6 +86,8 @@ def hand_over(old: Stepper, new: Stepper) -> None:
     if not new.scheme.inertial:  # others find the forces of their start
         state.support, state.contact = before.support.copy(), before.contact.copy()
     new.model.bars.put_history(old.model.bars.history())
+    new.removals.follow(old.removals)
+    new.ruptures.begin()
     new.model.temperatures.hold(old.model.bars.heat)
     new.model.rest_lengths.hold(old.model.bars.rest)
     _hand_over_links(old.model, new.model)

@@ -17,6 +17,8 @@ from ..tolerances import BEYOND, TIME
 from .collapse import tell_collapse
 from .massless import MasslessNodes
 from .prescribed import PrescribedMotion
+from .removals import Removals
+from .ruptures import Ruptures
 from .solution import Solution
 
 if TYPE_CHECKING:
@@ -42,6 +44,9 @@ class Stepper(ABC):
     massless : MasslessNodes if contact nodes are massless along their walls' normals, else None
     closed : (owned, walls) bool, nodes that have touched a wall and not left it since
     prescribed : PrescribedMotion of supports
+    ruptures : Ruptures, which counts broken bars
+    removals : Removals of bars and supports
+    support_changes : how often components have ceased or begun to be prescribed
     step_changed : whether the scheme was notified of another step size since the last booking
     totals_at_start, totals_solved : (3, 3) this rank's sums of support, external and damping force [N] at the start,
         and of the balance solved there by a scheme that solves for the next position; None after a restart
@@ -57,8 +62,8 @@ class Stepper(ABC):
     events : found with the last step and not recorded yet, the same on all ranks; each has ``row()`` and a text
     """
 
-    kept_numbers: tuple[str, ...] = ("part", "smallest")
-    kept_arrays: tuple[str, ...] = ("touching", "closed")
+    kept_numbers: tuple[str, ...] = ("part", "smallest", "removal_times", "removed_supports")
+    kept_arrays: tuple[str, ...] = ("touching", "closed", "removed_reactions")
     kept_bars: tuple[str, ...] = ()
     columns: tuple[str, ...] = ()
     remedy = "reduce time.step"
@@ -95,6 +100,9 @@ class Stepper(ABC):
         self.closed = np.zeros_like(self.touching)
         self.step_changed = False
         self.prescribed = PrescribedMotion(self)
+        self.ruptures = Ruptures(self)
+        self.removals = Removals(self)
+        self.support_changes = 0
         self._carried = CarriedNodes(model.contact)
         self.totals_at_start: np.ndarray | None = None
         self.totals_solved: np.ndarray | None = None
@@ -214,7 +222,48 @@ class Stepper(ABC):
     def step(self) -> None:
         """Advance from t_n to t_{n+1}; the state is complete at both. Collective if the solve is."""
         self._make_part((self.state.step + 1) * self.h)
+        self.leave()
         self.state.step += 1
+
+    def leave(self) -> None:
+        """Remove the bars and supports that are to go at the time reached. Collective."""
+        self.removals.apply()
+
+    def supports_changed(self) -> None:
+        """Take account of components that are no longer prescribed, or now are. Collective."""
+        self.support_changes += 1
+
+    def resume(self) -> None:
+        """Continue from a state that was restored from a checkpoint. Collective."""
+        self.ruptures.begin()
+        self.removals.resume()
+
+    @property
+    def removal_times(self) -> list[float]:
+        """See :class:`~pfem_petsc.stepping.removals.Removals`, as the next two."""
+        return self.removals.times
+
+    @removal_times.setter
+    def removal_times(self, times: list[float]) -> None:
+        self.removals.times = [float(time) for time in times]
+
+    @property
+    def removed_supports(self) -> list[str]:
+        """Names of the supports that are gone."""
+        return self.removals.gone
+
+    @removed_supports.setter
+    def removed_supports(self, names: list[str]) -> None:
+        self.removals.gone = list(names)
+
+    @property
+    def removed_reactions(self) -> np.ndarray:
+        """Reactions of removed supports (owned, 3 k) [N]."""
+        return self.removals.released
+
+    @removed_reactions.setter
+    def removed_reactions(self, forces: np.ndarray) -> None:
+        self.removals.released[:] = forces
 
     def _make_part(self, end: float) -> None:
         """Advance by ``part`` to the time ``end`` [s]."""
@@ -342,6 +391,8 @@ class Stepper(ABC):
         state, mesh = self.state, self.model.mesh
         mesh.update_ghosts(state.x)
         self.energy = self.model.bars.forces(state.x, state.f, commit)
+        if commit and self.energy.changed:
+            self.ruptures.note()
         failed = self.energy.failed
         if failed < 0 and self.energy.shortened:
             failed = self.model.bars.first_inverted(state.x, self.before)

@@ -15,6 +15,7 @@ import numpy as np
 from pydantic import Field, field_validator
 
 from ...case.base import Finite, NonNegativeFloat, PositiveFloat, StrictModel, listed
+from ...case.rupture import Rupture
 from ...energies import BAR_ENERGIES
 from ._softening import Softening, softened
 
@@ -72,6 +73,9 @@ class MaterialKeys(StrictModel):
             if not rows[k][0] > rows[k - 1][0]:
                 raise ValueError(f"row {k}: the temperature must increase from row to row")
         return rows
+
+    rupture: Rupture | None = None
+    """limits beyond which a bar breaks"""
 
     def pack(self) -> tuple[float, ...]:
         """Return the numbers that the response of the law reads as ``p``; at least one."""
@@ -150,6 +154,8 @@ class Law:
     modulus : function of p and temperatures (bars,) that returns the modulus of the elastic strain (bars,) [Pa], if it
         depends on the temperature
     no_mean_stress : why there is no ``mean_stress``, for the message
+    rupture : place of the internal variable that tells which share of a bar has left the model, see
+        :mod:`~pfem_petsc.mechanics.rupture`; -1 for laws whose bars cannot break
     """
 
     response: Callable[..., Any]
@@ -164,6 +170,7 @@ class Law:
     softening: Softening | None = None
     modulus: Callable[[tuple[Any, ...], np.ndarray], np.ndarray] | None = None
     no_mean_stress: str = ""
+    rupture: int = -1
 
     def __post_init__(self) -> None:
         for name in self.energies:

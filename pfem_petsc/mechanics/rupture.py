@@ -1,0 +1,206 @@
+"""Bars that break or are removed: a material law of which a share is left.
+
+Any law is turned into one whose bars can leave the model. Internal variables are added to those of the law: the state
+r, from 0 (intact) to 1 (broken) or to -1 (removed), and for each energy of the law the density w_r at which it was
+released. With the share that is left, s = 1 - |r|, a bar has
+
+    stress s sigma,   tangent s E_t,   stored energy s w,   rupture dissipation w_r,
+
+where sigma, E_t and w are those of the law. In the loop that evaluates the end of a step, r rises by 1/n (n: ``steps``
+of the limits) if a limit is reached or r > 0 already. The force of this evaluation is still that with the old r, so the
+step is made with the bar and the next one without. w_r rises by w times the decrease of s, so the sum of stored and
+released energy does not change when a bar breaks. Energies that the law has dissipated stay dissipated, s w + w_r.
+
+A bar of which nothing is left is not evaluated: its length may be zero, and the variables of its law do not change.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numba.extending import register_jitable
+
+from ..energies import STORED
+from .compiled import kernel
+from .kernels import no_bar_data, no_variables
+from .materials.base import Law
+from .rows import blend, dot, extend, put, sum_with, take, times
+
+if TYPE_CHECKING:
+    from ..case.rupture import Rupture
+
+__all__ = ["LIMITS", "WHOLE", "breakable", "limit_values", "make_release", "variable_of"]
+
+LIMITS = ("stress", "strain", "compressive_stress", "compressive_strain", "plastic_strain", "damage")
+"""Keys of the limits, in the order of their values."""
+
+WHOLE = 1.0 - 1e-9
+"""States beyond this are 1: the shares of several steps do not add up to it exactly."""
+
+_OF_LAW = len(LIMITS) + 1  # parameters from here on are those of the law
+
+_PLASTIC = ("accumulated_plastic_strain", "plastic_strain")
+
+
+@register_jitable
+def is_beyond(stress: float, strain: float, limits: tuple[float, ...]) -> bool:
+    """Return whether a limit of stress [Pa] or strain is reached."""
+    beyond = (stress >= limits[0]) | (strain >= limits[1])
+    return beyond | (-stress >= limits[2]) | (-strain >= limits[3])
+
+
+def limit_values(rupture: Rupture | None) -> tuple[float, ...]:
+    """Return the values of :data:`LIMITS`, infinite for those not given, and the share released per step."""
+    if rupture is None:
+        return (*(math.inf for _ in LIMITS), 1.0)
+    given = (getattr(rupture, key) for key in LIMITS)
+    return (*(math.inf if value is None else float(value) for value in given), 1.0 / rupture.steps)
+
+
+def variable_of(law: Law, limit: str) -> int:
+    """Return the place of the internal variable that a limit compares, -1 if the law has none."""
+    names = [name for name, _ in law.internal]
+    wanted = _PLASTIC if limit == "plastic_strain" else (limit,)
+    return next((names.index(name) for name in wanted if name in names), -1)
+
+
+@cache
+def breakable(law: Law) -> Law:
+    """Return the law for bars that can break; its parameters are those of :func:`limit_values` and of the law."""
+    count = len(law.internal)
+    stored = tuple(float(name in STORED) for name in law.energies)
+    limited = variable_of(law, "plastic_strain"), variable_of(law, "damage")
+    kept = tuple((f"{name}_at_rupture", "J/m³") for name in law.energies)
+    return dataclasses.replace(
+        law,
+        response=_response(law.response, is_beyond, count, *limited, stored),
+        internal=(*law.internal, ("rupture", ""), *kept),
+        energies=(*law.energies, "rupture_dissipation"),
+        smooth=False,
+        mean_stress=None if law.mean_stress is None else _mean_stress(law.mean_stress, count),
+        mean_correction=None if law.mean_correction is None else _correction(law.mean_correction, count),
+        modulus=None if law.modulus is None else _modulus(law.modulus),
+        rupture=count,
+    )
+
+
+@cache
+def make_release(law: Law, measure: Callable[..., Any]) -> Callable[..., Any]:
+    """Make the loop that removes a share of bars, for a law that is not breakable itself; see :func:`breakable`.
+
+    Its arguments are those of the loops in :mod:`~pfem_petsc.mechanics.kernels`; ``members``, the local bars; the state
+    -r that they are to have, if they have not left further; ``counted``, the end of the bars counted on this rank; and
+    ``moved``, to which the stored energies that are released [J] are added, one for each energy of the law.
+    """
+    count, like = len(law.internal), no_variables(law)
+    stored = np.array([name in STORED for name in law.energies])
+    n_energies = len(stored)
+    respond, first, of_law, of_bar = law.response, count + 1, _OF_LAW, no_bar_data(law)
+    n_rows = len(breakable(law).rows)
+
+    @kernel
+    def release(x, bars, rest, heat, p, area, history, start, members, state, counted, moved):
+        work = np.zeros((n_energies, 1))
+        for k in members:
+            column = k - start
+            now = abs(history[count, column])
+            if now >= state:
+                continue
+            a = bars[k, 0]
+            b = bars[k, 1]
+            dx = x[b, 0] - x[a, 0]
+            dy = x[b, 1] - x[a, 1]
+            dz = x[b, 2] - x[a, 2]
+            strain, _, _ = measure(math.sqrt(dx * dx + dy * dy + dz * dz) / rest[k])
+            warmth = 0.0
+            if heat.shape[1] > 0:
+                strain -= heat[0, k]
+                warmth = heat[1, k]
+            given = extend(p, history, n_rows, column, of_bar)
+            _, _, _, densities = respond(strain, 0.0, 0.0, warmth, given[of_law:], take(history, column, like))
+            put(work, 0, 0, densities)
+            for j in range(n_energies):
+                lost = (state - now) * work[j, 0]
+                history[first + j, column] += lost
+                if stored[j] and k < counted:
+                    moved[j] += area * rest[k] * lost
+            history[count, column] = -state
+
+    return release
+
+
+def _response(
+    law: Callable[..., Any],
+    beyond: Callable[..., Any],
+    count: int,
+    plastic: int,
+    damage: int,
+    stored: tuple[float, ...],
+) -> Callable[..., Any]:
+    """Make the response of the breakable form of a law with ``count`` internal variables of its own.
+
+    ``plastic``, ``damage``: places of the variables with a limit, or -1; ``stored``: one for energies that bars store.
+    """
+    first, of_law = count + 1, _OF_LAW
+    dissipated = tuple(1.0 - part for part in stored)
+    none = (0.0,) * len(stored)
+    by_plastic, by_damage = plastic >= 0, damage >= 0
+    plastic, damage = max(plastic, 0), max(damage, 0)
+
+    @register_jitable
+    def response(strain, rate, step, temperature, p, q):
+        state = q[count]
+        left = 1.0 - abs(state)
+        there = left > 0.0
+        stress, tangent, new, densities = law(strain, rate, step, temperature, p[of_law:], q[:count])
+        over = beyond(stress, strain, p[:4])
+        if by_plastic:
+            over = over | (abs(new[plastic]) >= p[4])
+        if by_damage:
+            over = over | (new[damage] >= p[5])
+        breaks = there & (state >= 0.0) & (over | (state > 0.0))
+        after = state + p[6] if breaks else state
+        after = 1.0 if after > WHOLE else after
+        remaining = 1.0 - abs(after)
+        densities = blend(there, densities, none)
+        kept = sum_with(q[first:], left - remaining, densities)
+        shown = sum_with(times(kept, dissipated), remaining, densities)
+        stress = left * stress if there else 0.0
+        tangent = left * tangent if there else 0.0
+        new = blend(there, new, q[:count])
+        return stress, tangent, new + (after,) + kept, shown + (dot(kept, stored),)  # noqa: RUF005 - tuples of Numba
+
+    return response
+
+
+def _mean_stress(law: Callable[..., Any], count: int) -> Callable[..., Any]:
+    of_law = _OF_LAW
+
+    @register_jitable
+    def mean_stress(stress0, strain0, strain, rate, step, temperature, p, q):
+        left = 1.0 - abs(q[count])
+        if left <= 0.0:
+            return 0.0, 0.0
+        mean, modulus = law(stress0 / left, strain0, strain, rate, step, temperature, p[of_law:], q[:count])
+        return left * mean, left * modulus
+
+    return mean_stress
+
+
+def _modulus(law: Callable[..., np.ndarray]) -> Callable[..., np.ndarray]:
+    return lambda p, temperatures: law(p[_OF_LAW:], temperatures)
+
+
+def _correction(law: Callable[..., np.ndarray], count: int) -> Callable[..., np.ndarray]:
+    def mean_correction(p: Any, stress: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+        left = 1.0 - np.abs(before[count])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            change = np.where(left > 0.0, stress / left, 0.0)
+        return left * law(p[_OF_LAW:], change, before[:count], after[:count])
+
+    return mean_correction

@@ -1,0 +1,177 @@
+"""Bars and supports that are removed: peaks, static answers, energies, stages, restarts."""
+
+import numpy as np
+import pytest
+from helpers.chains import AREA, MATERIAL, YOUNG
+from helpers.kills import differences
+from helpers.runs import run
+
+from pfem_petsc import Case, Simulation, open_result, write_mesh
+from pfem_petsc.errors import InputError
+
+HEIGHT, MASS = 2.0, None
+STIFF = YOUNG * AREA * HEIGHT**2 / (HEIGHT**2 + 1.0) ** 1.5  # of a leg, vertically [N/m]
+WEIGHT = 1e-5 * STIFF
+NODE_MASS = 3 * 0.5 * MATERIAL["density"] * AREA * np.sqrt(HEIGHT**2 + 1.0)
+SCHEME = {"integrator": "energy_momentum", "step": 4e-5}
+
+
+def tower(folder, comm, **tables):
+    """Three legs that lean to a top, which is guided vertically and loaded."""
+    angle = 2.0 * np.pi * np.arange(3) / 3.0
+    feet = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(3)])
+    groups = {"leg": np.array([2])}
+    if comm.rank == 0:
+        folder.mkdir(parents=True, exist_ok=True)
+    comm.Barrier()
+    points = np.vstack([feet, [[0.0, 0.0, HEIGHT]]])
+    write_mesh(folder / "tower.h5", points, [[0, 3], [1, 3], [2, 3]], bar_groups=groups, comm=comm)
+    data = {
+        "mesh": {"file": "tower.h5"},
+        "node_set": {"feet": {"indices": [0, 1]}, "third": {"indices": [2]}, "top": {"indices": [3]}},
+        "material": {"it": MATERIAL},
+        "section": {"it": {"area": AREA, "material": "it"}},
+        "support": [
+            {"node_set": "feet", "fix": "xyz"},
+            {"name": "foot", "node_set": "third", "fix": "xyz"},
+            {"node_set": "top", "fix": "xy"},
+        ],
+        "load": [{"node_set": "top", "force": [0.0, 0.0, -WEIGHT]}],
+        "output": {"fields_every": 0, "probe": [{"name": "top", "node_set": "top"}]},
+        **tables,
+    }
+    return Case.from_dict(data, source="tower.toml", folder=folder)
+
+
+PERIOD = 2.0 * np.pi * np.sqrt(NODE_MASS / (2.0 * STIFF))
+
+
+def fall(history):
+    return HEIGHT - history["probe/top/position"][:, 0, 2]
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("integrator", ["energy_momentum", "central_differences"])
+@pytest.mark.parametrize("duration, factor", [(0.0, 2.0), (10.0, 1.0)])
+def test_a_tower_that_loses_a_leg(duration, factor, integrator, comm, shared_tmp_path):
+    """Sudden: 1 - cos of the change from W/3k to W/2k, a peak of twice it; slow: the static answer."""
+    static = {"name": "load", "static": {"step": 1.0}}
+    end = (duration + 1.2) * PERIOD
+    time = {"integrator": integrator, "step": PERIOD / 200.0, "end": end}
+    remove = [{"bars": "leg", "time": 0.0, "duration": duration * PERIOD}]
+    motion = {
+        "name": "loss",
+        "time": time,
+        "remove": remove,
+        "load": [{"node_set": "top", "force": [0.0, 0.0, -WEIGHT]}],
+    }
+    case = tower(shared_tmp_path, comm, stage=[static, motion], solver={"rtol": 1e-11})
+    history = run(case, shared_tmp_path / "out", comm)
+    down = fall(history)
+    before, after = WEIGHT / (3.0 * STIFF), WEIGHT / (2.0 * STIFF)
+    assert down[history["stage"] == 0][-1] == pytest.approx(before, rel=1e-4)
+    peak = before + factor * (after - before)
+    assert down.max() == pytest.approx(peak, rel=0.01 if factor == 2.0 else 0.02)
+    assert history["broken_bars"].max() == 0
+    stored = 0.5 * STIFF * before**2
+    if not duration:
+        assert history["rupture_dissipation"][-1] == pytest.approx(stored, rel=1e-3)
+    scale = WEIGHT * after
+    assert np.abs(history["energy_imbalance"]).max() < 1e-7 * scale
+
+
+def test_a_leg_is_taken_away_in_equilibrium(comm, tmp_path):
+    """Load factors are those of the loads; equilibrium is found with the leg at 0.5 and without it from there on."""
+    case = tower(tmp_path, comm, static={"step": 0.3}, remove=[{"bars": "leg", "time": 0.5}])
+    history = run(case, tmp_path / "out", comm)
+    factor = history["load_factor"]
+    assert 0.5 in factor
+    legs = np.where(factor < 0.5, 3, 2)
+    np.testing.assert_allclose(fall(history), factor * WEIGHT / (legs * STIFF), rtol=1e-4, atol=1e-15)
+    assert np.abs(history["energy_imbalance"]).max() < 1e-8 * history["external_work"][-1]
+
+
+@pytest.mark.parametrize("method", ["newton", "relaxation"])
+def test_a_support_is_taken_away_in_equilibrium(method, comm, tmp_path):
+    """The leg that loses its foot hangs on the top without force; it is held in the horizontal directions."""
+    support = [
+        {"node_set": "feet", "fix": "xyz"},
+        {"name": "foot", "node_set": "third", "fix": "z"},
+        {"node_set": "third", "fix": "xy"},
+        {"node_set": "top", "fix": "xy"},
+    ]
+    remove = [{"supports": "foot", "time": 0.5, "duration": 0.25}]
+    case = tower(tmp_path, comm, static={"step": 0.125, "method": method}, support=support, remove=remove)
+    history = run(case, tmp_path / "out", comm)
+    down, factor = fall(history), history["load_factor"]
+    first, last = factor < 0.5, factor > 0.75
+    np.testing.assert_allclose(down[first], factor[first] * WEIGHT / (3.0 * STIFF), rtol=1e-4, atol=1e-15)
+    np.testing.assert_allclose(down[last], factor[last] * WEIGHT / (2.0 * STIFF), rtol=1e-4)
+    assert np.abs(history["energy_imbalance"]).max() < 1e-7 * history["external_work"][-1]
+
+
+@pytest.mark.parametrize("scheme", ["central_differences", "newmark"])
+@pytest.mark.parametrize("what", [{"bars": "leg"}, {"supports": "foot"}])
+def test_restarts_are_bitwise_while_something_is_removed(what, scheme, comm, tmp_path):
+    """From before, within and after a gradual removal; in fused steps as in single ones."""
+    step = PERIOD / 100.0
+    time = {"integrator": scheme, "step": step, "end": 60 * step}
+    remove = [{**what, "time": 20 * step, "duration": 20 * step}]
+    case = tower(tmp_path, comm, time=time, remove=remove)
+    whole = run(case, tmp_path / "whole", comm)
+    for at in (15, 20, 30, 45):
+        tables = {**case.to_dict(), "output": {**case.to_dict()["output"], "checkpoint_every": at}}
+        again = Case.from_dict(tables, folder=tmp_path)
+        folder = tmp_path / str(at)
+        with Simulation(again, comm, folder, quiet=True) as first:
+            for made in first:
+                if made.step == at:
+                    break
+        with Simulation(again, comm, folder, True, quiet=True) as rest:
+            rest.run()
+        found = differences(tmp_path / "whole" / "result.vtkhdf", folder / "result.vtkhdf")
+        assert not [name for name in found if "history" in name], at
+    with Simulation(case, comm, tmp_path / "fused", quiet=True) as fused:
+        for _ in fused.batches(min_steps=1):
+            pass
+    history = open_result(tmp_path / "fused").history
+    for column in history:
+        np.testing.assert_array_equal(history[column], whole[column], err_msg=column)
+    assert np.abs(whole["energy_imbalance"]).max() < 1e-8 * whole["external_work"].max()
+
+
+@pytest.mark.parallel
+def test_what_is_gone_stays_away_in_later_stages(comm, shared_tmp_path):
+    """A stage without a table [[remove]] goes on without the bars and supports that the stage before has removed."""
+    remove = [{"bars": "leg", "time": 0.5}, {"supports": "foot", "time": 0.25}]
+    first = {"name": "loss", "static": {"step": 0.25}, "remove": remove}
+    second = {
+        "name": "more",
+        "static": {"step": 0.5},
+        "load": [{"node_set": "top", "force": [0.0, 0.0, -2.0 * WEIGHT]}],
+    }
+    support = [
+        {"node_set": "feet", "fix": "xyz"},
+        {"name": "foot", "node_set": "third", "fix": "z"},
+        {"node_set": "third", "fix": "xy"},
+        {"node_set": "top", "fix": "xy"},
+    ]
+    case = tower(shared_tmp_path, comm, stage=[first, second], support=support)
+    history = run(case, shared_tmp_path / "out", comm)
+    assert fall(history)[-1] == pytest.approx(2.0 * WEIGHT / (2.0 * STIFF), rel=1e-4)
+    assert np.abs(history["energy_imbalance"]).max() < 1e-7 * history["external_work"][-1]
+
+
+@pytest.mark.parametrize(
+    "remove, told",
+    [
+        ({"time": 0.5}, "exactly one of the keys bars, supports"),
+        ({"bars": "leg", "supports": "foot", "time": 0.5}, "exactly one of the keys bars, supports"),
+        ({"bars": "legs", "time": 0.5}, r"remove\[0\].bars = 'legs': no such group of bars"),
+        ({"supports": "feet", "time": 0.5}, r"remove\[0\].supports"),
+        ({"bars": "leg", "time": -0.5}, r"remove\[0\].time"),
+    ],
+)
+def test_removals_that_make_no_sense_are_refused(remove, told, comm, tmp_path):
+    with pytest.raises(InputError, match=told):
+        Simulation(tower(tmp_path, comm, static={"step": 0.3}, remove=[remove]), comm, tmp_path / "out", quiet=True)

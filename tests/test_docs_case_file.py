@@ -24,6 +24,7 @@ MODELS = [
     *(
         tables.LoadFile,
         tables.VaryingGravity,
+        tables.VaryingWind,
         tables.Temperature,
         settings.TimeKeys,
         settings.StaticKeys,

@@ -25,6 +25,7 @@ MODELS = [
     *(
         tables.LoadFile,
         tables.VaryingGravity,
+        tables.VaryingWind,
         tables.Temperature,
         tables.Remove,
         settings.TimeKeys,

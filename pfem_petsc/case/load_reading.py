@@ -1,4 +1,4 @@
-"""Reads the tables of a case with rows over time, which may be in files: supports, loads, gravity, temperatures."""
+"""Reads the tables of a case with rows over time, which may be in files: supports, loads, gravity, wind."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .problems import Path as KeyPath
 from .problems import Problems, table_list
 from .table_files import TableFiles
 
-__all__ = ["read_gravity", "read_loads", "read_tabled"]
+__all__ = ["read_loads", "read_tabled", "read_varying"]
 
 M = TypeVar("M", bound=StrictModel)
 
@@ -68,25 +68,32 @@ def read_loads(
     return [entry for entry in found if entry is not None]
 
 
-def read_gravity(data: Any, files: TableFiles, problems: Problems) -> t.Gravity | t.VaryingGravity | None:
-    """Read [gravity], constant, or over time from rows or a file; rows of a file are added to a constant one."""
-    path: KeyPath = ("gravity",)
+def read_varying(
+    data: Any, table: str, models: tuple[type[M], type[M]], files: TableFiles, problems: Problems
+) -> M | None:
+    """Read [gravity] or [wind], constant, or over time from rows or a file, whose rows are added to a vector.
+
+    ``models`` are the constant one, whose first key is the vector, and the one with rows.
+    """
+    path: KeyPath = (table,)
+    constant, varying = models
+    key = next(iter(constant.model_fields))
     if not isinstance(data, Mapping):
-        return problems.read(t.Gravity, data, path)
-    given, known = data.get("acceleration"), list(t.VaryingGravity.model_fields)
+        return problems.read(constant, data, path)
+    given, known = data.get(key), list(varying.model_fields)
     varies = isinstance(given, list | tuple) and any(isinstance(row, list | tuple) for row in given)
-    if "acceleration_file" not in data:
-        return problems.read(t.VaryingGravity if varies else t.Gravity, data, path, known=known)
-    constant = np.zeros(3)
+    if f"{key}_file" not in data:
+        return problems.read(varying if varies else constant, data, path, known=known)
+    added = np.zeros(3)
     if given is not None and not varies:
-        read = problems.read(t.Gravity, {"acceleration": given}, path)
+        read = problems.read(constant, {key: given}, path)
         if read is None:
             return None
-        constant = np.array(read.acceleration)
-    rest = {key: value for key, value in data.items() if key != "acceleration" or varies}
-    row = files.resolved(rest, path, problems, ("acceleration",))
+        added = np.array(getattr(read, key))
+    rest = {name: value for name, value in data.items() if name != key or varies}
+    row = files.resolved(rest, path, problems, (key,))
     if row is None:
         return None
-    rows = np.array(row["acceleration"])
-    rows[:, 1:] += constant
-    return problems.read(t.VaryingGravity, {**row, "acceleration": rows.tolist()}, path)
+    rows = np.array(row[key])
+    rows[:, 1:] += added
+    return problems.read(varying, {**row, key: rows.tolist()}, path)

@@ -7,10 +7,10 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from .base import Finite, PositiveFloat, StrictModel, Vector3
+from .base import Finite, NonNegativeFloat, PositiveFloat, StrictModel, Vector3
 from .rows import FileName, Table2, Table4, increasing
 
-__all__ = ["Gravity", "Load", "LoadFile", "Temperature", "VaryingGravity"]
+__all__ = ["Gravity", "Load", "LoadFile", "Temperature", "VaryingGravity", "VaryingWind", "Wind"]
 
 
 class Load(StrictModel):
@@ -91,6 +91,40 @@ class VaryingGravity(StrictModel):
     def mean(self) -> tuple[float, ...]:
         """Mean of the rows (3,) [m/s2]."""
         return tuple(np.mean(np.array(self.acceleration)[:, 1:], axis=0).tolist())
+
+
+class Wind(StrictModel):
+    """Wind that drags the bars, the same everywhere."""
+
+    velocity: Vector3
+    """velocity [m/s]; or rows [t, vx, vy, vz] [s, m/s], constant outside"""
+    velocity_file: FileName | None = None
+    """such rows from the columns of a CSV or NPZ file, added to a constant velocity"""
+    density: PositiveFloat = 1.225
+    """density of the fluid [kg/m3]; default: air at 15 degrees Celsius"""
+    drag_coefficient: NonNegativeFloat = 1.2
+    """drag coefficient C_d of bars whose section has none"""
+
+
+class VaryingWind(StrictModel):
+    """Wind over time."""
+
+    velocity: Table4
+    """rows [t, vx, vy, vz] [s, m/s], constant outside"""
+    velocity_file: FileName | None = None
+    """such rows from the columns of a CSV or NPZ file, added to a constant velocity"""
+    density: PositiveFloat = 1.225
+    """density of the fluid [kg/m3]; default: air at 15 degrees Celsius"""
+    drag_coefficient: NonNegativeFloat = 1.2
+    """drag coefficient C_d of bars whose section has none"""
+    interpolation: Literal["linear", "smooth"] = "linear"
+    """interpolation between the rows: straight lines, or a cubic spline"""
+
+    @field_validator("velocity")
+    @classmethod
+    def _times(cls, rows: tuple[Any, ...]) -> tuple[Any, ...]:
+        increasing(rows)
+        return rows
 
 
 class Temperature(StrictModel):

@@ -13,7 +13,7 @@ from ..registry import choices, lookup, nearest
 from . import settings as s
 from . import tables as t
 from .base import StrictModel
-from .load_reading import read_gravity, read_loads, read_tabled
+from .load_reading import read_loads, read_tabled, read_varying
 from .materials import read_materials
 from .problems import Path as KeyPath
 from .problems import Problems, table_list
@@ -36,10 +36,13 @@ _LONG_KEY = re.compile(r"""(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*)""" +
 
 KEYS = [
     *("title", "mesh", "node_set", "material", "section", "initial", "support"),
-    *("load", "gravity", "temperature", "wall", "contact_pair", "constraint", "remove", "contact"),
+    *("load", "gravity", "wind", "temperature", "wall", "contact_pair", "constraint", "remove", "contact"),
     *("time", "static", "stage", "modes", "output", "solver"),
 ]
 """Top-level keys of a case file."""
+
+VARYING = (("gravity", (t.Gravity, t.VaryingGravity)), ("wind", (t.Wind, t.VaryingWind)))
+"""Tables with a vector, constant or over time, and their models."""
 
 
 def parse_toml(text: str, source: str) -> dict[str, Any]:
@@ -105,7 +108,10 @@ def read_tables(data: Mapping[str, Any], folder: Path, problems: Problems) -> di
         "initial": _initial(data, problems),
         "support": read_tabled(t.Support, data, "support", files, problems, ("motion", "acceleration"), ("velocity",)),
         "load": read_loads(data, folder, files, problems),
-        "gravity": read_gravity(data["gravity"], files, problems) if "gravity" in data else None,
+        **{
+            table: read_varying(data[table], table, m, files, problems) if table in data else None
+            for table, m in VARYING
+        },
         "temperature": read_tabled(t.Temperature, data, "temperature", files, problems, ("table",), ("value",)),
         "wall": _kinds(data.get("wall"), "wall", "type", WALLS, "a wall of type", problems, files),
         "contact_pair": _pairs(data.get("contact_pair"), problems),

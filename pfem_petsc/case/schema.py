@@ -34,7 +34,7 @@ class Case:
     mesh : :class:`~pfem_petsc.case.tables.Mesh`: generator with parameters, or file
     node_set, material, section : tables by name, in file order
     initial, support, load, temperature, wall, contact_pair, constraint, remove : lists of tables
-    gravity : :class:`~pfem_petsc.case.tables.Gravity` or None
+    gravity, wind : :class:`~pfem_petsc.case.tables.Gravity`, :class:`~pfem_petsc.case.tables.Wind`, or None
     contact, output, solver : tables of :mod:`~pfem_petsc.case.settings`
     time, static, modes : what is computed, None for what is not; ``time`` and ``static`` exclude each other
     stage : the cases of its stages, empty for a case without them
@@ -213,6 +213,7 @@ class Case:
             "support": [_table(entry) for entry in self.support],
             "load": [_table(entry) for entry in self.load],
             "gravity": _table(self.gravity),
+            "wind": _table(self.wind),
             "temperature": [_table(entry) for entry in self.temperature],
             "wall": [_table(entry) for entry in self.wall],
             "contact_pair": [_table(entry) for entry in self.contact_pair],

@@ -18,7 +18,19 @@ __all__ = ["ANALYSES", "TABLES", "StageTables", "stages_of"]
 ANALYSES = ("time", "static")
 """Tables of which a stage has exactly one."""
 
-TABLES = ("initial", "support", "load", "gravity", "temperature", "wall", "remove", "contact", "output", "solver")
+TABLES = (
+    "initial",
+    "support",
+    "load",
+    "gravity",
+    "wind",
+    "temperature",
+    "wall",
+    "remove",
+    "contact",
+    "output",
+    "solver",
+)
 """Tables that a stage may give."""
 
 

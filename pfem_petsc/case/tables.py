@@ -20,7 +20,7 @@ from .base import (
     listed,
     number_or_rows,
 )
-from .load_tables import Gravity, Load, LoadFile, Temperature, VaryingGravity
+from .load_tables import Gravity, Load, LoadFile, Temperature, VaryingGravity, VaryingWind, Wind
 from .rows import FileName, Table4, increasing
 
 __all__ = [
@@ -38,6 +38,8 @@ __all__ = [
     "Support",
     "Temperature",
     "VaryingGravity",
+    "VaryingWind",
+    "Wind",
 ]
 
 Indices = Annotated[tuple[NonNegativeInt, ...], listed]
@@ -129,6 +131,10 @@ class Section(StrictModel):
     """second moment of area about the axis of buckling [m4], instead of a shape"""
     effective_length: PositiveFloat = 1.0
     """effective length factor K: a bar buckles over K times its length"""
+    diameter: PositiveFloat | None = None
+    """diameter in wind [m]; default: that of the shape, or of a round bar of this area"""
+    drag_coefficient: NonNegativeFloat | None = None
+    """drag coefficient in wind; default: that of [wind]"""
     pretension: Any = None
     """axial force in the mesh [N], or rows [t, force] [s, N]: linear between rows, constant outside"""
     prestress: Any = None

@@ -11,6 +11,7 @@ from ..case.tables import VaryingGravity
 from .nodal_loads import NodalLoads
 from .state_forces import ForceState, FunctionForce, StateForce
 from .time_tables import Table
+from .wind import Wind
 
 if TYPE_CHECKING:
     from ..case.schema import Case
@@ -39,6 +40,9 @@ class ExternalForce:
         self._nodes = nodes
         self.state_forces: list[StateForce] = []
         self._state: ForceState | None = None
+        self.wind = Wind(case, inertia.bars) if case.wind is not None else None
+        if self.wind is not None and case.time is not None:
+            self.state_forces.append(self.wind)
         self._keeps = case.holds("load"), case.holds("gravity")
         self._loads = None if self._keeps[0] else NodalLoads(case, nodes, inertia.mesh)
         varies = isinstance(case.gravity, VaryingGravity)
@@ -48,7 +52,7 @@ class ExternalForce:
         if varies:
             self._gravity_table = Table(case.gravity.acceleration, case.gravity.interpolation == "smooth")
         self.ramped = case.static is not None
-        self.active = bool(case.load) or bool(self.gravity.any()) or varies
+        self.active = bool(case.load) or bool(self.gravity.any()) or varies or bool(self.state_forces)
         self.held: np.ndarray | None = None
         self.held_gravity = np.zeros(3)
         self.reactions: list[tuple[np.ndarray, float, float]] = []
@@ -121,7 +125,13 @@ class ExternalForce:
         """Share that is left of what a stage replaces."""
         return max(1.0 - time, 0.0) if self.ramped else 0.0
 
-    def hold(self, force: np.ndarray, gravity: np.ndarray, active: bool) -> None:
-        """Take over what acts at the start of a stage: loads (owned, 3) [N] and gravity (3,) [m/s2]."""
+    def wind_at(self, time: float) -> np.ndarray:
+        """Velocity of the wind (3,) [m/s] at a time [s]."""
+        return np.zeros(3) if self.wind is None else self.wind.velocity(time)
+
+    def hold(self, force: np.ndarray, gravity: np.ndarray, wind: np.ndarray, active: bool) -> None:
+        """Take over what acts at the start of a stage: loads (owned, 3) [N], gravity [m/s2] and wind [m/s], (3,)."""
         self.held, self.held_gravity = force, gravity
+        if self.wind is not None:
+            self.wind.held = wind
         self.active = self.active or active

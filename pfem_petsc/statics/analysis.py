@@ -122,6 +122,11 @@ def _check(model: Model) -> None:
             f'{source}: contact.treatment = "{case.contact.treatment}" treats impacts, and a static analysis has none; '
             "remove the key"
         )
+    if model.external.wind is not None and model.external.wind.fastest():
+        raise InputError(
+            f"{source}: wind: drag turns with the bars, which a static analysis does not follow; take [time] with "
+            "damping, or the forces as [[load]]; a stage may have [stage.wind]"
+        )
     for wall in case.wall:
         if wall.mass is not None:
             raise InputError(

@@ -123,7 +123,7 @@ class Model:
         self.start = start
         self.supports.hold(start.position)
         active = self.comm.allreduce(bool(start.force.any()) or bool(start.gravity.any()), op=MPI.LOR)
-        self.external.hold(start.force, start.gravity, active)
+        self.external.hold(start.force, start.gravity, start.wind, active)
         if self.case.holds("wall"):
             self.contact.motion.held = np.array(start.walls).reshape(-1, 3)
 

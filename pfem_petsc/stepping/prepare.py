@@ -206,6 +206,7 @@ def make_stepper(model: Model, plan: Plan) -> Stepper:
     treatment = _treatment(model, plan)
     _check_walls(model, plan, treatment)
     _warn_of_damping(model, plan)
+    _warn_of_drag(model, plan)
     if treatment is not None:
         treatment.prepare(model)
     stepper = _stepper(model, plan)
@@ -250,6 +251,20 @@ def _warn_of_damping(model: Model, plan: Plan) -> None:
             f"time.step = {plan.step:.4g} s: damping stops nodes within a few steps (material.damping / density * step "
             f"= {rate * plan.step:.2g}), so the recorded damping dissipation has an error of this order; use "
             f"a time.step of at most {_DAMPED / rate:.2g} s, or less damping"
+        )
+
+
+def _warn_of_drag(model: Model, plan: Plan) -> None:
+    """Warn if drag stops bars within a few steps: by predicted velocities it is stable up to a rate of 2/3 a step."""
+    wind = model.external.wind
+    if wind is None:
+        return
+    rate = wind.rate(wind.fastest())
+    if rate * plan.step > _DAMPED:
+        model.warnings.append(
+            f"time.step = {plan.step:.4g} s: the drag of [wind] stops bars within a few steps (rho C_d d U / (density "
+            f"area) * step = {rate * plan.step:.2g}), which its explicit evaluation does not follow; use a time.step "
+            f"of at most {_DAMPED / rate:.2g} s"
         )
 
 

@@ -31,6 +31,7 @@ class StageStart:
     position : (owned, 3) of the nodes [m]
     force : (owned, 3) of the loads [N]
     gravity : (3,) acceleration [m/s2]
+    wind : (3,) velocity [m/s]
     walls : (w, 3) displacements of the walls of the stage before [m]
     """
 
@@ -39,6 +40,7 @@ class StageStart:
     position: np.ndarray
     force: np.ndarray
     gravity: np.ndarray
+    wind: np.ndarray
     walls: np.ndarray
 
     ARRAYS = ("position", "force")
@@ -53,14 +55,16 @@ class StageStart:
             "step": self.step,
             "time": self.time,
             "gravity": self.gravity.tolist(),
+            "wind": self.wind.tolist(),
             "walls": self.walls.tolist(),
         }
 
     @classmethod
     def restored(cls, scalars: dict[str, Any], arrays: dict[str, np.ndarray]) -> StageStart:
         """What :meth:`scalars` and :meth:`arrays` gave."""
-        gravity, walls = np.array(scalars["gravity"]), np.array(scalars["walls"]).reshape(-1, 3)
-        return cls(int(scalars["step"]), float(scalars["time"]), **arrays, gravity=gravity, walls=walls)
+        vectors = {name: np.array(scalars[name]) for name in ("gravity", "wind")}
+        walls = np.array(scalars["walls"]).reshape(-1, 3)
+        return cls(int(scalars["step"]), float(scalars["time"]), **arrays, **vectors, walls=walls)
 
 
 def end_of_stage(stepper: Stepper) -> StageStart:
@@ -73,6 +77,7 @@ def end_of_stage(stepper: Stepper) -> StageStart:
         position=state.position.copy(),
         force=external.loads_at(time),
         gravity=np.array(external.gravity_at(time)),
+        wind=np.array(external.wind_at(time)),
         walls=model.contact.motion.displacements(time),
     )
 

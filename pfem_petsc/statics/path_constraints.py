@@ -91,8 +91,7 @@ class Direction:
 
     def __init__(self, model: Model, node_set: str, direction: tuple[float, float, float]) -> None:
         self.comm = model.comm
-        begun = model.start
-        self._start = model.mesh.points[: model.mesh.n_owned] if begun is None else begun.position
+        self._model = model
         nodes = model.nodes[node_set]
         self.weights = np.zeros((model.mesh.n_owned, 3))
         count = model.comm.allreduce(len(nodes))
@@ -104,7 +103,10 @@ class Direction:
 
     def at(self, position: np.ndarray) -> float:
         """Return that of positions (owned, 3) relative to the mesh or to the start of the stage. Collective."""
-        return self.of(position - self._start)
+        model = self._model
+        # a stage gets its start after its analysis is built
+        start = model.mesh.points[: model.mesh.n_owned] if model.start is None else model.start.position
+        return self.of(position - start)
 
 
 class Component:

@@ -68,7 +68,7 @@ class Wind:
         else:
             self._constant = np.array(wind.velocity, dtype=np.float64)
         mesh = bars.mesh
-        self._mesh, self._rate = mesh, 0.0
+        self._bars, self._mesh, self._rate = bars, mesh, 0.0
         self._factor = np.zeros(len(mesh.bars))
         for block in bars.blocks:
             section, part = case.section[block.section], slice(block.start, block.stop)
@@ -95,7 +95,9 @@ class Wind:
         for local, given in ((self._x, state.position), (self._v, state.v)):
             local[:owned] = given
             self._mesh.update_ghosts(local)
-        _add_drag(self._mesh.bars, self._x, self._v, self._factor, self.velocity(time), owned, out)
+        # the share of a bar that is left has its drag: the ends of a broken bar may be far from each other
+        left = 1.0 - np.abs(self._bars.rupture()) if self._bars.can_break else 1.0
+        _add_drag(self._mesh.bars, self._x, self._v, self._factor * left, self.velocity(time), owned, out)
 
     def rate(self, speed: float) -> float:
         """Return the largest rate [1/s] of a bar's drag over its velocity and mass, at a speed [m/s]. Collective."""

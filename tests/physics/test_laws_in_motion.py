@@ -188,6 +188,24 @@ def test_products_are_derivatives_of_forces(law, strain, tower, comm, shared_tmp
         assert checked >= 2
 
 
+@pytest.mark.slow
+@pytest.mark.parallel
+@pytest.mark.parametrize("law", MATERIALS)
+def test_heat_that_comes_and_goes_balances(law, comm, shared_tmp_path):
+    """Work of changing temperatures on bars that yield, buckle, soften and are slack, with a scheme that conserves."""
+    velocity = 3.0 if law in ("cable", "damage") else -3.0
+    data = row_of_bars(law, "engineering", velocity, 100, "energy_momentum", elements=2).to_dict()
+    data["material"]["it"]["thermal_expansion"] = 1e-4
+    data["temperature"] = [{"table": [[0.0, 0.0], [0.03, 60.0], [0.06, -60.0], [0.1, 30.0]]}]
+    data["solver"] = {"rtol": 1e-13}
+    history = run(Case.from_dict(data), comm, shared_tmp_path / "out")
+    energy = history["kinetic_energy"][0]
+    assert np.abs(history["energy_imbalance"]).max() < 1e-12 * energy
+    assert np.abs(history["numerical_dissipation"]).max() < 1e-11 * energy
+    assert np.abs(history["thermal_work"]).max() > 1e-3 * energy
+    assert max(history["plastic_heat"][-1], history["damage_dissipation"][-1]) > 1e-3 * energy
+
+
 RESTARTED = [("strut", "central_differences"), ("cable", "newmark"), ("damage", "energy_momentum")]
 RESTARTED += [("compaction", "newmark"), ("cable", "central_differences"), ("strut", "energy_momentum")]
 

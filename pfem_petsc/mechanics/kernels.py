@@ -341,7 +341,8 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
             shift = heat[0, k] if has_thermal else 0.0
             warmth = heat[1, k] if has_thermal else 0.0
             q = take(history, k - start, like)
-            _, _, _, found = response(strain - shift, 0.0, 0.0, warmth, p, q)
+            given = extend(p, history, n_rows, k - start, of_bar)
+            _, _, _, found = response(strain - shift, 0.0, 0.0, warmth, given, q)
             for density in found:
                 out[k] += density
 

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..mechanics.broken_bars import state_before_rupture
+from ..mechanics.materials._work import SMALL
 from ..mechanics.strain import MEASURES
 
 if TYPE_CHECKING:
@@ -47,7 +48,7 @@ class BarChanges:
         self._variables = [block.history[: len(block.law.internal)].copy() for block in bars.blocks]
         self._thermal, self._warmth = bars.heat[0].copy(), bars.heat[1].copy()
         self._state = bars.rupture() if bars.can_break else np.empty(0)
-        if self.model.rest_lengths.varying:
+        if self.model.rest_lengths.varying or any(block.law.mean_of_work for block in bars.blocks):
             self._rest, self._lengths, self._densities = bars.rest.copy(), bars.lengths(x), bars.densities(x)
 
     def works(self) -> tuple[float, float]:
@@ -84,10 +85,24 @@ class BarChanges:
         if block.law.rupture >= 0:
             last = self._with_bars(before["_state"][part], part, last)
         mean = 0.5 * (first + last)
+        if block.law.mean_of_work:
+            return self._mean_of_work(before, block, mean)
         if block.law.mean_correction is not None:
             variables = before["_variables"][k][:, counted], self._variables[k][:, counted]
             mean += block.law.mean_correction(block.parameters, last - first, *variables)
         return mean
+
+    def _mean_of_work(self, before: dict, block: BarBlock, mean: np.ndarray) -> np.ndarray:
+        """Return the change of energies over that of strains of the counted bars of a block [Pa]; ``mean`` where these
+        hardly change."""
+        part, strain = slice(block.start, block.counted), _STRAINS[block.measure]
+        first, last = (
+            strain(of["_lengths"][part] / of["_rest"][part]) - (of["_thermal"][part] if len(of["_thermal"]) else 0.0)
+            for of in (before, vars(self))
+        )
+        change, work = last - first, self._densities[part] - before["_densities"][part]
+        large = np.abs(change) > SMALL * (np.abs(first) + np.abs(last))
+        return np.divide(work, change, out=mean, where=large)
 
     def _with_bars(self, state: np.ndarray, part: slice, stress: np.ndarray) -> np.ndarray:
         """Return stresses at the end of the step [Pa] of bars that broke there as they were before."""

@@ -64,6 +64,7 @@ def draw_case(seed: int) -> dict[str, Any]:
     case["time"] = time
     case["output"] = _output(chance, motion, case["node_set"])
     case |= _solver(chance, time)
+    _bar_law(random.Random(f"bar law {seed}"), case, 1.8 * body.size)
     _prestress(random.Random(f"prestress {seed}"), case, motion.end)
     return _plain(case)
 
@@ -84,6 +85,33 @@ def _prestress(chance: random.Random, case: dict[str, Any], end: float) -> None:
 
     rows = sorted(chance.random() for _ in range(chance.randint(1, 4)))
     section[key] = value() if chance.random() < 0.4 else [[row * end, value()] for row in rows]
+
+
+def _bar_law(chance: random.Random, case: dict[str, Any], longest: float) -> None:
+    """Replace the law of a material, drawn on its own so that cases without it stay as they are."""
+    if chance.random() > 0.12:
+        return
+    name = chance.choice(sorted(case["material"]))
+    table = {key: value for key, value in case["material"][name].items() if not key.endswith(("_hardening", "_stress"))}
+    young, law = table["young_modulus"], chance.choice(("cable", "strut", "strut", "damage", "compaction"))
+    table["law"], strong = law, young * 10 ** chance.uniform(-3, -1.7)
+    if law == "damage":
+        energy = 0.5 * strong**2 / young * longest * 10 ** chance.uniform(0.05, 1.0)
+        table |= {"tensile_strength": strong, "fracture_energy": energy}
+    elif law == "strut" or chance.random() < 0.6:
+        table["yield_stress"] = strong
+    if law == "strut":
+        table["imperfection"] = chance.choice((0.0, 10 ** chance.uniform(-4, -2)))
+    if law == "cable" and "yield_stress" in table and chance.random() < 0.7:
+        table["isotropic_hardening"] = young * 10 ** chance.uniform(-2, -0.3)
+    if law == "compaction":
+        table |= {"compaction_strain": 10 ** chance.uniform(-3, -1.5), "compaction_modulus": 0.2 * young}
+    case["material"][name] = table
+    for section in case["section"].values():
+        if section["material"] == name:
+            shape = {"shape": "tube", "thickness": 0.1 * section["area"] ** 0.5}
+            section |= chance.choice(({"shape": "round"}, shape, {"second_moment": 0.05 * section["area"] ** 2}))
+            section["effective_length"] = chance.choice((1.0, 0.7, 0.5))
 
 
 def _time(chance: random.Random, body: Body) -> dict[str, Any]:

@@ -151,6 +151,18 @@ def taut_cable(run):
 
 
 @number
+def octet_buckling(run):
+    """Its first peak is less than that of elastoplastic bars by Euler's stress over the yield stress."""
+    history = run("octet_buckling")
+    force = -history["probe/top/reaction"][:, :, 2].sum(axis=1)
+    slenderness = 0.01 / np.sqrt(2.0) / (0.5 * np.sqrt(5e-8 / np.pi))
+    assert force.max() == pytest.approx(23.29, abs=0.01)
+    assert force.max() / 83.87 == pytest.approx(np.pi**2 * 70e9 / slenderness**2 / 200e6, rel=0.02)
+    assert force.min() < -20.0 and abs(force[-1]) > 1.0  # straightened in tension, by the time of its first height
+    assert abs(history["energy_imbalance"]).max() < 1e-7 * history["plastic_dissipation"][-1]
+
+
+@number
 def octet_compression(run):
     """It yields at rho sigma_Y/3 of the relative density (formulas: 7), and the plate leaves it on its way back."""
     history = run("octet_compression")

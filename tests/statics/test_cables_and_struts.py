@@ -217,6 +217,25 @@ def test_strength_of_an_octet_cell_follows_yield_and_euler(comm, shared_tmp_path
     assert forces[0] / euler == pytest.approx(forces[2] / (200e6 * areas[2]), rel=0.03)
 
 
+@pytest.mark.parametrize("law", ["cable", "strut", "damage"])
+def test_prestress(law, comm, shared_tmp_path):
+    """Bars of two lengths between supports have the force that their section prescribes."""
+    keys = {"cable": {}, "strut": {"yield_stress": 2e8}, "damage": {"tensile_strength": 2e8, "fracture_energy": 1e6}}
+    force = -900.0 if law == "strut" else 900.0  # Euler's loads are 1571 and 1005 N
+    case = case_of(
+        shared_tmp_path,
+        comm,
+        [[0, 0, 0], [1.0, 0, 0], [1.0, 1.25, 0]],
+        [[0, 1], [1, 2]],
+        fixed=(0, 1, 2),
+        material={"m": {"law": law, "young_modulus": 2e11, "density": 7850.0, **keys[law]}},
+        section={"s": {"area": 1e-4, "material": "m", "shape": "round", "pretension": force}},
+        static={"step": 1.0},
+    )
+    _, fields = run(case, comm, shared_tmp_path / "out")
+    assert fields["axial_force"] == pytest.approx([force, force], rel=1e-9)
+
+
 def test_unsuitable_bars_are_refused(comm, shared_tmp_path):
     case = strut_case(Strut(200e9, 200e6, 200.0), {"step": 0.5})
     data = case.to_dict()

@@ -7,9 +7,9 @@ from typing import Any
 
 from numba.extending import register_jitable
 
-__all__ = ["mean_of_work"]
+__all__ = ["SMALL", "mean_of_work"]
 
-_SMALL = 1e-6  # change of strain over strain, below which the quotient is rounding, and the trapezoidal rule is exact
+SMALL = 1e-6  # change of strain over strain, below which the quotient is rounding, and the trapezoidal rule is exact
 
 
 def mean_of_work(response: Callable[..., Any]) -> Callable[..., Any]:
@@ -23,7 +23,7 @@ def mean_of_work(response: Callable[..., Any]) -> Callable[..., Any]:
     def mean_stress(stress0, strain0, strain, rate, step, temperature, p, q):
         stress, tangent, _, after = response(strain, rate, step, temperature, p, q)
         change = strain - strain0
-        if not abs(change) > _SMALL * (abs(strain) + abs(strain0)):
+        if not abs(change) > SMALL * (abs(strain) + abs(strain0)):
             return 0.5 * (stress0 + stress), 0.5 * tangent
         _, _, _, before = response(strain0, 0.0, 0.0, temperature, p, q)
         work = 0.0

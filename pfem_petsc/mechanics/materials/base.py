@@ -148,6 +148,8 @@ class Law:
     mean_correction : ``mean_stress`` minus the mean of both ends [Pa], as a function of p without data of bars, the
         change of stress and the internal variables before and after, (variables, bars), for the work of changing
         temperatures; None for zero
+    mean_of_work : whether ``mean_stress`` is the change of all energies over that of the strain, from ``_work.py``; it
+        then holds for the work of changing temperatures too
     static_limit : for a law with ``rate``: whether it has a limit at the rate zero, which static analyses take; the
         step is then infinite
     softening : how the law softens by the key ``softening``; None: the key is refused
@@ -166,6 +168,7 @@ class Law:
     smooth: bool = False
     mean_stress: Callable[..., Any] | None = None
     mean_correction: Callable[[tuple[float, ...], np.ndarray, np.ndarray, np.ndarray], np.ndarray] | None = None
+    mean_of_work: bool = False
     static_limit: bool = False
     softening: Softening | None = None
     modulus: Callable[[tuple[Any, ...], np.ndarray], np.ndarray] | None = None

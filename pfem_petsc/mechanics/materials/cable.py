@@ -64,4 +64,5 @@ LAW = Law(
     internal=(("plastic_strain", ""), ("slack", "")),
     energies=("elastic_energy", "plastic_heat", "hardening_energy"),
     mean_stress=mean_of_work(response),
+    mean_of_work=True,
 )

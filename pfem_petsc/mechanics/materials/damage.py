@@ -83,4 +83,5 @@ LAW = Law(
     energies=("elastic_energy", "damage_dissipation"),
     bar_data=("strain_when_parted",),
     mean_stress=mean_of_work(response),
+    mean_of_work=True,
 )

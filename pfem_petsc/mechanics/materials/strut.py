@@ -282,4 +282,5 @@ LAW = Law(
     energies=("elastic_energy", "plastic_heat"),
     bar_data=("slenderness", "bending", "shortening", "unstable_from", "unstable_to"),
     mean_stress=mean_of_work(response),
+    mean_of_work=True,
 )

@@ -290,3 +290,18 @@ def test_case_with_tables_is_written_and_read(tmp_path):
         again = Case.from_toml(case.to_toml())
         assert again.material == case.material
         assert json.loads(json.dumps(case.to_dict()))["material"]["it"]["softening"] == SOFTENING
+
+
+def test_critical_step_is_that_of_the_largest_modulus(tmp_path):
+    """A bar that becomes four times as stiff while it cools takes half the step from the start."""
+    rows = [[-50.0, 4.0, 1.0], [0.0, 1.0, 1.0]]
+    found = []
+    for keys, temperature in (({}, []), ({"softening": rows}, [{"table": [[0.0, 0.0], [1e-4, -50.0]]}])):
+        case = one_bar("elastic", "central_differences", steps=4, **keys) | {"temperature": temperature}
+        case["time"] |= {"step": "auto"}
+        with Simulation(Case.from_dict(case), output=tmp_path / str(len(keys)), quiet=True) as simulation:
+            simulation.start()
+            found.append(simulation.plan.critical_step)
+            held = simulation.model.bars.heat[1]
+            assert not held.any()
+    assert found[0] / found[1] == pytest.approx(2.0, rel=1e-3)

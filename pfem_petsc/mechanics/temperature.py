@@ -70,7 +70,7 @@ class Temperatures:
         kept = self.values.copy()
         for block in self._bars.blocks:
             if block.law.modulus is not None:
-                rows = block.parameters[1]
+                rows = block.parameters[-1]  # of the factors
                 self.values[block.start : block.stop] = rows[np.argmax(rows[:, 1]), 0]
         try:
             yield

@@ -305,3 +305,27 @@ def test_critical_step_is_that_of_the_largest_modulus(tmp_path):
             held = simulation.model.bars.heat[1]
             assert not held.any()
     assert found[0] / found[1] == pytest.approx(2.0, rel=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("law", "integrator", "keys"),
+    [
+        ("johnson_cook", "energy_momentum", {}),
+        ("multilinear", "central_differences", {"softening": SOFTENING}),
+        ("elastic", "energy_momentum", {"softening": SOFTENING}),
+    ],
+)
+def test_bars_of_these_laws_break(law, integrator, keys, tmp_path):
+    """In four steps, while heated: what the bar stores is booked as the dissipation of its rupture, nothing is lost."""
+    case = one_bar(law, integrator, steps=60, **keys)
+    case["material"]["it"] |= {"thermal_expansion": 1.2e-5, "rupture": {"strain": 0.004, "steps": 4}}
+    table = [[0.0, 0.0], [6e-4, 200.0]] if law == "elastic" else [[0.0, 100.0], [1.0, 100.0]]
+    case["temperature"] = [{"table": table}]
+    history = run(Case.from_dict(case), tmp_path / "out")
+    start = history["kinetic_energy"][0]
+    assert history["rupture_dissipation"][-1] > 1e-3 * start and history["elastic_energy"][-1] == 0.0
+    assert abs(history["energy_imbalance"]).max() < 1e-12 * start
+    if integrator == "energy_momentum":
+        assert abs(history["numerical_dissipation"]).max() < 1e-11 * start
+    assert np.ptp(history["probe/tip/velocity"][-10:, 0, 0]) < 1e-9  # flies on

@@ -16,6 +16,8 @@ def draw_laws(chance: random.Random, case: dict[str, Any], end: float) -> None:
     if chance.random() > 0.12:
         return
     table = case["material"][chance.choice(sorted(case["material"]))]
+    if "law" in table:  # drawn elsewhere
+        return
     if "temperature" not in case and chance.random() < 0.3:
         case["temperature"] = [{"table": [[0.0, 0.0], [end * chance.uniform(0.1, 1.0), chance.uniform(-60.0, 60.0)]]}]
     softens = "temperature" in case and chance.random() < 0.7

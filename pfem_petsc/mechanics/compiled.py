@@ -27,6 +27,8 @@ __all__ = ["Compilation", "code_digest", "inlined", "kernel"]
 # Assuming "no NaN" would hide divergence.
 _FAST = {"nsz"}
 
+_LONGEST = 130  # characters in the names of cached files for a variant of a loop; file systems take 255 in all
+
 
 def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a loop; the machine code is cached on disk if a folder for it is writable."""
@@ -74,7 +76,10 @@ def _variant(function: Callable[..., Any]) -> str:
             walk(cell.cell_contents)
 
     walk(function)
-    return "-".join(sorted(found))
+    text = "-".join(sorted(found))
+    if len(text) <= _LONGEST:
+        return text
+    return f"{text[:_LONGEST]}-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
 
 
 def inlined(function: Callable[..., Any]) -> Callable[..., Any]:

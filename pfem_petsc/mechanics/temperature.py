@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -61,6 +63,19 @@ class Temperatures:
         if self._holds and self.any:
             self._bars.heat[:] = heat
             self._bars.heat_at_start = self._bars.heat.copy()
+
+    @contextmanager
+    def stiffest(self) -> Iterator[None]:
+        """Give bars that soften the temperature at which their modulus is largest."""
+        kept = self.values.copy()
+        for block in self._bars.blocks:
+            if block.law.modulus is not None:
+                rows = block.parameters[-1]  # of the factors
+                self.values[block.start : block.stop] = rows[np.argmax(rows[:, 1]), 0]
+        try:
+            yield
+        finally:
+            self.values[:] = kept
 
     def apply(self, time: float) -> None:
         """Set the thermal strains of the bars at a time [s]; later entries of the case override earlier ones."""

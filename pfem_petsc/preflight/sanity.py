@@ -39,6 +39,8 @@ def _materials(case: Case) -> Iterator[str]:
                 f"{key}.young_modulus = {material.young_modulus:g} Pa gives a wave speed of "
                 f"{engineering(speed, 'm/s')}: that of steel is 5 km/s, of rubber 30 m/s; {_HINT}"
             )
+        if material.softening is not None and not case.temperature:
+            yield f"{key}.softening: without a [[temperature]] its factors are those of the reference temperature"
         yield from material.suspicions(key, _HINT)
 
 

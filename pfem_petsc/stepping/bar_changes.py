@@ -71,19 +71,13 @@ class BarChanges:
                 change = self._thermal[part] - before["_thermal"][part]
                 heating -= float((block.area * rest * mean * change).sum())
                 if block.law.modulus is not None:
-                    first, last = (
-                        block.law.modulus(block.parameters, at[part]) for at in (before["_warmth"], self._warmth)
-                    )
-                    energy = 0.5 * before["_stress"][part] * self._stress[part] * (1.0 / first - 1.0 / last)
-                    heating += float((block.area * rest * energy).sum())
+                    heating += float((block.area * rest * self._softening(before, block)).sum())
         return heating, stressing
 
     def _mean_stress(self, before: dict, k: int, block: BarBlock) -> np.ndarray:
         """Return the mean stress of the counted bars of a block in the step [Pa]."""
-        part, counted = slice(block.start, block.counted), slice(block.counted - block.start)
-        first, last = before["_stress"][part], self._stress[part]
-        if block.law.rupture >= 0:
-            last = self._with_bars(before["_state"][part], part, last)
+        counted = slice(block.counted - block.start)
+        first, last = self._ends(before, block)
         mean = 0.5 * (first + last)
         if block.law.mean_of_work:
             return self._mean_of_work(before, block, mean)
@@ -103,6 +97,24 @@ class BarChanges:
         change, work = last - first, self._densities[part] - before["_densities"][part]
         large = np.abs(change) > SMALL * (np.abs(first) + np.abs(last))
         return np.divide(work, change, out=mean, where=large)
+
+    def _ends(self, before: dict, block: BarBlock) -> tuple[np.ndarray, np.ndarray]:
+        """Return the stresses of the counted bars of a block at start and end of the step [Pa]."""
+        part = slice(block.start, block.counted)
+        first, last = before["_stress"][part], self._stress[part]
+        if block.law.rupture >= 0:
+            last = self._with_bars(before["_state"][part], part, last)
+        return first, last
+
+    def _softening(self, before: dict, block: BarBlock) -> np.ndarray:
+        """Return the work per volume [J/m3] that temperatures do by changing the modulus of the counted bars."""
+        part = slice(block.start, block.counted)
+        moduli = (block.law.modulus(block.parameters, at[part]) for at in (before["_warmth"], self._warmth))
+        product = np.multiply(*self._ends(before, block)) * (1.0 / next(moduli) - 1.0 / next(moduli))
+        if block.law.rupture >= 0:  # stresses are those of the share that is left
+            left = 1.0 - np.abs(before["_state"][part])
+            product = np.divide(product, left, out=np.zeros_like(product), where=left > 0.0)
+        return 0.5 * product
 
     def _with_bars(self, state: np.ndarray, part: slice, stress: np.ndarray) -> np.ndarray:
         """Return stresses at the end of the step [Pa] of bars that broke there as they were before."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -106,11 +107,7 @@ def make_plan(model: Model, recorded: Mapping[str, Any] | None = None) -> Plan:
     scheme = lookup("pfem_petsc.integrators", time.integrator, f"{case.source}: time.integrator").Scheme(time.scheme)
     _check_laws(case, scheme)
     if recorded is None:
-        frequency = highest_frequency(model, model.mesh.points)
-        if model.rest_lengths.varying:
-            with model.rest_lengths.shortest():
-                other = highest_frequency(model, model.mesh.points)
-            frequency = Frequency(min(frequency.lower, other.lower), max(frequency.upper, other.upper))
+        frequency = _highest_frequency(model)
     else:
         frequency = Frequency(*recorded["frequency"])
     if not np.isfinite(frequency.upper):
@@ -159,6 +156,20 @@ def make_plan(model: Model, recorded: Mapping[str, Any] | None = None) -> Plan:
         else:
             linear = _linear(model, scheme, 0.0 if scheme.explicit else step * frequency.upper / 2.0, steps)
     return Plan(scheme, step, steps, critical, frequency, linear, asked)
+
+
+def _highest_frequency(model: Model) -> Frequency:
+    """Return bounds on the highest frequency of the model at any time, unstrained. Collective."""
+    frequency = highest_frequency(model, model.mesh.points)
+    with ExitStack() as stack:
+        if model.rest_lengths.varying:
+            stack.enter_context(model.rest_lengths.shortest())
+        if model.temperatures.varying and any(law_of(m).modulus is not None for m in model.case.material.values()):
+            stack.enter_context(model.temperatures.stiffest())
+        elif not model.rest_lengths.varying:
+            return frequency
+        other = highest_frequency(model, model.mesh.points)
+    return Frequency(min(frequency.lower, other.lower), max(frequency.upper, other.upper))
 
 
 def _check_laws(case: Case, scheme: Scheme) -> None:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from .body import Body, draw_body
+from .laws import draw_laws
 from .walls import draw_walls
 
 __all__ = ["Motion", "draw_case"]
@@ -65,6 +66,7 @@ def draw_case(seed: int) -> dict[str, Any]:
     case["output"] = _output(chance, motion, case["node_set"])
     case |= _solver(chance, time)
     _bar_law(random.Random(f"bar law {seed}"), case, 1.8 * body.size)
+    draw_laws(random.Random(f"laws {seed}"), case, motion.end)
     _prestress(random.Random(f"prestress {seed}"), case, motion.end)
     return _plain(case)
 

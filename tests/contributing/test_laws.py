@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import re
 
 import numpy as np
 import pytest
+from document_laws import text_of, undocumented
 from helpers.contributed import run
 
 from pfem_petsc import Case, Simulation, open_result
@@ -142,6 +144,30 @@ def test_law_without_mean_stress_is_refused_by_the_energy_momentum_scheme(exampl
     said = capsys.readouterr().err
     assert 'material.it.law = "viscoplastic" is not compatible with time.integrator = "energy_momentum"' in said
     assert "mean_stress" in said and "use another integrator or law" in said
+
+
+def test_keys_of_a_law_are_documented_by_their_texts(examples, monkeypatch):
+    """Nothing but the law's file: its part of the documentation is made from its Parameters."""
+    text = text_of("viscoplastic")
+    assert text.startswith("#### `viscoplastic`\n\nViscoplastic bar with kinematic hardening")
+    for key, unit in (("hardening", "[Pa]"), ("viscosity", "[Pa s]"), ("rate_viscosity", "[Pa s]")):
+        assert re.search(rf"^\| `{key}` \| \S+ \| .*{re.escape(unit)}\.? \|$", text, flags=re.MULTILINE), key
+    assert "`dissipated_density` [J/m³]" in text
+    assert undocumented("viscoplastic") == []
+    module = importlib.import_module("pfem_petsc.mechanics.materials.viscoplastic")
+    monkeypatch.setattr(module.Parameters.model_fields["viscosity"], "description", None)
+    assert undocumented("viscoplastic") == ["viscosity"]
+
+
+def test_law_without_a_static_limit_or_softening_is_refused(examples, tmp_path, capsys):
+    table = one_bar("newmark", 2e-3, 10).to_dict()
+    with pytest.raises(InputError, match=r"material.it.softening.*viscoplastic does not soften by a table"):
+        Case.from_dict(table | {"material": {"it": LAW | {"softening": [[0.0, 1.0, 1.0]]}}})
+    static = {key: value for key, value in table.items() if key not in ("time", "initial")}
+    path = tmp_path / "bar.toml"
+    path.write_text(Case.from_dict(static | {"static": {"method": "newton"}}).to_toml())
+    assert main(["run", str(path), "-o", str(tmp_path / "out")]) == 2
+    assert "depends on the rate of strain, and a static analysis has no time" in capsys.readouterr().err
 
 
 def test_unknown_law_and_keys_of_another_are_refused(examples):

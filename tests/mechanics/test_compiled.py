@@ -4,14 +4,22 @@ import importlib
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import numba
 import numpy as np
 import pytest
 
 from pfem_petsc import Case, Simulation
-from pfem_petsc.mechanics.compiled import Compilation
+from pfem_petsc.case.materials import LAWS
+from pfem_petsc.integrators.central_differences import Scheme
+from pfem_petsc.mechanics.compiled import Compilation, _variant
+from pfem_petsc.mechanics.kernels import make_kernels
+from pfem_petsc.mechanics.materials._softening import softened
+from pfem_petsc.mechanics.strain import MEASURES
+from pfem_petsc.registry import choices, lookup
 from pfem_petsc.stepping.explicit import ExplicitStepper
+from pfem_petsc.stepping.fused_loop import make_fused_loop
 
 MODULE = """
 from pfem_petsc.mechanics.compiled import kernel
@@ -139,3 +147,18 @@ def test_every_process_finds_the_fused_loop_of_another():
         command = [sys.executable, "-c", program]
         keys.add(subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout)
     assert len(keys) == 1
+
+
+def test_loops_of_all_laws_have_names_of_their_own():
+    """Of each law and strain measure, softened by temperature or not, and short enough for any file system."""
+    names = []
+    for name in choices(LAWS):
+        law = lookup(LAWS, name, "").LAW
+        for variant in (law, softened(law)) if law.softening is not None else (law,):
+            for measure in MEASURES.values():
+                kernels = make_kernels(variant, measure)
+                names.append(_variant(kernels.forces.py_func))
+                fused = make_fused_loop(kernels.sweep_forces, *Scheme.loops)
+                longest = fused._cache._cache_file._data_path("x")
+                assert len(Path(longest).name) < 220
+    assert len(names) > 40 and len(set(names)) == len(names)

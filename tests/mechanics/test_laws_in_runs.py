@@ -290,3 +290,42 @@ def test_case_with_tables_is_written_and_read(tmp_path):
         again = Case.from_toml(case.to_toml())
         assert again.material == case.material
         assert json.loads(json.dumps(case.to_dict()))["material"]["it"]["softening"] == SOFTENING
+
+
+def test_critical_step_is_that_of_the_largest_modulus(tmp_path):
+    """A bar that becomes four times as stiff while it cools takes half the step from the start."""
+    rows = [[-50.0, 4.0, 1.0], [0.0, 1.0, 1.0]]
+    found = []
+    for keys, temperature in (({}, []), ({"softening": rows}, [{"table": [[0.0, 0.0], [1e-4, -50.0]]}])):
+        case = one_bar("elastic", "central_differences", steps=4, **keys) | {"temperature": temperature}
+        case["time"] |= {"step": "auto"}
+        with Simulation(Case.from_dict(case), output=tmp_path / str(len(keys)), quiet=True) as simulation:
+            simulation.start()
+            found.append(simulation.plan.critical_step)
+            held = simulation.model.bars.heat[1]
+            assert not held.any()
+    assert found[0] / found[1] == pytest.approx(2.0, rel=1e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("law", "integrator", "keys"),
+    [
+        ("johnson_cook", "energy_momentum", {}),
+        ("multilinear", "central_differences", {"softening": SOFTENING}),
+        ("elastic", "energy_momentum", {"softening": SOFTENING}),
+    ],
+)
+def test_bars_of_these_laws_break(law, integrator, keys, tmp_path):
+    """In four steps, while heated: what the bar stores is booked as the dissipation of its rupture, nothing is lost."""
+    case = one_bar(law, integrator, steps=60, **keys)
+    case["material"]["it"] |= {"thermal_expansion": 1.2e-5, "rupture": {"strain": 0.004, "steps": 4}}
+    table = [[0.0, 0.0], [6e-4, 200.0]] if law == "elastic" else [[0.0, 100.0], [1.0, 100.0]]
+    case["temperature"] = [{"table": table}]
+    history = run(Case.from_dict(case), tmp_path / "out")
+    start = history["kinetic_energy"][0]
+    assert history["rupture_dissipation"][-1] > 1e-3 * start and history["elastic_energy"][-1] == 0.0
+    assert abs(history["energy_imbalance"]).max() < 1e-12 * start
+    if integrator == "energy_momentum":
+        assert abs(history["numerical_dissipation"]).max() < 1e-11 * start
+    assert np.ptp(history["probe/tip/velocity"][-10:, 0, 0]) < 1e-9  # flies on

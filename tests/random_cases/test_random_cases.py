@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 from random_trusses.draw import draw_case
+from random_trusses.laws import LAWS
 from random_trusses.loading import Loaded
 from random_trusses.oracle import check_result
 from random_trusses.running import case_text, run_case
@@ -97,6 +98,8 @@ def test_generator_draws_all_of_what_is_documented():
     }  # fmt: skip
     materials = {key for table in tables for material in table["material"].values() for key in material}
     assert materials >= {"yield_stress", "isotropic_hardening", "kinematic_hardening", "thermal_expansion", "damping"}
+    laws = {material.get("law") for table in tables for material in table["material"].values()}
+    assert laws >= set(LAWS) and "softening" in materials
     assert {key for table in tables for key in table} >= {
         "support", "load", "gravity", "temperature", "contact_pair", "initial", "solver", "output",
     }  # fmt: skip

@@ -120,6 +120,8 @@ class Stepper(ABC):
         if supports.any:
             state.position[supports.at] = supports.positions(0.0)
             state.v[supports.at] = supports.rates(0.0, 0.0)[0]
+        if model.external.state_forces:
+            model.external.follow(state.position, state.v)
         if self.massless is not None and self.massless.settle(state.x, 0.0, 0.0) > BEYOND * model.length:
             self.fault = SimulationFailure(
                 "step 0, t = 0 s: contact nodes without mass found no equilibrium; take another contact.treatment"

@@ -68,6 +68,7 @@ def draw_case(seed: int) -> dict[str, Any]:
     _bar_law(random.Random(f"bar law {seed}"), case, 1.8 * body.size)
     draw_laws(random.Random(f"laws {seed}"), case, motion.end)
     _prestress(random.Random(f"prestress {seed}"), case, motion.end)
+    _loads_over_time(random.Random(f"loads {seed}"), case, motion)
     return _plain(case)
 
 
@@ -114,6 +115,36 @@ def _bar_law(chance: random.Random, case: dict[str, Any], longest: float) -> Non
             shape = {"shape": "tube", "thickness": 0.1 * section["area"] ** 0.5}
             section |= chance.choice(({"shape": "round"}, shape, {"second_moment": 0.05 * section["area"] ** 2}))
             section["effective_length"] = chance.choice((1.0, 0.7, 0.5))
+
+
+def _loads_over_time(chance: random.Random, case: dict[str, Any], motion: Motion) -> None:
+    """Wind, gravity over time and smooth tables, drawn on their own so that cases without them stay as they are."""
+    if chance.random() > 0.12:
+        return
+
+    def rows(values: Any) -> list[list[float]]:
+        times = sorted(chance.random() for _ in range(chance.randint(1, 5)))
+        return [[t * motion.end, *(chance.uniform(-1.0, 1.0) * np.array(values))] for t in times]
+
+    smooth = {"interpolation": "smooth"} if chance.random() < 0.5 else {}
+    if not any(wall.get("gravity") for wall in case.get("wall", ())) and chance.random() < 0.5:
+        strength = motion.speed / motion.end * _vector(chance, chance.uniform(0.1, 2.0))
+        case["gravity"] = {"acceleration": rows(strength), **smooth}
+    for load in case.get("load", ()):
+        load |= smooth if "table" in load else {}
+    # nodes without mass cannot follow wind, which is refused
+    massless = case.get("contact", {}).get("treatment") == "mass_redistribution" and chance.random() > ODD
+    if ("gravity" not in case or chance.random() < 0.6) and not massless:
+        wind = motion.speed * _vector(chance, chance.uniform(0.3, 1.5))
+        # drag that stops the lightest bars at twice the speed of the body in some part of the run
+        section = min(case["section"].values(), key=lambda s: case["material"][s["material"]]["density"] * s["area"])
+        line = case["material"][section["material"]]["density"] * section["area"]
+        widest = max(2.0 * np.sqrt(s["area"] / np.pi) for s in case["section"].values())
+        density = chance.uniform(0.02, 0.8) * line / (1.2 * widest * 2.0 * motion.speed * motion.end)
+        steady = chance.random() < 0.4
+        case["wind"] = {"velocity": wind if steady else rows(wind), "density": density, **({} if steady else smooth)}
+        if chance.random() < 0.3:
+            section["drag_coefficient"] = chance.uniform(0.0, 1.2)
 
 
 def _time(chance: random.Random, body: Body) -> dict[str, Any]:

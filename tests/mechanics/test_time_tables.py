@@ -8,6 +8,7 @@ from mpi4py import MPI
 from pfem_petsc import Case
 from pfem_petsc.errors import InputError
 from pfem_petsc.mechanics.time_tables import Group, TimeTables, grouped
+from pfem_petsc.restart.compare import changed_keys
 from pfem_petsc.stepping.model import Model
 
 AT = [-1.0, 0.0, 0.1, 0.5, 1.0, 1.3, 2.0, 2.9999, 3.0, 7.0]
@@ -190,5 +191,8 @@ def test_a_changed_file_is_noticed(tmp_path):
     assert again == first and len(again.load[0].digest) == 64
     np.savez(tmp_path / "x.npz", nodes=np.array([4]), force=FORCE[1:])
     assert Case.from_toml(first.to_toml()) == first
+    now = case([{"file": str(tmp_path / "x.npz")}])
+    with pytest.raises(InputError, match=r"belongs to a different case .*: load\[0\].digest: "):
+        changed_keys(tmp_path / "checkpoint.h5", first.to_dict(), now.to_dict(), "case")
     with pytest.raises(InputError, match="this file is not the one that the case was made with"):
         Model(again, MPI.COMM_SELF)

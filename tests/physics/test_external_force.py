@@ -167,6 +167,13 @@ def test_refusals(tmp_path):
         pytest.raises(InputError, match=r"this case has no \[time\]"),
     ):
         simulation.external_force(on_end)
+    wall = {"name": "w", "type": "plane", "point": [9.0, 0.0, 0.0], "normal": [-1.0, 0.0, 0.0], "node_set": "end"}
+    massless = rod(wall=[wall], contact={"treatment": "mass_redistribution"})
+    with (
+        Simulation(massless, MPI.COMM_SELF, output=tmp_path / "m", quiet=True) as simulation,
+        pytest.raises(InputError, match="leaves nodes without mass"),
+    ):
+        simulation.external_force(on_end)
     with Simulation(rod(), MPI.COMM_SELF, output=tmp_path / "t", quiet=True) as simulation:
         with pytest.raises(InputError, match="is not a function"):
             simulation.external_force(1.0)

@@ -165,6 +165,10 @@ def test_refusals_and_warnings(tmp_path):
     static["static"] = {"method": "newton"}
     with pytest.raises(InputError, match="wind: drag turns with the bars"):
         Simulation(Case.from_dict(static), MPI.COMM_SELF, output=tmp_path / "s", quiet=True)
+    wall = {"name": "w", "type": "plane", "point": [0.0, 0.0, -9.0], "normal": [0.0, 0.0, 1.0], "node_set": "start"}
+    massless = {"wall": [wall], "contact": {"treatment": "mass_redistribution"}}
+    with pytest.raises(InputError, match=r"a node without mass cannot follow \[wind\]"):
+        Simulation(case(**massless), MPI.COMM_SELF, output=tmp_path / "m", quiet=True)
     strong = case(wind={"velocity": [0.0, 900.0, 0.0], "density": 1000.0})
     with Simulation(strong, MPI.COMM_SELF, output=tmp_path / "t", quiet=True) as simulation:
         assert any("the drag of [wind] stops bars" in text for text in simulation.model.warnings)

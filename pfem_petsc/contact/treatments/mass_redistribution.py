@@ -92,6 +92,11 @@ def redistribute(model: Model) -> Redistribution:
             )
     if inertia.damped:
         raise InputError(f"{key}: a node without mass cannot be damped; take a material without damping")
+    if model.external.state_forces:
+        raise InputError(
+            f"{key}: a node without mass cannot follow [wind], whose force depends on its velocity; take another "
+            "contact.treatment"
+        )
     owned = mesh.n_owned
     members = contact.members
     with agreed(mesh.comm):

@@ -35,7 +35,7 @@ def check_path(model: Model, keys: PathKeys) -> None:
     if model.can_touch:
         raise InputError(
             f'{case.source}: static.method = "{case.static.method}" follows paths without contact; remove walls, '
-            'contact pairs and constraints, or take static.method = "newton"'
+            'contact pairs and constraints, or take static.method = "newton", with static.stabilise beyond limit points'
         )
     if not (model.external.active or model.supports.moving or model.bars_vary):
         raise InputError(f"{case.source}: static: nothing depends on the load factor; give a [[load]] or a table")

@@ -7,6 +7,7 @@ from mpi4py import MPI
 import pfem_petsc.statics.stability
 from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.errors import InputError, SimulationFailure
+from pfem_petsc.solvers.linear import has_mumps
 
 
 def von_mises(static=None, **tables):
@@ -125,6 +126,27 @@ def test_factorised_inertia_finds_the_same(tmp_path, monkeypatch):
         assert found[0][f"event/{column}"].tolist() == found[1][f"event/{column}"].tolist()
     np.testing.assert_allclose(found[0]["event/load_factor"], found[1]["event/load_factor"], rtol=1e-8)
     np.testing.assert_allclose(found[0]["probe/ring/position"], found[1]["probe/ring/position"], atol=1e-8)
+
+
+@pytest.mark.parallel
+def test_large_models_have_their_bifurcations_by_mumps(comm, shared_tmp_path, monkeypatch):
+    """Multigrid solves for the path, the inertia is that of a factorisation on all ranks; beyond, the log tells."""
+    stability = pfem_petsc.statics.stability
+    if not has_mumps():
+        pytest.skip("this PETSc does not have MUMPS")
+    monkeypatch.setattr(stability, "DENSE", 0)
+    monkeypatch.setattr(stability, "LARGEST", 0)
+    keys = ["static.step=0.05", "static.max_points=15", "output.fields_every=0", "solver.linear=gamg"]
+    case = Case.load("dome_16", keys)
+    with Simulation(case, comm, output=shared_tmp_path / "a", quiet=True) as simulation:
+        simulation.run()
+    if comm.rank == 0:
+        history = open_result(shared_tmp_path / "a").history
+        bifurcations = np.asarray(history["event/kind"]) == "bifurcation"
+        assert history["event/load_factor"][bifurcations] == pytest.approx([0.3096137053, 0.3203373879], rel=1e-6)
+    monkeypatch.setattr(stability, "LARGEST_WITH_MUMPS", 0)
+    with Simulation(case, comm, output=shared_tmp_path / "b", quiet=True) as simulation:
+        assert "the model has 27 unknowns, more than 0" in simulation.stepper.scheme.notice
 
 
 @pytest.mark.parallel

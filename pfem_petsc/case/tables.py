@@ -117,8 +117,10 @@ class NodeSet(StrictModel):
 class Section(StrictModel):
     """Cross-section and material of bars."""
 
-    area: PositiveFloat
+    area: PositiveFloat | None = None
     """cross-section area [m2]"""
+    area_field: Annotated[str, Field(min_length=1)] | None = None
+    """cell field of the mesh file with the area of each bar [m2], instead of ``area``"""
     material: str
     """name of a material"""
     bars: str | None = None
@@ -153,6 +155,12 @@ class Section(StrictModel):
         if info.field_name == "rest_length" and not all(1e-3 < row[1] < 1e3 for row in rows):
             raise ValueError("expected a factor on the length in the mesh, like 0.99, or rows [t, factor]")
         return value
+
+    @model_validator(mode="after")
+    def _one_area(self) -> Section:
+        if (self.area is None) == (self.area_field is None):
+            raise ValueError("expected exactly one of the keys area, area_field")
+        return self
 
     @model_validator(mode="after")
     def _one_prestress(self) -> Section:

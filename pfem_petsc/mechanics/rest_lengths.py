@@ -135,11 +135,13 @@ def _stretches(block: BarBlock, measure: Callable, key: str, value: float, where
     as_force = key == "pretension"
     target = value / block.area if as_force else value
     try:
-        if not block.law.bar_data:
+        if not block.law.bar_data and np.ndim(target) == 0:
             return stretch_of(block.law, measure, block.parameters, target, as_force)
-        kinds, which = np.unique(block.history[len(block.law.rows) :], axis=1, return_inverse=True)
-        each = [(*block.parameters, *data) for data in kinds.T.tolist()]
-        return np.array([stretch_of(block.law, measure, p, target, as_force) for p in each])[np.ravel(which)]
+        data = block.history[len(block.law.rows) :]
+        rows = np.vstack([np.broadcast_to(target, data.shape[1:]), data])
+        kinds, which = np.unique(rows, axis=1, return_inverse=True)
+        each = [(force, (*block.parameters, *given)) for force, *given in kinds.T.tolist()]
+        return np.array([stretch_of(block.law, measure, p, force, as_force) for force, p in each])[np.ravel(which)]
     except ValueError as error:
         unit = "N" if key == "pretension" else "Pa"
         raise InputError(f"{where} = {value:g} {unit}: {error}") from error

@@ -68,13 +68,13 @@ class BarChanges:
                 stressing += self._stressing(before, block, mean, rest)
             if model.temperatures.varying:
                 change = self._thermal[part] - before["_thermal"][part]
-                heating -= float((block.area * rest * mean * change).sum())
+                heating -= float((block.counted_area * rest * mean * change).sum())
                 if block.law.modulus is not None:
                     first, last = (
                         block.law.modulus(block.parameters, at[part]) for at in (before["_warmth"], self._warmth)
                     )
                     energy = 0.5 * before["_stress"][part] * self._stress[part] * (1.0 / first - 1.0 / last)
-                    heating += float((block.area * rest * energy).sum())
+                    heating += float((block.counted_area * rest * energy).sum())
         return heating, stressing
 
     def _mean_stress(self, before: dict, k: int, block: BarBlock) -> np.ndarray:
@@ -105,4 +105,4 @@ class BarChanges:
         whole = strain(last / rest1) - strain(first / rest0)
         moved = strain(last / rest) - strain(first / rest)
         density = 0.5 * (before["_densities"][part] + self._densities[part])
-        return float((block.area * (rest * mean * (whole - moved) + density * (rest1 - rest0))).sum())
+        return float((block.counted_area * (rest * mean * (whole - moved) + density * (rest1 - rest0))).sum())

@@ -79,6 +79,13 @@ def check_areas(case: Case, slab: MeshSlab, sections: np.ndarray) -> None:
                 f"{key}: bar {wrong[0] + slab.first_bar} of {slab.source} (and {len(wrong) - 1} more here) has "
                 f"{values[wrong[0]]:g} m2; give each bar of the section an area > 0"
             )
+        least = 0.0 if section.thickness is None else np.pi * section.thickness**2
+        thin = np.flatnonzero((sections == index) & (values < least))
+        if len(thin):
+            raise InputError(
+                f"{case.source}: section.{name}.thickness = {section.thickness!r} m is too much for the tube of bar "
+                f"{thin[0] + slab.first_bar}, whose area is {values[thin[0]]:g} m2"
+            )
 
 
 def section_of_bars(case: Case, slab: MeshSlab) -> np.ndarray:

@@ -147,6 +147,17 @@ def test_areas_that_are_not_positive(wrong, shared_tmp_path, comm):
         )
 
 
+def test_areas_too_small_for_a_tube(tmp_path):
+    from mpi4py import MPI
+
+    file = written(tmp_path, MPI.COMM_SELF)
+    section = {"area_field": "thickness", "material": "m", "shape": "tube", "thickness": 6e-4}
+    with pytest.raises(
+        InputError, match=r"thickness = 0.0006 m is too much for the tube of bar 0, whose area is 1e-06"
+    ):
+        Simulation(graded(file, {"s": section}), output=tmp_path / "o", quiet=True)
+
+
 @pytest.mark.parametrize(
     ("section", "mesh", "text"),
     [

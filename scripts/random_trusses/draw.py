@@ -65,6 +65,7 @@ def draw_case(seed: int) -> dict[str, Any]:
     case["output"] = _output(chance, motion, case["node_set"])
     case |= _solver(chance, time)
     _prestress(random.Random(f"prestress {seed}"), case, motion.end)
+    _stiffness_damping(random.Random(f"stiffness damping {seed}"), case, body.limit)
     return _plain(case)
 
 
@@ -84,6 +85,14 @@ def _prestress(chance: random.Random, case: dict[str, Any], end: float) -> None:
 
     rows = sorted(chance.random() for _ in range(chance.randint(1, 4)))
     section[key] = value() if chance.random() < 0.4 else [[row * end, value()] for row in rows]
+
+
+def _stiffness_damping(chance: random.Random, case: dict[str, Any], limit: float) -> None:
+    """Damp a material in proportion to its stiffness, drawn on its own; rest lengths that change exclude it."""
+    if chance.random() > 0.08 or any(isinstance(value, list) for s in case["section"].values() for value in s.values()):
+        return
+    material = case["material"][chance.choice(sorted(case["material"]))]
+    material["stiffness_damping"] = limit * 10 ** chance.uniform(-3.0, -1.0)
 
 
 def _time(chance: random.Random, body: Body) -> dict[str, Any]:

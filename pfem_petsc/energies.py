@@ -38,6 +38,7 @@ ENERGIES = (
     Energy("hardening_energy", "part", "bars"),
     Energy("damage_dissipation", "lost", "bars"),
     Energy("rupture_dissipation", "lost", "bars"),
+    Energy("viscous_dissipation", "lost", "bars"),
     Energy("damping_dissipation", "lost", "ledger"),
     Energy("friction_dissipation", "lost", "ledger"),
     Energy("impact_dissipation", "lost", "ledger"),

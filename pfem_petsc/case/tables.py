@@ -117,8 +117,10 @@ class NodeSet(StrictModel):
 class Section(StrictModel):
     """Cross-section and material of bars."""
 
-    area: PositiveFloat
+    area: PositiveFloat | None = None
     """cross-section area [m2]"""
+    area_field: Annotated[str, Field(min_length=1)] | None = None
+    """cell field of the mesh file with the area of each bar [m2], instead of ``area``"""
     material: str
     """name of a material"""
     bars: str | None = None
@@ -155,6 +157,12 @@ class Section(StrictModel):
         return value
 
     @model_validator(mode="after")
+    def _one_area(self) -> Section:
+        if (self.area is None) == (self.area_field is None):
+            raise ValueError("expected exactly one of the keys area, area_field")
+        return self
+
+    @model_validator(mode="after")
     def _one_prestress(self) -> Section:
         given = [key for key in PRESTRESSES if getattr(self, key) is not None]
         if len(given) > 1:
@@ -172,7 +180,7 @@ class Section(StrictModel):
             raise ValueError('shape = "tube" and thickness [m] need each other')
         if self.shape is not None and self.second_moment is not None:
             raise ValueError("second_moment follows from the shape: give one of the two")
-        if self.thickness is not None and math.pi * self.thickness**2 > self.area:
+        if self.thickness is not None and self.area is not None and math.pi * self.thickness**2 > self.area:
             raise ValueError(
                 f"thickness = {self.thickness!r} m is too much for a tube of area = {self.area!r} m2: a solid bar of "
                 f"this area has a radius of {math.sqrt(self.area / math.pi):.6g} m"

@@ -18,7 +18,7 @@ from .conserving import make_conserving_kernels
 from .kernels import make_kernels
 from .materials.base import Law, UnsuitableBarError
 from .rupture import breakable, limit_values, make_release
-from .sections import bar_shapes
+from .sections import areas_of, bar_shapes
 from .strain import MEASURES
 from .sweep import Sweep, make_sweep
 
@@ -54,15 +54,16 @@ class StrainEnergy(NamedTuple):
 class BarBlock:
     """Local bars [start, stop) of one section, of which [start, counted) are counted on this rank.
 
-    ``modulus`` is the largest tangent modulus of the law [Pa]; ``history`` (rows, stop - start) holds ``law.rows``
-    and, after them, ``law.bar_data``; ``release`` removes bars, if they can leave the model.
+    ``area`` [m2] is a number, or (stop - start,) if it differs from bar to bar. ``modulus`` is the largest tangent
+    modulus of the law [Pa]; ``history`` (rows, stop - start) holds ``law.rows`` and, after them, ``law.bar_data``;
+    ``release`` removes bars, if they can leave the model.
     """
 
     section: str
     start: int
     counted: int
     stop: int
-    area: float
+    area: float | np.ndarray
     density: float
     damping: float
     thermal_expansion: float
@@ -75,6 +76,11 @@ class BarBlock:
     kernels: SimpleNamespace
     conserving: SimpleNamespace | None
     release: Callable | None
+
+    @property
+    def counted_area(self) -> float | np.ndarray:
+        """Area of the counted bars [m2], a number or (counted - start,)."""
+        return self.area if isinstance(self.area, float) else self.area[: self.counted - self.start]
 
     def variables(self) -> Iterator[tuple[str, str, np.ndarray]]:
         """Yield name, unit and values (stop - start,) of all data kept from step to step."""
@@ -165,7 +171,7 @@ class Bars:
                     start=block.start,
                     counted=block.counted,
                     stop=block.stop,
-                    area=section.area,
+                    area=areas_of(section, block, mesh),
                     density=material.density,
                     damping=material.damping,
                     thermal_expansion=material.thermal_expansion,

@@ -24,7 +24,7 @@ from numba.extending import register_jitable
 from .compiled import kernel
 from .kernels import COLLAPSED_STRETCH, last_row, no_bar_data, no_variables
 from .materials.base import Law
-from .rows import extend, take
+from .rows import bar_value, extend, take
 from .strain import engineering, green, logarithmic
 
 __all__ = ["make_conserving_kernels"]
@@ -128,8 +128,9 @@ def make_conserving_kernels(law: Law, measure: Callable) -> SimpleNamespace:
             dy = x[b, 1] - x[a, 1]
             dz = x[b, 2] - x[a, 2]
             first = rest0[k] if changes else rest[k]
+            section = bar_value(area, k - start)
             c, _, _ = pair(
-                ox, oy, oz, dx, dy, dz, first, rest[k], shift0, shift, warmth0, warmth, given, area, step, kept, q
+                ox, oy, oz, dx, dy, dz, first, rest[k], shift0, shift, warmth0, warmth, given, section, step, kept, q
             )
             dx, dy, dz = 0.5 * (ox + dx), 0.5 * (oy + dy), 0.5 * (oz + dz)
             f[a, 0] -= c * dx
@@ -181,12 +182,13 @@ def make_conserving_kernels(law: Law, measure: Callable) -> SimpleNamespace:
             dy = x[b, 1] - x[a, 1]
             dz = x[b, 2] - x[a, 2]
             first = rest0[k] if changes else rest[k]
+            section = bar_value(area, k - start)
             c, dc, inverse = pair(
-                ox, oy, oz, dx, dy, dz, first, rest[k], shift0, shift, warmth0, warmth, given, area, step, kept, q
+                ox, oy, oz, dx, dy, dz, first, rest[k], shift0, shift, warmth0, warmth, given, section, step, kept, q
             )
             d = (0.5 * (ox + dx), 0.5 * (oy + dy), 0.5 * (oz + dz))
             n = (dx * inverse, dy * inverse, dz * inverse)
-            mass = inertia * lengths[k]
+            mass = bar_value(inertia, k - start) * lengths[k]
             for side in range(4):
                 slot = slots[k, side]
                 if slot < 0:

@@ -18,7 +18,7 @@ from numba.extending import register_jitable
 from ..energies import BAR_ENERGIES
 from .compiled import inlined, kernel
 from .materials.base import Law
-from .rows import accumulate, differ, extend, put, take
+from .rows import accumulate, bar_value, differ, extend, put, take
 from .sweep import CHUNK
 
 __all__ = ["COLLAPSED_STRETCH", "SHORTENED_STRETCH", "last_row", "make_kernels", "no_bar_data", "no_variables"]
@@ -48,10 +48,10 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
     ``densities``.
 
     Common arguments: ``x`` (local nodes, 3) [m]; ``bars`` (b, 2) local ends; ``rest`` (b,) rest lengths [m]; ``heat``
-    (2, b) thermal strains and temperatures [K], or (2, 0) for none; ``p`` the law's parameters; ``area`` [m2]; ``step``
-    from the start of the step to ``x`` [s]; ``history`` (rows, n) of the bars of this block: ``law.rows`` of bar ``k``
-    in column ``k - start``, and after them its ``law.bar_data``, which no loop writes. No array is passed to an inner
-    function: reference counting would cost more than the bar.
+    (2, b) thermal strains and temperatures [K], or (2, 0) for none; ``p`` the law's parameters; ``area`` [m2], a number
+    or (n,); ``step`` from the start of the step to ``x`` [s]; ``history`` (rows, n) of the bars of this block:
+    ``law.rows`` of bar ``k`` in column ``k - start``, and after them its ``law.bar_data``, which no loop writes. No
+    array is passed to an inner function: reference counting would cost more than the bar.
     """
     response, like, by_rate, last, n_rows = law.response, no_variables(law), law.rate, last_row(law), len(law.rows)
     of_bar = no_bar_data(law)
@@ -119,7 +119,8 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
                     rate = (strain - history[last, begin + i]) / step
                 given = extend(p, history, n_rows, begin + i, of_bar)
                 stress, _, new, densities = response(strain, rate, step, warmth, given, q)
-                accumulate(work, 4, i, area * rests[i], densities)
+                section = bar_value(area, begin + i)
+                accumulate(work, 4, i, section * rests[i], densities)
                 if n_rows > 0:
                     put(work, first_new, i, new)
                     changed += 1 if by_rate or differ(new, q) else 0
@@ -132,7 +133,7 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
                         left = 1.0 - abs(q[gone])
                         kept = stress / left if left > 0.0 else 0.0
                     work[first_new + last + 1, i] = kept
-                work[3, i] = area * stress * slope / length
+                work[3, i] = section * stress * slope / length
             if n_rows > 0 and commit and changed > 0:
                 for j in range(n_rows):
                     for i in range(n):
@@ -217,13 +218,14 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
             q = take(history, k - start, like)
             before = history[last, k - start] if by_rate else 0.0
             given = extend(p, history, n_rows, k - start, of_bar)
-            axial, geometric, inverse = stiffness(nx, ny, nz, rest[k], shift, warmth, given, area, step, before, q)
+            section = bar_value(area, k - start)
+            axial, geometric, inverse = stiffness(nx, ny, nz, rest[k], shift, warmth, given, section, step, before, q)
             nx *= inverse
             ny *= inverse
             nz *= inverse
             axial = weight * (axial - geometric)
             geometric = weight * geometric
-            mass = inertia * lengths[k]
+            mass = bar_value(inertia, k - start) * lengths[k]
             for side in range(4):
                 slot = slots[k, side]
                 if slot < 0:
@@ -262,7 +264,8 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
             q = take(history, k - start, like)
             before = history[last, k - start] if by_rate else 0.0
             given = extend(p, history, n_rows, k - start, of_bar)
-            axial, geometric, inverse = stiffness(nx, ny, nz, rest[k], shift, warmth, given, area, step, before, q)
+            section = bar_value(area, k - start)
+            axial, geometric, inverse = stiffness(nx, ny, nz, rest[k], shift, warmth, given, section, step, before, q)
             nx *= inverse
             ny *= inverse
             nz *= inverse
@@ -295,7 +298,8 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
             q = take(history, k - start, like)
             before = history[last, k - start] if by_rate else 0.0
             given = extend(p, history, n_rows, k - start, of_bar)
-            axial, geometric, inverse = stiffness(dx, dy, dz, rest[k], shift, warmth, given, area, step, before, q)
+            section = bar_value(area, k - start)
+            axial, geometric, inverse = stiffness(dx, dy, dz, rest[k], shift, warmth, given, section, step, before, q)
             stored[k, 0] = dx * inverse
             stored[k, 1] = dy * inverse
             stored[k, 2] = dz * inverse
@@ -325,7 +329,7 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
                 stress, _, _, _ = response(strain - shift, 0.0, 0.0, warmth, given, q)
             strain_out[k] = strain
             stress_out[k] = stress
-            force_out[k] = area * stress * slope
+            force_out[k] = bar_value(area, k - start) * stress * slope
 
     @kernel
     def densities(x, bars, rest, heat, p, area, step, history, start, stop, out):

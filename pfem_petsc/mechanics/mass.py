@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .compiled import kernel
+from .rows import bar_value
 
 if TYPE_CHECKING:
     from ..mesh.distribution import DistributedMesh
@@ -23,18 +24,19 @@ __all__ = ["Inertia", "consistent_product"]
 @kernel
 def _lump(bars, lengths, start, stop, density, out):
     for k in range(start, stop):
-        half = 0.5 * density * lengths[k]
+        half = 0.5 * bar_value(density, k - start) * lengths[k]
         out[bars[k, 0]] += half
         out[bars[k, 1]] += half
 
 
 @kernel
 def consistent_product(bars, lengths, start, stop, density, u, out):
-    """Add the consistent mass matrix of a line density [kg/m] times ``u`` to ``out``, both (local nodes, 3)."""
+    """Add the consistent mass matrix of a line density [kg/m], a number or (stop - start,), times ``u`` to ``out``;
+    both (local nodes, 3)."""
     for k in range(start, stop):
         a = bars[k, 0]
         b = bars[k, 1]
-        m = density * lengths[k] / 6.0
+        m = bar_value(density, k - start) * lengths[k] / 6.0
         for i in range(3):
             out[a, i] += m * (2.0 * u[a, i] + u[b, i])
             out[b, i] += m * (u[a, i] + 2.0 * u[b, i])
@@ -110,7 +112,7 @@ class Inertia:
         out[:] = self._out[:owned]
         return out
 
-    def coefficients(self, alpha: float, eta: float) -> list[float]:
+    def coefficients(self, alpha: float, eta: float) -> list[float | np.ndarray]:
         """Return (alpha rho + eta c_m) A / 6 [kg/(m s2)] per block, the consistent part of a Hessian; or zeros."""
         if not self.consistent:
             return [0.0] * len(self.bars.blocks)

@@ -22,7 +22,7 @@ from .strain import MEASURES
 from .time_tables import Table
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
     from ..case.schema import Case
     from .bars import BarBlock, Bars
@@ -52,7 +52,7 @@ class RestLengths:
             self.varying = False
             return
         bars.rest = bars.mesh_lengths.copy()
-        tables = False
+        varies = False
         for name, key in given.items():
             if key is None:
                 continue
@@ -60,20 +60,20 @@ class RestLengths:
             measure = MEASURES[case.material[section.material].strain]
             where = f"{case.source}: section.{name}.{key}"
             value = getattr(section, key)
-            table = None if isinstance(value, float) else Table(value)
-            tables |= table is not None
+            rows = ((0.0, value),) if isinstance(value, float) else value
             blocks = [block for block in bars.blocks if block.section == name]
-            if table is not None and blocks and blocks[0].law.rate:
+            if len(rows) > 1 and blocks and blocks[0].law.rate:
                 raise InputError(
                     f"{where}: the material {section.material!r} depends on the strain rate, which a rest length that "
                     "changes over time does not support; give one value"
                 )
-            for each in table.values[:, 0].tolist() if table is not None else [value]:
+            for _, each in rows:
                 for block in blocks:  # refuses what the law cannot bear
                     _stretches(block, measure, key, each, where)
-            self._entries += [_Entry(block, measure, key, value, table, where) for block in blocks]
+            varies |= len(rows) > 1
+            self._entries += [_Entry(block, measure, key, rows, where) for block in blocks]
         # in later stages they stay as they are
-        self.varying = tables and not self._held
+        self.varying = varies and not self._held
         self.apply(math.inf if self._held else 0.0)
         if self.varying:
             bars.rest_at_start = bars.rest.copy()
@@ -102,13 +102,14 @@ class RestLengths:
 
 
 class _Entry:
-    """The bars of a block, with their value or table of values."""
+    """The bars of a block, with the values that they have over time."""
 
     def __init__(
-        self, block: BarBlock, measure: Callable, key: str, value: float, table: Table | None, where: str
+        self, block: BarBlock, measure: Callable, key: str, rows: Sequence[tuple[float, float]], where: str
     ) -> None:
         self.block, self.measure, self.key, self.where = block, measure, key, where
-        self.value, self.table = value, table
+        self.values = [value for _, value in rows]
+        self._table = Table(rows)
         self._found: tuple[float, np.ndarray | float] | None = None  # the last value and its stretch
 
     def _stretch(self, value: float) -> np.ndarray | float:
@@ -118,14 +119,13 @@ class _Entry:
 
     def apply(self, bars: Bars, time: float) -> None:
         """Set the rest lengths of the bars at a time [s], or at a load factor."""
-        value = self.value if self.table is None else float(self.table(time)[0])
+        value = float(self._table(time)[0])
         part = slice(self.block.start, self.block.stop)
         bars.rest[part] = bars.mesh_lengths[part] / self._stretch(value)
 
     def largest(self) -> np.ndarray | float:
         """Return the largest stretch in the mesh at any time."""
-        values = [self.value] if self.table is None else self.table.values[:, 0].tolist()
-        return functools.reduce(np.maximum, map(self._stretch, values))
+        return functools.reduce(np.maximum, map(self._stretch, self.values))
 
 
 def _stretches(block: BarBlock, measure: Callable, key: str, value: float, where: str) -> np.ndarray | float:
@@ -135,11 +135,13 @@ def _stretches(block: BarBlock, measure: Callable, key: str, value: float, where
     as_force = key == "pretension"
     target = value / block.area if as_force else value
     try:
-        if not block.law.bar_data:
+        if not block.law.bar_data and np.ndim(target) == 0:
             return stretch_of(block.law, measure, block.parameters, target, as_force)
-        kinds, which = np.unique(block.history[len(block.law.rows) :], axis=1, return_inverse=True)
-        each = [(*block.parameters, *data) for data in kinds.T.tolist()]
-        return np.array([stretch_of(block.law, measure, p, target, as_force) for p in each])[np.ravel(which)]
+        data = block.history[len(block.law.rows) :]
+        rows = np.vstack([np.broadcast_to(target, data.shape[1:]), data])
+        kinds, which = np.unique(rows, axis=1, return_inverse=True)
+        each = [(force, (*block.parameters, *given)) for force, *given in kinds.T.tolist()]
+        return np.array([stretch_of(block.law, measure, p, force, as_force) for force, p in each])[np.ravel(which)]
     except ValueError as error:
         unit = "N" if key == "pretension" else "Pa"
         raise InputError(f"{where} = {value:g} {unit}: {error}") from error

@@ -13,7 +13,7 @@ from numba.core import cgutils, types
 from numba.core.imputils import impl_ret_borrowed
 from numba.extending import intrinsic
 
-__all__ = ["accumulate", "blend", "differ", "dot", "extend", "put", "sum_with", "take", "times"]
+__all__ = ["accumulate", "bar_value", "blend", "differ", "dot", "extend", "put", "sum_with", "take", "times"]
 
 
 def _places(context: Any, builder: Any, signature: Any, args: Any, first: int, column: int, count: int) -> list[Any]:
@@ -26,6 +26,20 @@ def _places(context: Any, builder: Any, signature: Any, args: Any, first: int, c
         begin = context.cast(builder, args[first], signature.args[first], types.intp)
     rows = (builder.add(begin, context.get_constant(types.intp, j)) for j in range(count))
     return [cgutils.get_item_pointer(context, builder, array_type, array, [row, at]) for row in rows]
+
+
+@intrinsic
+def bar_value(typingctx, values, bar):  # noqa: ANN001, ANN201 - Numba's types
+    """Return ``values[bar]`` of an array, or ``values`` itself if it is a number, at no cost."""
+    if not isinstance(values, types.Array):
+        return values(values, bar), lambda context, builder, signature, args: args[0]
+
+    def generate(context, builder, signature, args):  # noqa: ANN001, ANN202
+        array = context.make_array(values)(context, builder, args[0])
+        at = context.cast(builder, args[1], signature.args[1], types.intp)
+        return builder.load(cgutils.get_item_pointer(context, builder, values, array, [at]))
+
+    return values.dtype(values, bar), generate
 
 
 @intrinsic

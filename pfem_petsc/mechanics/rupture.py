@@ -29,7 +29,7 @@ from ..energies import STORED
 from .compiled import kernel
 from .kernels import no_bar_data, no_variables
 from .materials.base import Law
-from .rows import blend, dot, extend, put, sum_with, take, times
+from .rows import bar_value, blend, dot, extend, put, sum_with, take, times
 
 if TYPE_CHECKING:
     from ..case.rupture import Rupture
@@ -128,7 +128,7 @@ def make_release(law: Law, measure: Callable[..., Any]) -> Callable[..., Any]:
                 lost = (state - now) * work[j, 0]
                 history[first + j, column] += lost
                 if stored[j] and k < counted:
-                    moved[j] += area * rest[k] * lost
+                    moved[j] += bar_value(area, column) * rest[k] * lost
             history[count, column] = -state
 
     return release

@@ -20,9 +20,10 @@ from .materials.base import BarShapes
 if TYPE_CHECKING:
     from ..case.schema import Case
     from ..case.tables import Section
+    from ..mesh.distribution import Block, DistributedMesh
     from ..mesh.slab import MeshSlab
 
-__all__ = ["bar_shapes", "section_of_bars"]
+__all__ = ["area_fields", "areas_of", "bar_shapes", "check_areas", "section_of_bars"]
 
 
 def bar_shapes(section: Section, length: np.ndarray, area: np.ndarray) -> BarShapes:
@@ -44,6 +45,47 @@ def bar_shapes(section: Section, length: np.ndarray, area: np.ndarray) -> BarSha
         moment = 0.25 * np.pi * (outer**4 - inner**4)
         modulus = 4.0 / 3.0 * (outer**3 - inner**3)
     return BarShapes(length, area, moment, modulus, outer, section.effective_length * length)
+
+
+def area_fields(case: Case) -> dict[str, str]:
+    """Return the cell fields of the mesh that sections take their areas from, each with the key that names it."""
+    named = [(s.area_field, f"{case.source}: section.{name}.area_field") for name, s in case.section.items()]
+    return {field: key for field, key in reversed(named) if field is not None}
+
+
+def areas_of(section: Section, block: Block, mesh: DistributedMesh) -> float | np.ndarray:
+    """Return the area of the bars of a block [m2]: a number, or (stop - start,)."""
+    if section.area_field is None:
+        return float(section.area)
+    return np.ascontiguousarray(mesh.bar_fields[section.area_field][block.start : block.stop])
+
+
+def check_areas(case: Case, slab: MeshSlab, sections: np.ndarray) -> None:
+    """Refuse areas of a mesh field that are not positive. ``sections``: of :func:`section_of_bars`.
+
+    Raises
+    ------
+    InputError
+        Names the first such bar of this rank.
+    """
+    for index, (name, section) in enumerate(case.section.items()):
+        if section.area_field is None:
+            continue
+        values = slab.bar_fields[section.area_field]
+        wrong = np.flatnonzero((sections == index) & ~((values > 0.0) & np.isfinite(values)))
+        if len(wrong):
+            key = f"{case.source}: section.{name}.area_field = {section.area_field!r}"
+            raise InputError(
+                f"{key}: bar {wrong[0] + slab.first_bar} of {slab.source} (and {len(wrong) - 1} more here) has "
+                f"{values[wrong[0]]:g} m2; give each bar of the section an area > 0"
+            )
+        least = 0.0 if section.thickness is None else np.pi * section.thickness**2
+        thin = np.flatnonzero((sections == index) & (values < least))
+        if len(thin):
+            raise InputError(
+                f"{case.source}: section.{name}.thickness = {section.thickness!r} m is too much for the tube of bar "
+                f"{thin[0] + slab.first_bar}, whose area is {values[thin[0]]:g} m2"
+            )
 
 
 def section_of_bars(case: Case, slab: MeshSlab) -> np.ndarray:

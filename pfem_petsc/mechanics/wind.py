@@ -79,7 +79,7 @@ class Wind:
             coefficient = wind.drag_coefficient if section.drag_coefficient is None else section.drag_coefficient
             self._factor[part] = 0.25 * wind.density * coefficient * diameter
             # dF/dw over the mass of the bar, for w = 1 m/s
-            most = float(np.max(4.0 * self._factor[part], initial=0.0)) / (block.density * block.area)
+            most = float(np.max(4.0 * self._factor[part] / (block.density * block.area), initial=0.0))
             self._rate = max(self._rate, most)
         self._x, self._v = np.zeros((mesh.n_local, 3)), np.zeros((mesh.n_local, 3))
 

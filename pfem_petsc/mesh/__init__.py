@@ -6,6 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from mpi4py import MPI
 
     from .slab import MeshSlab
@@ -13,7 +15,7 @@ if TYPE_CHECKING:
 __all__ = ["load_slab"]
 
 
-def load_slab(mesh: Any, comm: MPI.Comm) -> MeshSlab:
+def load_slab(mesh: Any, comm: MPI.Comm, fields: Mapping[str, str] | None = None) -> MeshSlab:
     """Return this rank's part of the mesh of a case after checks, with warnings in ``warnings``. Collective.
 
     Parameters
@@ -21,6 +23,7 @@ def load_slab(mesh: Any, comm: MPI.Comm) -> MeshSlab:
     mesh : the ``[mesh]`` table of a case
         With ``generator`` and ``parameters``, or ``file``: the suffix chooses the reader (``.msh``, ``.vtu``,
         ``.vtkhdf``, ``.h5``).
+    fields : names of cell fields to read, each with the key that asks for it, for messages
 
     Raises
     ------
@@ -35,6 +38,8 @@ def load_slab(mesh: Any, comm: MPI.Comm) -> MeshSlab:
         from ..errors import InputError
 
         with agreed(comm):
+            for name, key in (fields or {}).items():
+                raise InputError(f"{key} = {name!r}: generated meshes have no cell fields; give area")
             generator = lookup("pfem_petsc.mesh.generators", mesh.generator, "mesh.generator")
             try:
                 slab = generator.generate(mesh.parameters, comm.rank, comm.size)
@@ -43,6 +48,6 @@ def load_slab(mesh: Any, comm: MPI.Comm) -> MeshSlab:
     else:
         from .readers import read_slab
 
-        slab = read_slab(Path(mesh.file), comm)
+        slab = read_slab(Path(mesh.file), comm, fields or {})
     slab.warnings = check_mesh(slab, comm)
     return slab

@@ -62,6 +62,8 @@ class DistributedMesh:
     """int32 local indices of owned members, ascending."""
     bar_groups: dict[str, np.ndarray]
     """int32 local bar indices, ascending."""
+    bar_fields: dict[str, np.ndarray]
+    """(b,) float64: values of local bars."""
     partitioner: str
     """The partitioner, for the log."""
 
@@ -151,7 +153,7 @@ def _alone(mesh: DistributedMesh, slab: MeshSlab, section: np.ndarray) -> None:
     mesh._exchange = GhostExchange(mesh.comm, np.array([0, slab.n_nodes]), mesh.ghost_numbers)
     mesh.node_groups = {name: np.sort(place[members]) for name, members in slab.node_groups.items()}
     groups = {name: _membership(members, len(slab.bars)) for name, members in slab.bar_groups.items()}
-    _arrange_bars(mesh, place[slab.bars], None, section, groups)
+    _arrange_bars(mesh, place[slab.bars], None, section, groups, slab.bar_fields)
 
 
 def _among_ranks(mesh: DistributedMesh, slab: MeshSlab, section: np.ndarray, owners: np.ndarray) -> None:
@@ -168,7 +170,7 @@ def _among_ranks(mesh: DistributedMesh, slab: MeshSlab, section: np.ndarray, own
     # The directory has the PETSc numbers (and with `starts` the owners) of the slab's nodes on the rank of the slab.
     directory = to_owner.reply(numbers)
 
-    bars, bar_ids, section, groups = _fetch_bars(slab, section, directory, starts, comm)
+    bars, bar_ids, section, groups, fields = _fetch_bars(slab, section, directory, starts, comm)
 
     first, last = starts[comm.rank], starts[comm.rank + 1]
     elsewhere = bars[(bars < first) | (bars >= last)]
@@ -189,7 +191,7 @@ def _among_ranks(mesh: DistributedMesh, slab: MeshSlab, section: np.ndarray, own
     mesh.update_ghosts(travelling)
     mesh.node_ids = travelling[:, 0].astype(np.int64)
 
-    _arrange_bars(mesh, ends, bar_ids, section, groups)
+    _arrange_bars(mesh, ends, bar_ids, section, groups, fields)
     mesh.node_groups = {}
     for name, members in slab.node_groups.items():
         member_numbers = directory[members - slab.first_node]
@@ -199,8 +201,9 @@ def _among_ranks(mesh: DistributedMesh, slab: MeshSlab, section: np.ndarray, own
 
 def _fetch_bars(
     slab: MeshSlab, section: np.ndarray, directory: np.ndarray, starts: np.ndarray, comm: MPI.Comm
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-    """Return ends (PETSc numbers), mesh numbers, sections and group memberships of bars connected to owned nodes."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Return ends (PETSc numbers), mesh numbers, sections, group memberships and fields of bars connected to owned
+    nodes."""
     wanted, place = np.unique(slab.bars, return_inverse=True)
     asking = Router(comm, slab_of(wanted, slab.n_nodes, comm.size))
     asked = asking.send(wanted.astype(np.int64)) - slab.first_node
@@ -215,7 +218,9 @@ def _fetch_bars(
     groups = {}
     for name, members in slab.bar_groups.items():
         groups[name] = to_owners.send(_membership(members - slab.first_bar, len(slab.bars))[bar])
-    return to_owners.send(numbers[bar]), to_owners.send(bar + slab.first_bar), to_owners.send(section[bar]), groups
+    fields = {name: to_owners.send(values[bar]) for name, values in slab.bar_fields.items()}
+    ids, sections = to_owners.send(bar + slab.first_bar), to_owners.send(section[bar])
+    return to_owners.send(numbers[bar]), ids, sections, groups, fields
 
 
 def _arrange_bars(
@@ -224,6 +229,7 @@ def _arrange_bars(
     bar_ids: np.ndarray | None,
     section: np.ndarray,
     groups: dict[str, np.ndarray],
+    fields: dict[str, np.ndarray],
 ) -> None:
     """Sort the local bars by section, counted bars first, then for locality; ``bar_ids`` None: 0, 1, ..."""
     borrowed = ends[:, 0] >= mesh.n_owned
@@ -236,6 +242,7 @@ def _arrange_bars(
     mesh.bars = ends[order]
     mesh.bar_ids = order if bar_ids is None else bar_ids[order]
     mesh.bar_groups = {name: np.flatnonzero(mask[order]).astype(np.int32) for name, mask in groups.items()}
+    mesh.bar_fields = {name: values[order] for name, values in fields.items()}
     counts = np.bincount(kind) if kind is not None else np.array([len(ends)])
     counts = np.append(counts, np.zeros(len(counts) % 2, counts.dtype)).reshape(-1, 2)
     mesh.blocks = []

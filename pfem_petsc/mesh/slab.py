@@ -33,6 +33,9 @@ class MeshSlab:
     """Members (int64 mesh numbers) within this rank's nodes; the same names in the same order on all ranks."""
     bar_groups: dict[str, np.ndarray] = field(default_factory=dict)
     """Members (int64 mesh numbers) within this rank's bars; the same names in the same order on all ranks."""
+    bar_fields: dict[str, np.ndarray] = field(default_factory=dict)
+    """Values of this rank's bars, (bars here,) float64, of the cell fields that were asked for; the same names on all
+    ranks."""
     source: str = "mesh"
     """The file or the generator, for messages."""
     structured: bool = False

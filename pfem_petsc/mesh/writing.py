@@ -29,6 +29,7 @@ def write_mesh(
     *,
     node_groups: Mapping[str, ArrayLike] | None = None,
     bar_groups: Mapping[str, ArrayLike] | None = None,
+    bar_fields: Mapping[str, ArrayLike] | None = None,
     comm: MPI.Comm | None = None,
 ) -> Path:
     """Write nodes and bars to an HDF5 file for ``mesh.file``; an earlier file of this name is replaced. Collective.
@@ -39,6 +40,7 @@ def write_mesh(
     points : (nodes, 3) positions [m]
     bars : (bars, 2) integers, the nodes at the ends of each bar, numbered from 0
     node_groups, bar_groups : numbers of the members, or a boolean mask, for each name
+    bar_fields : (bars,) numbers for each name, such as areas [m2] for ``area_field`` of sections
     comm : default: the world; its rank 0 writes its arrays
 
     Returns
@@ -56,7 +58,9 @@ def write_mesh(
         from mpi4py import MPI
 
         comm = MPI.COMM_WORLD
-    return on_root(comm, _write, Path(path).absolute(), points, bars, node_groups or {}, bar_groups or {})
+    return on_root(
+        comm, _write, Path(path).absolute(), points, bars, node_groups or {}, bar_groups or {}, bar_fields or {}
+    )
 
 
 def _write(
@@ -65,6 +69,7 @@ def _write(
     bars: ArrayLike,
     node_groups: Mapping[str, ArrayLike],
     bar_groups: Mapping[str, ArrayLike],
+    bar_fields: Mapping[str, ArrayLike],
 ) -> Path:
     from mpi4py import MPI
 
@@ -83,6 +88,7 @@ def _write(
         bars=ends.astype(np.int64),
         node_groups={name: _members(path, "node_groups", name, m, len(nodes)) for name, m in node_groups.items()},
         bar_groups={name: _members(path, "bar_groups", name, m, len(ends)) for name, m in bar_groups.items()},
+        bar_fields={name: _field(path, name, values, len(ends)) for name, values in bar_fields.items()},
         source=str(path),
     )
     check_mesh(slab, MPI.COMM_SELF)
@@ -112,11 +118,25 @@ def _array(path: Path, name: str, values: ArrayLike, width: int, kinds: str) -> 
     return array
 
 
+def _field(path: Path, name: str, values: ArrayLike, n: int) -> np.ndarray:
+    """Return the values of a cell field."""
+    where = f"{path}: bar_fields[{name!r}]"
+    _check_name(where, name)
+    array = np.asarray(values)
+    if array.shape != (n,) or array.dtype.kind not in "fiu":
+        raise InputError(f"{where} has shape {array.shape} and type {array.dtype}; expected ({n},) numbers")
+    return array.astype(np.float64)
+
+
+def _check_name(where: str, name: str) -> None:
+    if not isinstance(name, str) or not name or "/" in name or name == ".":
+        raise InputError(f"{where}: expected a name without slashes")
+
+
 def _members(path: Path, kind: str, name: str, values: ArrayLike, n: int) -> np.ndarray:
     """Return the numbers of the members of a group, ascending."""
     where = f"{path}: {kind}[{name!r}]"
-    if not isinstance(name, str) or not name or "/" in name or name == ".":
-        raise InputError(f"{where}: expected a name without slashes")
+    _check_name(where, name)
     array = np.asarray(values)
     if array.dtype.kind == "b" and array.shape == (n,):
         return np.flatnonzero(array)

@@ -46,7 +46,7 @@ def _materials(case: Case) -> Iterator[str]:
 
 def _sections(case: Case) -> Iterator[str]:
     for name, section in case.section.items():
-        if not 1e-18 <= section.area <= 10.0:
+        if section.area is not None and not 1e-18 <= section.area <= 10.0:
             yield f"section.{name}.area = {section.area:g} m2: no bar has that; 1 mm2 is 1e-6 m2"
 
 
@@ -59,17 +59,20 @@ def _weightless(case: Case) -> Iterator[str]:
 def _slender(case: Case, model: Model) -> Iterator[str]:
     """Bars far longer than thick: a mesh in millimetres with areas in square metres."""
     mesh = model.mesh
-    longest = np.zeros(len(case.section))
-    for block in mesh.blocks:
-        rest = model.bars.mesh_lengths[block.start : block.counted]
-        longest[block.section] = max(longest[block.section], float(rest.max(initial=0.0)))
-    longest = np.max(model.comm.allgather(longest), axis=0)
-    for (name, section), length in zip(case.section.items(), longest.tolist(), strict=True):
-        thickness = math.sqrt(section.area)
-        if length > _SLENDER * thickness and section.area >= 1e-18:  # smaller areas are reported as such
+    worst = np.zeros((len(case.section), 3))  # length over thickness, length, area
+    for block, bars in zip(mesh.blocks, model.bars.blocks, strict=True):
+        lengths = model.bars.mesh_lengths[block.start : block.counted]
+        if len(lengths):
+            areas = np.broadcast_to(bars.counted_area, lengths.shape)
+            ratios = lengths / np.sqrt(areas)
+            k = int(np.lexsort((lengths, ratios))[-1])
+            worst[block.section] = ratios[k], lengths[k], areas[k]
+    for name, *rows in zip(case.section, *model.comm.allgather(worst.tolist()), strict=True):
+        ratio, length, area = max(rows)
+        if ratio > _SLENDER and area >= 1e-18:  # smaller areas are reported as such
             yield (
-                f"section.{name}: a bar of {engineering(length, 'm')} is {length / thickness:,.0f} times as long as it "
-                f"is thick (area = {section.area:g} m2): is the mesh in millimetres? {_HINT}"
+                f"section.{name}: a bar of {engineering(length, 'm')} is {ratio:,.0f} times as long as it "
+                f"is thick (area = {area:g} m2): is the mesh in millimetres? {_HINT}"
             )
 
 

@@ -69,9 +69,9 @@ class BarChanges:
                 stressing += self._stressing(before, block, mean, rest)
             if model.temperatures.varying:
                 change = self._thermal[part] - before["_thermal"][part]
-                heating -= float((block.area * rest * mean * change).sum())
+                heating -= float((block.counted_area * rest * mean * change).sum())
                 if block.law.modulus is not None:
-                    heating += float((block.area * rest * self._softening(before, block)).sum())
+                    heating += float((block.counted_area * rest * self._softening(before, block)).sum())
         return heating, stressing
 
     def _mean_stress(self, before: dict, k: int, block: BarBlock) -> np.ndarray:
@@ -132,4 +132,4 @@ class BarChanges:
         whole = strain(last / rest1) - strain(first / rest0)
         moved = strain(last / rest) - strain(first / rest)
         density = 0.5 * (before["_densities"][part] + self._densities[part])
-        return float((block.area * (rest * mean * (whole - moved) + density * (rest1 - rest0))).sum())
+        return float((block.counted_area * (rest * mean * (whole - moved) + density * (rest1 - rest0))).sum())

@@ -20,7 +20,7 @@ class BarArrays(NamedTuple):
     watched: np.ndarray
     heat: np.ndarray
     parameters: tuple
-    area: float
+    area: float | np.ndarray
     history: np.ndarray
     slack: int
 

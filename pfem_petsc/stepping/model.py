@@ -16,7 +16,8 @@ from ..mechanics.compiled import kernel
 from ..mechanics.loads import ExternalForce
 from ..mechanics.mass import Inertia
 from ..mechanics.rest_lengths import RestLengths
-from ..mechanics.sections import section_of_bars
+from ..mechanics.rows import bar_value
+from ..mechanics.sections import area_fields, check_areas, section_of_bars
 from ..mechanics.supports import Supports
 from ..mechanics.temperature import Temperatures
 from ..mesh import load_slab
@@ -35,8 +36,9 @@ __all__ = ["Model"]
 @kernel
 def _node_stiffness(bars, rest, start, stop, axial, out):
     for k in range(start, stop):
-        out[bars[k, 0]] += axial / rest[k]
-        out[bars[k, 1]] += axial / rest[k]
+        stiffness = bar_value(axial, k - start) / rest[k]
+        out[bars[k, 0]] += stiffness
+        out[bars[k, 1]] += stiffness
 
 
 class Model:
@@ -99,13 +101,14 @@ class Model:
     def _load_mesh(self) -> DistributedMesh:
         case, comm = self.case, self.comm
         try:
-            slab = load_slab(case.mesh, comm)
+            slab = load_slab(case.mesh, comm, area_fields(case))
         except InputError as error:
             # a generator knows its keys, but not the file that they are in
             raise error if case.mesh.generator is None else InputError(f"{case.source}: {error}") from error
         self.warnings += slab.warnings
         with agreed(comm):
             sections = section_of_bars(case, slab)
+            check_areas(case, slab, sections)
         return distribute(slab, sections, comm)
 
     @property

@@ -122,8 +122,9 @@ def make_plan(model: Model, recorded: Mapping[str, Any] | None = None) -> Plan:
         raise InputError(
             f"{case.source}: time: {time.integrator} with these parameters is unstable at any step; take gamma >= 1/2"
         )
-    critical = limit / frequency.upper if frequency.upper > 0.0 else np.inf
-    certain = limit / frequency.lower if frequency.lower > 0.0 else np.inf
+    betas = [case.material[section.material].stiffness_damping for section in case.section.values()]
+    critical = _stable_step(scheme, limit, frequency.upper, max(betas))
+    certain = _stable_step(scheme, limit, frequency.lower, min(betas))
     if recorded is not None:
         step = float(recorded["step"])
         steps = _steps_to(time.end, step, case.source)
@@ -170,6 +171,20 @@ def _highest_frequency(model: Model) -> Frequency:
             return frequency
         other = highest_frequency(model, model.mesh.points)
     return Frequency(min(frequency.lower, other.lower), max(frequency.upper, other.upper))
+
+
+def _stable_step(scheme: Scheme, limit: float, frequency: float, beta: float) -> float:
+    """Return the stable step [s] at an angular frequency [rad/s], from the limit of Omega without damping C = beta K.
+
+    In explicit steps the rate of strain is that of the step before. Schemes become unstable by an eigenvalue -1, with
+    which this rate is 2/h times the strain: as with the stiffness K (1 + 2 beta/h), hence h^2 + 2 beta h = (limit/w)^2.
+    """
+    if not frequency > 0.0:
+        return np.inf
+    step = limit / frequency
+    if not scheme.explicit or not beta:
+        return step
+    return step * step / (beta + float(np.hypot(beta, step)))
 
 
 def _check_laws(case: Case, scheme: Scheme) -> None:

@@ -69,6 +69,7 @@ def draw_case(seed: int) -> dict[str, Any]:
     draw_laws(random.Random(f"laws {seed}"), case, motion.end)
     _prestress(random.Random(f"prestress {seed}"), case, motion.end)
     _loads_over_time(random.Random(f"loads {seed}"), case, motion)
+    _stiffness_damping(random.Random(f"stiffness damping {seed}"), case, body.limit)
     return _plain(case)
 
 
@@ -145,6 +146,14 @@ def _loads_over_time(chance: random.Random, case: dict[str, Any], motion: Motion
         case["wind"] = {"velocity": wind if steady else rows(wind), "density": density, **({} if steady else smooth)}
         if chance.random() < 0.3:
             section["drag_coefficient"] = chance.uniform(0.0, 1.2)
+
+
+def _stiffness_damping(chance: random.Random, case: dict[str, Any], limit: float) -> None:
+    """Damp a material in proportion to its stiffness, drawn on its own; rest lengths that change exclude it."""
+    if chance.random() > 0.08 or any(isinstance(value, list) for s in case["section"].values() for value in s.values()):
+        return
+    material = case["material"][chance.choice(sorted(case["material"]))]
+    material["stiffness_damping"] = limit * 10 ** chance.uniform(-3.0, -1.0)
 
 
 def _time(chance: random.Random, body: Body) -> dict[str, Any]:

@@ -173,6 +173,25 @@ def test_energy_momentum_conserves_energy_while_stressing(strain, plastic, tmp_p
     assert np.abs(history["energy_imbalance"]).max() < 1e-11 * scale
 
 
+LAWS = {
+    "cable": ({"law": "cable"}, {}),
+    "strut": ({"law": "strut", "yield_stress": 5e7}, {"shape": "round"}),
+}
+
+
+@pytest.mark.parametrize("law", LAWS)
+def test_balance_with_other_laws(law, tmp_path):
+    """Laws that read data of each bar, or are slack in compression, are stressed in the same way."""
+    material, section = LAWS[law]
+    time = {"integrator": "central_differences", "end": 2e-3, "step": 5e-5}
+    history = run(rod({"pretension": RAMP, **section}, material, ends=("start",), time=time), tmp_path)
+    assert history["kinetic_energy"].max() > 0.05 * history["prestress_work"].max() > 0.0
+    assert np.abs(history["energy_imbalance"]).max() < 1e-11 * history["prestress_work"].max()
+    held = run(rod({"pretension": RAMP, **section}, material, time={"end": 1e-3}), tmp_path / "held")
+    np.testing.assert_allclose(held["prestress_work"], held["elastic_energy"], rtol=1e-10, atol=1e-12)
+    assert open_result(tmp_path / "held").field("axial_force", -1) == pytest.approx([1500.0] * 2, rel=1e-12)
+
+
 @pytest.mark.parallel
 def test_restart_while_stressing_is_bitwise(shared_tmp_path, comm):
     """The table comes back to the value of its start, and the rest lengths are those of the checkpoint."""

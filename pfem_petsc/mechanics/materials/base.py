@@ -18,6 +18,7 @@ from ...case.base import Finite, NonNegativeFloat, PositiveFloat, StrictModel, l
 from ...case.rupture import Rupture
 from ...energies import BAR_ENERGIES
 from ._softening import Softening, softened
+from ._stiffness_damping import damped
 
 __all__ = ["BarShapes", "Law", "MaterialKeys", "UnsuitableBarError"]
 
@@ -60,6 +61,8 @@ class MaterialKeys(StrictModel):
     """coefficient of thermal expansion [1/K]"""
     damping: NonNegativeFloat = 0.0
     """damping c_m proportional to mass density [kg/(m3 s)]"""
+    stiffness_damping: NonNegativeFloat = 0.0
+    """factor beta of a damping C = beta K proportional to stiffness [s]: a viscous stress of E beta times the rate"""
     strain: Literal["engineering", "green", "logarithmic"] = "engineering"
     """strain measure"""
     softening: Annotated[tuple[SofteningRow, ...], listed, Field(min_length=1)] | None = None
@@ -97,13 +100,14 @@ class MaterialKeys(StrictModel):
 
     def numbers(self) -> tuple[Any, ...]:
         """Return what the response of :meth:`choose` reads as ``p``."""
-        if self.softening is None:
-            return self.pack()
-        return self.pack(), np.array(self.softening, dtype=float)
+        own = self.pack() if self.softening is None else (self.pack(), np.array(self.softening, dtype=float))
+        return own if not self.stiffness_damping else (own, self.young_modulus * self.stiffness_damping)
 
     def choose(self, law: Law) -> Law:
-        """Return the variant of the law that the keys ask for: the law itself, or softened by temperature."""
-        return law if self.softening is None else softened(law)
+        """Return the variant of the law that the keys ask for: the law itself, softened by temperature, or with damping
+        proportional to its stiffness."""
+        chosen = law if self.softening is None else softened(law)
+        return damped(chosen) if self.stiffness_damping else chosen
 
     def upper_modulus(self) -> float:
         """:meth:`largest_modulus` at any temperature [Pa]."""

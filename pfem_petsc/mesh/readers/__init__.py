@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import importlib
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,10 +13,10 @@ if TYPE_CHECKING:
 
     from ..slab import MeshSlab
 
-__all__ = ["SUFFIXES", "read_slab"]
+__all__ = ["SUFFIXES", "missing_field", "read_slab"]
 
 SUFFIXES = {".msh": "gmsh", ".vtu": "vtk", ".vtkhdf": "vtk", ".h5": "hdf5"}
-"""Reader module for each suffix; each has ``read(path, comm) -> MeshSlab``, collective."""
+"""Reader module for each suffix; each has ``read(path, comm, fields) -> MeshSlab``, collective."""
 
 _GEOMETRY = "; this is a geometry: mesh it by `gmsh -1 {name} -o {stem}.msh`"
 _MESHIO = "; convert it by `meshio convert {name} {stem}.vtu`"
@@ -26,8 +27,9 @@ _CONVERT = {
 """How to make a file that is read out of another; meshio is installed with the program."""
 
 
-def read_slab(path: Path, comm: MPI.Comm) -> MeshSlab:
-    """Read this rank's part of the mesh in a file. Collective.
+def read_slab(path: Path, comm: MPI.Comm, fields: Mapping[str, str] | None = None) -> MeshSlab:
+    """Read this rank's part of the mesh in a file, with cell fields by name, each with the key that asks for it, for
+    messages. Collective.
 
     Raises
     ------
@@ -42,7 +44,17 @@ def read_slab(path: Path, comm: MPI.Comm) -> MeshSlab:
     if reader is None:
         hint = _CONVERT.get(path.suffix.lower(), "").format(name=path.name, stem=path.stem)
         raise InputError(f"mesh.file: no reader for {path.name!r}; known suffixes: {', '.join(SUFFIXES)}{hint}")
-    return importlib.import_module(f"{__name__}.{reader}").read(path, comm)
+    return importlib.import_module(f"{__name__}.{reader}").read(path, comm, fields or {})
+
+
+def missing_field(path: Path, fields: Mapping[str, str], known: Iterable[str]) -> str | None:
+    """Return the message about the first of ``fields`` that is not among the ``known`` cell fields of a file."""
+    known = sorted(known)
+    for name, key in fields.items():
+        if name not in known:
+            there = f"; it has {', '.join(known)}" if known else ""
+            return f"{key} = {name!r}: {path} has no cell field of this name with one number for each bar{there}"
+    return None
 
 
 def _check_file(path: Path) -> None:

@@ -7,6 +7,7 @@ surfaces and volumes are ignored with a warning. Nodes are numbered from 0 in fi
 from __future__ import annotations
 
 import codecs
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from mpi4py import MPI
 
 from ...errors import InputError
 from ..slab import MeshSlab
+from . import missing_field
 from .gmsh_sections import Format, Numbers, sections
 from .scatter import WholeMesh, read_and_scatter
 
@@ -31,14 +33,17 @@ Elements = list[tuple[int, np.ndarray, np.ndarray]]
 """Runs of elements: type, (n, nodes of an element) tags of nodes, (n, physical groups) tags, 0 for none."""
 
 
-def read(path: Path, comm: MPI.Comm) -> MeshSlab:
-    """Return this rank's slab of the mesh in a Gmsh file, which rank 0 reads. Collective.
+def read(path: Path, comm: MPI.Comm, fields: Mapping[str, str] | None = None) -> MeshSlab:
+    """Return this rank's slab of the mesh in a Gmsh file, which rank 0 reads; cell fields are refused. Collective.
 
     Raises
     ------
     InputError
         On all ranks, naming the section, for any content that is not a mesh of bars.
     """
+    missing = missing_field(path, fields or {}, ())
+    if missing is not None:
+        raise InputError(f"{missing}; files .h5, .vtu and .vtkhdf can have fields")
     return read_and_scatter(_read, path, comm)
 
 

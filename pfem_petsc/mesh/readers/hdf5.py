@@ -1,11 +1,12 @@
 """The mesh file format of this package: HDF5, read and written by all ranks, each its slab.
 
 ``/points`` (n_nodes, 3) float [m], ``/bars`` (n_bars, 2) integers from 0, ``/node_groups/<name>`` and
-``/bar_groups/<name>`` with the numbers of members, in any order.
+``/bar_groups/<name>`` with the numbers of members, in any order; ``/bar_fields/<name>`` (n_bars,) float.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from mpi4py import MPI
 from ...errors import InputError
 from ...parallel.agreement import agreed, on_root
 from ..slab import MeshSlab, check_size, slab_range
+from . import missing_field
 
 __all__ = ["read", "write_hdf5"]
 
@@ -26,15 +28,16 @@ _PIECE = 1 << 20
 _COMPRESSION = 1100
 
 
-def read(path: Path, comm: MPI.Comm) -> MeshSlab:
-    """Return this rank's slab of the mesh in an HDF5 file. Collective; no rank reads more than its part at a time.
+def read(path: Path, comm: MPI.Comm, fields: Mapping[str, str] | None = None) -> MeshSlab:
+    """Return this rank's slab of the mesh in an HDF5 file, with the named cell fields. Collective; no rank reads more
+    than its part at a time.
 
     Raises
     ------
     InputError
         On all ranks, naming the dataset, if the file is not HDF5 or its datasets are not those of a mesh.
     """
-    n_nodes, n_bars, node_names, bar_names = on_root(comm, _describe, path)
+    n_nodes, n_bars, node_names, bar_names = on_root(comm, _describe, path, fields)
     check_size(n_nodes, str(path))
     first_node, last_node = slab_range(n_nodes, comm.rank, comm.size)
     first_bar, last_bar = slab_range(n_bars, comm.rank, comm.size)
@@ -50,6 +53,10 @@ def read(path: Path, comm: MPI.Comm) -> MeshSlab:
                 bars=file["bars"][first_bar:last_bar].astype(np.int64, copy=False),
                 node_groups=_groups(path, file, "node_groups", node_names, n_nodes, first_node, last_node),
                 bar_groups=_groups(path, file, "bar_groups", bar_names, n_bars, first_bar, last_bar),
+                bar_fields={
+                    name: file["bar_fields"][name][first_bar:last_bar].astype(np.float64, copy=False)
+                    for name in fields or {}
+                },
                 source=str(path),
             )
         except MemoryError:
@@ -71,8 +78,12 @@ def write_hdf5(path: Path, slab: MeshSlab, comm: MPI.Comm) -> None:
                     for kind, groups in (("node_groups", slab.node_groups), ("bar_groups", slab.bar_groups)):
                         for name in groups:
                             file.create_dataset(f"{kind}/{name}", (0,), np.int64, maxshape=(None,), chunks=(4096,))
+                    for name in slab.bar_fields:
+                        file.create_dataset(f"bar_fields/{name}", (slab.n_bars,), np.float64)
                 file["points"][slab.first_node : slab.first_node + len(slab.points)] = slab.points
                 file["bars"][slab.first_bar : slab.first_bar + len(slab.bars)] = slab.bars
+                for name, values in slab.bar_fields.items():
+                    file[f"bar_fields/{name}"][slab.first_bar : slab.first_bar + len(values)] = values
                 for kind, groups in (("node_groups", slab.node_groups), ("bar_groups", slab.bar_groups)):
                     for name, members in groups.items():
                         dataset = file[f"{kind}/{name}"]
@@ -91,7 +102,7 @@ def _opened(path: Path) -> Any:
         raise InputError(f"{path}: not a readable HDF5 file ({error})") from None
 
 
-def _describe(path: Path) -> tuple[int, int, list[str], list[str]]:
+def _describe(path: Path, fields: Mapping[str, str] | None = None) -> tuple[int, int, list[str], list[str]]:
     """Check shape and type of every dataset; return sizes and names of groups."""
     import h5py
 
@@ -113,9 +124,24 @@ def _describe(path: Path) -> tuple[int, int, list[str], list[str]]:
                     raise InputError(f"{path}: /{name} declares {dataset.shape} values but holds {stored} bytes")
                 counts.append(len(dataset))
             names = [_names(path, file, kind) for kind in ("node_groups", "bar_groups")]
+            missing = missing_field(path, fields or {}, _fields(file, counts[1]))
+            if missing is not None:
+                raise InputError(missing)
         except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
             raise InputError(f"{path}: cannot be read ({error}); the file may be damaged: write it again") from None
     return counts[0], counts[1], names[0], names[1]
+
+
+def _fields(file: Any, n_bars: int) -> list[str]:
+    """Return the names of the cell fields."""
+    import h5py
+
+    group = file.get("bar_fields")
+    if not isinstance(group, h5py.Group):
+        return []
+    sets = {name: group.get(name) for name in group}
+    right = [name for name, data in sets.items() if isinstance(data, h5py.Dataset) and data.shape == (n_bars,)]
+    return [name for name in right if sets[name].dtype.kind in "fiu"]
 
 
 def _names(path: Path, file: Any, kind: str) -> list[str]:

@@ -26,6 +26,8 @@ class WholeMesh:
     """(n_bars, 2) int64."""
     node_groups: dict[str, np.ndarray] = field(default_factory=dict)
     bar_groups: dict[str, np.ndarray] = field(default_factory=dict)
+    bar_fields: dict[str, np.ndarray] = field(default_factory=dict)
+    """(n_bars,) float64."""
     warnings: list[str] = field(default_factory=list)
 
 
@@ -46,8 +48,9 @@ def read_and_scatter(read: Callable[[Path], WholeMesh], path: Path, comm: MPI.Co
                 raise InputError(f"{path}: the mesh does not fit in memory; write it as .h5 for many ranks") from None
     head = None
     if whole is not None:
-        head = (len(whole.points), len(whole.bars), list(whole.node_groups), list(whole.bar_groups), whole.warnings)
-    n_nodes, n_bars, node_names, bar_names, warnings = comm.bcast(head)
+        names = [list(named) for named in (whole.node_groups, whole.bar_groups, whole.bar_fields)]
+        head = (len(whole.points), len(whole.bars), *names, whole.warnings)
+    n_nodes, n_bars, node_names, bar_names, field_names, warnings = comm.bcast(head)
     check_size(n_nodes, str(path))
     points = _scatter(comm, whole.points if whole else np.empty((0, 3)), n_nodes)
     bars = _scatter(comm, whole.bars if whole else np.empty((0, 2), np.int64), n_bars)
@@ -60,6 +63,10 @@ def read_and_scatter(read: Callable[[Path], WholeMesh], path: Path, comm: MPI.Co
         bars=bars,
         node_groups={name: _members(comm, whole and whole.node_groups[name], n_nodes) for name in node_names},
         bar_groups={name: _members(comm, whole and whole.bar_groups[name], n_bars) for name in bar_names},
+        bar_fields={
+            name: _scatter(comm, whole.bar_fields[name][:, None] if whole else np.empty((0, 1)), n_bars)[:, 0]
+            for name in field_names
+        },
         source=str(path),
         warnings=warnings,
     )

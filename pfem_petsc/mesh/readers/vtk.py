@@ -12,6 +12,8 @@ import signal
 import subprocess
 import sys
 import tempfile
+from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,28 +21,28 @@ from mpi4py import MPI
 
 from ...errors import InputError
 from ..slab import MeshSlab
-from . import vtk_extract
+from . import missing_field, vtk_extract
 from .scatter import WholeMesh, read_and_scatter
 
 __all__ = ["read"]
 
 
-def read(path: Path, comm: MPI.Comm) -> MeshSlab:
-    """Return this rank's slab of the mesh in a VTK file, which rank 0 reads. Collective.
+def read(path: Path, comm: MPI.Comm, fields: Mapping[str, str] | None = None) -> MeshSlab:
+    """Return this rank's slab of the mesh in a VTK file, which rank 0 reads, with the named cell fields. Collective.
 
     Raises
     ------
     InputError
         On all ranks, for any content that is not an unstructured grid of lines.
     """
-    return read_and_scatter(_read, path, comm)
+    return read_and_scatter(partial(_read, fields=fields or {}), path, comm)
 
 
-def _read(path: Path) -> WholeMesh:
+def _read(path: Path, fields: Mapping[str, str]) -> WholeMesh:
     with tempfile.TemporaryDirectory() as folder:
         result = Path(folder, "mesh.npz")
         # -P removes the program's folder from the path, where this module would shadow the package vtk.
-        command = [sys.executable, "-P", vtk_extract.__file__, str(path.resolve()), str(result)]
+        command = [sys.executable, "-P", vtk_extract.__file__, str(path.resolve()), str(result), *fields]
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
         done = subprocess.run(command, env=environment, capture_output=True, text=True, errors="replace", check=False)
         if done.returncode == vtk_extract.REFUSED:
@@ -61,4 +63,7 @@ def _read(path: Path) -> WholeMesh:
                     mesh.warnings.append(f"{path}: left out {arrays[key]} cells that are no lines")
                 if slash:
                     getattr(mesh, kind)[name] = arrays[key]
+            missing = missing_field(path, fields, arrays["cell_fields"].tolist())
+            if missing is not None:
+                raise InputError(missing)
     return mesh

@@ -1,4 +1,4 @@
-"""Extracts a mesh of lines from a VTK file; run as a program, ``vtk_extract.py FILE RESULT.npz``.
+"""Extracts a mesh of lines from a VTK file; run as a program, ``vtk_extract.py FILE RESULT.npz [FIELD ...]``.
 
 It is a separate process because VTK aborts the process on some damaged files. Imports neither MPI nor this package. For
 a file without a mesh of bars the status is 3 and the reason is printed on stdout.
@@ -19,8 +19,9 @@ _VTK_LINE = 3
 _ARRAYS = ("group", "section")
 
 
-def main(path: str, result: str) -> int:
-    """Read ``path``, write ``points``, ``bars`` and ``node_groups/<name>``, ``bar_groups/<name>`` to ``result``."""
+def main(path: str, result: str, *fields: str) -> int:
+    """Read ``path``; write ``points``, ``bars``, ``node_groups/<name>``, ``bar_groups/<name>``, ``bar_fields/<name>``
+    of the named cell fields, and the names of all, ``cell_fields``, to ``result``."""
     from vtkmodules.vtkCommonCore import vtkOutputWindow, vtkStringOutputWindow
 
     # a damaged file can request any amount of memory, which takes time to fill: compressed files need at most 200 times
@@ -40,7 +41,7 @@ def main(path: str, result: str) -> int:
     try:
         if lines:
             raise ValueError(f"cannot be read: {(messages or lines)[0].strip()}")
-        arrays = _arrays(grid)
+        arrays = _arrays(grid, fields)
     except ValueError as error:
         print(error)
         return REFUSED
@@ -58,7 +59,7 @@ def _reader(path: str) -> Any:
     return vtkHDFReader()
 
 
-def _arrays(grid: Any) -> dict[str, np.ndarray]:
+def _arrays(grid: Any, fields: tuple[str, ...]) -> dict[str, np.ndarray]:
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
     if grid is None or not grid.IsA("vtkUnstructuredGrid"):
@@ -84,6 +85,12 @@ def _arrays(grid: Any) -> dict[str, np.ndarray]:
     for kind, data, kept in (("node_groups", grid.GetPointData(), None), ("bar_groups", grid.GetCellData(), lines)):
         for name, members in _groups(data, grid.GetFieldData(), kept).items():
             arrays[f"{kind}/{name}"] = members
+    cells = grid.GetCellData()
+    known = [cells.GetArray(i) for i in range(cells.GetNumberOfArrays())]
+    known = {a.GetName(): a for a in known if a is not None and a.GetName() and a.GetNumberOfComponents() == 1}
+    arrays["cell_fields"] = np.array(list(known), dtype=str)
+    for name in set(fields) & set(known):
+        arrays[f"bar_fields/{name}"] = vtk_to_numpy(known[name]).astype(np.float64)[lines]
     return arrays
 
 

@@ -10,7 +10,7 @@ from helpers.cables import funicular
 from helpers.mesh_files import case_of
 from helpers.strut_twin import Strut, solid
 
-from pfem_petsc import Case, Simulation, open_result
+from pfem_petsc import Case, Simulation, open_result, write_mesh
 from pfem_petsc.errors import InputError, SimulationFailure
 
 pytestmark = pytest.mark.parallel
@@ -173,48 +173,59 @@ def test_load_control_ends_at_the_peak(comm, shared_tmp_path):
         assert 0.6 < simulation.state.time < 1.0 / 1.5
 
 
+def octet_strength(area, cells, comm, folder):
+    """Largest force [N] on octet cells of round struts of an area, pressed by 1.2 % between frictionless plates."""
+    side, height = 0.01 * cells[0], 0.01 * cells[2]
+    case = Case.from_dict(
+        {
+            "mesh": {"generator": "lattice", "kind": "octet", "cells": cells, "pitch": 0.01},
+            "node_set": {
+                "bottom": {"group": "bottom"},
+                "top": {"group": "top"},
+                "corner": {"nearest": [0.0, 0.0, 0.0]},
+                "beside": {"nearest": [side, 0.0, 0.0]},
+            },
+            "material": {"m": {"law": "strut", "young_modulus": 70e9, "density": 2700.0, "yield_stress": 200e6}},
+            "section": {"s": {"area": area, "material": "m", "shape": "round"}},
+            "support": [
+                {"node_set": "bottom", "fix": "z"},
+                {"node_set": "corner", "fix": "xy"},
+                {"node_set": "beside", "fix": "y"},
+                {
+                    "node_set": "top",
+                    "fix": "z",
+                    "motion": [[0, 0, 0, 0], [1, 0, 0, -0.012 * height]],
+                    "interpolation": "linear",
+                },
+            ],
+            "static": {"step": 0.05},
+            "output": {"fields_every": 0, "probe": [{"name": "top", "node_set": "top"}]},
+        }
+    )
+    history, _ = run(case, comm, folder)
+    return -history["probe/top/reaction"][:, :, 2].sum(axis=1).min()
+
+
 @pytest.mark.slow
 def test_strength_of_an_octet_cell_follows_yield_and_euler(comm, shared_tmp_path):
     """Areas over 16 to 1: with the area where struts yield, with its square where they buckle."""
-
-    def strength(area):
-        case = Case.from_dict(
-            {
-                "mesh": {"generator": "lattice", "kind": "octet", "cells": [1, 1, 1], "pitch": 0.01},
-                "node_set": {
-                    "bottom": {"group": "bottom"},
-                    "top": {"group": "top"},
-                    "corner": {"nearest": [0.0, 0.0, 0.0]},
-                    "beside": {"nearest": [0.01, 0.0, 0.0]},
-                },
-                "material": {"m": {"law": "strut", "young_modulus": 70e9, "density": 2700.0, "yield_stress": 200e6}},
-                "section": {"s": {"area": area, "material": "m", "shape": "round"}},
-                "support": [
-                    {"node_set": "bottom", "fix": "z"},
-                    {"node_set": "corner", "fix": "xy"},
-                    {"node_set": "beside", "fix": "y"},
-                    {
-                        "node_set": "top",
-                        "fix": "z",
-                        "motion": [[0, 0, 0, 0], [1, 0, 0, -1.2e-4]],
-                        "interpolation": "linear",
-                    },
-                ],
-                "static": {"step": 0.05},
-                "output": {"fields_every": 0, "probe": [{"name": "top", "node_set": "top"}]},
-            }
-        )
-        history, _ = run(case, comm, shared_tmp_path / "out")
-        return -history["probe/top/reaction"][:, :, 2].sum(axis=1).min()
-
     areas = 4.5e-8 * 4.0 ** np.arange(3)  # slendernesses of 118, 59 and 30; 58.8 is that of both
-    forces = np.array([strength(area) for area in areas])
+    forces = np.array([octet_strength(area, [1, 1, 1], comm, shared_tmp_path / "out") for area in areas])
     slopes = np.diff(np.log(forces)) / np.log(4.0)
     assert slopes == pytest.approx([2.0, 1.0], abs=0.02)
     length = 0.01 / math.sqrt(2.0)
     euler = 0.25 * math.pi * 70e9 * areas[0] ** 2 / length**2
     # in both, the same multiple of the strength of a bar
     assert forces[0] / euler == pytest.approx(forces[2] / (200e6 * areas[2]), rel=0.03)
+
+
+@pytest.mark.thorough
+def test_strength_of_octet_cells_at_many_areas(comm, shared_tmp_path):
+    areas = 4.5e-8 * 2.0 ** np.linspace(0.0, 4.0, 9)
+    for cells in ([1, 1, 1], [2, 1, 1]):
+        forces = np.array([octet_strength(area, cells, comm, shared_tmp_path / "out") for area in areas])
+        slopes = np.diff(np.log(forces)) / np.diff(np.log(areas))
+        assert slopes[:4] == pytest.approx(2.0, abs=0.05) and slopes[4:] == pytest.approx(1.0, abs=0.05)
 
 
 @pytest.mark.parametrize("law", ["cable", "strut", "damage"])
@@ -234,6 +245,57 @@ def test_prestress(law, comm, shared_tmp_path):
     )
     _, fields = run(case, comm, shared_tmp_path / "out")
     assert fields["axial_force"] == pytest.approx([force, force], rel=1e-9)
+
+
+def test_each_strut_buckles_at_the_load_of_its_own_area_and_length(comm, shared_tmp_path):
+    if comm.rank == 0:
+        points = [[0.0, 0, 0], [1.0, 0, 0], [2.5, 0, 0]]
+        fields = {"a": np.array([1e-4, 3e-4])}
+        write_mesh(shared_tmp_path / "graded.h5", points, [[0, 1], [1, 2]], bar_fields=fields)
+    comm.Barrier()
+    motion = {"fix": "xyz", "interpolation": "linear"}
+    case = Case.from_dict(
+        {
+            "mesh": {"file": "graded.h5"},
+            "node_set": {name: {"indices": [k]} for k, name in enumerate(("first", "middle", "last"))},
+            "material": {"m": {"law": "strut", "young_modulus": 2e11, "density": 7850.0, "yield_stress": 8e8}},
+            "section": {"s": {"area_field": "a", "material": "m", "shape": "round"}},
+            "support": [
+                {"node_set": "first", "motion": [[0, 0, 0, 0], [1, 2e-4, 0, 0]], **motion},
+                {"node_set": "middle", "fix": "xyz"},
+                {"node_set": "last", "motion": [[0, 0, 0, 0], [1, -3e-4, 0, 0]], **motion},
+            ],
+            "static": {"step": 0.5},
+        },
+        folder=shared_tmp_path,
+    )
+    _, fields = run(case, comm, shared_tmp_path / "out")
+    euler = 0.25 * math.pi * 2e11 * np.array([1e-4, 3e-4]) ** 2 / np.array([1.0, 1.5]) ** 2
+    assert fields["axial_force"] == pytest.approx(-euler, rel=1e-9)
+
+
+@pytest.mark.parametrize("linear", ["cg", "gamg"])
+def test_iterative_solvers_take_slack_cables_whose_nodes_are_held(linear, comm, shared_tmp_path):
+    """A square of bars on two feet with two diagonals, one of which is slack."""
+    diagonals = {"law": "cable", "young_modulus": 2e11, "density": 7850.0}
+    case = case_of(
+        shared_tmp_path,
+        comm,
+        SQUARE,
+        [[0, 1], [1, 2], [2, 3], [3, 0], [0, 2], [1, 3]],
+        node_set={"feet": {"indices": [0, 3]}, "all": {"all": True}, "pushed": {"indices": [2]}},
+        material={"m": diagonals},
+        section={"s": {"area": 1e-3, "material": "m", "pretension": 500.0}},
+        support=[{"node_set": "feet", "fix": "xyz"}, {"node_set": "all", "fix": "y"}],
+        load=[{"node_set": "pushed", "force": [1000.0, 0.0, 4000.0]}],
+        static={"step": 0.5},
+        solver={"linear": linear},
+    )
+    history, fields = run(case, comm, shared_tmp_path / "out")
+    assert (fields["status"] == 2.0).sum() == history["slack_bars"][-1]
+    force = fields["axial_force"]
+    assert force.min() >= 0.0
+    assert force[1] + force[4] / math.sqrt(2.0) == pytest.approx(1000.0, rel=1e-3)
 
 
 def test_unsuitable_bars_are_refused(comm, shared_tmp_path):

@@ -66,6 +66,10 @@ def describe(result: Result) -> list[str]:
     lines += ["history columns:", "  " + " ".join(names)]
     if count:
         lines += _energies(history, names)
+    if count and "broken_bars" in names and history["broken_bars"][-1]:
+        broken = history["broken_bars"]
+        first = axis.place(float(history["time"][(broken > 0).argmax()]))
+        lines.append(f"{int(broken[-1]):,} of {result.n_bars:,} bars broke, the first at {first}")
     return lines
 
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
+from ..fields import STATUS
 from ..output.units import prefix_for
 from .camera import VIEWS, Camera, aim
 from .fields import ColourField, ColourScale
@@ -173,7 +174,7 @@ class _Film:
         self.start = np.asarray(self.result.positions(0), dtype=float)
         low, high = np.full(3, np.inf), np.full(3, -np.inf)
         for frame in self.frames:
-            points = self.positions(frame)
+            points = self._held(frame)
             low, high = np.fmin(low, points.min(axis=0)), np.fmax(high, points.max(axis=0))
         self.bounds = np.array([low, high])
         walls = self.result.case.every_wall
@@ -222,6 +223,19 @@ class _Film:
         points = np.asarray(self.result.positions(frame), dtype=float)
         return points if self.scale == 1.0 else self.start + self.scale * (points - self.start)
 
+    def gone(self, frame: int) -> np.ndarray | None:
+        """Return the bars (b,) that have left the model, None if the result does not tell."""
+        if "status" not in self.result.cell_fields:
+            return None
+        return np.asarray(self.result.field("status", frame)) == STATUS.index("broken")
+
+    def _held(self, frame: int) -> np.ndarray:
+        """Return the positions of nodes with bars: others may fly far away, and would shrink the picture."""
+        points, gone = self.positions(frame), self.gone(frame)
+        if gone is None or gone.all():
+            return points
+        return points[np.unique(self.bars[~gone])]
+
     def time(self, frame: int) -> str:
         if hasattr(self.result, "caption"):
             return self.result.caption(frame)
@@ -255,7 +269,8 @@ class _Film:
 
     def draw(self, scene: Any, frame: int) -> np.ndarray:
         colours = self.colours.colours(self.colour.values(frame))
-        return scene.draw(self.positions(frame), colours, self.colour.on_nodes, self.surfaces[frame], self.shown[frame])
+        walls = self.surfaces[frame], self.shown[frame]
+        return scene.draw(self.positions(frame), colours, self.colour.on_nodes, *walls, self.gone(frame))
 
 
 def _draw_frames(film: _Film, folder: Path, size: tuple[int, int], title: str, style: dict[str, Any]) -> list[Path]:

@@ -98,6 +98,7 @@ class Scene:
         on_nodes: bool,
         surfaces: Sequence[Surface] | None = None,
         shown: Sequence[bool] | None = None,
+        gone: np.ndarray | None = None,
     ) -> np.ndarray:
         """Draw a frame.
 
@@ -108,6 +109,7 @@ class Scene:
         on_nodes : whether the colours are those of nodes
         surfaces : the walls at their current positions; None: unchanged
         shown : which of them are drawn; None: unchanged
+        gone : (b,) bool, bars that are left out; None: unchanged
 
         Returns
         -------
@@ -121,6 +123,8 @@ class Scene:
             for visible, meshes in zip(shown, self._walls, strict=True):
                 for _, actor in meshes:
                     actor.SetVisibility(visible)
+        if gone is not None:
+            self._leave_out(gone)
         moved = (points - self._origin).astype(np.float32)
         self._lines.points = moved
         if self._balls is not None:
@@ -159,6 +163,12 @@ class Scene:
     def close(self) -> None:
         """Free the window."""
         self._plotter.close()
+
+    def _leave_out(self, gone: np.ndarray) -> None:
+        """Draw bars (b,) as points inside one of their nodes."""
+        lines = np.column_stack([np.full(len(self._bars), 2), self._bars])
+        lines[gone, 2] = lines[gone, 1]
+        self._lines.lines = lines.ravel()
 
     def _lit(self, points: np.ndarray, colours: np.ndarray) -> np.ndarray:
         """Return colours of bars shaded like thin cylinders, for lines that the graphics does not shade."""

@@ -197,8 +197,11 @@ class Batches:
         # if walls stop nodes immediately, damping in the first step uses velocities other than those of the state
         if self._refused or count < _FEWEST or end < self._min_steps or begin == 0:
             return True
-        if self._batch is None or self._changes != stepper.support_changes:
-            self._changes = stepper.support_changes
+        if self._changes != stepper.support_changes:
+            # the forces of the last step act at supports that are gone; the arrays of the loop alternate
+            self._changes, self._batch = stepper.support_changes, None
+            return True
+        if self._batch is None:
             self._refused = not Batch.serves(stepper)
             if self._refused:
                 return True

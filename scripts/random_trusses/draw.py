@@ -14,6 +14,7 @@ import numpy as np
 
 from .body import Body, draw_body
 from .laws import draw_laws
+from .rupture import draw_rupture
 from .walls import draw_walls
 
 __all__ = ["Motion", "draw_case"]
@@ -70,6 +71,7 @@ def draw_case(seed: int) -> dict[str, Any]:
     _prestress(random.Random(f"prestress {seed}"), case, motion.end)
     _loads_over_time(random.Random(f"loads {seed}"), case, motion)
     _stiffness_damping(random.Random(f"stiffness damping {seed}"), case, body.limit)
+    draw_rupture(random.Random(f"rupture {seed}"), case, motion.end)
     return _plain(case)
 
 

@@ -178,7 +178,8 @@ def _energy(case: Case, history: dict[str, np.ndarray], warned: list[str], size:
     constant = not any(isinstance(getattr(s, s.prestressed or "area"), tuple) for s in case.section.values())
     if constant and (np.diff(heat) < -1e-9 * scale).any() or heat.min() < -1e-9 * scale:
         faults.append(("plastic heat falls", f"{np.diff(heat).min() / scale:.3g} of the largest energy"))
-    for name in ("damping_dissipation", "friction_dissipation", "impact_dissipation", "damage_dissipation"):
+    kinds = ("damping", "friction", "impact", "damage", "rupture")
+    for name in (f"{kind}_dissipation" for kind in kinds):
         if name in history and history[name].min() < -1e-9 * scale:
             faults.append((f"{name} negative", f"{history[name].min() / scale:.3g} of the largest energy"))
     return faults + _gains(case, history, warned, scale)

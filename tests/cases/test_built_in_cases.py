@@ -185,6 +185,20 @@ def hanging_net(run):
 
 
 @number
+def net_cut(run):
+    """A corner lets go of its quarter of the weight; ropes tear later, with the energy that the limit says, or more."""
+    history = run("net_cut", "stage.1.time.end=1.0")
+    weight = 1000.0 * 1e-4 * 9.81 * 2 * 11 * 10.0
+    held = history["probe/corner/reaction"][:, 0, 2]
+    assert held[history["stage"] == 0][-1] == pytest.approx(weight / 4.0, rel=1e-6)
+    assert (held[history["time"] > 1.102] == 0.0).all()
+    assert history["broken_bars"][-1] == 1
+    released = 0.5 * 2.5e6**2 / 1e8 * 1e-4
+    assert released < history["rupture_dissipation"][-1] < 1.1 * released
+    assert abs(history["energy_imbalance"]).max() < 1e-9 * history["external_work"].max()
+
+
+@number
 def tensegrity_prism(run):
     """The head of a strut is 150 degrees beyond its foot."""
     history = run("tensegrity_prism")

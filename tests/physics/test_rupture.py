@@ -291,6 +291,18 @@ def test_static_loads_go_on_with_the_bars_that_are_left(method, comm, tmp_path):
     assert np.asarray(status).tolist() == [1, 0, 0]
 
 
+def test_modes_are_those_of_the_bars_that_are_left(comm, tmp_path):
+    """f = sqrt(k/m)/2 pi of the inclined bars alone, with the mass of all."""
+    stiff, inclined = YOUNG * AREA, 2.0 * YOUNG * AREA / np.sqrt(8.0)
+    limits = [{"strain": 0.55e-4}, {"strain": 1.0}, {"strain": 1.0}]
+    case = parallel_bars(tmp_path, comm, [AREA] * 3, limits, STATIC, 1e-4 * (stiff + inclined))
+    case = Case.from_dict({**case.to_dict(), "modes": {"count": 1}}, folder=tmp_path)
+    assert Simulation(case, comm, output=tmp_path / "out", quiet=True).run() == 0
+    mass = 0.5 * DENSITY * AREA * (1.0 + 2.0 * np.sqrt(2.0))
+    frequency = open_result(tmp_path / "out").modes.frequency
+    np.testing.assert_allclose(frequency, np.sqrt(inclined / mass) / (2.0 * np.pi), rtol=5e-4)
+
+
 def test_static_rupture_cascades_until_none_breaks_or_all_collapses(comm, tmp_path):
     """What the others cannot carry ends the run with the reason; the log has the bars in their order."""
     limits = [{"strain": 0.55e-4}, {"strain": 1e-4}, {"strain": 1e-4}]

@@ -32,7 +32,7 @@ def load_of(stepper: Stepper, balance: Balance) -> np.ndarray:
 
 
 def load_now(stepper: Stepper, time: float) -> np.ndarray:
-    """Return the external force (owned, 3) [N] at a time [s] and at the present positions and velocities. Collective."""
+    """Return the external force (owned, 3) [N] at a time [s] and the present positions and velocities. Collective."""
     external = stepper.model.external
     if external.state_forces:
         external.follow(stepper.state.position, stepper.state.v)

@@ -15,6 +15,7 @@ from ..integrators.base import Balance, Scheme, State
 from ..mechanics.bars import StrainEnergy
 from ..tolerances import BEYOND, TIME
 from .collapse import tell_collapse
+from .loading import load_now, load_of
 from .massless import MasslessNodes
 from .prescribed import PrescribedMotion
 from .removals import Removals
@@ -128,7 +129,7 @@ class Stepper(ABC):
             )
         self.evaluate(commit=True)
         if model.external.active:
-            state.external = self._load_now(0.0)
+            state.external = load_now(self, 0.0)
         load = state.external - state.f[: model.mesh.n_owned]
         if model.inertia.damped:
             load -= model.inertia.damping_times(state.v, np.zeros_like(load))
@@ -182,7 +183,7 @@ class Stepper(ABC):
             return state.a
         load = -state.f[: len(state.a)]
         if model.external.active:
-            load += self._load_now(state.time)
+            load += load_now(self, state.time)
         if model.inertia.damped:
             load -= model.inertia.damping_times(state.v, np.empty_like(load))
         held = model.supports.fixed | (state.contact != 0.0).any(axis=1)[:, None]
@@ -309,7 +310,7 @@ class Stepper(ABC):
         if self.prescribed.moving:
             self.prescribed.prescribe(self.balance)
         self.model.contact.motion.begin(state.time, self.part)
-        state.external = self._load(self.balance)
+        state.external = load_of(self, self.balance)
         if self.scheme.inertial:
             self.model.bars.step = self.balance.time - state.time
         self.solution = self.solve(self.balance)
@@ -333,43 +334,6 @@ class Stepper(ABC):
         a = self.accelerate(load - self.model.inertia.mass_times(carried, np.empty_like(load)))
         a[supports.at] = carried[supports.at]
         return a
-
-    def _load(self, balance: Balance) -> np.ndarray:
-        if not self.model.external.active:
-            return self.zero
-        external = self.model.external
-        total = np.zeros_like(self.state.v)
-        part = np.empty_like(total)
-        for weight, time in balance.loads:
-            if external.state_forces:
-                external.follow(*self._expected(balance, time))
-            total += weight * external.at(time, part)
-        if external.failure is not None and self.fault is None:
-            self.fault = SimulationFailure(f"{self.when(balance)}: external_force: the function {external.failure}")
-        return total
-
-    def _load_now(self, time: float) -> np.ndarray:
-        """Return the external force (owned, 3) [N] at a time [s] and at the state's positions and velocities."""
-        external = self.model.external
-        if external.state_forces:
-            external.follow(self.state.position, self.state.v)
-        force = external.at(time, np.empty_like(self.state.v))
-        if external.failure is not None and self.fault is None:
-            self.fault = SimulationFailure(f"{self.arrived()}: external_force: the function {external.failure}")
-        return force
-
-    def _expected(self, balance: Balance, time: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return positions and velocities (owned, 3) at a time [s] of a balance that is not solved yet.
-
-        The acceleration is that of the state; nodes in contact, whose acceleration may jump, go on without.
-        """
-        state = self.state
-        a = np.where((state.contact != 0.0).any(axis=1)[:, None], 0.0, state.a)
-        if self.scheme.solves_next_position:  # the velocity of the state is that of the step before
-            known = 0.0 if balance.a_hat is None else balance.a_hat
-            return state.position, balance.v_hat + (balance.eta / balance.alpha) * (a - known)
-        ahead = time - state.time
-        return state.position + ahead * (state.v + (0.5 * ahead) * a), state.v + ahead * a
 
     def remarks(self) -> list[str]:
         """What users should know at the end of a run."""

@@ -130,6 +130,28 @@ def test_forces_of_a_lattice(comm):
     np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-15)
 
 
+@pytest.mark.parametrize("scheme", ["central_differences", "newmark"])
+def test_bars_that_have_left_have_no_drag(scheme, tmp_path):
+    """Nodes of removed bars fly on, those of the others are still driven."""
+    the_case = case(
+        scheme,
+        1e-3,
+        0.1,
+        mesh={"generator": "two_rods", "length": 1.0, "elements": 2, "gap": 0.1},
+        node_set={"all": {"all": True}, "first": {"group": "start"}, "second": {"group": "end"}},
+        gravity={"acceleration": [0.0, 0.0, 0.0]},
+        wind={"velocity": [0.0, 20.0, 0.0]},
+        remove=[{"bars": "second", "time": 0.05}],
+        output={"fields_every": 0, "probe": [{"name": name, "node_set": name} for name in ("first", "second")]},
+    )
+    history = run(the_case, tmp_path / "out", MPI.COMM_SELF)
+    first, second = (history[f"probe/{name}/velocity"][:, 0, 1] for name in ("first", "second"))
+    assert second[50] == pytest.approx(first[50], rel=1e-9)
+    assert first[-1] > 1.5 * first[50]
+    assert np.ptp(second[52:]) < 1e-12 * second[50]
+    assert np.abs(history["energy_imbalance"]).max() < 1e-9 * history["kinetic_energy"].max()
+
+
 @pytest.mark.parallel
 @pytest.mark.parametrize("scheme", ["central_differences", "wilson"])
 def test_restart_and_stages(scheme, comm, shared_tmp_path):

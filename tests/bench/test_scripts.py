@@ -53,6 +53,13 @@ def test_implicit_operators_agree():
     assert tops[0] == pytest.approx(tops[1], rel=1e-8)
 
 
+@pytest.mark.slow
+def test_static_solvers_agree():
+    tops = [driver("run_ours.py", 3, "static", 1, solver)["top"] for solver in ("mumps", "gamg")]
+    assert tops[0] == pytest.approx(tops[1], rel=1e-8)
+    assert tops[0] < 0.0  # the edges bulge outwards
+
+
 def test_model_of_one_rank_and_of_many():
     parts = Parts(bar=1e-8, overhead=5e-5, latency=1e-6, bandwidth=1e10, reduction=4e-6, nodes_per_bar=0.125)
     alone = step_time(parts, 1e6, np.array([1]))

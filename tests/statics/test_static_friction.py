@@ -262,3 +262,28 @@ def test_a_rod_that_two_walls_hold(shared_tmp_path, comm, elements, fix, frictio
 def test_a_rod_that_nothing_holds_along_walls_is_told_what_would(shared_tmp_path, comm):
     with pytest.raises(SimulationFailure, match="walls without friction do not hold nodes along them: give supports"):
         rod_between_walls(shared_tmp_path, comm, 4, "z", 0.0)
+
+
+def test_a_free_rod_between_another_rod_and_a_wall(shared_tmp_path, comm):
+    """The first rod closes a gap of 2 mm, pushes the second one over 3 mm onto the wall, and both shorten."""
+    data = {
+        "mesh": {"generator": "two_rods", "length": 1.0, "elements": 2, "gap": 0.002},
+        "node_set": {
+            "all": {"all": True},
+            **{name: {"group": name} for name in ("start", "first_end", "second_start")},
+        },
+        "material": {"m": {"young_modulus": 1e6, "density": 1000.0}},
+        "section": {"s": {"area": 1e-2, "material": "m"}},
+        "support": [
+            {"node_set": "all", "fix": "yz"},
+            {"node_set": "start", "fix": "x", "interpolation": "linear", "motion": [[0, 0, 0, 0], [1, 0.02, 0, 0]]},
+        ],
+        "contact_pair": [{"name": "ends", "first": "first_end", "second": "second_start", "direction": [1.0, 0, 0]}],
+        "wall": [{"name": "stop", "type": "plane", "point": [2.005, 0.0, 0.0], "normal": [-1.0, 0.0, 0.0]}],
+        "static": {"step": 0.125},
+        "output": {"fields_every": 0},
+    }
+    history = history_of(Case.from_dict(data), comm, shared_tmp_path)
+    force = 0.5 * 1e4 * np.maximum(0.02 * history["load_factor"] - 0.005, 0.0)
+    np.testing.assert_allclose(history["pair/ends/force"][:, 0], force, atol=1e-6)
+    np.testing.assert_allclose(history["wall/stop/force"][:, 0], -force, atol=1e-6)

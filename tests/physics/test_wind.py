@@ -8,7 +8,7 @@ from helpers.runs import run
 from helpers.stopped import everywhere
 from mpi4py import MPI
 
-from pfem_petsc import Case, Simulation, write_mesh
+from pfem_petsc import Case, Simulation
 from pfem_petsc.errors import InputError
 from pfem_petsc.stepping.model import Model
 
@@ -198,20 +198,3 @@ def test_refusals_and_warnings(tmp_path):
         case(wind={"density": 1.0})
     with pytest.raises(InputError, match=r"wind.density = -1.0: expected a value > 0"):
         case(wind={"velocity": [1.0, 0.0, 0.0], "density": -1.0})
-
-
-def test_removed_bar_has_no_drag(tmp_path):
-    """Wind across a rod of two bars; one is removed at 10 ms; from then on only the other one's nodes accelerate."""
-    mesh = tmp_path / "two.h5"
-    write_mesh(mesh, [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0]], [[0, 1], [1, 2]], bar_groups={"one": [0]})
-    data = case("central_differences", 2e-4, 0.03).to_dict()
-    data |= {"mesh": {"file": str(mesh)}, "remove": [{"bars": "one", "time": 0.01}]}
-    data |= {"wind": {"velocity": [0.0, 20.0, 0.0]}, "gravity": {"acceleration": [0.0, 0.0, 0.0]}}
-    data["node_set"] = {"all": {"indices": [0, 1, 2]}}
-    history = run(Case.from_dict(data), tmp_path / "out", MPI.COMM_SELF)
-    t, v = history["time"], history["probe/all/velocity"][:, :, 1]
-    after = t > 0.0105
-    assert np.ptp(v[after, 0]) < 1e-12 * v[-1, 0] and v[-1, 0] > 1e-3
-    relative = 20.0 - v[after, 1:][0].mean()
-    half = 0.5 * 1.225 * 1.2 * DIAMETER * relative**2 / 2.0  # of a bar of 1 m, at each end [N]
-    assert np.diff(v[after, 2])[0] / 2e-4 == pytest.approx(half / (0.5 * DENSITY * AREA), rel=1e-2)

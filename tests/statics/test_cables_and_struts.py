@@ -225,7 +225,7 @@ def test_strength_of_octet_cells_at_many_areas(comm, shared_tmp_path):
     for cells in ([1, 1, 1], [2, 1, 1]):
         forces = np.array([octet_strength(area, cells, comm, shared_tmp_path / "out") for area in areas])
         slopes = np.diff(np.log(forces)) / np.diff(np.log(areas))
-        assert slopes[:4] == pytest.approx(2.0, abs=0.05) and slopes[4:] == pytest.approx(1.0, abs=0.05)
+        assert slopes[:4] == pytest.approx(2.0, abs=0.1) and slopes[4:] == pytest.approx(1.0, abs=0.1)
 
 
 @pytest.mark.parametrize("law", ["cable", "strut", "damage"])

@@ -196,6 +196,17 @@ def test_softened_elastic_bar_keeps_its_energy_while_heated(comm, shared_tmp_pat
     assert np.ptp(total) < 1e-12 * start
 
 
+@pytest.mark.slow
+def test_heated_bar_with_a_rate_keeps_its_balance(tmp_path):
+    """While it flows and expands by heat, in the scheme that conserves energy."""
+    case = one_bar("perzyna", "energy_momentum", steps=60, elements=2, thermal_expansion=1.2e-5)
+    case["temperature"] = [{"table": [[0.0, 0.0], [6e-4, 400.0]]}]
+    history = run(Case.from_dict(case), tmp_path / "out")
+    start = history["kinetic_energy"][0]
+    assert history["plastic_heat"][-1] > 0.3 * start and abs(history["thermal_work"]).max() > 1e-2 * start
+    assert abs(history["numerical_dissipation"]).max() < 1e-11 * start
+
+
 def test_restrained_bar_that_softens(tmp_path):
     """Held at both ends: the stress follows -E(T) alpha T until it yields at s_Y(T)."""
     for law, keys in (("elastic", {}), ("elastoplastic", {"yield_stress": 250e6})):

@@ -94,6 +94,7 @@ def softened(law: Law) -> Law:
         smooth=False,
         mean_stress=mean_at_temperature if elastic else None,
         mean_correction=None,
+        mean_of_work=False,  # a change of the modulus changes energies too
         no_mean_stress="" if elastic else _REASON,
         modulus=modulus,
     )

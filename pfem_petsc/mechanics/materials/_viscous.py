@@ -144,6 +144,7 @@ def viscous_law(
         rate=True,
         static_limit=True,
         mean_stress=mean_stress,
+        mean_of_work=True,
         softening=None if scale is None else Softening(scale),
     )
 

@@ -144,7 +144,9 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
                     stretch = length / rests[i]
                     if can_break:  # noqa: SIM102 - not compiled otherwise
                         if abs(history[gone, begin + i]) >= 1.0:
-                            work[3, i] = 0.0  # a bar that has left the model may have no length
+                            # it may have no length; one that breaks in this step has its force still
+                            if not (stretch > COLLAPSED_STRETCH):
+                                work[3, i] = 0.0
                             continue
                     if stretch < SHORTENED_STRETCH:
                         shortened = True

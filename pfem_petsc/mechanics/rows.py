@@ -9,11 +9,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from llvmlite import ir
 from numba.core import cgutils, types
 from numba.core.imputils import impl_ret_borrowed
 from numba.extending import intrinsic
 
-__all__ = ["accumulate", "bar_value", "blend", "differ", "dot", "extend", "put", "sum_with", "take", "times"]
+__all__ = ["accumulate", "bar_value", "blend", "differ", "extend", "keep_where", "put", "sum_where", "sum_with", "take"]
 
 
 def _places(context: Any, builder: Any, signature: Any, args: Any, first: int, column: int, count: int) -> list[Any]:
@@ -149,25 +150,31 @@ def sum_with(typingctx, one, factor, other):  # noqa: ANN001, ANN201
     return one(one, factor, other), _elementwise(combine)
 
 
-@intrinsic
-def times(typingctx, one, other):  # noqa: ANN001, ANN201
-    """Return the products of the components of two tuples of equal length."""
+def keep_where(flags: tuple[bool, ...]) -> Any:
+    """Make a function that returns a tuple with zeros where ``flags`` are false."""
 
-    def combine(builder: Any, args: Any, j: int) -> Any:
-        return builder.fmul(_part(builder, args[0], j), _part(builder, args[1], j))
+    @intrinsic
+    def keep(typingctx, values):  # noqa: ANN001, ANN202
+        def combine(builder: Any, args: Any, j: int) -> Any:
+            return _part(builder, args[0], j) if flags[j] else ir.Constant(ir.DoubleType(), 0.0)
 
-    return one(one, other), _elementwise(combine)
+        return values(values), _elementwise(combine)
+
+    return keep
 
 
-@intrinsic
-def dot(typingctx, one, other):  # noqa: ANN001, ANN201
-    """Return the sum of the products of the components of two tuples of equal length."""
-    count = len(one)
+def sum_where(flags: tuple[bool, ...]) -> Any:
+    """Make a function that returns the sum of the components of a tuple whose ``flags`` are true."""
 
-    def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        total = context.get_constant(types.float64, 0.0)
-        for j in range(count):
-            total = builder.fadd(total, builder.fmul(*(_part(builder, value, j) for value in args)))
-        return total
+    @intrinsic
+    def total(typingctx, values):  # noqa: ANN001, ANN202
+        def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            parts = [_part(builder, args[0], j) for j, wanted in enumerate(flags) if wanted]
+            found = ir.Constant(ir.DoubleType(), 0.0)
+            for k, part in enumerate(parts):
+                found = builder.fadd(found, part) if k else part
+            return found
 
-    return types.float64(one, other), generate
+        return types.float64(values), generate
+
+    return total

@@ -29,7 +29,7 @@ from ..energies import STORED
 from .compiled import kernel
 from .kernels import no_bar_data, no_variables
 from .materials.base import Law
-from .rows import bar_value, blend, dot, extend, put, sum_with, take, times
+from .rows import bar_value, blend, extend, keep_where, put, sum_where, sum_with, take
 
 if TYPE_CHECKING:
     from ..case.rupture import Rupture
@@ -73,7 +73,7 @@ def variable_of(law: Law, limit: str) -> int:
 def breakable(law: Law) -> Law:
     """Return the law for bars that can break; its parameters are those of :func:`limit_values` and of the law."""
     count = len(law.internal)
-    stored = tuple(float(name in STORED) for name in law.energies)
+    stored = tuple(name in STORED for name in law.energies)
     limited = variable_of(law, "plastic_strain"), variable_of(law, "damage")
     kept = tuple((f"{name}_at_rupture", "J/m³") for name in law.energies)
     return dataclasses.replace(
@@ -140,14 +140,14 @@ def _response(
     count: int,
     plastic: int,
     damage: int,
-    stored: tuple[float, ...],
+    stored: tuple[bool, ...],
 ) -> Callable[..., Any]:
     """Make the response of the breakable form of a law with ``count`` internal variables of its own.
 
-    ``plastic``, ``damage``: places of the variables with a limit, or -1; ``stored``: one for energies that bars store.
+    ``plastic``, ``damage``: places of the variables with a limit, or -1; ``stored``: which energies bars store.
     """
     first, of_law = count + 1, _OF_LAW
-    dissipated = tuple(1.0 - part for part in stored)
+    released, dissipated = sum_where(stored), keep_where(tuple(not part for part in stored))
     none = (0.0,) * len(stored)
     by_plastic, by_damage = plastic >= 0, damage >= 0
     plastic, damage = max(plastic, 0), max(damage, 0)
@@ -169,11 +169,11 @@ def _response(
         remaining = 1.0 - abs(after)
         densities = blend(there, densities, none)
         kept = sum_with(q[first:], left - remaining, densities)
-        shown = sum_with(times(kept, dissipated), remaining, densities)
+        shown = sum_with(dissipated(kept), remaining, densities)
         stress = left * stress if there else 0.0
         tangent = left * tangent if there else 0.0
         new = blend(there, new, q[:count])
-        return stress, tangent, new + (after,) + kept, shown + (dot(kept, stored),)  # noqa: RUF005 - tuples of Numba
+        return stress, tangent, new + (after,) + kept, shown + (released(kept),)  # noqa: RUF005 - tuples of Numba
 
     return response
 

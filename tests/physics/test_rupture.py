@@ -189,6 +189,25 @@ def test_the_energy_of_elastoplastic_bars_stays_balanced_while_they_let_go(comm,
     assert np.abs(history["numerical_dissipation"]).max() < 0.05 * history["kinetic_energy"][0]
 
 
+def test_the_last_force_of_a_bar_does_not_depend_on_others_that_are_short(comm, tmp_path):
+    """A row of bars that are pressed to less than their length by a fifth, and then break under that stress."""
+    free = {f"n{k}": {"indices": [k]} for k in range(1, 6)}
+    case = chain(
+        tmp_path,
+        comm,
+        5,
+        [2, 3],
+        {"compressive_strain": 0.15, "steps": 1},
+        {"integrator": "newmark", "beta": 0.25, "gamma": 0.5, "step": 2e-5, "end": 2e-3},
+        node_set={"foot": {"indices": [0]}, **free},
+        initial={"on": [{"node_set": f"n{k}", "velocity": [-60.0 * k, 0.0, 0.0]} for k in range(1, 6)]},
+        solver={"rtol": 1e-12},
+    )
+    history = run(case, tmp_path / "out", comm)
+    assert history["broken_bars"][-1] >= 1
+    assert np.abs(history["energy_imbalance"]).max() < 1e-10 * history["kinetic_energy"][0]
+
+
 SHRINKING = {
     "central_differences": {"step": 2e-5},
     "newmark": {"step": 1e-3, "beta": 0.25, "gamma": 0.5},

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..case.materials import law_of
 from ..errors import InputError
 from .kernels import COLLAPSED_STRETCH, no_variables
 from .strain import MEASURES
@@ -27,6 +28,9 @@ if TYPE_CHECKING:
     from ..case.schema import Case
     from .bars import BarBlock, Bars
     from .materials.base import Law
+
+    Bar = tuple[Law, tuple, Callable]
+    """Material law of intact bars, its parameters, and the strain measure."""
 
 __all__ = ["RestLengths", "stretch_of"]
 
@@ -57,21 +61,23 @@ class RestLengths:
             if key is None:
                 continue
             section = case.section[name]
-            measure = MEASURES[case.material[section.material].strain]
+            material = case.material[section.material]
             where = f"{case.source}: section.{name}.{key}"
             value = getattr(section, key)
             rows = ((0.0, value),) if isinstance(value, float) else value
             blocks = [block for block in bars.blocks if block.section == name]
-            if len(rows) > 1 and blocks and blocks[0].law.rate:
+            law = law_of(material)  # of intact bars, also of those that can break
+            if len(rows) > 1 and law.rate and not law.mean_of_work:
                 raise InputError(
                     f"{where}: the material {section.material!r} depends on the strain rate, which a rest length that "
                     "changes over time does not support; give one value"
                 )
+            bar = law, material.numbers(), MEASURES[material.strain]
             for _, each in rows:
                 for block in blocks:  # refuses what the law cannot bear
-                    _stretches(block, measure, key, each, where)
+                    _stretches(block, bar, key, each, where)
             varies |= len(rows) > 1
-            self._entries += [_Entry(block, measure, key, rows, where) for block in blocks]
+            self._entries += [_Entry(block, bar, key, rows, where) for block in blocks]
         # in later stages they stay as they are
         self.varying = varies and not self._held
         self.apply(math.inf if self._held else 0.0)
@@ -104,17 +110,15 @@ class RestLengths:
 class _Entry:
     """The bars of a block, with the values that they have over time."""
 
-    def __init__(
-        self, block: BarBlock, measure: Callable, key: str, rows: Sequence[tuple[float, float]], where: str
-    ) -> None:
-        self.block, self.measure, self.key, self.where = block, measure, key, where
+    def __init__(self, block: BarBlock, bar: Bar, key: str, rows: Sequence[tuple[float, float]], where: str) -> None:
+        self.block, self.bar, self.key, self.where = block, bar, key, where
         self.values = [value for _, value in rows]
         self._table = Table(rows)
         self._found: tuple[float, np.ndarray | float] | None = None  # the last value and its stretch
 
     def _stretch(self, value: float) -> np.ndarray | float:
         if self._found is None or self._found[0] != value:
-            self._found = value, _stretches(self.block, self.measure, self.key, value, self.where)
+            self._found = value, _stretches(self.block, self.bar, self.key, value, self.where)
         return self._found[1]
 
     def apply(self, bars: Bars, time: float) -> None:
@@ -128,20 +132,21 @@ class _Entry:
         return functools.reduce(np.maximum, map(self._stretch, self.values))
 
 
-def _stretches(block: BarBlock, measure: Callable, key: str, value: float, where: str) -> np.ndarray | float:
+def _stretches(block: BarBlock, bar: Bar, key: str, value: float, where: str) -> np.ndarray | float:
     """Return the stretch in the mesh of the bars of a block."""
     if key == "rest_length":
         return 1.0 / value
+    law, parameters, measure = bar
     as_force = key == "pretension"
     target = value / block.area if as_force else value
     try:
-        if not block.law.bar_data and np.ndim(target) == 0:
-            return stretch_of(block.law, measure, block.parameters, target, as_force)
+        if not law.bar_data and np.ndim(target) == 0:
+            return stretch_of(law, measure, parameters, target, as_force)
         data = block.history[len(block.law.rows) :]
         rows = np.vstack([np.broadcast_to(target, data.shape[1:]), data])
         kinds, which = np.unique(rows, axis=1, return_inverse=True)
-        each = [(force, (*block.parameters, *given)) for force, *given in kinds.T.tolist()]
-        return np.array([stretch_of(block.law, measure, p, force, as_force) for force, p in each])[np.ravel(which)]
+        each = [(force, (*parameters, *given)) for force, *given in kinds.T.tolist()]
+        return np.array([stretch_of(law, measure, p, force, as_force) for force, p in each])[np.ravel(which)]
     except ValueError as error:
         unit = "N" if key == "pretension" else "Pa"
         raise InputError(f"{where} = {value:g} {unit}: {error}") from error

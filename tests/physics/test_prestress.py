@@ -9,7 +9,10 @@ from helpers.stages import check_balances
 from helpers.stopped import everywhere
 
 from pfem_petsc import Case, Simulation, open_result
+from pfem_petsc.case.materials import law_of
 from pfem_petsc.errors import InputError
+from pfem_petsc.mechanics.rest_lengths import stretch_of
+from pfem_petsc.mechanics.strain import MEASURES
 
 YOUNG, AREA, DENSITY, LENGTH = 2e9, 1e-4, 1000.0, 2.0
 STRAINS = ["engineering", "green", "logarithmic"]
@@ -176,7 +179,29 @@ def test_energy_momentum_conserves_energy_while_stressing(strain, plastic, tmp_p
 LAWS = {
     "cable": ({"law": "cable"}, {}),
     "strut": ({"law": "strut", "yield_stress": 5e7}, {"shape": "round"}),
+    "rupture": ({"rupture": {"stress": 1e9}}, {}),
 }
+
+
+EVERY = {
+    "cable": {},
+    "compaction": {"compaction_strain": 0.3, "compaction_modulus": 1e9},
+    "cowper_symonds": {"yield_stress": 5e7, "rate_reference": 40.0, "rate_exponent": 5.0},
+    "damage": {"tensile_strength": 5e7, "fracture_energy": 1e5},
+    "elastoplastic": {"yield_stress": 5e7},
+    "voce": {"yield_stress": 5e7, "saturation_stress": 1e7, "saturation_rate": 10.0},
+}
+
+
+@pytest.mark.parametrize("law", EVERY)
+@pytest.mark.parametrize("keys", [{}, {"stiffness_damping": 1e-6}])
+def test_stretch_by_every_law(law, keys):
+    """All laws are elastic up to 10 MPa, and their loops can be called without being compiled."""
+    material = rod({}, {"law": law, **EVERY[law], **keys}).material["m"]
+    chosen = law_of(material)
+    data = (1e9,) * len(chosen.bar_data)  # a length, or a modulus, that is out of reach
+    stretch = stretch_of(chosen, MEASURES["engineering"], (*material.numbers(), *data), 1e7, as_force=True)
+    assert stretch == pytest.approx(1.0 + 1e7 / YOUNG, rel=1e-14)
 
 
 @pytest.mark.parametrize("law", LAWS)

@@ -84,6 +84,30 @@ def test_energy_momentum_balances_to_rounding(strain, plastic, tmp_path):
     assert np.abs(history["energy_imbalance"]).max() < 1e-11 * whole
 
 
+@pytest.mark.parametrize("integrator", ["energy_momentum", "central_differences"])
+def test_stressing_and_cooling_of_damped_bars(integrator, tmp_path):
+    """Works of changing rest lengths and temperatures have the viscous stress in them."""
+    step = 0.1 / FREQUENCY
+    case = rod(
+        0.1,
+        integrator,
+        step,
+        100 * step,
+        {"thermal_expansion": 1e-4},
+        solver={"rtol": 1e-13},
+        section={"s": {"area": AREA, "material": "m", "pretension": [[0.0, 0.0], [40 * step, 100.0]]}},
+        temperature=[{"table": [[0.0, 0.0], [30 * step, -50.0]]}],
+    )
+    history = run(case, tmp_path)
+    supplied = history["prestress_work"].max() + history["thermal_work"].max()
+    assert history["viscous_dissipation"][-1] > 1e-3 * supplied > 0.0
+    assert np.abs(history["energy_imbalance"]).max() < 1e-10 * supplied
+    exact = integrator == "energy_momentum"
+    assert (
+        np.abs(history["numerical_dissipation"]).max() < (1e-11 if exact else 0.03) * supplied
+    )  # the rate of explicit steps is late
+
+
 @pytest.mark.parametrize("integrator", ["central_differences", "newmark"])
 def test_rigid_rotation_is_not_damped(integrator, tmp_path):
     case = rod(

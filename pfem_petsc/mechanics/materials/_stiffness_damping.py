@@ -59,6 +59,8 @@ def damped(law: Law) -> Law:
         rate=True,
         mean_stress=None if mean_stress is None else mean_with_damping,
         mean_correction=_of_own(law.mean_correction),
+        # energies are functions of strain and internal variables, unless the law itself depends on the rate
+        mean_of_work=law.mean_of_work or (not law.rate and law.modulus is None),
         modulus=_of_own(law.modulus),
         static_limit=law.static_limit or not law.rate,
     )

@@ -19,6 +19,7 @@ import numpy as np
 from ..case.materials import law_of
 from ..errors import InputError
 from .kernels import COLLAPSED_STRETCH, no_variables
+from .rupture import intact
 from .strain import MEASURES
 from .time_tables import Table
 
@@ -162,6 +163,7 @@ def stretch_of(law: Law, measure: Callable, parameters: tuple[float, ...], targe
     """
     if target == 0.0:
         return 1.0
+    law, parameters = intact(law, parameters)
     response, virgin = law.response, no_variables(law)
     stretch = kept = 1.0
     best = miss = math.inf

@@ -34,7 +34,7 @@ from .rows import bar_value, blend, extend, keep_where, put, sum_where, sum_with
 if TYPE_CHECKING:
     from ..case.rupture import Rupture
 
-__all__ = ["LIMITS", "WHOLE", "breakable", "limit_values", "make_release", "variable_of"]
+__all__ = ["LIMITS", "WHOLE", "breakable", "intact", "limit_values", "make_release", "variable_of"]
 
 LIMITS = ("stress", "strain", "compressive_stress", "compressive_strain", "plastic_strain", "damage")
 """Keys of the limits, in the order of their values."""
@@ -62,6 +62,11 @@ def limit_values(rupture: Rupture | None) -> tuple[float, ...]:
     return (*(math.inf if value is None else float(value) for value in given), 1.0 / rupture.steps)
 
 
+def intact(law: Law, parameters: tuple[Any, ...]) -> tuple[Law, tuple[Any, ...]]:
+    """Return the law of intact bars and its parameters; the same for a law that is not breakable."""
+    return (law, parameters) if law.whole is None else (law.whole, parameters[_OF_LAW:])
+
+
 def variable_of(law: Law, limit: str) -> int:
     """Return the place of the internal variable that a limit compares, -1 if the law has none."""
     names = [name for name, _ in law.internal]
@@ -86,6 +91,7 @@ def breakable(law: Law) -> Law:
         mean_correction=None if law.mean_correction is None else _correction(law.mean_correction, count),
         modulus=None if law.modulus is None else _modulus(law.modulus),
         rupture=count,
+        whole=law,
     )
 
 

@@ -362,3 +362,22 @@ def test_paths_refuse_rupture(comm, tmp_path):
     )
     with pytest.raises(InputError, match="follows smooth paths"):
         Simulation(case, comm, output=tmp_path / "out", quiet=True)
+
+
+def test_bars_that_can_break_are_prestressed(comm, tmp_path):
+    """The rest length is that of the material as it is at first; the row breaks where the limit is below the stress."""
+    for limit, broken in ((2e6, 0), (0.5e6, 1)):
+        prestressed = {"area": AREA, "material": "weak", "bars": "weak", "prestress": 1e6}
+        case = chain(
+            tmp_path,
+            comm,
+            1,
+            [0],
+            {"stress": limit},
+            {**EXPLICIT, "step": 1e-4, "end": 1e-4},
+            section={"weak": prestressed},
+            support=[{"node_set": "both", "fix": "xyz"}],
+            node_set={"both": {"indices": [0, 1]}},
+        )
+        history = run(case, tmp_path / str(broken), comm)
+        assert history["broken_bars"].tolist() == [broken] * 2

@@ -162,6 +162,7 @@ class Law:
     no_mean_stress : why there is no ``mean_stress``, for the message
     rupture : place of the internal variable that tells which share of a bar has left the model, see
         :mod:`~pfem_petsc.mechanics.rupture`; -1 for laws whose bars cannot break
+    whole : the law of bars that are intact, if this one is made of it
     """
 
     response: Callable[..., Any]
@@ -178,6 +179,7 @@ class Law:
     modulus: Callable[[tuple[Any, ...], np.ndarray], np.ndarray] | None = None
     no_mean_stress: str = ""
     rupture: int = -1
+    whole: Law | None = None
 
     def __post_init__(self) -> None:
         for name in self.energies:

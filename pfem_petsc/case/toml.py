@@ -52,7 +52,7 @@ def cut_rows(text: str) -> tuple[str, list[Any]]:
     def cut(match: re.Match[str]) -> str:
         try:
             rows.append(json.loads(match[1]))
-        except ValueError:
+        except (ValueError, RecursionError):  # no JSON, or nested too deep
             return match[0]
         return f'= "{_MARK}{len(rows) - 1}"'
 

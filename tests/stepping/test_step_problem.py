@@ -10,6 +10,7 @@ from pfem_petsc import Case
 from pfem_petsc.contact.frames import build_frames
 from pfem_petsc.contact.transform import Transform
 from pfem_petsc.solvers.matrix_free import MatrixFreeHessian
+from pfem_petsc.stepping.loading import load_of
 from pfem_petsc.stepping.model import Model
 from pfem_petsc.stepping.prepare import make_plan, make_stepper
 from pfem_petsc.stepping.problem import StepProblem
@@ -54,7 +55,7 @@ class Twin:
         state.position[:], state.v, state.a = self.start[self.owned], self.v[self.owned], self.a[self.owned]
         self.stepper.evaluate(commit=False)
         self.balance = plan.scheme.balance(state, H)
-        state.external = self.stepper._load(self.balance)
+        state.external = load_of(self.stepper, self.balance)
         self.basis = np.tile(np.eye(3), (n, 1, 1))
         frames = self._frames(walls) if walls else None
         self.problem = StepProblem(self.model, state, self.balance, state.external, Transform(self.model, frames))

@@ -99,14 +99,14 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 def thinned(items: list[pytest.Item], ranks: int) -> list[pytest.Item]:
     """Return all tests except the thorough ones, with some of their sets of parameters.
 
-    Tests with more than three, two or one sets run with every third, fifth or eighth of them on 1, 2 and more ranks,
-    slow tests with a quarter of these. The selection depends on the number of ranks.
+    Tests with more than two sets (one on several ranks) run with every fourth, fifth or eighth of them on 1, 2 and 3
+    ranks, slow tests with a quarter of these. The selection depends on the number of ranks.
     """
     sets: dict[tuple[Path, str], list[pytest.Item]] = {}
     for item in items:
         if item.get_closest_marker("thorough") is None:
             sets.setdefault((item.path, getattr(item, "originalname", item.name)), []).append(item)
-    most, stride = {1: (3, 3), 2: (2, 5)}.get(ranks, (1, 8))
+    most, stride = {1: (2, 4), 2: (1, 5)}.get(ranks, (1, 8))
     chosen: set[pytest.Item] = set()
     for group in sets.values():
         slow = group[0].get_closest_marker("slow") is not None

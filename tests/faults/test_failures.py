@@ -204,6 +204,7 @@ def test_full_disk(on_ranks, tmp_path, small, words):
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.thorough
 def test_full_disk_at_a_checkpoint(on_ranks, tmp_path, small):
     """The results are whole, and the checkpoint before stays."""
     words = ("output.fields_every=0", "output.history_every=100000", "output.checkpoint_every=50")

@@ -90,7 +90,7 @@ def assert_near(one, other):
             assert np.abs(np.asarray(a.history[name], float) - b.history[name]).max() < 1e-10, name
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.parametrize(("ranks", "scheme"), [(5, "houbolt"), (8, "central_differences")])
 def test_killed_run_ends_as_if_undisturbed(tmp_path, ranks, scheme):
     case = alone(tmp_path, scheme)

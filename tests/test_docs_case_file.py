@@ -27,6 +27,7 @@ MODELS = [
         tables.VaryingGravity,
         tables.VaryingWind,
         tables.Temperature,
+        tables.NodalMass,
         tables.Remove,
         settings.TimeKeys,
         settings.StaticKeys,

@@ -36,7 +36,7 @@ _LONG_KEY = re.compile(r"""(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*)""" +
 
 KEYS = [
     *("title", "mesh", "node_set", "material", "section", "initial", "support"),
-    *("load", "gravity", "wind", "temperature", "wall", "contact_pair", "constraint", "remove", "contact"),
+    *("mass", "load", "gravity", "wind", "temperature", "wall", "contact_pair", "constraint", "remove", "contact"),
     *("time", "static", "stage", "modes", "output", "solver"),
 ]
 """Top-level keys of a case file."""
@@ -107,6 +107,7 @@ def read_tables(data: Mapping[str, Any], folder: Path, problems: Problems) -> di
         "section": _named(t.Section, data, "section", problems),
         "initial": _initial(data, problems),
         "support": read_tabled(t.Support, data, "support", files, problems, ("motion", "acceleration"), ("velocity",)),
+        "mass": _listed(t.NodalMass, data.get("mass"), ("mass",), problems),
         "load": read_loads(data, folder, files, problems),
         **{
             table: read_varying(data[table], table, m, files, problems) if table in data else None

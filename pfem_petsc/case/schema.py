@@ -34,6 +34,7 @@ class Case:
     mesh : :class:`~pfem_petsc.case.tables.Mesh`: generator with parameters, or file
     node_set, material, section : tables by name, in file order
     initial, support, load, temperature, wall, contact_pair, constraint, remove : lists of tables
+    point_mass : list of tables ``[[mass]]``
     gravity, wind : :class:`~pfem_petsc.case.tables.Gravity`, :class:`~pfem_petsc.case.tables.Wind`, or None
     contact, output, solver : tables of :mod:`~pfem_petsc.case.settings`
     time, static, modes : what is computed, None for what is not; ``time`` and ``static`` exclude each other
@@ -50,7 +51,8 @@ class Case:
 
     def __init__(self, attributes: Mapping[str, Any], *, name: str, source: str, folder: Path) -> None:
         for key in KEYS:
-            self.__dict__[key] = attributes.get(key, ()) if key == "stage" else attributes[key]
+            attribute = "point_mass" if key == "mass" else key
+            self.__dict__[attribute] = attributes.get(key, ()) if key == "stage" else attributes[key]
         self.__dict__.update(name=name, source=source, folder=Path(folder), overrides=(), number=0, given=())
         self.__dict__["removes_bars"] = any(entry.bars is not None for entry in self.remove)
 
@@ -211,6 +213,7 @@ class Case:
             "section": {name: _table(entry) for name, entry in self.section.items()},
             "initial": {**initial, "on": on} if on else initial,
             "support": [_table(entry) for entry in self.support],
+            "mass": [_table(entry) for entry in self.point_mass],
             "load": [_table(entry) for entry in self.load],
             "gravity": _table(self.gravity),
             "wind": _table(self.wind),

@@ -21,6 +21,7 @@ from .base import (
     number_or_rows,
 )
 from .load_tables import Gravity, Load, LoadFile, Temperature, VaryingGravity, VaryingWind, Wind
+from .point_tables import NodalMass
 from .rows import FileName, Table4, increasing
 
 __all__ = [
@@ -31,6 +32,7 @@ __all__ = [
     "LoadFile",
     "Mesh",
     "MeshKeys",
+    "NodalMass",
     "NodeSet",
     "PRESTRESSES",
     "Remove",

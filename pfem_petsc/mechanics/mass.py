@@ -1,7 +1,8 @@
 """Mass and damping, lumped at the nodes or consistent with the linear shape functions of the bar.
 
 The consistent mass of a bar is rho A l0 / 6 [[2, 1], [1, 2]] for each direction; its row sums are the lumped mass
-rho A l0 / 2. Damping is c_m per reference volume, distributed in the same way.
+rho A l0 / 2. Damping is c_m per reference volume, distributed in the same way. Masses of ``[[mass]]`` are those of
+their nodes, on the diagonal of both matrices.
 """
 
 from __future__ import annotations
@@ -15,10 +16,11 @@ from .compiled import kernel
 from .rows import bar_value
 
 if TYPE_CHECKING:
+    from ..case.schema import Case
     from ..mesh.distribution import DistributedMesh
     from .bars import BarBlock, Bars
 
-__all__ = ["Inertia", "consistent_product"]
+__all__ = ["Inertia", "consistent_product", "point_masses"]
 
 
 @kernel
@@ -42,17 +44,28 @@ def consistent_product(bars, lengths, start, stop, density, u, out):
             out[b, i] += m * (u[a, i] + 2.0 * u[b, i])
 
 
+def point_masses(case: Case, nodes: dict[str, np.ndarray], mesh: DistributedMesh) -> np.ndarray | None:
+    """Return the masses of ``[[mass]]`` (owned,) [kg]; None if the case has none. A node in several gets their sum."""
+    if not case.point_mass:
+        return None
+    points = np.zeros(mesh.n_owned)
+    for entry in case.point_mass:
+        points[nodes[entry.node_set]] += entry.value
+    return points
+
+
 class Inertia:
     """Mass M [kg] and damping C [kg/s] of the nodes that this rank owns.
 
     Attributes
     ----------
     mass, damping : (owned,) lumped values; also the row sums of the consistent matrices
+    points : (owned,) masses of nodes besides those of their bars, part of ``mass``; None for none on any rank
     consistent : whether products use the consistent matrices
     damped : whether any bar of the whole model has damping
     """
 
-    def __init__(self, mesh: DistributedMesh, bars: Bars, consistent: bool) -> None:
+    def __init__(self, mesh: DistributedMesh, bars: Bars, consistent: bool, points: np.ndarray | None) -> None:
         self.mesh = mesh
         self.bars = bars
         self.consistent = consistent
@@ -64,6 +77,9 @@ class Inertia:
             if block.damping:
                 _lump(bars.ends, bars.mesh_lengths, block.start, block.stop, block.damping * block.area, damping)
         self.mass = mass[: mesh.n_owned].copy()
+        self.points = points
+        if points is not None:
+            self.mass += points
         self.damping = damping[: mesh.n_owned].copy()
         self.damped = bool(mesh.comm.allreduce(float(damping.sum())) > 0.0)
         if consistent:
@@ -82,7 +98,10 @@ class Inertia:
 
     def mass_times(self, a: np.ndarray, out: np.ndarray) -> np.ndarray:
         """Compute ``out`` = M a for owned nodes, both (owned, 3). Collective with consistent mass."""
-        return self._times(a, out, self.mass, lambda block: block.density)
+        self._times(a, out, self.mass, lambda block: block.density)
+        if self.consistent and self.points is not None:
+            out += self.points[:, None] * a
+        return out
 
     def damping_times(self, v: np.ndarray, out: np.ndarray) -> np.ndarray:
         """Compute ``out`` = C v for owned nodes, both (owned, 3). Collective with consistent mass."""
@@ -113,7 +132,10 @@ class Inertia:
         return out
 
     def coefficients(self, alpha: float, eta: float) -> list[float | np.ndarray]:
-        """Return (alpha rho + eta c_m) A / 6 [kg/(m s2)] per block, the consistent part of a Hessian; or zeros."""
+        """Return (alpha rho + eta c_m) A / 6 [kg/(m s2)] per block, the consistent part of a Hessian; or zeros.
+
+        What :attr:`points` add to its diagonal is besides.
+        """
         if not self.consistent:
             return [0.0] * len(self.bars.blocks)
         return [(alpha * b.density + eta * b.damping) * b.area / 6.0 for b in self.bars.blocks]

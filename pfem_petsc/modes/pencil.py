@@ -122,7 +122,7 @@ class StateMatrices:
         self.model, self.holds = model, holds
         # a treatment of impact may have moved the masses of nodes
         same = consistent == model.inertia.consistent and model.inertia.redistribution is None
-        self.inertia = model.inertia if same else Inertia(model.mesh, model.bars, consistent)
+        self.inertia = model.inertia if same else Inertia(model.mesh, model.bars, consistent, model.inertia.points)
         self._ends = model.mesh.bars.astype(np.int64)
 
     def stiffness(self, bars: np.ndarray, diagonal: float | np.ndarray, added: tuple | None = None) -> PETSc.Mat:
@@ -149,6 +149,8 @@ class StateMatrices:
         def fill(values: np.ndarray) -> None:
             coefficients = inertia.coefficients(1.0, 0.0)
             self.model.bars.tangents(mesh.points, 0.0, coefficients, matrix.pattern, values)
+            if inertia.points is not None:
+                matrix.add_lumped(inertia.points, values)
 
         return self.holds.taken_out(matrix.fill(fill), inertia.mass)
 

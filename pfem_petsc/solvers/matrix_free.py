@@ -240,6 +240,8 @@ class MatrixFreeHessian:
             coefficients = inertia.coefficients(problem.balance.alpha, problem.balance.eta)
             for block, coefficient in zip(bars.blocks, coefficients, strict=True):
                 consistent_product(bars.ends, bars.mesh_lengths, block.start, block.stop, 6.0 * coefficient, u, out)
+            if inertia.points is not None:
+                out[:owned] += problem.balance.alpha * inertia.points[:, None] * u[:owned]
         else:
             np.multiply(problem.nodal[:, None], u[:owned], out=out[:owned])
             out[owned:] = 0.0
@@ -261,8 +263,11 @@ class MatrixFreeHessian:
             moved = self.model.inertia.redistribution
             upper = moved.tensors.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
             blocks[moved.touched] += problem.balance.alpha * upper
-        # the diagonal of the consistent mass is two thirds of the lumped one
-        nodal = problem.nodal * (2.0 / 3.0 if self.model.inertia.consistent else 1.0)
+        inertia, nodal = self.model.inertia, problem.nodal
+        if inertia.consistent:  # the diagonal of the bars' consistent mass is two thirds of the lumped one
+            nodal = 2.0 / 3.0 * nodal
+            if inertia.points is not None:
+                nodal += problem.balance.alpha / 3.0 * inertia.points
         diagonal = blocks[:owned][:, [0, 3, 5]] + nodal[:, None]
         problem.transform.diagonal(self._left, lambda nodes: self._blocks(blocks, nodal, nodes), diagonal)
         if self.model.supports.any:

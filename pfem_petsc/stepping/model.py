@@ -14,7 +14,7 @@ from ..errors import InputError
 from ..mechanics.bars import Bars
 from ..mechanics.compiled import kernel
 from ..mechanics.loads import ExternalForce
-from ..mechanics.mass import Inertia
+from ..mechanics.mass import Inertia, point_masses
 from ..mechanics.rest_lengths import RestLengths
 from ..mechanics.rows import bar_value
 from ..mechanics.sections import area_fields, check_areas, section_of_bars
@@ -69,7 +69,7 @@ class Model:
             self.warnings.append(f"{adjusted} node{'s' * (adjusted > 1)} that started beyond walls moved onto them")
         with agreed(comm):
             self.bars = Bars(mesh, case)
-        self.inertia = Inertia(mesh, self.bars, case.mass == "consistent")
+        self.inertia = Inertia(mesh, self.bars, case.mass == "consistent", point_masses(case, self.nodes, mesh))
         self.external = ExternalForce(case, self.nodes, self.inertia)
         with agreed(comm):
             self.supports = Supports(case, self.nodes, mesh)

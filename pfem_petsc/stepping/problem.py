@@ -110,6 +110,8 @@ class StepProblem:
             if inertia.redistribution is not None:
                 moved = inertia.redistribution
                 matrix.add_blocks(moved.touched, balance.alpha * moved.tensors, values)
+        elif inertia.points is not None and balance.alpha:
+            matrix.add_lumped(balance.alpha * inertia.points, values)
         coefficients = inertia.coefficients(balance.alpha, balance.eta)
         if balance.weight or inertia.consistent:
             bars, arguments = self.model.bars, (balance.weight, coefficients, matrix.pattern, values)

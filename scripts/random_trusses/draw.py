@@ -14,6 +14,7 @@ import numpy as np
 
 from .body import Body, draw_body
 from .laws import draw_laws
+from .points import draw_points
 from .rupture import draw_rupture
 from .walls import draw_walls
 
@@ -72,6 +73,7 @@ def draw_case(seed: int) -> dict[str, Any]:
     _loads_over_time(random.Random(f"loads {seed}"), case, motion)
     _stiffness_damping(random.Random(f"stiffness damping {seed}"), case, body.limit)
     draw_rupture(random.Random(f"rupture {seed}"), case, motion.end)
+    draw_points(random.Random(f"points {seed}"), case, body.size)
     return _plain(case)
 
 

@@ -35,6 +35,7 @@ REFUSED = {
         ["section.strut.shape=tube", "section.strut.thickness=1e300"],
         ["section.strut", "thickness = 1e+300 m is too much"],
     ),
+    "number for a table": (["material.steel.rupture=3"], ["material.steel.rupture = 3", "expected a table"]),
     "infinite": (["time.end=inf"], ["time.end = inf", "finite number"]),
     "not a number": (["mesh.length=nan"], ["mesh.length = nan", "finite number"]),
     "negative area": (["section.strut.area=-1.0"], ["section.strut.area = -1.0", "> 0", "[m2]"]),

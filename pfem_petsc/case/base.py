@@ -6,7 +6,7 @@ name of the key, before any work is done. Imports pydantic only.
 
 from __future__ import annotations
 
-import math
+import sys
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
@@ -24,6 +24,7 @@ __all__ = [
     "StrictModel",
     "Vector3",
     "WallParameters",
+    "is_finite_number",
     "listed",
     "number_or_rows",
 ]
@@ -49,15 +50,21 @@ listed = BeforeValidator(_tuple_from_list)
 """Annotation of a tuple type that accepts TOML lists: ``Annotated[tuple[float, float], listed]``."""
 
 
+def is_finite_number(value: Any) -> bool:
+    """Return whether a value of a key of any type is a number that double precision holds."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    return abs(value) <= sys.float_info.max  # whole numbers may be too large to be converted
+
+
 def number_or_rows(value: Any) -> float | tuple[tuple[float, float], ...]:
     """Return a finite number, or rows of two, of a key that takes both; for validators."""
     expected = "expected a number in SI units, without quotes and unit, or rows [t, value]"
     rows = value if isinstance(value, list | tuple) else [[0.0, value]]
-    if not all(isinstance(row, list | tuple) and len(row) == 2 for row in rows):
+    if not rows or not all(isinstance(row, list | tuple) and len(row) == 2 for row in rows):
         raise ValueError(expected)
-    for number in (number for row in rows for number in row):
-        if isinstance(number, bool) or not isinstance(number, int | float) or not math.isfinite(number):
-            raise ValueError(expected)
+    if not all(is_finite_number(number) for row in rows for number in row):
+        raise ValueError(expected)
     if rows is value:
         return tuple((float(t), float(number)) for t, number in rows)
     return float(value)

@@ -187,6 +187,7 @@ _SIMPLE = {
     "int_type": "expected an integer",
     "string_type": "expected a text in quotes",
     "bool_type": "expected true or false",
+    "model_type": "expected a table",
     "finite_number": "expected a finite number",
     "string_too_short": "expected a text that is not empty",
     "string_pattern_mismatch": "expected a name without slashes and control characters",

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
-import math
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, InstanceOf, field_validator
 
 from ..registry import choices, nearest
-from .base import Name, NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt, StrictModel, listed
+from .base import (
+    Name,
+    NonNegativeFloat,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    StrictModel,
+    is_finite_number,
+    listed,
+)
 
 __all__ = [
     "ContactSettings",
@@ -47,7 +55,7 @@ class TimeKeys(StrictModel):
             return "auto"
         if isinstance(step, bool) or not isinstance(step, int | float):
             raise ValueError('expected a number of seconds in SI units without quotes and unit, or "auto"')
-        if not (step > 0 and math.isfinite(step)):
+        if not (step > 0 and is_finite_number(step)):
             raise ValueError('expected a finite number of seconds > 0, or "auto"')
         return _computable(float(step))
 

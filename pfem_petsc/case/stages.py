@@ -1,7 +1,8 @@
 """Stages of a case: each is a case of its own, made of the tables in force, so that all checks of a case serve.
 
-A table that a stage gives replaces that table from this stage on; the others stay in force. ``initial`` is the
-exception: velocities are added at the start of the stage that gives them, and at no later one.
+A table that a stage gives replaces that table from this stage on; the others stay in force. ``initial`` and ``remove``
+are the exceptions: velocities are added at the start of the stage that gives them, and at no later one, and what a
+stage removes is gone in later ones, which may not even know the supports.
 """
 
 from __future__ import annotations
@@ -32,6 +33,10 @@ TABLES = (
     "solver",
 )
 """Tables that a stage may give."""
+
+
+_OF_ONE_STAGE = ("initial", "remove")
+"""Tables that are in force in the stage alone that gives them."""
 
 
 class _Named(StrictModel):
@@ -103,8 +108,8 @@ def stages_of(data: Mapping[str, Any], problems: Problems) -> list[StageTables]:
         tables = {key: row[key] for key in given}
         if "output" in tables:
             tables["output"] = _output(tables["output"], common.get("output", {}), k, problems)
-        if k and "initial" not in given:
-            common.pop("initial", None)
+        for key in _OF_ONE_STAGE if k else ():
+            common.pop(key, None)
         common |= tables
         owner |= dict.fromkeys((*given, *ANALYSES), k)
         owner.pop("output", None)

@@ -182,7 +182,7 @@ class Section(StrictModel):
             raise ValueError('shape = "tube" and thickness [m] need each other')
         if self.shape is not None and self.second_moment is not None:
             raise ValueError("second_moment follows from the shape: give one of the two")
-        if self.thickness is not None and self.area is not None and math.pi * self.thickness**2 > self.area:
+        if self.thickness is not None and self.area is not None and self.thickness > math.sqrt(self.area / math.pi):
             raise ValueError(
                 f"thickness = {self.thickness!r} m is too much for a tube of area = {self.area!r} m2: a solid bar of "
                 f"this area has a radius of {math.sqrt(self.area / math.pi):.6g} m"

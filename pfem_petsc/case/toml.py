@@ -120,4 +120,4 @@ def _is_nested(value: Any) -> bool:
 
 
 def _key(key: str) -> str:
-    return key if re.fullmatch(r"[A-Za-z0-9_-]+", key) else value_text(key)
+    return key if re.fullmatch(r"[A-Za-z0-9_-]+", str(key)) else value_text(key)

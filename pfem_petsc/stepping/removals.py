@@ -42,7 +42,6 @@ class Removals:
         self._stepper, self._model = stepper, stepper.model
         case, mesh = self._model.case, self._model.mesh
         self._entries = list(case.remove)
-        self._held = case.holds("remove")
         self._complete = [False] * len(self._entries)
         self.times = [_NEVER] * len(self._entries)
         self.gone: list[str] = []
@@ -70,8 +69,6 @@ class Removals:
 
     def _left(self) -> list[Remove]:
         """Return what is not removed yet."""
-        if self._held:
-            return []
         return [entry for k, entry in enumerate(self._entries) if not self._done(k)]
 
     def next(self) -> float:
@@ -100,8 +97,6 @@ class Removals:
 
         Supports change on all ranks or on none.
         """
-        if self._held:
-            return False
         now, changed = self._stepper.state.time, False
         for k, entry in enumerate(self._entries):
             if self._complete[k] or now < entry.time - TIME * max(entry.time, self._stepper.h):
@@ -120,7 +115,7 @@ class Removals:
         """Continue after state, times and reactions were restored."""
         for k, entry in enumerate(self._entries):
             self._complete[k] = self._done(k)
-            if entry.supports in self.gone and self.times[k] >= 0.0 and not self._held:
+            if entry.supports in self.gone and self.times[k] >= 0.0:
                 self._replace(entry, self.times[k])
         self._release(self.gone)
 

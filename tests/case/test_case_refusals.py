@@ -25,6 +25,17 @@ REFUSED = {
     "float for an integer": (["mesh.elements=4.0"], ["mesh.elements = 4.0", "expected an integer"]),
     "too large an integer": (["solver.max_newton=9223372036854775808"], ["solver.max_newton", "< 9.22337e+18"]),
     "integer beyond floats": ([f"time.end=1{'0' * 400}"], ["time.end", "fits in double precision"]),
+    "integer beyond floats for a step": ([f"time.step=1{'0' * 400}"], ["time.step", "finite number of seconds"]),
+    "integer beyond floats for a prestress": (
+        [f"section.strut.prestress=1{'0' * 400}"],
+        ["section.strut.prestress", SI],
+    ),
+    "no rows of a prestress": (["section.strut.pretension=[]"], ["section.strut.pretension = []", "rows [t, value]"]),
+    "thickness whose square overflows": (
+        ["section.strut.shape=tube", "section.strut.thickness=1e300"],
+        ["section.strut", "thickness = 1e+300 m is too much"],
+    ),
+    "number for a table": (["material.steel.rupture=3"], ["material.steel.rupture = 3", "expected a table"]),
     "infinite": (["time.end=inf"], ["time.end = inf", "finite number"]),
     "not a number": (["mesh.length=nan"], ["mesh.length = nan", "finite number"]),
     "negative area": (["section.strut.area=-1.0"], ["section.strut.area = -1.0", "> 0", "[m2]"]),
@@ -298,6 +309,12 @@ def test_a_simulation_is_of_a_case(given):
 
     with pytest.raises(InputError, match=r"expected a Case, got .*Case\.load .*Case\.from_dict"):
         Simulation(given)
+
+
+def test_numbers_as_keys_of_a_table_are_refused_with_the_table():
+    case = {"support": [{"node_set": "every", "fix": "x", "motion": {1: 2}}]}
+    with pytest.raises(InputError, match=r"support\[0\].motion = {1 = 2}"):
+        Case.from_dict(case)
 
 
 def test_ranges_stand_for_lists():

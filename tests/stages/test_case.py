@@ -38,6 +38,20 @@ def test_text_of_a_case_reads_back_equal():
     assert again.stages[2].support == []
 
 
+def test_a_support_that_a_stage_removes_need_not_be_known_to_later_ones():
+    data = {key: value for key, value in BLOCK.items() if key not in ("stage", "support")}
+    first = {
+        "static": {"step": 1.0},
+        "support": [{"name": "held", "node_set": "side", "fix": "z"}],
+        "remove": [{"supports": "held", "time": 0.5}],
+    }
+    motion = {"integrator": "newmark", "step": 1e-6, "end": 1e-5}
+    later = {"time": motion, "support": [{"node_set": "side", "fix": "xy"}]}
+    case = Case.from_dict({**data, "stage": [first, later]})
+    assert [len(stage.remove) for stage in case.stages] == [1, 0]
+    assert Case.from_toml(case.to_toml()) == case
+
+
 def test_modes_belong_to_the_last_stage():
     case = Case.from_dict({**BLOCK, "modes": {"count": 3}})
     assert [stage.modes is not None for stage in case.stages] == [False, False, False, True]

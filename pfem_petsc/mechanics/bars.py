@@ -2,32 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ..case.materials import internal_variables, law_of
+from ..case.materials import internal_variables
 from ..energies import BAR_ENERGIES
-from ..errors import InputError
 from ..fields import STATUS
-from .compiled import kernel
-from .conserving import make_conserving_kernels
-from .kernels import make_kernels
-from .materials.base import Law, UnsuitableBarError
-from .rupture import breakable, limit_values, make_release
-from .sections import areas_of, bar_shapes
-from .strain import MEASURES
-from .sweep import Sweep, make_sweep
+from .bar_blocks import BarBlock, laws_of, make_blocks
+from .bar_geometry import bar_lengths, first_inverted
 
 if TYPE_CHECKING:
     from ..case.schema import Case
     from ..mesh.distribution import DistributedMesh
     from ..solvers.matrix import BlockPattern
 
-__all__ = ["BarBlock", "Bars", "StrainEnergy", "first_inverted"]
+__all__ = ["Bars", "StrainEnergy"]
 
 
 class StrainEnergy(NamedTuple):
@@ -48,73 +38,6 @@ class StrainEnergy(NamedTuple):
     def total(self) -> float:
         """Stored and dissipated energy [J]."""
         return sum(self.energies)
-
-
-@dataclass(frozen=True)
-class BarBlock:
-    """Local bars [start, stop) of one section, of which [start, counted) are counted on this rank.
-
-    ``area`` [m2] is a number, or (stop - start,) if it differs from bar to bar. ``modulus`` is the largest tangent
-    modulus of the law [Pa]; ``history`` (rows, stop - start) holds ``law.rows`` and, after them, ``law.bar_data``;
-    ``release`` removes bars, if they can leave the model.
-    """
-
-    section: str
-    start: int
-    counted: int
-    stop: int
-    area: float | np.ndarray
-    density: float
-    damping: float
-    thermal_expansion: float
-    law: Law
-    measure: Callable
-    parameters: tuple[float, ...]
-    modulus: float
-    history: np.ndarray
-    sweep: Sweep
-    kernels: SimpleNamespace
-    conserving: SimpleNamespace | None
-    release: Callable | None
-
-    @property
-    def counted_area(self) -> float | np.ndarray:
-        """Area of the counted bars [m2], a number or (counted - start,)."""
-        return self.area if isinstance(self.area, float) else self.area[: self.counted - self.start]
-
-    def variables(self) -> Iterator[tuple[str, str, np.ndarray]]:
-        """Yield name, unit and values (stop - start,) of all data kept from step to step."""
-        for (name, unit), values in zip(self.law.rows, self.history, strict=False):
-            yield name, unit, values
-
-
-@kernel
-def _lengths(points, bars, rest):
-    for k in range(len(bars)):
-        a = bars[k, 0]
-        b = bars[k, 1]
-        dx = points[b, 0] - points[a, 0]
-        dy = points[b, 1] - points[a, 1]
-        dz = points[b, 2] - points[a, 2]
-        rest[k] = (dx * dx + dy * dy + dz * dz) ** 0.5
-
-
-@kernel
-def first_inverted(x, before, bars, rest):
-    """Return the first shortened bar whose direction has reversed, or -1; those with zero ``rest`` are not checked."""
-    for k in range(len(bars)):
-        a = bars[k, 0]
-        b = bars[k, 1]
-        dx = x[b, 0] - x[a, 0]
-        dy = x[b, 1] - x[a, 1]
-        dz = x[b, 2] - x[a, 2]
-        if dx * dx + dy * dy + dz * dz < 0.8 * rest[k] * rest[k]:
-            back = dx * (before[b, 0] - before[a, 0])
-            back += dy * (before[b, 1] - before[a, 1])
-            back += dz * (before[b, 2] - before[a, 2])
-            if back < 0.0:
-                return k
-    return -1
 
 
 class Bars:
@@ -141,75 +64,21 @@ class Bars:
         self.mesh, self.case = mesh, case
         self.ends = mesh.bars
         self.mesh_lengths = np.empty(len(mesh.bars))
-        _lengths(mesh.points, mesh.bars, self.mesh_lengths)
+        bar_lengths(mesh.points, mesh.bars, self.mesh_lengths)
         self.rest = self.mesh_lengths
         self.rest_at_start = np.empty(0)
         self.heat = np.empty((2, 0))
         self.heat_at_start = self.heat
         self.step = 0.0
         self.internal = internal_variables(case.material)
-        laws = {section.material: law_of(case.material[section.material]) for section in case.section.values()}
-        intact = dict(laws)
-        for name in laws:
-            if case.material[name].rupture is not None or case.removes_bars:
-                laws[name] = breakable(laws[name])
-        self.can_break = any(law.rupture >= 0 for law in laws.values())
+        self.blocks = make_blocks(mesh, case, self.mesh_lengths)
+        laws = laws_of(case).values()
+        self.can_break = any(law.rupture >= 0 for law in laws)
         self._watched = np.empty(len(mesh.bars) if self.can_break else 0)
-        self.kept_names = list(dict.fromkeys(name for law in laws.values() for name, _ in law.rows))
+        self.kept_names = list(dict.fromkeys(name for law in laws for name, _ in law.rows))
         self.far = np.maximum(
             mesh.bars[:, 0], mesh.bars[:, 1], out=np.empty(len(mesh.bars), dtype=np.uint32), casting="unsafe"
         )
-        names = list(case.section)
-        self.blocks: list[BarBlock] = []
-        for block in mesh.blocks:
-            section = case.section[names[block.section]]
-            material = case.material[section.material]
-            law, measure = laws[section.material], MEASURES[material.strain]
-            self.blocks.append(
-                BarBlock(
-                    section=names[block.section],
-                    start=block.start,
-                    counted=block.counted,
-                    stop=block.stop,
-                    area=areas_of(section, block, mesh),
-                    density=material.density,
-                    damping=material.damping,
-                    thermal_expansion=material.thermal_expansion,
-                    law=law,
-                    measure=measure,
-                    parameters=(*(limit_values(material.rupture) if law.rupture >= 0 else ()), *material.numbers()),
-                    modulus=material.upper_modulus(),
-                    history=np.zeros((len(law.rows) + len(law.bar_data), block.stop - block.start)),
-                    sweep=make_sweep(mesh.bars, block.start, block.counted, block.stop),
-                    kernels=make_kernels(law, measure),
-                    conserving=None if law.mean_stress is None else make_conserving_kernels(law, measure),
-                    release=make_release(intact[section.material], measure) if law.rupture >= 0 else None,
-                )
-            )
-        self.fill_bar_data()
-
-    def fill_bar_data(self) -> None:
-        """Give laws what they read of each bar, with its length in the mesh; to be repeated when areas have changed.
-
-        Raises
-        ------
-        InputError
-            On this rank, if a law cannot describe one of its bars.
-        """
-        for block in self.blocks:
-            if not block.law.bar_data:
-                continue
-            section, part = self.case.section[block.section], slice(block.start, block.stop)
-            shapes = bar_shapes(section, self.mesh_lengths[part], np.broadcast_to(block.area, block.stop - block.start))
-            try:
-                data = self.case.material[section.material].pack_bars(shapes)
-            except UnsuitableBarError as error:
-                bar = self.mesh.bar_ids[block.start + error.bar]
-                raise InputError(
-                    f"{self.case.source}: section.{block.section} with material.{section.material}: bar {bar}: "
-                    f"{error.reason}"
-                ) from error
-            block.history[len(block.law.rows) :] = data
 
     @property
     def slackens(self) -> bool:
@@ -326,7 +195,7 @@ class Bars:
     def lengths(self, x: np.ndarray) -> np.ndarray:
         """Return the length (b,) of each local bar [m]."""
         lengths = np.empty_like(self.rest)
-        _lengths(x, self.ends, lengths)
+        bar_lengths(x, self.ends, lengths)
         return lengths
 
     def fields(self, x: np.ndarray) -> dict[str, np.ndarray]:

@@ -9,7 +9,8 @@ import numpy as np
 from ..energies import BAR_ENERGIES
 
 if TYPE_CHECKING:
-    from .bars import BarBlock, Bars
+    from .bar_blocks import BarBlock
+    from .bars import Bars
 
 __all__ = ["release", "state_before_rupture"]
 

@@ -18,7 +18,8 @@ from .rows import bar_value
 if TYPE_CHECKING:
     from ..case.schema import Case
     from ..mesh.distribution import DistributedMesh
-    from .bars import BarBlock, Bars
+    from .bar_blocks import BarBlock
+    from .bars import Bars
 
 __all__ = ["Inertia", "consistent_product", "point_masses"]
 

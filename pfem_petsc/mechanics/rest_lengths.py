@@ -27,7 +27,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from ..case.schema import Case
-    from .bars import BarBlock, Bars
+    from .bar_blocks import BarBlock
+    from .bars import Bars
     from .materials.base import Law
 
     Bar = tuple[Law, tuple, Callable]

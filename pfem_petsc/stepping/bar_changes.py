@@ -20,7 +20,7 @@ from ..mechanics.materials._work import SMALL
 from ..mechanics.strain import MEASURES
 
 if TYPE_CHECKING:
-    from ..mechanics.bars import BarBlock
+    from ..mechanics.bar_blocks import BarBlock
     from .stepper import Stepper
 
 __all__ = ["BarChanges"]

@@ -15,7 +15,7 @@ import numpy as np
 from ..contact.flat import press_planes
 from ..contact.impact_loops import join_nodes, plane_gaps, stop_nodes, unpressed
 from ..contact.log import compare_contacts
-from ..mechanics.bars import first_inverted
+from ..mechanics.bar_geometry import first_inverted
 from ..mechanics.compiled import kernel
 from ..output.sums import HEAD
 from .impulses import WALLS, fill_impulses

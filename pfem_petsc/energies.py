@@ -47,6 +47,7 @@ ENERGIES = (
     Energy("thermal_work", "supplied", "ledger"),
     Energy("prestress_work", "supplied", "ledger"),
     Energy("numerical_dissipation", "lost", "ledger"),
+    Energy("spring_energy", "stored", "bars"),  # of springs to the ground, whose forces are added to those of the bars
 )
 
 STORED, LOST, SUPPLIED = (tuple(e.name for e in ENERGIES if e.side == side) for side in ("stored", "lost", "supplied"))

@@ -28,6 +28,8 @@ MODELS = [
         tables.VaryingWind,
         tables.Temperature,
         tables.NodalMass,
+        tables.Spring,
+        tables.Dashpot,
         tables.Remove,
         settings.TimeKeys,
         settings.StaticKeys,

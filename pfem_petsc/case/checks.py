@@ -36,7 +36,7 @@ def check_names(case: Mapping[str, Any], data: Mapping[str, Any], problems: Prob
     _unique("section", [(name, s.bars) for name, s in case["section"].items()], problems)
 
     on = [entry for entry in case["initial"] if entry.node_set is not None]
-    for key in ("support", "mass", "load", "wall"):
+    for key in ("support", "mass", "spring", "dashpot", "load", "wall"):
         for i, entry in enumerate(case[key]):
             _node_set((key, i), entry, node_sets, problems)
     for i, entry in enumerate(on):

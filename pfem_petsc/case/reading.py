@@ -36,7 +36,8 @@ _LONG_KEY = re.compile(r"""(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*)""" +
 
 KEYS = [
     *("title", "mesh", "node_set", "material", "section", "initial", "support"),
-    *("mass", "load", "gravity", "wind", "temperature", "wall", "contact_pair", "constraint", "remove", "contact"),
+    *("mass", "spring", "dashpot", "load", "gravity", "wind", "temperature", "wall", "contact_pair", "constraint"),
+    *("remove", "contact"),
     *("time", "static", "stage", "modes", "output", "solver"),
 ]
 """Top-level keys of a case file."""
@@ -108,6 +109,8 @@ def read_tables(data: Mapping[str, Any], folder: Path, problems: Problems) -> di
         "initial": _initial(data, problems),
         "support": read_tabled(t.Support, data, "support", files, problems, ("motion", "acceleration"), ("velocity",)),
         "mass": _listed(t.NodalMass, data.get("mass"), ("mass",), problems),
+        "spring": _listed(t.Spring, data.get("spring"), ("spring",), problems),
+        "dashpot": _listed(t.Dashpot, data.get("dashpot"), ("dashpot",), problems),
         "load": read_loads(data, folder, files, problems),
         **{
             table: read_varying(data[table], table, m, files, problems) if table in data else None

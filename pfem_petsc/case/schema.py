@@ -34,7 +34,7 @@ class Case:
     mesh : :class:`~pfem_petsc.case.tables.Mesh`: generator with parameters, or file
     node_set, material, section : tables by name, in file order
     initial, support, load, temperature, wall, contact_pair, constraint, remove : lists of tables
-    point_mass : list of tables ``[[mass]]``
+    point_mass : list of tables ``[[mass]]``; spring, dashpot : lists of tables
     gravity, wind : :class:`~pfem_petsc.case.tables.Gravity`, :class:`~pfem_petsc.case.tables.Wind`, or None
     contact, output, solver : tables of :mod:`~pfem_petsc.case.settings`
     time, static, modes : what is computed, None for what is not; ``time`` and ``static`` exclude each other
@@ -214,6 +214,8 @@ class Case:
             "initial": {**initial, "on": on} if on else initial,
             "support": [_table(entry) for entry in self.support],
             "mass": [_table(entry) for entry in self.point_mass],
+            "spring": [_table(entry) for entry in self.spring],
+            "dashpot": [_table(entry) for entry in self.dashpot],
             "load": [_table(entry) for entry in self.load],
             "gravity": _table(self.gravity),
             "wind": _table(self.wind),

@@ -21,11 +21,12 @@ from .base import (
     number_or_rows,
 )
 from .load_tables import Gravity, Load, LoadFile, Temperature, VaryingGravity, VaryingWind, Wind
-from .point_tables import NodalMass
+from .point_tables import Dashpot, NodalMass, Spring
 from .rows import FileName, Table4, increasing
 
 __all__ = [
     "ContactPair",
+    "Dashpot",
     "Gravity",
     "Initial",
     "Load",
@@ -37,6 +38,7 @@ __all__ = [
     "PRESTRESSES",
     "Remove",
     "Section",
+    "Spring",
     "Support",
     "Temperature",
     "VaryingGravity",

@@ -16,14 +16,17 @@ if TYPE_CHECKING:
     from ..case.schema import Case
     from ..mesh.distribution import DistributedMesh
     from ..solvers.matrix import BlockPattern
+    from .springs import Springs
 
 __all__ = ["Bars", "StrainEnergy"]
 
+_OF_SPRINGS = BAR_ENERGIES.index("spring_energy")
+
 
 class StrainEnergy(NamedTuple):
-    """Sums over the bars counted on this rank, in the order of :data:`~pfem_petsc.energies.BAR_ENERGIES` [J], the first
-    collapsed bar (local index, -1: none), whether any bar is so short that it may be inverted, and how many local bars
-    have changed their state of rupture."""
+    """Sums over the bars counted on this rank, and its springs, in the order of
+    :data:`~pfem_petsc.energies.BAR_ENERGIES` [J], the first collapsed bar (local index, -1: none), whether any bar is
+    so short that it may be inverted, and how many local bars have changed their state of rupture."""
 
     energies: tuple[float, ...] = (0.0,) * len(BAR_ENERGIES)
     failed: int = -1
@@ -58,7 +61,10 @@ class Bars:
     internal : name and unit of the internal variables of all laws of the case
     kept_names : names of all data that laws keep from step to step, the same on all ranks
     blocks : bars by section
+    springs : from nodes to the ground, whose forces and stiffness are added to those of the bars; None without
     """
+
+    springs: Springs | None = None
 
     def __init__(self, mesh: DistributedMesh, case: Case) -> None:
         self.mesh, self.case = mesh, case
@@ -127,6 +133,8 @@ class Bars:
             changed += broke
             if failed < 0:
                 failed = at
+        if self.springs is not None:
+            energies[_OF_SPRINGS] = self.springs.add_forces(x, f)
         return StrainEnergy(tuple(energies.tolist()), failed, shortened, changed)
 
     def keep_start(self) -> None:
@@ -158,9 +166,12 @@ class Bars:
                 pattern.slots,
                 values,
             )
+        if self.springs is not None:
+            self.springs.add_tangents(weight, pattern, values)
 
     def linearise(self, x: np.ndarray, weight: float, stored: np.ndarray) -> None:
-        """Fill ``stored`` (b, 5) with n, dN/dl - N/l [N/m] and N/l [N/m], times ``weight``, for each bar at ``x``."""
+        """Fill ``stored`` (b, 5) with n, dN/dl - N/l [N/m] and N/l [N/m], times ``weight``, for each bar at ``x``;
+        without springs."""
         for block in self.blocks:
             block.kernels.linearise(*self._arguments(x, block), block.start, block.stop, weight, stored)
 
@@ -170,6 +181,8 @@ class Bars:
         for block in self.blocks:
             arguments = self._arguments(x, block)
             block.conserving.forces(x0, self.heat_at_start, self.rest_at_start, *arguments, block.start, block.stop, f)
+        if self.springs is not None:
+            self.springs.add_step_forces(x0, x, f)
 
     def step_tangents(
         self,
@@ -185,12 +198,16 @@ class Bars:
             start = (x0, self.heat_at_start, self.rest_at_start)
             arguments = (*start, *self._arguments(x, block), block.start, block.stop)
             block.conserving.tangents(*arguments, m, self.mesh_lengths, weight, pattern.ptr, pattern.slots, values)
+        if self.springs is not None:  # the force at mid-step
+            self.springs.add_tangents(0.5 * weight, pattern, values)
 
     def product(self, x: np.ndarray, u: np.ndarray, out: np.ndarray) -> None:
         """Compute ``out`` = K_t(x) u for local arrays (nodes, 3); valid for owned nodes."""
         out[:] = 0.0
         for block in self.blocks:
             block.kernels.product(*self._arguments(x, block), block.start, block.stop, u, out)
+        if self.springs is not None:
+            self.springs.add_product(1.0, u, out)
 
     def lengths(self, x: np.ndarray) -> np.ndarray:
         """Return the length (b,) of each local bar [m]."""

@@ -2,7 +2,7 @@
 
 The consistent mass of a bar is rho A l0 / 6 [[2, 1], [1, 2]] for each direction; its row sums are the lumped mass
 rho A l0 / 2. Damping is c_m per reference volume, distributed in the same way. Masses of ``[[mass]]`` are those of
-their nodes, on the diagonal of both matrices.
+their nodes, on the diagonal of both matrices, and so are dashpots to the ground in the damping.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from .bar_blocks import BarBlock
     from .bars import Bars
 
-__all__ = ["Inertia", "consistent_product", "point_masses"]
+__all__ = ["Inertia", "PointInertia", "consistent_product"]
 
 
 @kernel
@@ -45,14 +45,35 @@ def consistent_product(bars, lengths, start, stop, density, u, out):
             out[b, i] += m * (u[a, i] + 2.0 * u[b, i])
 
 
-def point_masses(case: Case, nodes: dict[str, np.ndarray], mesh: DistributedMesh) -> np.ndarray | None:
-    """Return the masses of ``[[mass]]`` (owned,) [kg]; None if the case has none. A node in several gets their sum."""
-    if not case.point_mass:
-        return None
-    points = np.zeros(mesh.n_owned)
-    for entry in case.point_mass:
-        points[nodes[entry.node_set]] += entry.value
-    return points
+class PointInertia:
+    """Masses and dashpots of nodes besides those of their bars. A node in several tables gets their sum.
+
+    Attributes
+    ----------
+    mass, damping : (owned,) [kg], [kg/s]; None if the case has none
+    """
+
+    def __init__(self, case: Case, nodes: dict[str, np.ndarray], mesh: DistributedMesh) -> None:
+        self.mass: np.ndarray | None = None
+        self.damping: np.ndarray | None = None
+        if case.point_mass:
+            self.mass = np.zeros(mesh.n_owned)
+            for entry in case.point_mass:
+                self.mass[nodes[entry.node_set]] += entry.value
+        if case.dashpot:
+            self.damping = np.zeros(mesh.n_owned)
+            for entry in case.dashpot:
+                self.damping[nodes[entry.node_set]] += entry.coefficient
+
+    @property
+    def any(self) -> bool:
+        """Whether the case has any, the same on all ranks."""
+        return self.mass is not None or self.damping is not None
+
+    def nodal(self, alpha: float, eta: float) -> np.ndarray:
+        """Return alpha m + eta c (owned,) [N/m], if there are :attr:`any`."""
+        mass = 0.0 if self.mass is None else alpha * self.mass
+        return mass + (0.0 if self.damping is None else eta * self.damping)
 
 
 class Inertia:
@@ -61,12 +82,12 @@ class Inertia:
     Attributes
     ----------
     mass, damping : (owned,) lumped values; also the row sums of the consistent matrices
-    points : (owned,) masses of nodes besides those of their bars, part of ``mass``; None for none on any rank
+    points : PointInertia, part of ``mass`` and ``damping``
     consistent : whether products use the consistent matrices
     damped : whether any bar of the whole model has damping
     """
 
-    def __init__(self, mesh: DistributedMesh, bars: Bars, consistent: bool, points: np.ndarray | None) -> None:
+    def __init__(self, mesh: DistributedMesh, bars: Bars, consistent: bool, points: PointInertia) -> None:
         self.mesh = mesh
         self.bars = bars
         self.consistent = consistent
@@ -79,17 +100,19 @@ class Inertia:
                 _lump(bars.ends, bars.mesh_lengths, block.start, block.stop, block.damping * block.area, damping)
         self.mass = mass[: mesh.n_owned].copy()
         self.points = points
-        if points is not None:
-            self.mass += points
+        if points.mass is not None:
+            self.mass += points.mass
         self.damping = damping[: mesh.n_owned].copy()
-        self.damped = bool(mesh.comm.allreduce(float(damping.sum())) > 0.0)
+        if points.damping is not None:
+            self.damping += points.damping
+        self.damped = bool(mesh.comm.allreduce(float(self.damping.sum())) > 0.0)
         if consistent:
             self._u = np.zeros((mesh.n_local, 3))
             self._out = np.zeros((mesh.n_local, 3))
 
     def damp(self, damping: np.ndarray) -> None:
-        """Replace the damping by values of nodes (owned,). Collective."""
-        self.damping = damping
+        """Replace the damping, that of dashpots included, by values of nodes (owned,). Collective."""
+        self.damping, self.points.damping = damping, None
         self.damped = bool(self.mesh.comm.allreduce(float(damping.sum())) > 0.0)
 
     @property
@@ -100,8 +123,8 @@ class Inertia:
     def mass_times(self, a: np.ndarray, out: np.ndarray) -> np.ndarray:
         """Compute ``out`` = M a for owned nodes, both (owned, 3). Collective with consistent mass."""
         self._times(a, out, self.mass, lambda block: block.density)
-        if self.consistent and self.points is not None:
-            out += self.points[:, None] * a
+        if self.consistent and self.points.mass is not None:
+            out += self.points.mass[:, None] * a
         return out
 
     def damping_times(self, v: np.ndarray, out: np.ndarray) -> np.ndarray:
@@ -109,7 +132,10 @@ class Inertia:
         if not self.damped:
             out[:] = 0.0
             return out
-        return self._times(v, out, self.damping, lambda block: block.damping)
+        self._times(v, out, self.damping, lambda block: block.damping)
+        if self.consistent and self.points.damping is not None:
+            out += self.points.damping[:, None] * v
+        return out
 
     def _times(
         self, u: np.ndarray, out: np.ndarray, lumped: np.ndarray, density: Callable[[BarBlock], float]

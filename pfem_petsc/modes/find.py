@@ -155,7 +155,7 @@ def _buckling(
         )
     geometric[:, 3:] *= -1.0
     pencil = Pencil(
-        matrices.stiffness(geometric, 0.0),
+        matrices.stiffness(geometric, 0.0, springs=False),
         matrices.stiffness(material, float(largest[1])),
         state.position,
         holds.held,

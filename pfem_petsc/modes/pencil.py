@@ -125,15 +125,20 @@ class StateMatrices:
         self.inertia = model.inertia if same else Inertia(model.mesh, model.bars, consistent, model.inertia.points)
         self._ends = model.mesh.bars.astype(np.int64)
 
-    def stiffness(self, bars: np.ndarray, diagonal: float | np.ndarray, added: tuple | None = None) -> PETSc.Mat:
+    def stiffness(
+        self, bars: np.ndarray, diagonal: float | np.ndarray, added: tuple | None = None, springs: bool = True
+    ) -> PETSc.Mat:
         """Return the matrix of bars (b, 5), with ``diagonal`` (owned,) at held components. Collective.
 
+        ``springs``: whether those to the ground are part of it
         ``added``: owned nodes (m,) and blocks (m, 3, 3) [N/m] to add
         """
         matrix = HessianMatrix(self.model.mesh, self.model.supports.fixed, False)
 
         def fill(values: np.ndarray) -> None:
             matrix.add_bars(bars, values)
+            if springs and self.model.bars.springs is not None:
+                self.model.bars.springs.add_tangents(1.0, matrix.pattern, values)
             if added is not None:
                 matrix.add_blocks(*added, values)
 
@@ -149,8 +154,8 @@ class StateMatrices:
         def fill(values: np.ndarray) -> None:
             coefficients = inertia.coefficients(1.0, 0.0)
             self.model.bars.tangents(mesh.points, 0.0, coefficients, matrix.pattern, values)
-            if inertia.points is not None:
-                matrix.add_lumped(inertia.points, values)
+            if inertia.points.mass is not None:
+                matrix.add_lumped(inertia.points.mass, values)
 
         return self.holds.taken_out(matrix.fill(fill), inertia.mass)
 
@@ -163,6 +168,8 @@ class StateMatrices:
         axial, transverse = bars[:, 3] + bars[:, 4], bars[:, 4]
         low = self._at_nodes(2.0 * np.minimum(np.minimum(axial, transverse), 0.0))
         high = self._at_nodes(2.0 * np.maximum(np.maximum(axial, transverse), 0.0))
+        if self.model.bars.springs is not None:
+            high[self.model.bars.springs.nodes] += self.model.bars.springs.stiffness.max(axis=1)
         if blocks is not None:
             nodes, added = blocks
             values = np.linalg.eigvalsh(added)

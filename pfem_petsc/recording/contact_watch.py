@@ -84,7 +84,7 @@ class ContactWatch:
         """What an explicit scheme's own energy may have gained for a while [J]: all of it where nothing dissipates."""
         if not row["plastic_dissipation"] > 0.0 and not row["damping_dissipation"] > 0.0:
             return float("inf")
-        return self.swing * row["elastic_energy"]
+        return self.swing * (row["elastic_energy"] + row["spring_energy"])
 
     @staticmethod
     def _causes(row: dict[str, Any]) -> str:

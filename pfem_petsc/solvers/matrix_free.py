@@ -240,8 +240,8 @@ class MatrixFreeHessian:
             coefficients = inertia.coefficients(problem.balance.alpha, problem.balance.eta)
             for block, coefficient in zip(bars.blocks, coefficients, strict=True):
                 consistent_product(bars.ends, bars.mesh_lengths, block.start, block.stop, 6.0 * coefficient, u, out)
-            if inertia.points is not None:
-                out[:owned] += problem.balance.alpha * inertia.points[:, None] * u[:owned]
+            if inertia.points.any:
+                out[:owned] += inertia.points.nodal(problem.balance.alpha, problem.balance.eta)[:, None] * u[:owned]
         else:
             np.multiply(problem.nodal[:, None], u[:owned], out=out[:owned])
             out[owned:] = 0.0
@@ -250,6 +250,8 @@ class MatrixFreeHessian:
                 out[moved.touched] += problem.balance.alpha * np.einsum("kij,kj->ki", moved.tensors, u[moved.touched])
         for block in bars.blocks:
             _product(block.sweep.heads, block.sweep.starts, bars.far, self.stored, u, out)
+        if bars.springs is not None:
+            bars.springs.add_product(problem.balance.weight, u, out)
         problem.transform.linear(self._left, u, out)
         if fixed is not None:
             out[:owned][fixed] = held
@@ -259,6 +261,9 @@ class MatrixFreeHessian:
         problem, owned = self._problem, self.mesh.n_owned
         blocks = np.zeros((self.mesh.n_local, 6))
         _diagonal(self.mesh.bars, self.stored, blocks)
+        springs = self.model.bars.springs
+        if springs is not None:
+            blocks[springs.nodes[:, None], [0, 3, 5]] += problem.balance.weight * springs.stiffness
         if self.model.inertia.redistribution is not None:
             moved = self.model.inertia.redistribution
             upper = moved.tensors.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
@@ -266,8 +271,8 @@ class MatrixFreeHessian:
         inertia, nodal = self.model.inertia, problem.nodal
         if inertia.consistent:  # the diagonal of the bars' consistent mass is two thirds of the lumped one
             nodal = 2.0 / 3.0 * nodal
-            if inertia.points is not None:
-                nodal += problem.balance.alpha / 3.0 * inertia.points
+            if inertia.points.any:
+                nodal += inertia.points.nodal(problem.balance.alpha, problem.balance.eta) / 3.0
         diagonal = blocks[:owned][:, [0, 3, 5]] + nodal[:, None]
         problem.transform.diagonal(self._left, lambda nodes: self._blocks(blocks, nodal, nodes), diagonal)
         if self.model.supports.any:

@@ -122,6 +122,11 @@ def _check(model: Model) -> None:
             f'{source}: contact.treatment = "{case.contact.treatment}" treats impacts, and a static analysis has none; '
             "remove the key"
         )
+    if case.spring and case.static.method != "newton":
+        raise InputError(
+            f'{source}: spring: static.method = "{case.static.method}" does not have springs to the ground; take '
+            '"newton", or bars to supported nodes as springs'
+        )
     if model.external.wind is not None and model.external.wind.fastest():
         raise InputError(
             f"{source}: wind: drag turns with the bars, which a static analysis does not follow; take [time] with "
@@ -140,7 +145,8 @@ def _check(model: Model) -> None:
                 f'{source}: material.{name}.law = "{law_name(dict(material))}" depends on the rate of strain, and a '
                 "static analysis has no time; take another law"
             )
-    if not model.supports.any and not model.can_touch:
+    if not model.supports.any and not model.can_touch and model.bars.springs is None:
         raise InputError(
-            f"{source}: static: nothing holds the truss: its rigid-body motions are free; give a [[support]]"
+            f"{source}: static: nothing holds the truss: its rigid-body motions are free; give a [[support]] or "
+            "[[spring]]"
         )

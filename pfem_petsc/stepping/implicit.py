@@ -274,7 +274,7 @@ class ImplicitStepper(Stepper):
             if outcome.settled:
                 break
             candidates, links, guess = outcome.candidates, outcome.links, u
-        if not trial.candidates.anywhere and not model.supports.any:
+        if not trial.candidates.anywhere and not model.supports.any and model.bars.springs is None:
             self._keep_momentum(problem, u, g)
         state.contact, walls, self.held = active_set.forces(outcome, u)
         held = model.links.count_held(np.flatnonzero(self.held), len(u))

@@ -29,7 +29,7 @@ from ..output.sums import HEAD
 from .bar_changes import BarChanges
 from .impulses import Impulses, NoImpulses, wall_shares
 from .moment import Moment, balanced, moment_of
-from .node_loops import WORKS, book_nodes
+from .node_loops import TOTALS, WORKS, book_nodes
 from .sum_loops import add_totals, add_works
 
 if TYPE_CHECKING:
@@ -39,6 +39,7 @@ __all__ = ["Ledger"]
 
 _NOTHING = np.empty((0, 3))
 _AT = {energy.name: HEAD.first(energy.name) for energy in ENERGIES if energy.source != "derived"}
+_SUPPORT = TOTALS.index("support")
 _TOTALS = slice(HEAD.first("momentum"), HEAD["support_force"].stop)
 
 
@@ -234,6 +235,8 @@ class Ledger:
             self._works,
         )
         self.sums[_AT["kinetic_energy"]] = present.kinetic
+        if self.model.bars.springs is not None:  # reactions of the ground: the forces of bars cancel in the sum
+            self._totals[_SUPPORT] -= second.internal.sum(axis=0)
         add_totals(self.sums, self._totals)
 
     def _pair(self, first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -14,10 +14,11 @@ from ..errors import InputError
 from ..mechanics.bars import Bars
 from ..mechanics.compiled import kernel
 from ..mechanics.loads import ExternalForce
-from ..mechanics.mass import Inertia, point_masses
+from ..mechanics.mass import Inertia, PointInertia
 from ..mechanics.rest_lengths import RestLengths
 from ..mechanics.rows import bar_value
 from ..mechanics.sections import area_fields, check_areas, section_of_bars
+from ..mechanics.springs import make_springs
 from ..mechanics.supports import Supports
 from ..mechanics.temperature import Temperatures
 from ..mesh import load_slab
@@ -69,7 +70,8 @@ class Model:
             self.warnings.append(f"{adjusted} node{'s' * (adjusted > 1)} that started beyond walls moved onto them")
         with agreed(comm):
             self.bars = Bars(mesh, case)
-        self.inertia = Inertia(mesh, self.bars, case.mass == "consistent", point_masses(case, self.nodes, mesh))
+        self.bars.springs = make_springs(case, self.nodes, mesh)
+        self.inertia = Inertia(mesh, self.bars, case.mass == "consistent", PointInertia(case, self.nodes, mesh))
         self.external = ExternalForce(case, self.nodes, self.inertia)
         with agreed(comm):
             self.supports = Supports(case, self.nodes, mesh)
@@ -145,7 +147,7 @@ class Model:
     @property
     def steady(self) -> bool:
         """Whether the model is constant in time, and the fused loop supports its bars and contact."""
-        moving = self.supports.moving or self.bars_vary or bool(self.links)
+        moving = self.supports.moving or self.bars_vary or bool(self.links) or self.bars.springs is not None
         return not moving and len(self.bars.blocks) == 1 and self.external.steady and self.contact.steady
 
     def initial_velocity(self) -> np.ndarray:

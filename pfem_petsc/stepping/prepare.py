@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from mpi4py import MPI
 
 from ..case.materials import law_name, law_of
 from ..contact.free import FreeWalls
@@ -118,12 +119,14 @@ def make_plan(model: Model, recorded: Mapping[str, Any] | None = None) -> Plan:
     # mass-proportional damping: xi = c_m / (2 rho omega) is largest for the largest c_m / rho
     ratio = max(m.damping / m.density for m in case.material.values()) / (2.0 * max(frequency.lower, 1e-300))
     limit = scheme.limit(min(ratio, 1e3))
+    local = _dashpot_rate(model) / (2.0 * max(frequency.lower, 1e-300))  # of single nodes, not of all modes
+    safe = scheme.limit(min(ratio + local, 1e3)) if local else limit
     if limit == 0.0:
         raise InputError(
             f"{case.source}: time: {time.integrator} with these parameters is unstable at any step; take gamma >= 1/2"
         )
     betas = [case.material[section.material].stiffness_damping for section in case.section.values()]
-    critical = _stable_step(scheme, limit, frequency.upper, max(betas))
+    critical = _stable_step(scheme, safe, frequency.upper, max(betas))
     certain = _stable_step(scheme, limit, frequency.lower, min(betas))
     if recorded is not None:
         step = float(recorded["step"])
@@ -171,6 +174,15 @@ def _highest_frequency(model: Model) -> Frequency:
             return frequency
         other = highest_frequency(model, model.mesh.points)
     return Frequency(min(frequency.lower, other.lower), max(frequency.upper, other.upper))
+
+
+def _dashpot_rate(model: Model) -> float:
+    """Return the largest c/m of dashpots [1/s]; at most three times as large with consistent mass. Collective."""
+    inertia = model.inertia
+    if inertia.points.damping is None:
+        return 0.0
+    factor = 3.0 if inertia.consistent else 1.0
+    return factor * model.comm.allreduce(float((inertia.points.damping / inertia.mass).max(initial=0.0)), op=MPI.MAX)
 
 
 def _stable_step(scheme: Scheme, limit: float, frequency: float, beta: float) -> float:
@@ -272,10 +284,12 @@ def _warn_of_gain(model: Model, plan: Plan) -> None:
 def _warn_of_damping(model: Model, plan: Plan) -> None:
     """Warn if damping stops nodes within a few steps, when no rule over steps gives its dissipation accurately."""
     rate = max(material.damping / material.density for material in model.case.material.values())
+    rate = max(rate, _dashpot_rate(model))
     if rate * plan.step > _DAMPED:
         model.warnings.append(
-            f"time.step = {plan.step:.4g} s: damping stops nodes within a few steps (material.damping / density * step "
-            f"= {rate * plan.step:.2g}), so the recorded damping dissipation has an error of this order; use "
+            f"time.step = {plan.step:.4g} s: damping stops nodes within a few steps (material.damping / density, or "
+            f"dashpot.coefficient / mass, * step = {rate * plan.step:.2g}), so the recorded damping dissipation has "
+            f"an error of this order; use "
             f"a time.step of at most {_DAMPED / rate:.2g} s, or less damping"
         )
 

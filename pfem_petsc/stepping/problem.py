@@ -110,8 +110,8 @@ class StepProblem:
             if inertia.redistribution is not None:
                 moved = inertia.redistribution
                 matrix.add_blocks(moved.touched, balance.alpha * moved.tensors, values)
-        elif inertia.points is not None and balance.alpha:
-            matrix.add_lumped(balance.alpha * inertia.points, values)
+        elif inertia.points.any:
+            matrix.add_lumped(inertia.points.nodal(balance.alpha, balance.eta), values)
         coefficients = inertia.coefficients(balance.alpha, balance.eta)
         if balance.weight or inertia.consistent:
             bars, arguments = self.model.bars, (balance.weight, coefficients, matrix.pattern, values)
@@ -120,6 +120,8 @@ class StepProblem:
             elif stored is not None:
                 bars.tangents(self.x, 0.0, *arguments[1:])
                 matrix.add_bars(stored, values)
+                if bars.springs is not None:
+                    bars.springs.add_tangents(balance.weight, matrix.pattern, values)
             else:
                 bars.tangents(self.x, *arguments)
         self.transform.turn(matrix, values)

@@ -195,7 +195,10 @@ class Stepper(ABC):
     def _totals(self) -> np.ndarray:
         state, inertia = self.state, self.model.inertia
         damping = -inertia.damping_times(state.v, np.empty_like(state.v))
-        return np.array([state.support.sum(axis=0), state.external.sum(axis=0), damping.sum(axis=0)])
+        support = state.support.sum(axis=0)
+        if self.model.bars.springs is not None:
+            support -= state.f[: len(state.v)].sum(axis=0)
+        return np.array([support, state.external.sum(axis=0), damping.sum(axis=0)])
 
     def arrived(self) -> str:
         """The step whose end the state is at, complete or not, and its time, for messages."""

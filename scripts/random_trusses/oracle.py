@@ -201,6 +201,7 @@ def _gains(case: Case, history: dict[str, np.ndarray], warned: list[str], scale:
     moving = any(wall.velocity or wall.motion or wall.mass for wall in case.wall)
     put_in = history["kinetic_energy"][0] + history["elastic_energy"][0]
     put_in += np.abs(history["external_work"]).max() + np.abs(history["thermal_work"]).max()
+    put_in += history["spring_energy"][0]
     put_in += np.abs(history["prestress_work"]).max()
     reference = scale if moving else min(scale, float(put_in))
     lost = sum(history[name] for name in LOSSES if name in history)
@@ -215,7 +216,8 @@ def _gains(case: Case, history: dict[str, np.ndarray], warned: list[str], scale:
     stays = float(gain.mean())
     plan = make_plan(Model(case, MPI.COMM_SELF)) if stays > 0.05 * reference else None
     if plan is not None and plan.scheme.explicit:
-        swing = (0.5 * history["step_size"][last] * plan.frequency.upper) ** 2 * history["elastic_energy"][last]
+        held = history["elastic_energy"][last] + history["spring_energy"][last]
+        swing = (0.5 * history["step_size"][last] * plan.frequency.upper) ** 2 * held
         stays = min(stays, float((gain - swing).max()))
     if stays > 0.05 * reference:
         cause = "energy grows without a warning"

@@ -91,7 +91,11 @@ def redistribute(model: Model) -> Redistribution:
                 "its nodes lose mass; take another contact.treatment"
             )
     if inertia.damped:
-        raise InputError(f"{key}: a node without mass cannot be damped; take a material without damping")
+        raise InputError(
+            f"{key}: a node without mass cannot be damped; take a material without damping, no [[dashpot]]"
+        )
+    if model.bars.springs is not None:
+        raise InputError(f"{key}: a node without mass cannot have a [[spring]]; take another contact.treatment")
     if model.external.state_forces:
         raise InputError(
             f"{key}: a node without mass cannot follow [wind], whose force depends on its velocity; take another "

@@ -1,0 +1,68 @@
+"""Springs from nodes to the ground: forces -k (x - X) about the positions X of the mesh, one stiffness per axis.
+
+They are added to the internal forces of the bars, so every scheme integrates them with the bars. The forces of bars
+cancel in the sum over all nodes; what remains of it is the force of the truss on the ground by the springs.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from ..case.schema import Case
+    from ..mesh.distribution import DistributedMesh
+    from ..solvers.matrix import BlockPattern
+
+__all__ = ["Springs", "make_springs"]
+
+
+class Springs:
+    """Springs of the nodes that this rank owns.
+
+    Attributes
+    ----------
+    nodes : (m,) local indices, distinct
+    stiffness : (m, 3) [N/m]
+    anchors : (m, 3) positions without force [m]
+    """
+
+    def __init__(self, nodes: np.ndarray, stiffness: np.ndarray, anchors: np.ndarray) -> None:
+        self.nodes, self.stiffness, self.anchors = nodes, stiffness, anchors
+
+    def add_forces(self, x: np.ndarray, f: np.ndarray) -> float:
+        """Add the internal forces at positions ``x`` to ``f``, both (local, 3); return the stored energy [J]."""
+        stretch = x[self.nodes] - self.anchors
+        force = self.stiffness * stretch
+        f[self.nodes] += force
+        return 0.5 * float((force * stretch).sum())
+
+    def add_step_forces(self, x0: np.ndarray, x: np.ndarray, f: np.ndarray) -> None:
+        """Add the discrete gradient of a step from ``x0`` to ``x``, the force at mid-step: energies are quadratic."""
+        f[self.nodes] += self.stiffness * (0.5 * (x0[self.nodes] + x[self.nodes]) - self.anchors)
+
+    def add_product(self, weight: float, u: np.ndarray, out: np.ndarray) -> None:
+        """Add ``weight`` times the stiffness times ``u`` to ``out``, with a row for each owned node at least."""
+        out[self.nodes] += weight * self.stiffness * u[self.nodes]
+
+    def add_tangents(self, weight: float, pattern: BlockPattern, values: np.ndarray) -> None:
+        """Add ``weight`` times the stiffness to the values of a matrix."""
+        if not weight:
+            return
+        ptr = pattern.ptr.astype(np.int64)
+        start = 6 * ptr[self.nodes] + 3 * pattern.diagonal[self.nodes]
+        width = 3 * (ptr[self.nodes + 1] - ptr[self.nodes])
+        for i in range(3):
+            values[start + i * (width + 1)] += weight * self.stiffness[:, i]
+
+
+def make_springs(case: Case, nodes: dict[str, np.ndarray], mesh: DistributedMesh) -> Springs | None:
+    """Return the springs of ``[[spring]]``, None if the case has none. A node in several gets the sum of stiffness."""
+    if not case.spring:
+        return None
+    stiffness = np.zeros((mesh.n_owned, 3))
+    for entry in case.spring:
+        stiffness[nodes[entry.node_set]] += entry.stiffness
+    held = np.flatnonzero(stiffness.any(axis=1))
+    return Springs(held, stiffness[held], mesh.points[held].copy())

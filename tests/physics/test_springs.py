@@ -1,0 +1,195 @@
+"""Springs and dashpots to the ground, against closed forms of one bar."""
+
+import numpy as np
+import pytest
+from helpers.kills import differences
+from helpers.runs import run
+from helpers.stopped import everywhere
+from mpi4py import MPI
+
+from pfem_petsc import Case, Simulation
+from pfem_petsc.errors import InputError
+from pfem_petsc.output.result import open_result
+
+YOUNG, DENSITY, AREA, LENGTH, G = 2e6, 500.0, 1e-3, 2.0, 9.81
+BAR = DENSITY * AREA * LENGTH
+K = np.array([300.0, 500.0, 200.0])
+EXPLICIT = ["central_differences", "chung_lee", "hulbert_chung", "souza_moura"]
+IMPLICIT = ["newmark", "wilson", "houbolt", "generalized_alpha", "energy_momentum"]
+PARAMETERS = {"newmark": {"beta": 0.25, "gamma": 0.5}}
+
+
+def case(**tables):
+    """A bar that moves as a whole on equal springs at both ends."""
+    data = {
+        "mesh": {"generator": "rod", "length": LENGTH, "elements": 1},
+        "node_set": {"start": {"group": "start"}, "end": {"group": "end"}, "all": {"all": True}},
+        "material": {"m": {"young_modulus": YOUNG, "density": DENSITY}},
+        "section": {"s": {"area": AREA, "material": "m"}},
+        "spring": [{"node_set": "all", "stiffness": (0.25 * K).tolist()} for _ in range(2)],
+        "output": {"fields_every": 0, "probe": [{"name": "end", "node_set": "end"}]},
+        "solver": {"rtol": 1e-13},
+        **tables,
+    }
+    return Case.from_dict(data)
+
+
+def time_of(scheme, step, end, mass="lumped"):
+    return {"integrator": scheme, "step": step, "end": end, "mass": mass, **PARAMETERS.get(scheme, {})}
+
+
+@pytest.mark.parametrize("mass", ["lumped", "consistent"])
+@pytest.mark.parametrize("scheme", [*EXPLICIT, *IMPLICIT])
+def test_period(scheme, mass, tmp_path):
+    """Along each axis u = v/w sin(w t) with w^2 = k/m, of the whole bar; energies and momentum balance."""
+    omega = np.sqrt(K / BAR)
+    v = np.array([0.05, 0.1, -0.2])
+    it = case(time=time_of(scheme, 1e-3, 0.5, mass), initial={"velocity": v.tolist()})
+    history = run(it, tmp_path / "out", MPI.COMM_SELF)
+    t = history["time"][:, None]
+    u = history["centre_of_mass"] - history["centre_of_mass"][0]
+    exact = v / omega * np.sin(omega * t)
+    assert np.abs(u - exact).max() < (0.03 if scheme == "souza_moura" else 1e-3) * np.abs(exact).max()
+    scale = history["kinetic_energy"][0]
+    assert np.abs(history["energy_imbalance"]).max() < 1e-11 * scale
+    assert history["spring_energy"][-1] == pytest.approx(0.5 * (K * u[-1] ** 2).sum(), rel=1e-3)
+    gained = history["momentum"] - history["momentum"][0]
+    np.testing.assert_allclose(gained, history["support_impulse"], atol=1e-10 * np.abs(BAR * v).max())
+    if scheme == "energy_momentum":
+        assert np.abs(history["numerical_dissipation"]).max() < 1e-12 * scale
+
+
+@pytest.mark.parametrize("operator", ["assembled", "matrix_free"])
+def test_operators(operator, tmp_path):
+    """A chain on springs in large motion: both operators, and explicit steps, find the same motion."""
+    tables = {
+        "mesh": {"generator": "rod", "length": LENGTH, "elements": 4},
+        "spring": [
+            {"node_set": "start", "stiffness": [2e3, 1e3, 4e3]},
+            {"node_set": "end", "stiffness": [0.0, 90.0, 0.0]},
+        ],
+        "dashpot": [{"node_set": "end", "coefficient": 1.5}],
+        "gravity": {"acceleration": [0.0, 0.0, -G]},
+    }
+    implicit = case(
+        **tables,
+        time=time_of("generalized_alpha", 2.5e-4, 0.1, "consistent"),
+        solver={"linear": "cg", "operator": operator, "rtol": 1e-12},
+    )
+    first = run(implicit, tmp_path / "i", MPI.COMM_SELF)
+    second = run(
+        case(**tables, time=time_of("central_differences", 5e-5, 0.1, "consistent")), tmp_path / "e", MPI.COMM_SELF
+    )
+    np.testing.assert_allclose(first["probe/end/position"][-1], second["probe/end/position"][-1], atol=2e-5)
+    assert first["solver_iterations" if "solver_iterations" in first else "newton_iterations"].max() <= 6
+    for history in (first, second):
+        assert np.abs(history["energy_imbalance"]).max() < 1e-9 * history["external_work"].max()
+
+
+@pytest.mark.parametrize("mass", ["lumped", "consistent"])
+@pytest.mark.parametrize("scheme", [*EXPLICIT, *IMPLICIT])
+def test_dashpot(scheme, mass, tmp_path):
+    """m v' = -c v of a bar with equal dashpots at both ends: v = v0 exp(-c t/m)."""
+    c = 4.0
+    it = case(
+        spring=[],
+        dashpot=[{"node_set": "all", "coefficient": 0.5 * c}],
+        time=time_of(scheme, 1e-3, 0.4, mass),
+        initial={"velocity": [0.0, 0.3, 0.4]},
+    )
+    history = run(it, tmp_path / "out", MPI.COMM_SELF)
+    t = history["time"]
+    np.testing.assert_allclose(
+        history["momentum"][:, 1], 0.3 * BAR * np.exp(-c * t / BAR), atol=(3e-3 if scheme == "souza_moura" else 1e-3)
+    )
+    kinetic = history["kinetic_energy"]
+    np.testing.assert_allclose(history["damping_dissipation"], kinetic[0] - kinetic, atol=4e-3 * kinetic[0])
+    np.testing.assert_allclose(
+        history["momentum"] - history["momentum"][0], history["damping_impulse"], atol=1e-11 * 0.4 * BAR
+    )
+    assert np.abs(history["energy_imbalance"]).max() < 1e-11 * kinetic[0]
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("operator", ["assembled", "matrix_free"])
+def test_static_deflection_and_modes(operator, comm, shared_tmp_path):
+    """A chain of rods across its springs: nothing else holds it; reactions are those of the ground."""
+    mesh = {"generator": "rod", "length": LENGTH, "elements": 1}
+    weight = {"acceleration": [0.0, 0.0, -G]}
+    it = case(
+        mesh=mesh,
+        gravity=weight,
+        static={"method": "newton"},
+        modes={"count": 6},
+        solver={"linear": "cg" if operator == "matrix_free" else "mumps", "operator": operator, "rtol": 1e-12},
+    )
+    assert Simulation(it, comm, output=shared_tmp_path / "out", quiet=True).run() == 0
+    if comm.rank == 0:
+        with open_result(shared_tmp_path / "out") as result:
+            history = result.history
+            sag = BAR * G / K[2]
+            assert history["probe/end/position"][-1, 0, 2] == pytest.approx(-sag, rel=1e-10)
+            assert history["support_force"][-1, 2] == pytest.approx(BAR * G, rel=1e-10)
+            assert history["spring_energy"][-1] == pytest.approx(0.5 * K[2] * sag**2, rel=1e-9)
+            assert history["external_work"][-1] == pytest.approx(0.5 * K[2] * sag**2, rel=1e-9)
+            # both ends in and out of phase: the bar resists out of phase along x only
+            squares = np.concatenate([K / BAR, K[1:] / BAR, [(K[0] + 4.0 * YOUNG * AREA / LENGTH) / BAR]])
+            np.testing.assert_allclose(result.modes.eigenvalue, np.sort(squares), rtol=1e-8)
+
+
+def test_critical_step(tmp_path):
+    """2/w with bar and springs; dashpots reduce it where the scheme's limit depends on damping."""
+    top = np.sqrt((K[0] + 4.0 * YOUNG * AREA / LENGTH) / BAR)
+    steps = {}
+    for c in (0.0, 20.0):
+        for scheme in ("central_differences", "chung_lee"):
+            it = case(
+                dashpot=[{"node_set": "end", "coefficient": c}], time={**time_of(scheme, "auto", 0.1), "safety": 0.9}
+            )
+            with Simulation(it, MPI.COMM_SELF, output=tmp_path / f"{scheme}{c}", quiet=True) as simulation:
+                steps[scheme, c] = simulation.plan.critical_step
+    assert steps["central_differences", 0.0] == pytest.approx(2.0 / top, rel=1e-6)
+    assert steps["central_differences", 20.0] == steps["central_differences", 0.0]
+    assert steps["chung_lee", 20.0] < 0.99 * steps["chung_lee", 0.0]
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("scheme", ["central_differences", "energy_momentum"])
+def test_ranks_restart_and_stages(scheme, comm, shared_tmp_path):
+    """As on one rank; bitwise over a restart; springs keep their place in the next stage."""
+    data = case(time=time_of(scheme, 2e-4, 0.01)).to_dict()
+    time = data.pop("time")
+    data["mesh"] = {"generator": "rod", "length": LENGTH, "elements": 5}
+    data["dashpot"] = [{"node_set": "all", "coefficient": 0.3}]
+    data["gravity"] = {"acceleration": [0.0, 3.0, -G]}
+    data["stage"] = [{"name": "one", "time": time}, {"name": "two", "time": time}]
+    data["initial"] = {"angular_velocity": [0.0, 0.0, 3.0]}
+    folders = shared_tmp_path / "whole", shared_tmp_path / "parts"
+    history = run(Case.from_dict(data), folders[0], comm)
+    assert np.abs(history["energy_imbalance"]).max() < 1e-10 * history["kinetic_energy"].max()
+    with Simulation(Case.from_dict(data), comm, output=folders[1], quiet=True) as simulation:
+        for made in simulation:
+            if made.step == 70:
+                simulation.outputs.checkpointing.write()
+                break
+    assert Simulation(Case.from_dict(data), comm, output=folders[1], quiet=True, restart=True).run() == 0
+    assert everywhere(comm, differences, *(folder / "result.vtkhdf" for folder in folders)) == {}
+    if comm.size > 1:
+        one = run(Case.from_dict(data), shared_tmp_path / "alone", MPI.COMM_SELF) if comm.rank == 0 else None
+        alone = comm.bcast(one)
+        np.testing.assert_allclose(history["probe/end/position"], alone["probe/end/position"], rtol=1e-9, atol=1e-12)
+
+
+def test_refusals(tmp_path):
+    some = {"time": time_of("newmark", 1e-3, 1e-3)}
+    with pytest.raises(InputError, match=r"spring\[0\].stiffness = .*expected values >= 0"):
+        case(**some, spring=[{"node_set": "end", "stiffness": [1.0, -1.0, 0.0]}])
+    with pytest.raises(InputError, match=r"dashpot\[0\].node_set"):
+        case(**some, dashpot=[{"node_set": "ende", "coefficient": 1.0}])
+    for method in ("arc_length", "relaxation"):
+        with pytest.raises(InputError, match=f'spring: static.method = "{method}" does not have springs'):
+            Simulation(case(static={"method": method}), MPI.COMM_SELF, output=tmp_path / method, quiet=True)
+    wall = {"name": "w", "type": "plane", "point": [0.0, 0.0, -9.0], "normal": [0.0, 0.0, 1.0], "node_set": "start"}
+    massless = {"wall": [wall], "contact": {"treatment": "mass_redistribution"}, **some}
+    with pytest.raises(InputError, match=r"a node without mass cannot have a \[\[spring\]\]"):
+        Simulation(case(**massless), MPI.COMM_SELF, output=tmp_path / "m", quiet=True)

@@ -106,7 +106,7 @@ class Removals:
             self._complete[k] = self._done(k)
             share = 1.0 if self._complete[k] else (now - entry.time) / entry.duration
             if entry.bars is not None:
-                self._remove_bars(entry.bars, share)
+                self._remove_bars(self._members[entry.bars], share)
             elif begins:
                 self._remove_support(entry, now)
         return changed
@@ -123,14 +123,14 @@ class Removals:
         """Begin a stage after that of other removals: supports that are gone stay away, and bars go entirely."""
         for k, entry in enumerate(before._entries):
             if entry.bars is not None and before.times[k] >= 0.0:
-                self._remove_bars(entry.bars, 1.0)
+                self._remove_bars(before._members[entry.bars], 1.0)
         if self._model.case.holds("support"):
             self.gone = list(before.gone)
             self._release(self.gone)
 
-    def _remove_bars(self, name: str, share: float) -> None:
+    def _remove_bars(self, members: np.ndarray, share: float) -> None:
         stepper = self._stepper
-        change = release(self._model.bars, stepper.state.x, self._members[name], share)
+        change = release(self._model.bars, stepper.state.x, members, share)
         energies = np.array(stepper.energy.energies) + change
         stepper.energy = stepper.energy._replace(energies=tuple(energies.tolist()))
 

@@ -20,7 +20,7 @@ def tower(folder, comm, **tables):
     """Three legs that lean to a top, which is guided vertically and loaded."""
     angle = 2.0 * np.pi * np.arange(3) / 3.0
     feet = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(3)])
-    groups = {"leg": np.array([2])}
+    groups = {"leg": np.array([2]), "second": np.array([1])}
     if comm.rank == 0:
         folder.mkdir(parents=True, exist_ok=True)
     comm.Barrier()
@@ -142,10 +142,11 @@ def test_restarts_are_bitwise_while_something_is_removed(what, scheme, comm, tmp
 
 @pytest.mark.parallel
 def test_what_is_gone_stays_away_in_later_stages(comm, shared_tmp_path):
-    """A stage without a table [[remove]] goes on without the bars and supports that the stage before has removed."""
+    """Stages with and without a table [[remove]] go on without what stages before have removed."""
     remove = [{"bars": "leg", "time": 0.5}, {"supports": "foot", "time": 0.25}]
     first = {"name": "loss", "static": {"step": 0.25}, "remove": remove}
-    second = {
+    second = {"name": "other loss", "static": {"step": 0.5}, "remove": [{"bars": "second", "time": 0.5}]}
+    third = {
         "name": "more",
         "static": {"step": 0.5},
         "load": [{"node_set": "top", "force": [0.0, 0.0, -2.0 * WEIGHT]}],
@@ -156,9 +157,10 @@ def test_what_is_gone_stays_away_in_later_stages(comm, shared_tmp_path):
         {"node_set": "third", "fix": "xy"},
         {"node_set": "top", "fix": "xy"},
     ]
-    case = tower(shared_tmp_path, comm, stage=[first, second], support=support)
+    case = tower(shared_tmp_path, comm, stage=[first, second, third], support=support)
     history = run(case, shared_tmp_path / "out", comm)
-    assert fall(history)[-1] == pytest.approx(2.0 * WEIGHT / (2.0 * STIFF), rel=1e-4)
+    for number, (load, legs) in enumerate([(1.0, 2.0), (1.0, 1.0), (2.0, 1.0)]):
+        assert fall(history)[history["stage"] == number][-1] == pytest.approx(load * WEIGHT / (legs * STIFF), rel=1e-4)
     assert np.abs(history["energy_imbalance"]).max() < 1e-7 * history["external_work"][-1]
 
 

@@ -21,6 +21,7 @@ from .parallel.agreement import on_root
 from .parallel.petsc_log import instrument, staged
 from .preflight.forecast import forecast
 from .preflight.inspection import inspect, warnings_before
+from .preflight.sanity import odd_accelerations
 from .preflight.summary import summarise
 from .recording.recorder import Recorder
 from .restart.folder import Restart, find_restart, finished, finished_message
@@ -191,9 +192,8 @@ class Simulation:
         recorder = Recorder(self.stepper, None)
         entries, warnings = inspect(self.model.case, self.model)
         entries |= forecast(self.case, self.model, self.plan, self.outputs.fields, recorder.columns, recorder.types)
-        return entries, self.model.warnings + warnings_before(
-            self.model.case, self.model, self.analysis.plan
-        ) + warnings
+        warnings += warnings_before(self.model.case, self.model, self.analysis.plan)
+        return entries, self.model.warnings + odd_accelerations(self.case) + warnings
 
     def on_step(self, function: Callable[[Step], object], every: int = 1) -> None:
         """Register a function to be called on all ranks after each step whose number is a multiple of ``every``.

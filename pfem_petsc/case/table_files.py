@@ -6,6 +6,7 @@ The resolved case has the rows, so that it does not depend on the file any more,
 from __future__ import annotations
 
 import math
+import re
 import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -101,8 +102,8 @@ def file_columns(path: Path) -> Columns:
     """Return the columns of a CSV, NPZ or NPY file.
 
     In CSV files, columns are separated by semicolons, commas, tabs or blanks; empty lines, lines that start with ``#``
-    and one heading are skipped. In NPZ files, each array (n,) is a column of its name, and each array (n, k) has the
-    columns ``NAME[0]`` to ``NAME[k-1]``.
+    and headings before the first row are skipped; the last heading has the names of the columns. In NPZ files, each
+    array (n,) is a column of its name, and each array (n, k) has the columns ``NAME[0]`` to ``NAME[k-1]``.
 
     Raises
     ------
@@ -158,6 +159,13 @@ def _is_number(word: str) -> bool:
     return True
 
 
+def _is_heading(words: list[str]) -> bool:
+    """Tell headings from rows, and from rows with a mistake: these start with a number, maybe with a decimal comma."""
+    if any(words) and all(_is_number(word) for word in words if word):
+        return False
+    return not (_is_number(words[0]) or re.fullmatch(r"[-+.,eE\d]*\d[-+.,eE\d]*", words[0]))
+
+
 def _text_columns(text: str) -> Columns:
     heading: list[str] = []
     rows: list[list[str]] = []
@@ -166,12 +174,13 @@ def _text_columns(text: str) -> Columns:
         if not line.strip() or line.lstrip().startswith("#"):
             continue
         words = _words(line)
-        if not rows and not heading and not all(_is_number(word) for word in words if word):
+        if not rows and _is_heading(words):
             heading = [word.strip("\"'") for word in words]
             continue
         if rows and len(words) != len(rows[0]):
             raise InputError(
-                f"line {number}: expected {len(rows[0])} columns as in line {numbers[0]}, got {line.strip()[:60]!r}"
+                f"line {number}: expected {len(rows[0])} columns as in line {numbers[0]}, got {line.strip()[:60]!r}; "
+                "lines that are no rows start with #, or stand before the first row"
             )
         rows.append(words)
         numbers.append(number)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from pathlib import Path
@@ -21,6 +22,8 @@ from .forces import draw_forces
 __all__ = ["plot"]
 
 History = Mapping[str, np.ndarray]
+
+_NOTE_WIDTH = 100  # characters of a line above the axes
 
 
 def plot(
@@ -123,8 +126,10 @@ def _energies(history: History, title: str, file: Path) -> Path | None:
     styles.append({"color": "#1f242c", "linewidth": 1.2, "linestyle": (0, (4, 2)), "zorder": 1.5})
     chart.curves(upper, "energy", "J", curves, styles=styles)
     if still:
-        text = "zero throughout: " + ", ".join(still)
-        upper.annotate(text, (0, 1.02), xycoords="axes fraction", fontsize=8, color="#5b6472")
+        text = textwrap.fill("zero throughout: " + ", ".join(still), _NOTE_WIDTH)
+        note = upper.annotate(text, (0, 1.02), xycoords="axes fraction", fontsize=8, color="#5b6472", va="bottom")
+        note.set_in_layout(False)  # a long line must not take the width of the axes; the title makes the height for it
+        upper.set_title("\n" * text.count("\n"), fontsize=9)
     chart.curves(lower, "balance error", "J", [("balance error", error)], styles=[{"color": COLOURS[1]}])
     worst = float(np.nanmax(np.abs(error)))
     if largest > 0:

@@ -14,10 +14,13 @@ if TYPE_CHECKING:
     from ..case.schema import Case
     from ..stepping.model import Model
 
-__all__ = ["far_points", "odd_numbers"]
+__all__ = ["far_points", "odd_accelerations", "odd_numbers"]
 
 _SLENDER = 1e4
 """Length over thickness of a bar beyond which one of the two is mostly in another unit: a cable of 100 m and 1 cm."""
+
+_STRONGEST = 50.0
+"""Acceleration [m/s2] beyond which a record is mostly in another unit: the strongest ground motions reach 40 m/s2."""
 
 _HINT = "case files are in SI units (m, kg, s, N, Pa)"
 
@@ -26,6 +29,28 @@ def odd_numbers(case: Case, model: Model) -> list[str]:
     """Return one message for each suspicious value: key, value, reason. Collective."""
     texts = [*_materials(case), *_sections(case), *_mesh(case, model), *_slender(case, model), *_weightless(case)]
     return [f"{case.source}: {text}" for text in texts]
+
+
+def odd_accelerations(case: Case) -> list[str]:
+    """Return one message for each ground acceleration or gravity, of all stages, that is beyond those of the Earth."""
+    texts = []
+    for k, stage in enumerate(case.stages):
+        where = f"stage[{k}]." if case.stage and k > 0 else ""  # tables at the top belong to the first stage
+        tables = [(f"support[{n}].acceleration", entry.acceleration) for n, entry in enumerate(stage.support)]
+        if stage.gravity is not None:
+            tables.append(("gravity.acceleration", stage.gravity.acceleration))
+        for key, given in tables:
+            table = key.split("[")[0].split(".")[0]
+            if given is None or (k > 0 and stage.holds(table)):
+                continue
+            rows = np.atleast_2d(np.array(given, dtype=float))
+            peak = float(np.abs(rows[:, -3:]).max(initial=0.0))
+            if peak > _STRONGEST:
+                texts.append(
+                    f"{case.source}: {where}{key} reaches {peak:.4g} m/s2, {peak / 9.80665:.3g} g: a record in cm/s2 "
+                    "needs scale = 0.01, lengths in mm 0.001"
+                )
+    return texts
 
 
 def _materials(case: Case) -> Iterator[str]:

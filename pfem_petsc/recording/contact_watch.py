@@ -43,6 +43,7 @@ class ContactWatch:
         self.rounding = model.rounding * model.length  # of energies [J]: what is at rest has no other
         self.rows = 0
         contact, time = model.case.contact, model.case.time
+        self.key = "time.safety" if time.step == "auto" else "time.step"
         self.what = f'{time.integrator} with contact.treatment = "{contact.treatment}" and time.mass = "{time.mass}"'
         self.start: float | None = None
         self.scale = 0.0
@@ -77,7 +78,7 @@ class ContactWatch:
             self.told = True
             self.tell(
                 f"{at}: the total energy, dissipated energy included, has grown by {made}, without contact: the "
-                f"steps are too large for the motion within them{self._causes(row)}; reduce time.step"
+                f"steps are too large for the motion within them{self._causes(row)}; reduce {self.key}"
             )
 
     def _swing(self, row: dict[str, Any]) -> float:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..modes.find import Found, find_modes
+from ..modes.members import weakest_member
 from ..output.modes import NAMES
 from ..output.units import MODE
 from ..output.vtkhdf import ResultWriter
@@ -38,12 +39,29 @@ def record_modes(stepper: Stepper, writer: ResultWriter, folder: Path, progress:
     _write_file(stepper, found, folder)
     for text in _told(found, settings.count):
         progress.message(text)
+    if found.kind == "buckling":
+        _tell_members(stepper, found, progress)
     if found.negative:
         are = "eigenvalues are" if found.negative > 1 else "eigenvalue is"
         progress.warning(
             f"unstable equilibrium: {found.negative} {are} negative: such a motion grows as exp(2 pi |f| t); its "
             "frequency is given as -|f|"
         )
+
+
+def _tell_members(stepper: Stepper, found: Found, progress: Progress) -> None:
+    """Report the first bar that buckles as a column, which the factors of the truss do not contain. Collective."""
+    weakest = weakest_member(stepper.model, stepper.state.x)
+    if weakest is None:
+        return
+    factor, bar = weakest
+    text = (
+        f"bar {bar} is the first that buckles as a column, at the factor {factor:.6g} (pi^2 E I/(K L)^2 over its force)"
+    )
+    if not len(found.values) or factor < found.values[0]:
+        progress.warning(f"{text}, before the truss does: its factors are for bars that stay straight")
+    else:
+        progress.message(text)
 
 
 def _told(found: Found, asked: int) -> list[str]:
@@ -63,7 +81,8 @@ def _told(found: Found, asked: int) -> list[str]:
     for first in range(0, len(found.values), _PER_LINE):
         numbers = "  ".join(f"{value:.6g}" for value in found.values[first : first + _PER_LINE])
         last = min(first + _PER_LINE, len(found.values))
-        lines.append(f"{head} {first + 1}-{last}: {numbers} {unit}".rstrip())
+        which = f"{first + 1}-{last}" if last > first + 1 else f"{last}"
+        lines.append(f"{head} {which}: {numbers} {unit}".rstrip())
     return lines
 
 

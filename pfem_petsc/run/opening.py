@@ -11,6 +11,7 @@ from ..errors import printable
 from ..output.progress import Progress
 from ..output.vtkhdf import ResultWriter
 from ..preflight.inspection import warnings_before
+from ..preflight.sanity import odd_accelerations
 from ..preflight.summary import summarise
 from ..recording.fields import Fields
 from ..recording.history import History
@@ -48,7 +49,7 @@ def open_progress(
     )
     progress.summary(summarise(case, model, plan))
     own = plan.plans[model.case.number] if case.stage else plan
-    for warning in model.warnings + warnings_before(model.case, model, own):
+    for warning in model.warnings + odd_accelerations(case) + warnings_before(model.case, model, own):
         progress.warning(warning)
     if plan.scheme.notice:
         progress.message(plan.scheme.notice)

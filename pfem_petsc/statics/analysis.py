@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -108,7 +108,10 @@ def _linear(model: Model) -> LinearChoice:
         smooth = all(law_of(material).smooth for material in model.case.material.values())
         most = _DIRECT_UP_TO if smooth else _DIRECT_YIELDING_UP_TO
         request = "mumps" if unknowns <= most and solver.operator != "matrix_free" else "gamg"
-    return choose_linear(request, unknowns, np.inf, True, solver.operator)
+    choice = choose_linear(request, unknowns, np.inf, True, solver.operator)
+    if solver.linear == "auto":
+        choice = replace(choice, why=choice.why.removesuffix(" (asked for)"))
+    return choice
 
 
 def _check(model: Model) -> None:

@@ -224,8 +224,8 @@ class StaticStepper(ImplicitStepper):
         """Return the message about the load factor beyond which no equilibrium was found."""
         slips = ""
         others = (
-            'static.method = "arc_length" follows the path beyond a limit point, "relaxation" finds the equilibrium of '
-            "slack structures"
+            'static.method = "arc_length" follows the path beyond a limit point, static.stabilise and stages in time '
+            'lead beyond jumps, as of struts that snap, and "relaxation" finds the equilibrium of slack structures'
         )
         if self.model.can_touch:
             others = "static.stabilise, or supports that move the truss instead of loads, lead beyond a limit point"

@@ -72,5 +72,5 @@ def failure_message(
     return (
         f"no convergence after {report.newton} Newton iterations: {report.why}; residual {report.norm:.3g} N, "
         f"required {tolerance:.3g} N; worst at node {node} ({residual:.3g} N). "
-        f'{remedy[0].upper()}{remedy[1:]}, or set solver.linear = "mumps"'
+        f"{remedy[0].upper()}{remedy[1:]}"
     )

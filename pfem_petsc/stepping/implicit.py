@@ -261,7 +261,9 @@ class ImplicitStepper(Stepper):
             if relaxed:
                 continue
             if not report.converged:
-                text = failure_message(problem, w, bounds.arrays, report, tolerance, self.remedy)
+                exact = self._choice.krylov == "preonly"
+                remedy = self.remedy if exact else f'{self.remedy}, or set solver.linear = "mumps"'
+                text = failure_message(problem, w, bounds.arrays, report, tolerance, remedy)
                 raise NotConverged(f"{self.when(balance)}: {text}")
             bounds.project(w, 2.0 * zero_tolerance(model.length))
             u = problem.increment(w).copy()

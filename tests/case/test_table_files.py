@@ -75,10 +75,21 @@ DAMAGED = {
     "no number": ("t,p\n0,1\n1,x\n", ["t", "p"], "line 3: expected numbers, got 'x'"),
     "not finite": ("t,p\n0,1\n1,inf\n", ["t", "p"], "line 3: expected two finite numbers"),
     "not increasing": ("t,p\n0,1\n\n0,2\n", ["t", "p"], "line 4: times must increase, but 0.0 follows 0.0"),
-    "uneven": ("t,p\n0,1\n1\n", ["t", "p"], "line 3: expected 2 columns as in line 2, got '1'"),
+    "uneven": ("t,p\n0,1\n1\n", ["t", "p"], "line 3: expected 2 columns as in line 2, got '1'; lines that are no rows"),
+    "words in the first row": ("t,p\n0,x\n1,2\n", ["t", "p"], "line 2: expected numbers, got 'x'"),
+    "title, not commented, in the rows": ("t,p\n0,1\nend\n", ["t", "p"], "line 3: expected 2 columns"),
+    "decimal commas alone": ("0,0;1,5\n1,0;2,5\n", None, "line 1: expected numbers, got '0,0'"),
     "no rows": ("t,p\n", ["t", "p"], "this file has no rows"),
     "decimal commas": ("t;p\n0,0;1,5\n", [0, 1], "line 2: expected numbers, got '0,0'"),
 }
+
+
+@pytest.mark.parametrize("title", ["Station: XYZ\n", "Station XYZ, 1995\n\nUnits: s, m\n", ",,\nrecord\n"])
+def test_lines_before_the_rows_are_headings(case_text, tmp_path, title):
+    (tmp_path / "x.csv").write_text(title + "t (s), u, p\n 0.0, 7, 1.0\n 0.5, 7, 2.0\n")
+    given = '{file = "x.csv", columns = ["t (s)", "p"]}'
+    case = Case.from_toml(case_text, tmp_path, overrides=["load.0.table=", f"load.0.table_file={given}"])
+    assert case.load[0].table == ((0.0, 1.0), (0.5, 2.0))
 
 
 @pytest.mark.parametrize("text, columns, told", DAMAGED.values(), ids=DAMAGED)

@@ -179,3 +179,10 @@ def test_sizes_that_cannot_be_computed_with_are_refused(comm, module, keys, text
 def test_keys_are_checked(module, keys):
     with pytest.raises(ValidationError):
         module.Parameters(**keys)
+
+
+def test_corners_of_a_net_are_counted_from_the_origin(comm):
+    mesh = whole(made(net, comm, size=[6.0, 5.0], cells=[3, 2]), comm)
+    for k, corner in enumerate([(0.0, 0.0), (6.0, 0.0), (6.0, 5.0), (0.0, 5.0)], 1):
+        (node,) = mesh.node_groups[f"corner_{k}"]
+        assert tuple(mesh.points[node]) == (*corner, 0.0)

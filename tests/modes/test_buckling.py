@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from helpers.mesh_files import case_of
 from helpers.statics import ARCH_AREA, ARCH_YOUNG, LIMIT, arch_of, press
 
 from pfem_petsc import Case, Simulation
@@ -133,3 +134,26 @@ def test_what_has_no_factor_is_told(solver, shared_tmp_path, comm):
     )
     with pytest.raises(SimulationFailure, match="mechanism"):
         Simulation(cable, comm, output=shared_tmp_path / "cable", quiet=True).run()
+
+
+def test_the_first_bar_that_buckles_as_a_column_is_told(shared_tmp_path, comm):
+    """Bars stay straight in the modes; log and formula agree on the column that buckles long before the truss."""
+    points = np.array([[1.0, 0.0, 0.0], [-0.5, 0.8, 0.0], [-0.5, -0.8, 0.0], [0.0, 0.0, 2.0]])
+    ends, area = np.array([[0, 3], [1, 3], [2, 3]]), 3e-4
+    tables = {
+        "material": {"steel": {"law": "strut", "yield_stress": 355e6, "young_modulus": 210e9, "density": 7850.0}},
+        "section": {"legs": {"area": area, "material": "steel", "shape": "round", "effective_length": 0.7}},
+        "node_set": {"feet": {"indices": [0, 1, 2]}, "top": {"indices": [3]}},
+        "support": [{"node_set": "feet", "fix": "xyz"}],
+        "load": [{"node_set": "top", "force": [0.0, 0.0, -1e3]}],
+        "static": {"step": 1.0},
+        "modes": {"kind": "buckling", "count": 1},
+    }
+    case = case_of(shared_tmp_path, comm, points, ends, **tables)
+    factors, _, force = buckled(case, shared_tmp_path / "out", comm)
+    lengths = np.linalg.norm(points[ends[:, 1]] - points[ends[:, 0]], axis=1)
+    columns = np.pi**2 * 210e9 * area**2 / (4.0 * np.pi) / (0.7 * lengths) ** 2 / -force
+    text = (shared_tmp_path / "out" / "log.txt").read_text()
+    assert columns.min() < factors[0]
+    assert f"bar {columns.argmin()} is the first that buckles as a column, at the factor {columns.min():.6g}" in text
+    assert "before the truss does" in text

@@ -7,6 +7,7 @@ import pytest
 from helpers.synthetic import SyntheticResult, ring, write_result
 from PIL import Image
 
+from pfem_petsc.energies import LOST, STORED, SUPPLIED
 from pfem_petsc.errors import InputError
 from pfem_petsc.post.chart import thinned, window_mean
 from pfem_petsc.post.plot import balance_error, plot
@@ -36,6 +37,19 @@ def test_what_a_result_lacks_is_left_out(tmp_path, result):
     result.history = {name: values for name, values in result.history.items() if "/" not in name}
     names = [path.name for path in plot(result, tmp_path / "pictures")]
     assert names == ["energies.png", "momentum.png", "solver.png"]
+
+
+def test_many_terms_that_are_zero_leave_the_width_to_the_curves(tmp_path, result):
+    def size(picture):
+        """Columns between the first and the last that have a curve, and columns of the picture."""
+        pixels = np.asarray(Image.open(picture).convert("RGB")).astype(int)
+        coloured = np.flatnonzero((np.ptp(pixels, axis=2) > 60).sum(axis=0))
+        return np.ptp(coloured), pixels.shape[1]
+
+    zero = 0.0 * result.history["kinetic_energy"]
+    result.history |= {name: zero for name in (*STORED, *LOST, *SUPPLIED) if name not in result.history}
+    curves, picture = size(plot(result, tmp_path)[0])
+    assert curves > 0.6 * picture
 
 
 @pytest.mark.slow

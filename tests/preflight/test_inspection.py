@@ -110,6 +110,18 @@ def test_odd_values_are_told(comm, override, texts):
         assert text in told[0]
 
 
+def test_ground_accelerations_in_other_units_are_told(comm):
+    overrides = ["stage.1.support.0.acceleration=[[0.0,0,0,0],[0.5,300.0,0,0],[1.0,0,0,0]]"]
+    _, told = Simulation(Case.load("dome_earthquake", overrides), comm, check_only=True).inspect()
+    (text,) = [text for text in told if "acceleration" in text]
+    assert "stage[1].support[0].acceleration reaches 300 m/s2, 30.6 g" in text and "scale = 0.01" in text
+    _, told = Simulation(
+        Case.load("dome_earthquake", ["gravity.acceleration=[0,0,-9810]"]), comm, check_only=True
+    ).inspect()
+    assert [text for text in told if "gravity.acceleration reaches 9810 m/s2" in text] == told
+    assert Simulation(Case.load("dome_earthquake"), comm, check_only=True).inspect()[1] == []
+
+
 def test_far_from_the_origin(comm, shared_tmp_path):
     points, bars, _, _ = TRUSSES["tetrahedron"]
     simulation = Simulation(case_of(shared_tmp_path, comm, np.add(points, 1e7), bars), comm, check_only=True)

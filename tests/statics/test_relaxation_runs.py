@@ -16,7 +16,6 @@ pytestmark = pytest.mark.parallel
 
 INCREMENTS = [
     *("static.step=0.25", "mesh.cells=[4, 4]", "output.checkpoint_every=1", "output.fields_every=1"),
-    *("node_set.left_corners.indices=[0, 20]", "node_set.right_corners.indices=[4, 24]"),
 ]
 FLOOR = "wall=[{name='floor', type='plane', point=[0.0, 0.0, -2.3], normal=[0.0, 0.0, 1.0]}]"
 

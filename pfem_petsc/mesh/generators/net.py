@@ -24,8 +24,9 @@ class Parameters(StrictModel):
 def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
     """Generate this rank's part: node i + j (nx + 1) at (i lx/nx, j ly/ny, 0); bars along x, then along y.
 
-    Node groups ``corners``, ``edges`` (corners included) and ``centre`` (the node next to the middle); bar groups
-    ``warp`` (along x) and ``weft`` (along y).
+    Node groups ``corners``, ``corner_1`` to ``corner_4`` (from the origin, then that at the end of the x axis),
+    ``edges`` (corners included) and ``centre`` (the node next to the middle); bar groups ``warp`` (along x) and
+    ``weft`` (along y).
     """
     nx, ny = parameters.cells
     across, along = nx + 1, nx * (ny + 1)
@@ -44,6 +45,7 @@ def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
     warp = bars < along
     start = np.where(warp, bars + bars // nx, bars - along)
     ends = np.stack([start, start + np.where(warp, 1, across)], axis=1)
+    corners = (0, nx, n_nodes - 1, n_nodes - across)
     side = ((i == 0) | (i == nx)).astype(int) + ((j == 0) | (j == ny))
     return MeshSlab(
         n_nodes=n_nodes,
@@ -54,6 +56,7 @@ def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
         bars=ends.astype(index_type(n_nodes)),
         node_groups={
             "corners": numbers[side == 2],
+            **{f"corner_{k}": numbers[numbers == node] for k, node in enumerate(corners, 1)},
             "edges": numbers[side > 0],
             "centre": numbers[numbers == nx // 2 + (ny // 2) * across],
         },

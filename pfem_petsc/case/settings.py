@@ -17,6 +17,7 @@ from .base import (
     is_finite_number,
     listed,
 )
+from .rows import Table2, increasing
 
 __all__ = [
     "ContactSettings",
@@ -47,6 +48,16 @@ class TimeKeys(StrictModel):
     """mass matrix"""
     safety: Annotated[float, Field(gt=0.0, le=1.0)] = 0.9
     """factor on the critical step if step = "auto\""""
+    damping_table: Table2 | None = None
+    """rows [t, factor] [s, -] of the damping of all materials over time, constant outside; default: factor 1"""
+
+    @field_validator("damping_table")
+    @classmethod
+    def _factors(cls, table: tuple[Any, ...] | None) -> tuple[Any, ...] | None:
+        increasing(table)
+        if any(row[1] < 0.0 for row in table or ()):
+            raise ValueError("expected factors >= 0")
+        return table
 
     @field_validator("step")
     @classmethod

@@ -14,6 +14,7 @@ import numpy as np
 
 from .compiled import kernel
 from .rows import bar_value
+from .time_tables import Table
 
 if TYPE_CHECKING:
     from ..case.schema import Case
@@ -84,13 +85,16 @@ class Inertia:
     mass, damping : (owned,) lumped values; also the row sums of the consistent matrices
     points : PointInertia, part of ``mass`` and ``damping``
     consistent : whether products use the consistent matrices
-    damped : whether any bar of the whole model has damping
+    damped : whether the whole model has any damping, at any time
+    factor : of the damping of materials at the time of the last :meth:`change`
     """
 
     def __init__(self, mesh: DistributedMesh, bars: Bars, consistent: bool, points: PointInertia) -> None:
         self.mesh = mesh
         self.bars = bars
         self.consistent = consistent
+        self._table: Table | None = None
+        self.factor = 1.0
         self.redistribution = None  # of contact nodes' masses; see pfem_petsc.contact.treatments.mass_redistribution
         mass = np.zeros(mesh.n_local)
         damping = np.zeros(mesh.n_local)
@@ -103,6 +107,7 @@ class Inertia:
         if points.mass is not None:
             self.mass += points.mass
         self.damping = damping[: mesh.n_owned].copy()
+        self._of_bars = self.damping.copy()
         if points.damping is not None:
             self.damping += points.damping
         self.damped = bool(mesh.comm.allreduce(float(self.damping.sum())) > 0.0)
@@ -110,9 +115,34 @@ class Inertia:
             self._u = np.zeros((mesh.n_local, 3))
             self._out = np.zeros((mesh.n_local, 3))
 
+    def vary(self, rows: tuple | None) -> None:
+        """Multiply the damping of materials by rows [t, factor] over time, from here on."""
+        if rows is not None:
+            self._table = Table(rows)
+            self.change(0.0)
+
+    @property
+    def varies(self) -> bool:
+        """Whether the damping of materials is multiplied by a table over time."""
+        return self._table is not None
+
+    @property
+    def largest_factor(self) -> float:
+        """Largest factor of the table, 1 without one."""
+        return 1.0 if self._table is None else float(self._table.values.max())
+
+    def change(self, time: float) -> None:
+        """Take the damping at a time [s], if it varies."""
+        if self._table is None:
+            return
+        self.factor = float(self._table(time)[0])
+        self.damping = self.factor * self._of_bars
+        if self.points.damping is not None:
+            self.damping += self.points.damping
+
     def damp(self, damping: np.ndarray) -> None:
         """Replace the damping, that of dashpots included, by values of nodes (owned,). Collective."""
-        self.damping, self.points.damping = damping, None
+        self.damping, self.points.damping, self._table = damping, None, None
         self.damped = bool(self.mesh.comm.allreduce(float(damping.sum())) > 0.0)
 
     @property
@@ -132,7 +162,7 @@ class Inertia:
         if not self.damped:
             out[:] = 0.0
             return out
-        self._times(v, out, self.damping, lambda block: block.damping)
+        self._times(v, out, self.damping, lambda block: self.factor * block.damping)
         if self.consistent and self.points.damping is not None:
             out += self.points.damping[:, None] * v
         return out
@@ -165,4 +195,4 @@ class Inertia:
         """
         if not self.consistent:
             return [0.0] * len(self.bars.blocks)
-        return [(alpha * b.density + eta * b.damping) * b.area / 6.0 for b in self.bars.blocks]
+        return [(alpha * b.density + eta * self.factor * b.damping) * b.area / 6.0 for b in self.bars.blocks]

@@ -72,7 +72,7 @@ class LaggedPreconditioner:
         self.matrix = HessianMatrix(mesh, model.supports.fixed, model.supports.any, symmetric)
         self.bars = model.bars
         self.remembers = len(model.bars.kept_names) > 0
-        self.outlasts = not model.bars_vary
+        self.outlasts = not model.bars_vary and not model.inertia.varies
         self.place = np.zeros((mesh.n_owned, 0))
         self.history = np.zeros((len(mesh.bars), 0))
         self.count = [0.0] * 6

@@ -62,7 +62,7 @@ class Ledger:
         ones = np.ones_like(inertia.mass)
         # factors in the loops: lumped values, or one if products with the matrices are given
         self._mass = ones if inertia.products else inertia.mass
-        self._damping = ones if inertia.products else inertia.damping
+        self._damping = ones if inertia.products or inertia.varies else inertia.damping
         self._damping = self._damping if inertia.damped else np.empty(0)
         self._works = np.zeros(len(WORKS))
         self._totals = np.zeros((6, 3))
@@ -81,7 +81,8 @@ class Ledger:
                 self._pending = [self._impact(self._before, started=True), stepper.solution.walls.friction]
                 if inertia.damped:  # damping treats nodes that walls stop at the start as already stopped
                     v = stepper.velocity_solved
-                    self._before.v = inertia.damping_times(v, np.empty_like(v)) if inertia.products else v
+                    given = inertia.products or inertia.varies
+                    self._before.v = inertia.damping_times(v, np.empty_like(v)) if given else v
 
     def update(self) -> None:
         """Add the last step."""
@@ -249,6 +250,8 @@ class Ledger:
         jump = self.stepper.treatment.jump
         a, v = after.a.copy(), after.v.copy()
         a[jump.nodes], v[jump.nodes] = jump.a, jump.v
+        if self.model.inertia.varies:
+            v[jump.nodes] *= self.model.inertia.damping[jump.nodes, None]
         return replace(after, a=a, v=v, contact=self.stepper.state.contact), jump.energy
 
     def resume(self, kinetic: float) -> None:

@@ -72,6 +72,8 @@ class Model:
             self.bars = Bars(mesh, case)
         self.bars.springs = make_springs(case, self.nodes, mesh)
         self.inertia = Inertia(mesh, self.bars, case.mass == "consistent", PointInertia(case, self.nodes, mesh))
+        if case.time is not None:
+            self.inertia.vary(case.time.damping_table)
         self.external = ExternalForce(case, self.nodes, self.inertia)
         with agreed(comm):
             self.supports = Supports(case, self.nodes, mesh)
@@ -147,7 +149,13 @@ class Model:
     @property
     def steady(self) -> bool:
         """Whether the model is constant in time, and the fused loop supports its bars and contact."""
-        moving = self.supports.moving or self.bars_vary or bool(self.links) or self.bars.springs is not None
+        moving = (
+            self.supports.moving
+            or self.bars_vary
+            or bool(self.links)
+            or self.bars.springs is not None
+            or self.inertia.varies
+        )
         return not moving and len(self.bars.blocks) == 1 and self.external.steady and self.contact.steady
 
     def initial_velocity(self) -> np.ndarray:

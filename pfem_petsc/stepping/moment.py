@@ -20,7 +20,8 @@ class Moment:
     """Data of the ledger at an instant; arrays (owned, 3).
 
     With lumped mass ``momentum``, ``a`` and ``v`` are velocity, acceleration and velocity; with consistent mass they
-    are M v [kg m/s], M a and C v [N]. ``velocity`` and ``acceleration`` are always velocity and acceleration.
+    are M v [kg m/s], M a and C v [N], and ``v`` also with damping over time. ``velocity`` and ``acceleration`` are
+    always velocity and acceleration.
     """
 
     momentum: np.ndarray
@@ -47,6 +48,7 @@ def moment_of(stepper: Stepper) -> Moment:
     if inertia.products:
         momentum = inertia.mass_times(state.v, np.empty_like(state.v))
         a = inertia.mass_times(state.a, np.empty_like(state.a))
+    if inertia.products or inertia.varies:
         v = inertia.damping_times(state.v, np.empty_like(state.v))
     internal = state.f[:owned]
     return Moment(
@@ -74,6 +76,7 @@ def balanced(stepper: Stepper, before: Moment) -> Moment:
     v = balance.eta * u + balance.v_hat if inertia.damped else u
     if inertia.products:
         a = inertia.mass_times(a, np.empty_like(a))
+    if inertia.products or inertia.varies:
         v = inertia.damping_times(v, np.empty_like(v))
     internal = before.internal
     if balance.weight == 1.0:

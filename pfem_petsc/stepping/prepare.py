@@ -117,7 +117,11 @@ def make_plan(model: Model, recorded: Mapping[str, Any] | None = None) -> Plan:
             "young_modulus, density and area (SI units)"
         )
     # mass-proportional damping: xi = c_m / (2 rho omega) is largest for the largest c_m / rho
-    ratio = max(m.damping / m.density for m in case.material.values()) / (2.0 * max(frequency.lower, 1e-300))
+    ratio = (
+        model.inertia.largest_factor
+        * max(m.damping / m.density for m in case.material.values())
+        / (2.0 * max(frequency.lower, 1e-300))
+    )
     limit = scheme.limit(min(ratio, 1e3))
     local = _dashpot_rate(model) / (2.0 * max(frequency.lower, 1e-300))  # of single nodes, not of all modes
     safe = scheme.limit(min(ratio + local, 1e3)) if local else limit
@@ -284,7 +288,7 @@ def _warn_of_gain(model: Model, plan: Plan) -> None:
 def _warn_of_damping(model: Model, plan: Plan) -> None:
     """Warn if damping stops nodes within a few steps, when no rule over steps gives its dissipation accurately."""
     rate = max(material.damping / material.density for material in model.case.material.values())
-    rate = max(rate, _dashpot_rate(model))
+    rate = max(model.inertia.largest_factor * rate, _dashpot_rate(model))
     if rate * plan.step > _DAMPED:
         model.warnings.append(
             f"time.step = {plan.step:.4g} s: damping stops nodes within a few steps (material.damping / density, or "

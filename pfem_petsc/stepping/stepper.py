@@ -241,6 +241,7 @@ class Stepper(ABC):
 
     def resume(self) -> None:
         """Continue from a state that was restored from a checkpoint. Collective."""
+        self.model.inertia.change(self.state.time)
         self.ruptures.begin()
         self.removals.resume()
 
@@ -312,6 +313,7 @@ class Stepper(ABC):
         self.balance = self.scheme.balance(state, self.part)
         if self.prescribed.moving:
             self.prescribed.prescribe(self.balance)
+        self.model.inertia.change(sum(weight * time for weight, time in self.balance.loads))
         self.model.contact.motion.begin(state.time, self.part)
         state.external = load_of(self, self.balance)
         if self.scheme.inertial:

@@ -21,6 +21,9 @@ def draw_points(chance: random.Random, case: dict[str, Any], size: float) -> Non
     if bar and math.isfinite(bar) and chance.random() < 0.15:
         node_sets = [chance.choice(sorted(case["node_set"])) for _ in range(chance.randint(1, 2))]
         case["mass"] = [{"node_set": name, "value": bar * 10 ** chance.uniform(-2, 1)} for name in node_sets]
+    if any("damping" in material for material in case["material"].values()) and chance.random() < 0.3:
+        end = case["time"]["end"]
+        case["time"]["damping_table"] = [[0.0, chance.uniform(0.0, 2.0)], [chance.uniform(0.1, 1.0) * end, 0.0]]
     if case.get("contact", {}).get("treatment") == "mass_redistribution":
         return  # refuses both
     stiffness = max(area * material["young_modulus"] for area, material in sections) / size

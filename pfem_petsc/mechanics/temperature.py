@@ -33,7 +33,7 @@ class Temperatures:
     def __init__(self, case: Case, mesh: DistributedMesh, bars: Bars) -> None:
         self.any = bool(case.temperature)
         self.varying = any(entry.table is not None for entry in case.temperature)
-        self._bars = bars
+        self._case, self._bars = case, bars
         self._entries = []
         for index, entry in enumerate(case.temperature):
             members = slice(None)
@@ -70,7 +70,7 @@ class Temperatures:
         kept = self.values.copy()
         for block in self._bars.blocks:
             if block.law.modulus is not None:
-                rows = block.parameters[-1]  # of the factors
+                rows = np.array(self._case.material[self._case.section[block.section].material].softening)
                 self.values[block.start : block.stop] = rows[np.argmax(rows[:, 1]), 0]
         try:
             yield

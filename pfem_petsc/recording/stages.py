@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..energies import ENERGIES
+from ..energies import BAR_ENERGIES, ENERGIES
 from ..output.row import Row, RowLayout
 
 if TYPE_CHECKING:
@@ -107,8 +107,9 @@ def carried_sums(recorder: Recorder, last: Mapping[str, Any], kick: tuple[float,
     change["external_work"] += work + max(gained, 0.0) + first["wall_kinetic_energy"] - last["wall_kinetic_energy"]
     change["numerical_dissipation"] += max(-gained, 0.0)
     if "temperature" in recorder.model.case.given:
-        stored = ("elastic_energy", "plastic_dissipation")
-        change["thermal_work"] += sum(first[name] - last[name] for name in stored)
+        # dissipation too: bars may be damaged or break by it at once
+        of_bars = [name for name in BAR_ENERGIES if name in layout.places]
+        change["thermal_work"] += sum(first[name] - last[name] for name in of_bars)
     change["external_impulse"] += momentum
     change["support_impulse"] += first["momentum"] - last["momentum"] - momentum
     carried = np.zeros(layout.width)

@@ -114,3 +114,43 @@ def test_heating_in_halved_steps(shared_tmp_path, comm):
         assert halves["kinetic_energy"].max() > 1e-3
         for name in ("probe/end/position", "probe/end/velocity", "elastic_energy", "thermal_work"):
             assert history[name] == pytest.approx(halves[name][::2], rel=1e-9, abs=1e-12), name
+
+
+def held_bar(folder, comm, law, **tables):
+    """A bar whose ends are held, heated over time or from a stage on."""
+    material = {"young_modulus": 1e6, "density": 1e3, "thermal_expansion": 1e-4, **law}
+    data = {
+        "mesh": {"generator": "rod", "length": 1.0, "elements": 1},
+        "node_set": {"every": {"all": True}},
+        "material": {"it": material},
+        "section": {"it": {"area": 1e-4, "material": "it"}},
+        "support": [{"node_set": "every", "fix": "xyz"}],
+        "output": {"fields_every": 0},
+        **tables,
+    }
+    return run(Case.from_dict(data, source="bar.toml"), folder / "out", comm)
+
+
+SHORT = {"integrator": "newmark", "step": 1e-3, "end": 2e-3}
+
+
+@pytest.mark.parametrize(
+    ("law", "lost"),
+    [
+        ({"law": "damage", "tensile_strength": 100.0, "fracture_energy": 0.05}, "damage_dissipation"),
+        ({"rupture": {"stress": 100.0}}, "rupture_dissipation"),
+    ],
+)
+def test_what_a_stage_damages_by_cooling_at_once_is_thermal_work(law, lost, comm, shared_tmp_path):
+    stages = [{"time": SHORT}, {"time": SHORT, "temperature": [{"value": -2.0}]}]
+    history = held_bar(shared_tmp_path, comm, law, stage=stages)
+    assert history[lost][-1] > 0.0
+    assert np.abs(history["energy_imbalance"]).max() < 1e-12 * history["thermal_work"][-1]
+
+
+def test_bars_that_soften_and_are_damped_in_proportion_to_stiffness_are_heated(comm, shared_tmp_path):
+    """All in one: the modulus at the end is halved, and the force with it."""
+    law = {"softening": [[0.0, 1.0, 1.0], [50.0, 0.5, 0.5]], "stiffness_damping": 1e-3}
+    rows = [[0.0, 0.0], [1e-3, 50.0]]
+    history = held_bar(shared_tmp_path, comm, law, time=SHORT, temperature=[{"table": rows}])
+    assert history["elastic_energy"][-1] == pytest.approx(0.5 * 0.5e6 * (50.0 * 1e-4) ** 2 * 1e-4)

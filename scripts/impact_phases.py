@@ -27,7 +27,8 @@ from pfem_petsc.errors import InputError, SimulationFailure
 from pfem_petsc.registry import lookup
 from pfem_petsc.stepping.contact_check import BOUND, contact_gain, overshoots
 from pfem_petsc.stepping.model import Model
-from pfem_petsc.stepping.prepare import make_plan, make_stepper
+from pfem_petsc.stepping.plan import make_plan
+from pfem_petsc.stepping.prepare import make_stepper
 from pfem_petsc.stepping.stepper import Stepper
 
 DOCS = Path(__file__).parent.parent / "docs"

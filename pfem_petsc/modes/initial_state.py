@@ -46,7 +46,7 @@ class _InitialStepper(Stepper):
 
     def start(self) -> None:
         self.start_without_motion()
-        self.totals_at_start = self._totals()
+        self.totals_at_start = self.totals()
 
     def accelerate(self, load: np.ndarray) -> np.ndarray:
         return np.zeros_like(load)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from ..mesh.distribution import DistributedMesh
     from ..recording.fields import Fields
     from ..stepping.model import Model
-    from ..stepping.prepare import Plan
+    from ..stepping.plan import Plan
 
 __all__ = ["checkpoint_bytes", "forecast", "memory_of_machine", "memory_warning", "result_bytes"]
 

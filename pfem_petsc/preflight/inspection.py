@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from ..case.schema import Case
     from ..mesh.distribution import DistributedMesh
     from ..stepping.model import Model
-    from ..stepping.prepare import Plan
+    from ..stepping.plan import Plan
 
 __all__ = ["inspect", "warnings_before"]
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from ..case.schema import Case
-    from ..stepping.prepare import Plan
+    from ..stepping.plan import Plan
 
 __all__ = ["jumping_motions"]
 

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from ..case.schema import Case
     from ..contact.walls.base import WallKeys
     from ..stepping.model import Model
-    from ..stepping.prepare import Plan
+    from ..stepping.plan import Plan
 
 __all__ = ["summarise"]
 

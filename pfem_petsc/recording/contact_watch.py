@@ -9,7 +9,7 @@ from ..energies import STORED, SUPPLIED
 
 if TYPE_CHECKING:
     from ..stepping.model import Model
-    from ..stepping.prepare import Plan
+    from ..stepping.plan import Plan
 
 __all__ = ["ContactWatch", "NoContactWatch"]
 

@@ -19,7 +19,7 @@ from .stages import StageColumns, StageRows, carried_sums
 
 if TYPE_CHECKING:
     from ..run.synchroniser import Synchroniser
-    from ..stepping.prepare import Plan
+    from ..stepping.plan import Plan
     from ..stepping.stepper import Stepper
 
 __all__ = ["History"]

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from ..recording.blowup import BlowUp
     from ..recording.recorder import Recorder
     from ..stepping.ledger import Ledger
-    from ..stepping.prepare import Plan
+    from ..stepping.plan import Plan
     from ..stepping.stepper import Stepper
 
 __all__ = ["Checkpoints"]

@@ -21,7 +21,7 @@ from .compare import changed_keys, check_version
 
 if TYPE_CHECKING:
     from ..case.schema import Case
-    from ..stepping.prepare import Plan
+    from ..stepping.plan import Plan
 
 __all__ = ["RESULT", "Restart", "find_restart", "finished", "finished_message", "prepare_folder"]
 

@@ -9,7 +9,7 @@ from ..analysis import Analysis
 from ..modes.choice import describe_modes
 from ..modes.initial_state import InitialState
 from ..statics.analysis import StaticAnalysis
-from ..stepping.prepare import make_plan
+from ..stepping.plan import make_plan
 from ..stepping.time_stepping import TimeStepping
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from ..recording.history import History
 from ..recording.recorder import Recorder
 from ..restart.folder import RESULT, Restart
 from ..stepping.model import Model
-from ..stepping.prepare import Plan
+from ..stepping.plan import Plan
 
 __all__ = ["open_progress", "open_result_file"]
 

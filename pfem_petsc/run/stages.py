@@ -33,7 +33,7 @@ __all__ = ["StagedPlan", "Stages"]
 
 @dataclass(frozen=True)
 class StagedPlan:
-    """The plans of all stages on one axis; see :class:`~pfem_petsc.stepping.prepare.Plan`.
+    """The plans of all stages on one axis; see :class:`~pfem_petsc.stepping.plan.Plan`.
 
     Attributes
     ----------

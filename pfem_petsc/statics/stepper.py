@@ -99,7 +99,7 @@ class StaticStepper(ImplicitStepper):
         # the ledger books as that of inertia
         lack = state.external - state.f[: model.mesh.n_owned] + state.contact + state.support
         state.a = lack / model.inertia.mass[:, None]
-        self.totals_at_start = self._totals()
+        self.totals_at_start = self.totals()
         self.scheme.start(state, self.h)
         model.contact.motion.start(self.h)
 

@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..contact.alarm import CarriedNodes
-from ..contact.initial_equilibrium import start_at_rest
 from ..errors import SimulationFailure
 from ..integrators.base import Balance, Scheme, State
 from ..mechanics.bars import StrainEnergy
-from ..tolerances import BEYOND, TIME
+from ..tolerances import TIME
 from .collapse import tell_collapse
 from .loading import load_now, load_of
 from .massless import MasslessNodes
@@ -21,6 +20,7 @@ from .prescribed import PrescribedMotion
 from .removals import Removals
 from .ruptures import Ruptures
 from .solution import Solution
+from .start import start_at_zero, start_in_motion
 
 if TYPE_CHECKING:
     from .model import Model
@@ -114,63 +114,11 @@ class Stepper(ABC):
 
     def start(self) -> None:
         """Initialise velocity, internal force and acceleration of the state. Collective."""
-        state, model = self.state, self.model
-        velocity = model.initial_velocity()
-        state.v = velocity if model.start is None else state.v + velocity
-        supports = model.supports
-        if supports.any:
-            state.position[supports.at] = supports.positions(0.0)
-            state.v[supports.at] = supports.rates(0.0, 0.0)[0]
-        if model.external.state_forces:
-            model.external.follow(state.position, state.v)
-        if self.massless is not None and self.massless.settle(state.x, 0.0, 0.0) > BEYOND * model.length:
-            self.fault = SimulationFailure(
-                "step 0, t = 0 s: contact nodes without mass found no equilibrium; take another contact.treatment"
-            )
-        self.evaluate(commit=True)
-        if model.external.active:
-            state.external = load_now(self, 0.0)
-        load = state.external - state.f[: model.mesh.n_owned]
-        if model.inertia.damped:
-            load -= model.inertia.damping_times(state.v, np.zeros_like(load))
-        state.a = self._acceleration(load)
-        if model.can_touch and model.inertia.redistribution is None:
-            walls = start_at_rest(model, state, self._acceleration, load)
-            if walls is not None:
-                held = model.links.count_held(walls.nodes[walls.touching.any(axis=1)], len(state.v))
-                self.solution.walls, self.solution.contacts = walls, held
-        if self.massless is not None:
-            state.contact, self.solution.walls = self.massless.press(state.position, load, 0.0)
-            self.solution.contacts = int(self.solution.walls.touching.sum())
-        if supports.any:
-            inertial = model.inertia.mass_times(state.a, np.empty_like(state.a))
-            state.support = np.zeros_like(state.v)
-            state.support[supports.fixed] = (inertial - load - state.contact)[supports.fixed]
-        self.totals_at_start = self._totals()
-        self.walls_at_start = self.solution.walls.force
-        self.links_at_start = model.links.totals()
-        self.scheme.start(state, self.h)
-        motion = model.contact.motion
-        motion.start(self.h)
-        if self.scheme.solves_next_position:
-            v, speeds = state.v, motion.speeds
-            self._solve_and_finish(self.state.time)
-            self.totals_solved = self._totals()
-            self.velocity_solved = state.v
-            # nodes on a wall have not lost their velocity yet; the scheme continues from its own memory
-            state.v = v
-            motion.set_speeds(speeds)
+        start_in_motion(self)
 
     def start_without_motion(self) -> None:
         """Initialise positions, internal forces and loads at time zero, where nothing moves. Collective."""
-        state, model = self.state, self.model
-        state.v = np.zeros_like(self.zero)
-        state.a = np.zeros_like(self.zero)
-        if model.supports.any:
-            state.position[model.supports.at] = model.supports.positions(0.0)
-        self.evaluate(commit=True)
-        if model.external.active:
-            state.external = model.external.at(0.0, np.empty_like(state.v))
+        start_at_zero(self)
 
     def acceleration(self) -> np.ndarray:
         """Acceleration (owned, 3) to record [m/s2]; collective with consistent mass.
@@ -192,7 +140,8 @@ class Stepper(ABC):
             load += state.contact - model.inertia.mass_times(known, np.empty_like(load))
         return np.where(held, state.a, self.accelerate(load))
 
-    def _totals(self) -> np.ndarray:
+    def totals(self) -> np.ndarray:
+        """Return this rank's sums (3, 3) of support, external and damping force [N] at the state."""
         state, inertia = self.state, self.model.inertia
         damping = -inertia.damping_times(state.v, np.empty_like(state.v))
         support = state.support.sum(axis=0)
@@ -285,9 +234,9 @@ class Stepper(ABC):
             self.scheme.advance(self.state, self.part)
             self.prescribed.place(end)
             self._arrive(end)
-            self._solve_and_finish(end)
+            self.solve_and_finish(end)
         else:
-            self._solve_and_finish(end)
+            self.solve_and_finish(end)
             if self.prescribed.moving:
                 self.prescribed.place(end)
                 self.prescribed.take_rates(end)
@@ -308,7 +257,8 @@ class Stepper(ABC):
             self.model.change_bars(end)
         self.evaluate(commit=True)
 
-    def _solve_and_finish(self, end: float) -> None:
+    def solve_and_finish(self, end: float) -> None:
+        """Solve the balance of the part to a time [s] and update the state. Collective if the solve is."""
         state = self.state
         self.balance = self.scheme.balance(state, self.part)
         if self.prescribed.moving:
@@ -329,7 +279,7 @@ class Stepper(ABC):
         if self.scheme.turns_held and self.treatment is None:
             self.model.contact.calm(fresh, state.v, self.balance.time, self.part)
 
-    def _acceleration(self, load: np.ndarray) -> np.ndarray:
+    def initial_acceleration(self, load: np.ndarray) -> np.ndarray:
         """Return the acceleration (owned, 3) with M a = load [N], prescribed values included. Collective."""
         supports = self.model.supports
         if not supports.moving:

@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from ..analysis import Analysis
-from .prepare import Plan, make_stepper
+from .plan import Plan
+from .prepare import make_stepper
 
 if TYPE_CHECKING:
     from .model import Model

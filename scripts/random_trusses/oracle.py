@@ -24,7 +24,7 @@ from mpi4py import MPI
 from pfem_petsc.case.schema import Case
 from pfem_petsc.contact.walls.base import WallKeys
 from pfem_petsc.stepping.model import Model
-from pfem_petsc.stepping.prepare import make_plan
+from pfem_petsc.stepping.plan import make_plan
 
 from .loading import Loaded
 

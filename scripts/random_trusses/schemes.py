@@ -18,7 +18,7 @@ from mpi4py import MPI
 from pfem_petsc import Case
 from pfem_petsc.errors import InputError
 from pfem_petsc.stepping.model import Model
-from pfem_petsc.stepping.prepare import make_plan
+from pfem_petsc.stepping.plan import make_plan
 
 from .loading import Loaded
 from .running import case_text, clear, run_case

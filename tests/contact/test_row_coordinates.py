@@ -16,7 +16,8 @@ from pfem_petsc.contact.transform import Transform
 from pfem_petsc.solvers.matrix import HessianMatrix
 from pfem_petsc.solvers.matrix_free import MatrixFreeHessian
 from pfem_petsc.stepping.model import Model
-from pfem_petsc.stepping.prepare import make_plan, make_stepper
+from pfem_petsc.stepping.plan import make_plan
+from pfem_petsc.stepping.prepare import make_stepper
 from pfem_petsc.stepping.problem import StepProblem
 
 

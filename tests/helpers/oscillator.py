@@ -14,7 +14,7 @@ from pfem_petsc.registry import lookup
 from pfem_petsc.stepping.explicit import ExplicitStepper
 from pfem_petsc.stepping.implicit import ImplicitStepper
 from pfem_petsc.stepping.model import Model
-from pfem_petsc.stepping.prepare import make_plan
+from pfem_petsc.stepping.plan import make_plan
 
 YOUNG, DENSITY, LENGTH = 2.0, 1.0, 1.0
 OMEGA = {"lumped": np.sqrt(2 * YOUNG / DENSITY) / LENGTH, "consistent": np.sqrt(3 * YOUNG / DENSITY) / LENGTH}

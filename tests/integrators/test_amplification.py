@@ -9,7 +9,7 @@ from pfem_petsc import Simulation
 from pfem_petsc.errors import InputError
 from pfem_petsc.output.result import open_result
 from pfem_petsc.stepping.model import Model
-from pfem_petsc.stepping.prepare import make_plan
+from pfem_petsc.stepping.plan import make_plan
 
 # h/T, damping ratio and its digits, period error [%] and its digits; from amplification matrices of the literature.
 TABLE = {

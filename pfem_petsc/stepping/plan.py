@@ -1,0 +1,226 @@
+"""The plan of a run: scheme, time step and linear solver, resolved once before the first step."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from mpi4py import MPI
+
+from ..case.materials import law_name, law_of
+from ..errors import InputError
+from ..integrators.base import Scheme
+from ..output.units import TIME as AXIS
+from ..output.units import Axis, engineering
+from ..registry import lookup
+from ..solvers.linear import LinearChoice, choose_linear
+from ..tolerances import TIME
+from .stability import Frequency, highest_frequency
+
+if TYPE_CHECKING:
+    from ..case.schema import Case
+    from .model import Model
+
+__all__ = ["Plan", "dashpot_rate", "make_plan"]
+
+_MOST_STEPS = 2.0**53  # beyond this, consecutive steps do not have distinct times
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The resolved settings of a run.
+
+    Attributes
+    ----------
+    scheme : the integrator
+    step : time step [s]
+    steps : number of steps to the end
+    critical_step : largest stable step of the scheme [s], infinite if unconditionally stable
+    frequency : bounds on the highest natural frequency [rad/s]
+    linear : linear solver, None where every node is solved on its own
+    asked : what the case asks for of it, ``solver.linear`` and ``solver.operator``
+    axis : of the times in the results
+    """
+
+    scheme: Scheme
+    step: float
+    steps: int
+    critical_step: float
+    frequency: Frequency
+    linear: LinearChoice | None
+    asked: tuple[str, str] = ("auto", "auto")
+    axis: Axis = AXIS
+
+    @property
+    def end(self) -> float:
+        """Time of the last step [s]."""
+        return self.step * self.steps
+
+    def beyond(self, steps: np.ndarray, times: np.ndarray) -> np.ndarray:
+        """Which of recorded steps with their times lie beyond the end."""
+        return steps > self.steps
+
+    def entries(self, case: Case) -> dict[str, str]:
+        """Label and text of what a user checks before a run."""
+        parameters = ", ".join(f"{k} = {v:g}" for k, v in case.time.scheme.model_dump().items())
+        critical = engineering(self.critical_step, "s") if np.isfinite(self.critical_step) else "none (implicit)"
+        return {
+            "integrator": case.time.integrator + (f" ({parameters})" if parameters else ""),
+            "critical step": critical,
+            "time step": f"{engineering(self.step, 's', 6)}, {self.steps:,} steps to {engineering(self.end, 's')}",
+        }
+
+    def record(self) -> dict[str, Any]:
+        """Return the numbers that a restart must not compute again, exact to the last bit."""
+        linear = None if self.linear is None else {"asked": list(self.asked), "choice": asdict(self.linear)}
+        return {"step": self.step, "frequency": list(self.frequency), "linear": linear}
+
+
+def make_plan(model: Model, recorded: Mapping[str, Any] | None = None) -> Plan:
+    """Resolve the settings that the case leaves open. Collective.
+
+    Parameters
+    ----------
+    model : Model
+    recorded : :meth:`Plan.record` of the run that is continued, whose time step and frequencies are kept
+
+    Raises
+    ------
+    InputError
+        On all ranks, if the step is certainly unstable.
+    """
+    case = model.case
+    time = case.time
+    scheme = lookup("pfem_petsc.integrators", time.integrator, f"{case.source}: time.integrator").Scheme(time.scheme)
+    _check_laws(case, scheme)
+    if recorded is None:
+        frequency = _highest_frequency(model)
+    else:
+        frequency = Frequency(*recorded["frequency"])
+    if not np.isfinite(frequency.upper):
+        raise InputError(
+            f"{case.source}: material: the stiffness of the bars over their mass overflows double precision: correct "
+            "young_modulus, density and area (SI units)"
+        )
+    # mass-proportional damping: xi = c_m / (2 rho omega) is largest for the largest c_m / rho
+    ratio = (
+        model.inertia.largest_factor
+        * max(m.damping / m.density for m in case.material.values())
+        / (2.0 * max(frequency.lower, 1e-300))
+    )
+    limit = scheme.limit(min(ratio, 1e3))
+    local = dashpot_rate(model) / (2.0 * max(frequency.lower, 1e-300))  # of single nodes, not of all modes
+    safe = scheme.limit(min(ratio + local, 1e3)) if local else limit
+    if limit == 0.0:
+        raise InputError(
+            f"{case.source}: time: {time.integrator} with these parameters is unstable at any step; take gamma >= 1/2"
+        )
+    betas = [case.material[section.material].stiffness_damping for section in case.section.values()]
+    critical = _stable_step(scheme, safe, frequency.upper, max(betas))
+    certain = _stable_step(scheme, limit, frequency.lower, min(betas))
+    if recorded is not None:
+        step = float(recorded["step"])
+        steps = _steps_to(time.end, step, case.source)
+    elif time.step == "auto":
+        if not np.isfinite(critical):
+            raise InputError(
+                f'{case.source}: time.step = "auto": {time.integrator} has no critical step here; give time.step [s]'
+            )
+        steps = _steps_to(time.end, time.safety * critical, case.source)
+        step = time.end / steps
+    else:
+        step = float(time.step)
+        if step > certain * (1.0 + TIME):
+            raise InputError(
+                f"{case.source}: time.step = {step:g} s is above the limit of {time.integrator}, which is unstable "
+                f'beyond {critical:.6g} s for this model; reduce it, or use time.step = "auto"'
+            )
+        steps = _steps_to(time.end, step, case.source)
+        if step > time.end * (1.0 + TIME):
+            model.warnings.append(
+                f"time.step = {step:g} s is longer than time.end = {time.end:g} s: the run makes one step, "
+                f"to t = {step:g} s"
+            )
+    asked = case.solver.linear, case.solver.operator
+    linear = None
+    if not scheme.explicit or model.inertia.consistent:
+        kept = None if recorded is None else recorded.get("linear")
+        if kept is not None and tuple(kept["asked"]) == asked:
+            linear = LinearChoice(**kept["choice"])
+        else:
+            linear = _linear(model, scheme, 0.0 if scheme.explicit else step * frequency.upper / 2.0, steps)
+    return Plan(scheme, step, steps, critical, frequency, linear, asked)
+
+
+def _highest_frequency(model: Model) -> Frequency:
+    """Return bounds on the highest frequency of the model at any time, unstrained. Collective."""
+    frequency = highest_frequency(model, model.mesh.points)
+    with ExitStack() as stack:
+        if model.rest_lengths.varying:
+            stack.enter_context(model.rest_lengths.shortest())
+        if model.temperatures.varying and any(law_of(m).modulus is not None for m in model.case.material.values()):
+            stack.enter_context(model.temperatures.stiffest())
+        elif not model.rest_lengths.varying:
+            return frequency
+        other = highest_frequency(model, model.mesh.points)
+    return Frequency(min(frequency.lower, other.lower), max(frequency.upper, other.upper))
+
+
+def dashpot_rate(model: Model) -> float:
+    """Return the largest c/m of dashpots [1/s]; at most three times as large with consistent mass. Collective."""
+    inertia = model.inertia
+    if inertia.points.damping is None:
+        return 0.0
+    factor = 3.0 if inertia.consistent else 1.0
+    return factor * model.comm.allreduce(float((inertia.points.damping / inertia.mass).max(initial=0.0)), op=MPI.MAX)
+
+
+def _stable_step(scheme: Scheme, limit: float, frequency: float, beta: float) -> float:
+    """Return the stable step [s] at an angular frequency [rad/s], from the limit of Omega without damping C = beta K.
+
+    In explicit steps the rate of strain is that of the step before. Schemes become unstable by an eigenvalue -1, with
+    which this rate is 2/h times the strain: as with the stiffness K (1 + 2 beta/h), hence h^2 + 2 beta h = (limit/w)^2.
+    """
+    if not frequency > 0.0:
+        return np.inf
+    step = limit / frequency
+    if not scheme.explicit or not beta:
+        return step
+    return step * step / (beta + float(np.hypot(beta, step)))
+
+
+def _check_laws(case: Case, scheme: Scheme) -> None:
+    """Refuse material laws that are not compatible with the scheme."""
+    for name, material in case.material.items():
+        reason = law_of(material).refuses(scheme)
+        if reason is not None:
+            raise InputError(
+                f'{case.source}: material.{name}.law = "{law_name(dict(material))}" is not compatible with '
+                f'time.integrator = "{case.time.integrator}": {reason}; use another integrator or law'
+            )
+
+
+def _linear(model: Model, scheme: Scheme, over: float, steps: int) -> LinearChoice:
+    """Choose the linear solver for steps of ``over`` times the limit of central differences."""
+    case = model.case
+    impact = model.can_touch or not all(law_of(material).smooth for material in case.material.values())
+    solver, unknowns = case.solver, 3 * model.mesh.n_nodes
+    try:
+        choice = choose_linear(solver.linear, unknowns, over, scheme.symmetric, solver.operator, steps, impact)
+    except InputError as error:
+        raise InputError(f"{case.source}: {error}") from error
+    if not model.contact.symmetric and choice.krylov == "cg":
+        return replace(choice, why=f"{choice.why}; GMRES near walls with friction")
+    return choice
+
+
+def _steps_to(end: float, step: float, source: str) -> int:
+    if not end / step < _MOST_STEPS:
+        raise InputError(
+            f"{source}: time.end = {end:g} s in steps of {step:g} s needs more steps than can be counted; use a larger "
+            "time.step or a smaller time.end"
+        )
+    return max(int(np.ceil(end / step * (1.0 - 1e-12) - 1e-9)), 1)

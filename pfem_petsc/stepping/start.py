@@ -1,0 +1,79 @@
+"""The state of a stepper at the start of a run or of a stage."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..contact.initial_equilibrium import start_at_rest
+from ..errors import SimulationFailure
+from ..tolerances import BEYOND
+from .loading import load_now
+
+if TYPE_CHECKING:
+    from .stepper import Stepper
+
+__all__ = ["start_at_zero", "start_in_motion"]
+
+
+def start_in_motion(stepper: Stepper) -> None:
+    """Initialise velocity, internal force and acceleration of the state. Collective."""
+    state, model = stepper.state, stepper.model
+    velocity = model.initial_velocity()
+    state.v = velocity if model.start is None else state.v + velocity
+    supports = model.supports
+    if supports.any:
+        state.position[supports.at] = supports.positions(0.0)
+        state.v[supports.at] = supports.rates(0.0, 0.0)[0]
+    if model.external.state_forces:
+        model.external.follow(state.position, state.v)
+    if stepper.massless is not None and stepper.massless.settle(state.x, 0.0, 0.0) > BEYOND * model.length:
+        stepper.fault = SimulationFailure(
+            "step 0, t = 0 s: contact nodes without mass found no equilibrium; take another contact.treatment"
+        )
+    stepper.evaluate(commit=True)
+    if model.external.active:
+        state.external = load_now(stepper, 0.0)
+    load = state.external - state.f[: model.mesh.n_owned]
+    if model.inertia.damped:
+        load -= model.inertia.damping_times(state.v, np.zeros_like(load))
+    state.a = stepper.initial_acceleration(load)
+    if model.can_touch and model.inertia.redistribution is None:
+        walls = start_at_rest(model, state, stepper.initial_acceleration, load)
+        if walls is not None:
+            held = model.links.count_held(walls.nodes[walls.touching.any(axis=1)], len(state.v))
+            stepper.solution.walls, stepper.solution.contacts = walls, held
+    if stepper.massless is not None:
+        state.contact, stepper.solution.walls = stepper.massless.press(state.position, load, 0.0)
+        stepper.solution.contacts = int(stepper.solution.walls.touching.sum())
+    if supports.any:
+        inertial = model.inertia.mass_times(state.a, np.empty_like(state.a))
+        state.support = np.zeros_like(state.v)
+        state.support[supports.fixed] = (inertial - load - state.contact)[supports.fixed]
+    stepper.totals_at_start = stepper.totals()
+    stepper.walls_at_start = stepper.solution.walls.force
+    stepper.links_at_start = model.links.totals()
+    stepper.scheme.start(state, stepper.h)
+    motion = model.contact.motion
+    motion.start(stepper.h)
+    if stepper.scheme.solves_next_position:
+        v, speeds = state.v, motion.speeds
+        stepper.solve_and_finish(stepper.state.time)
+        stepper.totals_solved = stepper.totals()
+        stepper.velocity_solved = state.v
+        # nodes on a wall have not lost their velocity yet; the scheme continues from its own memory
+        state.v = v
+        motion.set_speeds(speeds)
+
+
+def start_at_zero(stepper: Stepper) -> None:
+    """Initialise positions, internal forces and loads at time zero, where nothing moves. Collective."""
+    state, model = stepper.state, stepper.model
+    state.v = np.zeros_like(stepper.zero)
+    state.a = np.zeros_like(stepper.zero)
+    if model.supports.any:
+        state.position[model.supports.at] = model.supports.positions(0.0)
+    stepper.evaluate(commit=True)
+    if model.external.active:
+        state.external = model.external.at(0.0, np.empty_like(state.v))

@@ -192,8 +192,8 @@ class Simulation:
         recorder = Recorder(self.stepper, None)
         entries, warnings = inspect(self.model.case, self.model)
         entries |= forecast(self.case, self.model, self.plan, self.outputs.fields, recorder.columns, recorder.types)
-        warnings += warnings_before(self.model.case, self.model, self.analysis.plan)
-        return entries, self.model.warnings + odd_accelerations(self.case) + warnings
+        before = warnings_before(self.model.case, self.model, self.analysis.plan)
+        return entries, self.model.warnings + odd_accelerations(self.case) + before + warnings
 
     def on_step(self, function: Callable[[Step], object], every: int = 1) -> None:
         """Register a function to be called on all ranks after each step whose number is a multiple of ``every``.

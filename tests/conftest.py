@@ -100,7 +100,7 @@ def thinned(items: list[pytest.Item], ranks: int) -> list[pytest.Item]:
     """Return all tests except the thorough ones, with some of their sets of parameters.
 
     Tests with more than two sets (one on several ranks) run with every fourth, fifth or eighth of them on 1, 2 and 3
-    ranks, slow tests with a quarter of these. The selection depends on the number of ranks.
+    ranks, slow tests with a quarter of these. On three ranks every second test runs.
     """
     sets: dict[tuple[Path, str], list[pytest.Item]] = {}
     for item in items:
@@ -108,7 +108,7 @@ def thinned(items: list[pytest.Item], ranks: int) -> list[pytest.Item]:
             sets.setdefault((item.path, getattr(item, "originalname", item.name)), []).append(item)
     most, stride = {1: (2, 4), 2: (1, 5)}.get(ranks, (1, 8))
     chosen: set[pytest.Item] = set()
-    for group in sets.values():
+    for group in list(sets.values())[:: 2 if ranks > 2 else 1]:
         slow = group[0].get_closest_marker("slow") is not None
         if slow or len(group) > most:
             every = 4 * stride if slow else stride

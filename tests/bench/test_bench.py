@@ -71,7 +71,7 @@ def bench(*options):
     return subprocess.run(command, capture_output=True, text=True, timeout=240)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_the_verb_writes_what_it_measured(tmp_path):
     path = tmp_path / "bench.json"
     done = bench("--sizes", "100", "1000", "--seconds", "0.05", "-o", str(path))

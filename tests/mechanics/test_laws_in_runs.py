@@ -99,7 +99,7 @@ def test_thrown_bar_is_integrated_as_by_scipy(law, measure, comm, shared_tmp_pat
     assert (np.diff(history["plastic_heat"]) > -1e-9).all()
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 @pytest.mark.parametrize("law", ["johnson_cook", "multilinear", "voce"])
 def test_laws_in_the_fused_loop(law, tmp_path):
     """Many steps in one call are the single steps to the last bit."""
@@ -218,7 +218,7 @@ def test_restrained_bar_that_softens(tmp_path):
         assert history["probe/tip/reaction"][-1, 0, 0] == pytest.approx(stress * AREA, rel=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.thorough
 def test_thermal_work_of_laws_that_yield_while_heated(tmp_path):
     """What is no heat, energy of the bars or thermal work vanishes with the square of the step."""
     left = []

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
-from pydantic import Field, field_validator, model_validator
+from pydantic import Field, model_validator
 
 from .base import Finite, NonNegativeFloat, PositiveFloat, StrictModel, Vector3
-from .rows import FileName, Table2, Table4, increasing
+from .rows import FileName, Table2, Table4
 
 __all__ = ["Gravity", "Load", "LoadFile", "Temperature", "VaryingGravity", "VaryingWind", "Wind"]
 
@@ -26,12 +26,6 @@ class Load(StrictModel):
     """the rows of ``table`` from the columns of a CSV or NPZ file: its name, or a table of :class:`TableFile`"""
     interpolation: Literal["linear", "smooth"] = "linear"
     """interpolation of ``table`` between its rows: straight lines, or a cubic spline"""
-
-    @field_validator("table")
-    @classmethod
-    def _table_times(cls, table: tuple[Any, ...] | None) -> tuple[Any, ...] | None:
-        increasing(table)
-        return table
 
     @model_validator(mode="after")
     def _interpolates(self) -> Load:
@@ -71,21 +65,13 @@ class Gravity(StrictModel):
         return self.acceleration
 
 
-class VaryingGravity(StrictModel):
+class VaryingGravity(Gravity):
     """Uniform acceleration of every mass that varies over time."""
 
     acceleration: Table4
     """rows [t, ax, ay, az] [s, m/s2], constant outside"""
-    acceleration_file: FileName | None = None
-    """such rows from the columns of a CSV or NPZ file, added to a constant acceleration"""
     interpolation: Literal["linear", "smooth"] = "linear"
     """interpolation between the rows: straight lines, or a cubic spline"""
-
-    @field_validator("acceleration")
-    @classmethod
-    def _times(cls, rows: tuple[Any, ...]) -> tuple[Any, ...]:
-        increasing(rows)
-        return rows
 
     @property
     def mean(self) -> tuple[float, ...]:
@@ -106,25 +92,13 @@ class Wind(StrictModel):
     """drag coefficient C_d of bars whose section has none"""
 
 
-class VaryingWind(StrictModel):
+class VaryingWind(Wind):
     """Wind over time."""
 
     velocity: Table4
     """rows [t, vx, vy, vz] [s, m/s], constant outside"""
-    velocity_file: FileName | None = None
-    """such rows from the columns of a CSV or NPZ file, added to a constant velocity"""
-    density: PositiveFloat = 1.225
-    """density of the fluid [kg/m3]; default: air at 15 degrees Celsius"""
-    drag_coefficient: NonNegativeFloat = 1.2
-    """drag coefficient C_d of bars whose section has none"""
     interpolation: Literal["linear", "smooth"] = "linear"
     """interpolation between the rows: straight lines, or a cubic spline"""
-
-    @field_validator("velocity")
-    @classmethod
-    def _times(cls, rows: tuple[Any, ...]) -> tuple[Any, ...]:
-        increasing(rows)
-        return rows
 
 
 class Temperature(StrictModel):
@@ -140,12 +114,6 @@ class Temperature(StrictModel):
     """the rows of ``table`` from the columns of a CSV or NPZ file: its name, or a table of :class:`TableFile`"""
     interpolation: Literal["linear", "smooth"] = "linear"
     """interpolation of ``table`` between its rows: straight lines, or a cubic spline"""
-
-    @field_validator("table")
-    @classmethod
-    def _table_times(cls, table: tuple[Any, ...] | None) -> tuple[Any, ...] | None:
-        increasing(table)
-        return table
 
     @model_validator(mode="after")
     def _exactly_one(self) -> Temperature:

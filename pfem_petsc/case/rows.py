@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import chain
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
-from pydantic import Field, ValidatorFunctionWrapHandler, WrapValidator
+from pydantic import AfterValidator, Field, ValidatorFunctionWrapHandler, WrapValidator
 
 from .base import Finite, listed
 
 __all__ = ["FileName", "Table2", "Table4", "increasing"]
 
+Rows = TypeVar("Rows", bound=Sequence[Sequence[float]])
 Row2 = Annotated[tuple[Finite, Finite], listed]
 Row4 = Annotated[tuple[Finite, Finite, Finite, Finite], listed]
 
@@ -31,17 +32,20 @@ def _numbers(width: int) -> WrapValidator:
     return WrapValidator(read)
 
 
-Table2 = Annotated[tuple[Row2, ...], listed, _numbers(2)]
-Table4 = Annotated[tuple[Row4, ...], listed, _numbers(4)]
 FileName = Annotated[str, Field(min_length=1)]
 
 
-def increasing(rows: Sequence[Sequence[float]] | None) -> None:
-    """Refuse a time table that is empty or whose times do not increase."""
-    if rows is None:
-        return
+def increasing(rows: Rows) -> Rows:
+    """Return the rows of a table over time; refuse it if it is empty or its times do not increase."""
     if not rows:
         raise ValueError("expected at least one row")
     for k in range(1, len(rows)):
         if rows[k][0] <= rows[k - 1][0]:
             raise ValueError(f"times must increase, but row {k} has t = {rows[k][0]!r} after {rows[k - 1][0]!r}")
+    return rows
+
+
+Table2 = Annotated[tuple[Row2, ...], listed, _numbers(2), AfterValidator(increasing)]
+"""rows [t, value] with increasing times"""
+Table4 = Annotated[tuple[Row4, ...], listed, _numbers(4), AfterValidator(increasing)]
+"""rows [t, x, y, z] with increasing times"""

@@ -17,7 +17,7 @@ from .base import (
     is_finite_number,
     listed,
 )
-from .rows import Table2, increasing
+from .rows import Table2
 
 __all__ = [
     "ContactSettings",
@@ -54,7 +54,6 @@ class TimeKeys(StrictModel):
     @field_validator("damping_table")
     @classmethod
     def _factors(cls, table: tuple[Any, ...] | None) -> tuple[Any, ...] | None:
-        increasing(table)
         if any(row[1] < 0.0 for row in table or ()):
             raise ValueError("expected factors >= 0")
         return table

@@ -240,12 +240,6 @@ class Support(StrictModel):
             raise ValueError('expected any of the components x, y, z, each once, like "xz"')
         return fix
 
-    @field_validator("motion", "acceleration")
-    @classmethod
-    def _motion_times(cls, rows: tuple[Any, ...] | None) -> tuple[Any, ...] | None:
-        increasing(rows)
-        return rows
-
     @model_validator(mode="after")
     def _moves_what_it_fixes(self) -> Support:
         keys = [key for key in ("motion", "velocity", "acceleration") if getattr(self, key) is not None]

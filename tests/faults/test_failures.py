@@ -16,7 +16,7 @@ import os, signal, shutil, sys, time
 import numpy as np
 from mpi4py import MPI
 from pfem_petsc.cli.main import main
-from pfem_petsc.stepping import prepare
+from pfem_petsc.stepping import plan
 from pfem_petsc.stepping.stepper import Stepper
 from pfem_petsc.stepping.explicit import ExplicitStepper
 from pfem_petsc.stepping.implicit import ImplicitStepper
@@ -126,7 +126,7 @@ def test_velocities_that_are_no_numbers_in_an_implicit_step(on_ranks, tmp_path):
 
 def test_unstable_step(on_ranks, tmp_path):
     """The frequency is taken for half of what it is, as where a structure stiffens far beyond its first state."""
-    halved = "found = prepare.highest_frequency\nprepare.highest_frequency = lambda *given: type(found(*given))("
+    halved = "found = plan.highest_frequency\nplan.highest_frequency = lambda *given: type(found(*given))("
     halved += "*(0.5 * frequency for frequency in found(*given)))\n"
     # two per cent above the limit, so that it takes some steps; stiff, so that the bar is far from zero length then
     words = ["pendulum", "--quiet", "--set", "material.default.young_modulus=1e10", "time.step=4.56e-4"]

@@ -126,7 +126,7 @@ class Bars:
             law = (block.parameters, block.area, self.step, block.history)
             part = np.zeros(len(BAR_ENERGIES))
             at, short, broke = block.kernels.forces(
-                x, *block.sweep, self.far, self.rest, self.heat, *law, commit, f, part
+                x, block.sweep, self.far, self.rest, self.heat, *law, commit, f, part
             )
             energies += part
             shortened |= short
@@ -170,7 +170,7 @@ class Bars:
             self.springs.add_tangents(weight, pattern, values)
 
     def linearise(self, x: np.ndarray, weight: float, stored: np.ndarray) -> None:
-        """Fill ``stored`` (b, 5) with n, dN/dl - N/l [N/m] and N/l [N/m], times ``weight``, for each bar at ``x``;
+        """Fill ``stored`` (5, b) with n, dN/dl - N/l [N/m] and N/l [N/m], times ``weight``, for each bar at ``x``;
         without springs."""
         for block in self.blocks:
             block.kernels.linearise(*self._arguments(x, block), block.start, block.stop, weight, stored)

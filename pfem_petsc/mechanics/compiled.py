@@ -190,6 +190,10 @@ class _Digest:
             update(thing.__name__.encode())
         elif isinstance(thing, type):
             update(repr((thing.__qualname__, getattr(thing, "_fields", ()))).encode())
+            if thing.__module__.partition(".")[0] == __name__.partition(".")[0]:  # it may generate code
+                for part in vars(thing).values():
+                    if isinstance(part, FunctionType):
+                        self._add_function(part)
         elif isinstance(thing, (tuple, list, frozenset)):
             for part in sorted(thing, key=repr) if isinstance(thing, frozenset) else thing:
                 self.add(part)

@@ -18,12 +18,13 @@ from numba.extending import register_jitable
 from ..energies import BAR_ENERGIES
 from .compiled import inlined, kernel
 from .materials.base import Law
-from .rows import accumulate, bar_value, differ, extend, put, take
-from .sweep import CHUNK
+from .rows import CHUNK, accumulate, bar_value, differ, extend, put, take
+from .strips import add_strips, differences
 
 __all__ = ["COLLAPSED_STRETCH", "SHORTENED_STRETCH", "last_row", "make_kernels", "no_bar_data", "no_variables"]
 
 COLLAPSED_STRETCH = 1e-3  # below this fraction of its rest length a bar is crushed, and no truss model applies
+_2, _3, _4 = 2 * CHUNK, 3 * CHUNK, 4 * CHUNK
 SHORTENED_STRETCH = math.sqrt(0.8)  # only bars shorter than this are checked for passing through zero length
 
 
@@ -61,43 +62,42 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
     can_break, gone = law.rupture >= 0, max(law.rupture, 0)
 
     @inlined
-    def sweep_forces(x, heads, starts, chunks, counted, far, rest, heat, p, area, step, history, commit, f, energies):
-        """Add internal forces to ``f``, and sums over counted bars to ``energies``, see
-        :data:`~pfem_petsc.energies.BAR_ENERGIES` [J]; return the first failed bar or -1, whether any bar is so short
-        that it may be inverted, and how many bars have changed their state of rupture.
+    def sweep_part(x, sweep, begun, ended, far, rest, heat, p, area, step, history, commit, f, work):
+        """Add the internal forces of the chunks [begun, ended) of a sweep to ``f``; arguments and results as those of
+        :func:`forces`.
 
-        ``heads``, ``starts``, ``chunks``, ``counted``: a :class:`~pfem_petsc.mechanics.sweep.Sweep`; ``far`` (b,) the
-        other end of each bar. One sum is kept per position in a chunk, so vector instructions need no reordering.
+        ``work`` ((4 + energies + rows) CHUNK,): end differences, force over length, sums of the energies, new history.
+        One sum is kept per position in a chunk, so vector instructions need no reordering.
         """
         failed = -1
         shortened = False
         broke = 0
         has_thermal = heat.shape[1] > 0
+        heads, fars, starts, chunks = sweep.heads, sweep.fars, sweep.starts, sweep.chunks
         origin = starts[0]
-        # end differences, force over length, energies, new history
-        work = np.zeros((4 + n_energies + n_rows, CHUNK))
-        for chunk in range(len(chunks) - 1):
-            if chunk == counted:  # the remaining bars are counted on other ranks
-                for j in range(n_energies):
-                    energies[places[j]] += work[4 + j].sum()
+        xs, ys, zs, cs = work[:CHUNK], work[CHUNK:_2], work[_2:_3], work[_3:_4]
+        lasts = work[(first_new + last) * CHUNK : (first_new + last + 1) * CHUNK]
+        stresses = work[(first_new + last + 1) * CHUNK : (first_new + last + 2) * CHUNK]
+        for chunk in range(begun, ended):
             first = starts[chunks[chunk]]
             stop = starts[chunks[chunk + 1]]
             n = stop - first
-            for run in range(chunks[chunk], chunks[chunk + 1]):
-                a = heads[run]
-                ax = x[a, 0]
-                ay = x[a, 1]
-                az = x[a, 2]
-                for k in range(starts[run], starts[run + 1]):
-                    b = far[k]
-                    i = k - first
-                    dx = x[b, 0] - ax
-                    dy = x[b, 1] - ay
-                    dz = x[b, 2] - az
-                    work[0, i] = dx
-                    work[1, i] = dy
-                    work[2, i] = dz
-                    work[3, i] = dx * dx + dy * dy + dz * dz
+            if sweep.diagonal[chunk]:
+                for run in range(chunks[chunk], chunks[chunk + 1]):
+                    at = starts[run]
+                    differences(x, heads[run], fars[run], starts[run + 1] - at, xs, ys, zs, at - first)
+            else:
+                for run in range(chunks[chunk], chunks[chunk + 1]):
+                    a = heads[run]
+                    ax = x[a, 0]
+                    ay = x[a, 1]
+                    az = x[a, 2]
+                    for k in range(starts[run], starts[run + 1]):
+                        b = far[k]
+                        i = k - first
+                        xs[i] = x[b, 0] - ax
+                        ys[i] = x[b, 1] - ay
+                        zs[i] = x[b, 2] - az
             rests = rest[first:stop]
             displacements = heat[0][first:stop]
             warmths = heat[1][first:stop]
@@ -105,7 +105,7 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
             short = 0
             changed = 0
             for i in range(n):
-                length = math.sqrt(work[3, i])
+                length = math.sqrt(xs[i] * xs[i] + ys[i] * ys[i] + zs[i] * zs[i])
                 stretch = length / rests[i]
                 short += 0 if stretch >= SHORTENED_STRETCH else 1  # NaN counts
                 strain, slope, _ = measure(stretch)
@@ -127,26 +127,28 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
                     if can_break:
                         broke += 1 if new[gone] != q[gone] else 0
                 if by_rate:
-                    work[first_new + last, i] = strain
+                    lasts[i] = strain
                     kept = stress
                     if can_break:  # the stress of what is left of the bar
                         left = 1.0 - abs(q[gone])
                         kept = stress / left if left > 0.0 else 0.0
-                    work[first_new + last + 1, i] = kept
-                work[3, i] = section * stress * slope / length
+                    stresses[i] = kept
+                cs[i] = section * stress * slope / length
             if n_rows > 0 and commit and changed > 0:
                 for j in range(n_rows):
+                    row = work[(first_new + j) * CHUNK : (first_new + j + 1) * CHUNK]
+                    kept = history[j]
                     for i in range(n):
-                        history[j, begin + i] = work[first_new + j, i]
+                        kept[begin + i] = row[i]
             if short > 0:
                 for i in range(n):
-                    length = math.sqrt(work[0, i] ** 2 + work[1, i] ** 2 + work[2, i] ** 2)
+                    length = math.sqrt(xs[i] ** 2 + ys[i] ** 2 + zs[i] ** 2)
                     stretch = length / rests[i]
                     if can_break:  # noqa: SIM102 - not compiled otherwise
                         if abs(history[gone, begin + i]) >= 1.0:
                             # it may have no length; one that breaks in this step has its force still
                             if not (stretch > COLLAPSED_STRETCH):
-                                work[3, i] = 0.0
+                                cs[i] = 0.0
                             continue
                     if stretch < SHORTENED_STRETCH:
                         shortened = True
@@ -154,34 +156,64 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
                         if failed < 0:
                             failed = np.int64(first + i)  # signed, like -1
                         # the norms of the solver must detect an inadmissible trial position
-                        work[3, i] = 0.0 if commit else math.nan
-            for run in range(chunks[chunk], chunks[chunk + 1]):
-                fx = 0.0
-                fy = 0.0
-                fz = 0.0
-                for k in range(starts[run], starts[run + 1]):
-                    b = far[k]
-                    i = k - first
-                    c = work[3, i]
-                    gx = c * work[0, i]
-                    gy = c * work[1, i]
-                    gz = c * work[2, i]
-                    fx += gx
-                    fy += gy
-                    fz += gz
-                    f[b, 0] += gx
-                    f[b, 1] += gy
-                    f[b, 2] += gz
-                a = heads[run]
-                f[a, 0] -= fx
-                f[a, 1] -= fy
-                f[a, 2] -= fz
-        if counted == len(chunks) - 1:
-            for j in range(n_energies):
-                energies[places[j]] += work[4 + j].sum()
+                        cs[i] = 0.0 if commit else math.nan
+            if sweep.diagonal[chunk]:
+                for run in range(chunks[chunk], chunks[chunk + 1]):
+                    at = starts[run]
+                    add_strips(f, heads[run], fars[run], starts[run + 1] - at, xs, ys, zs, cs, at - first)
+            else:
+                for run in range(chunks[chunk], chunks[chunk + 1]):
+                    fx = 0.0
+                    fy = 0.0
+                    fz = 0.0
+                    for k in range(starts[run], starts[run + 1]):
+                        b = far[k]
+                        i = k - first
+                        c = cs[i]
+                        gx = c * xs[i]
+                        gy = c * ys[i]
+                        gz = c * zs[i]
+                        fx += gx
+                        fy += gy
+                        fz += gz
+                        f[b, 0] += gx
+                        f[b, 1] += gy
+                        f[b, 2] += gz
+                    a = heads[run]
+                    f[a, 0] -= fx
+                    f[a, 1] -= fy
+                    f[a, 2] -= fz
         return failed, shortened, broke
 
-    forces = kernel(sweep_forces)
+    @inlined
+    def sum_energies(work, energies):
+        """Add the sums of ``work`` to ``energies``, see :data:`~pfem_petsc.energies.BAR_ENERGIES` [J]."""
+        for j in range(n_energies):
+            energies[places[j]] += work[(4 + j) * CHUNK : (5 + j) * CHUNK].sum()
+
+    @kernel
+    def forces(x, sweep, far, rest, heat, p, area, step, history, commit, f, energies):
+        """Add internal forces to ``f``, and sums over counted bars to ``energies``, see
+        :data:`~pfem_petsc.energies.BAR_ENERGIES` [J]; return the first failed bar or -1, whether any bar is so short
+        that it may be inverted, and how many bars have changed their state of rupture.
+
+        ``sweep``: a :class:`~pfem_petsc.mechanics.sweep.Sweep`; ``far`` (b,) the upper end of each bar.
+        """
+        work = np.zeros((4 + n_energies + n_rows) * CHUNK)
+        failed = -1
+        shortened = False
+        broke = 0
+        limits = (0, sweep.counted, len(sweep.diagonal))
+        for side in range(2):
+            at, short, more = sweep_part(
+                x, sweep, limits[side], limits[side + 1], far, rest, heat, p, area, step, history, commit, f, work
+            )
+            if side == 0:  # the remaining bars are counted on other ranks
+                sum_energies(work, energies)
+            failed = at if failed < 0 else failed
+            shortened = shortened or short
+            broke += more
+        return failed, shortened, broke
 
     @register_jitable
     def stiffness(dx, dy, dz, rest, shift, warmth, p, area, step, before, q):
@@ -287,7 +319,7 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
 
     @kernel
     def linearise(x, bars, rest, heat, p, area, step, history, start, stop, weight, stored):
-        """Write the data of each bar for products with ``weight`` K_t, n, dN/dl - N/l and N/l, to ``stored`` (b, 5)."""
+        """Write the data of each bar for products with ``weight`` K_t, n, dN/dl - N/l and N/l, to ``stored`` (5, b)."""
         has_thermal = heat.shape[1] > 0
         for k in range(start, stop):
             a = bars[k, 0]
@@ -302,11 +334,11 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
             given = extend(p, history, n_rows, k - start, of_bar)
             section = bar_value(area, k - start)
             axial, geometric, inverse = stiffness(dx, dy, dz, rest[k], shift, warmth, given, section, step, before, q)
-            stored[k, 0] = dx * inverse
-            stored[k, 1] = dy * inverse
-            stored[k, 2] = dz * inverse
-            stored[k, 3] = weight * (axial - geometric)
-            stored[k, 4] = weight * geometric
+            stored[0, k] = dx * inverse
+            stored[1, k] = dy * inverse
+            stored[2, k] = dz * inverse
+            stored[3, k] = weight * (axial - geometric)
+            stored[4, k] = weight * geometric
 
     @kernel
     def fields(x, bars, rest, heat, p, area, step, history, start, stop, strain_out, stress_out, force_out):
@@ -354,7 +386,9 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
 
     return SimpleNamespace(
         forces=forces,
-        sweep_forces=sweep_forces,
+        sweep_part=sweep_part,
+        sum_energies=sum_energies,
+        work_rows=4 + n_energies + n_rows,
         tangents=tangents,
         product=product,
         linearise=linearise,

@@ -1,7 +1,9 @@
-"""The order of loops over bars: runs of bars with the same head node, gathered into chunks.
+"""The order of loops over bars: runs of bars whose ends are known from the first one, gathered into chunks.
 
-The force on the head node of a run is summed in registers. Square roots and divisions are evaluated for a whole chunk
-by vector instructions, between gathering the end differences and scattering the forces.
+In a *diagonal* run both ends advance by one node from bar to bar, as in lattices and in all meshes with constant
+offsets between the numbers of neighbours: their loops load and store consecutive numbers. In a *star* all bars have the
+same lower end, whose force is summed in registers. Square roots and divisions are evaluated for a whole chunk by vector
+instructions, between the end differences and the sums of forces.
 """
 
 from __future__ import annotations
@@ -10,12 +12,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..mesh.ordering import LEAST_RUN, NODE_BLOCK
 from .compiled import kernel
+from .rows import CHUNK
 
-__all__ = ["CHUNK", "Sweep", "make_sweep"]
-
-CHUNK = 256
-"""Maximum number of bars of a chunk, whose working arrays then fit into the fastest cache."""
+__all__ = ["Sweep", "make_sweep"]
 
 
 class Sweep(NamedTuple):
@@ -24,60 +25,92 @@ class Sweep(NamedTuple):
 
     Attributes
     ----------
-    heads : (runs,) uint32, head node of each run
+    heads : (runs,) uint32, lower end of the first bar of each run
+    fars : (runs,) uint32, its upper end
     starts : (runs + 1,) uint32, first bar of each run, and the end
     chunks : (chunks + 1,) uint32, first run of each chunk, and the end
+    diagonal : (chunks,) bool, whether the runs of a chunk are diagonal, else stars
     counted : number of leading chunks whose bars are counted on this rank
+    parts : (parts + 1,) int64, first chunk of each part, and the end: the counted bars by their lower ends, part k with
+        those of the nodes [k, k + 1) times :data:`~pfem_petsc.mesh.ordering.NODE_BLOCK`
     """
 
     heads: np.ndarray
+    fars: np.ndarray
     starts: np.ndarray
     chunks: np.ndarray
+    diagonal: np.ndarray
     counted: int
+    parts: np.ndarray
 
 
 def make_sweep(bars: np.ndarray, start: int, counted: int, stop: int, chunk: int = CHUNK) -> Sweep:
-    """Make the sweep over ``bars`` (b, 2) [start, stop), of which [start, counted) are counted, by their smaller ends.
+    """Make the sweep over ``bars`` (b, 2) [start, stop), of which [start, counted) are counted.
 
-    Runs end where this node changes, at ``counted``, and after ``chunk`` bars.
+    Chunks end after ``chunk`` bars, at ``counted``, and where the lower end passes to another block of nodes.
     """
+    firsts = np.empty(_cut(bars, start, counted, stop, chunk, np.empty(0, dtype=np.uint32)) + 1, dtype=np.uint32)
+    _cut(bars, start, counted, stop, chunk, firsts)
+    firsts[-1] = stop
+    diagonal = np.empty(len(firsts) - 1, dtype=np.bool_)
+    chunks = np.empty(len(firsts), dtype=np.uint32)
     none = np.empty(0, dtype=np.uint32)
-    runs, chunks, counted_chunks = _cut(bars, start, counted, stop, chunk, none, none, none)
-    heads, starts, firsts = (np.empty(n, dtype=np.uint32) for n in (runs, runs + 1, chunks + 1))
-    _cut(bars, start, counted, stop, chunk, heads, starts, firsts)
-    starts[runs], firsts[chunks] = stop, runs
-    return Sweep(heads, starts, firsts, counted_chunks)
+    runs = _find_runs(bars, firsts, diagonal, chunks, none, none, none)
+    heads, fars, starts = (np.empty(n, dtype=np.uint32) for n in (runs, runs, runs + 1))
+    _find_runs(bars, firsts, diagonal, chunks, heads, fars, starts)
+    starts[runs] = stop
+    chunks_counted = int(np.searchsorted(firsts[:-1], counted))
+    lower = bars[firsts[:chunks_counted]].min(axis=1) // NODE_BLOCK
+    parts = np.searchsorted(lower, np.arange((int(lower[-1]) if len(lower) else -1) + 2))
+    return Sweep(heads, fars, starts, chunks, diagonal, chunks_counted, parts.astype(np.int64))
 
 
 @kernel
-def _cut(bars, start, counted, stop, chunk, heads, starts, chunks):
-    """Return the numbers of runs, chunks and counted chunks; fill the arrays unless they are empty."""
-    fill = len(heads) > 0
-    n_runs = 0
-    n_chunks = 0
-    counted_chunks = 0
-    chunk_start = start
-    k = start
-    while k < stop:
-        if k == counted:
-            counted_chunks = n_chunks
-        node = min(bars[k, 0], bars[k, 1])
-        limit = min(stop, k + chunk)
-        if k < counted:
-            limit = min(limit, counted)
-        end = k + 1
-        while end < limit and min(bars[end, 0], bars[end, 1]) == node:
-            end += 1
-        if n_chunks == 0 or k == counted or end - chunk_start > chunk:
-            if fill:
-                chunks[n_chunks] = n_runs
-            n_chunks += 1
-            chunk_start = k
-        if fill:
-            heads[n_runs] = node
-            starts[n_runs] = k
-        n_runs += 1
-        k = end
-    if counted == stop:
-        counted_chunks = n_chunks
-    return n_runs, n_chunks, counted_chunks
+def _cut(bars, start, counted, stop, chunk, firsts):
+    """Return the number of chunks; write their first bars unless ``firsts`` is empty."""
+    count = 0
+    first = start
+    block = -1
+    for k in range(start, stop):
+        here = min(bars[k, 0], bars[k, 1]) // NODE_BLOCK
+        if k in (start, counted) or here != block or k - first == chunk:
+            if len(firsts) > 0:
+                firsts[count] = k
+            count += 1
+            first = k
+            block = here
+    return count
+
+
+@kernel
+def _find_runs(bars, firsts, diagonal, chunks, heads, fars, starts):
+    """Return the number of runs; write chunks, the first run of each, and the runs unless ``heads`` is empty."""
+    count = 0
+    for c in range(len(firsts) - 1):
+        chunks[c] = count
+        breaks = 1
+        for k in range(firsts[c] + 1, firsts[c + 1]):
+            breaks += 0 if _follows(bars, k) else 1
+        diagonal[c] = firsts[c + 1] - firsts[c] >= LEAST_RUN * breaks
+        for k in range(firsts[c], firsts[c + 1]):
+            low = min(bars[k, 0], bars[k, 1])
+            if k > firsts[c]:
+                if diagonal[c]:
+                    if _follows(bars, k):
+                        continue
+                elif low == min(bars[k - 1, 0], bars[k - 1, 1]):
+                    continue
+            if len(heads) > 0:
+                heads[count] = low
+                fars[count] = max(bars[k, 0], bars[k, 1])
+                starts[count] = k
+            count += 1
+    chunks[len(firsts) - 1] = count
+    return count
+
+
+@kernel
+def _follows(bars, k):
+    """Whether both ends of bar k are the nodes after those of bar k - 1."""
+    low = min(bars[k, 0], bars[k, 1]) == min(bars[k - 1, 0], bars[k - 1, 1]) + 1
+    return low and max(bars[k, 0], bars[k, 1]) == max(bars[k - 1, 0], bars[k - 1, 1]) + 1

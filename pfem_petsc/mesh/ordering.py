@@ -9,10 +9,16 @@ from __future__ import annotations
 
 import numpy as np
 
-__all__ = ["BITS", "bar_order", "hilbert_keys", "node_order", "sweep_keys"]
+__all__ = ["BITS", "LEAST_RUN", "NODE_BLOCK", "bar_order", "hilbert_keys", "node_order", "sweep_keys"]
 
 BITS = 21
 """Bits of each coordinate in a key: three times this fits in 64 bits."""
+
+NODE_BLOCK = 512
+"""Number of nodes whose bars and node loops follow each other, so that their data stay in the cache."""
+
+LEAST_RUN = 4
+"""Mean number of bars of the runs of constant offset from which a block goes by these: shorter loops do not pay."""
 
 # Number of points processed at a time, so that temporary arrays stay in the cache.
 _PIECE = 1 << 15
@@ -134,7 +140,10 @@ def node_order(keys: np.ndarray, ids: np.ndarray | None = None) -> np.ndarray:
 
 
 def bar_order(bars: np.ndarray, group: np.ndarray | None, n_local: int) -> np.ndarray:
-    """Return the order (indices) of bars by group, then lower local end, then higher local end.
+    """Return the order (indices) of bars by group and block of nodes of the lower local end.
+
+    In a block bars are in order of the offset between both ends, then of the lower end, if many have the same offset,
+    else in order of the lower, then of the higher end.
 
     Parameters
     ----------
@@ -145,12 +154,31 @@ def bar_order(bars: np.ndarray, group: np.ndarray | None, n_local: int) -> np.nd
     n_local : int
         Number of local nodes.
     """
-    key = np.minimum(bars[:, 0], bars[:, 1]).astype(np.uint64)
-    key *= np.uint64(n_local)
-    key += np.maximum(bars[:, 0], bars[:, 1]).astype(np.uint64)
-    if group is None:
-        return np.argsort(key, kind="stable")
-    if int(group.max(initial=0) + 1) * n_local**2 < 1 << 64:
-        key += group.astype(np.uint64) * np.uint64(n_local**2)
-        return np.argsort(key, kind="stable")
-    return np.lexsort((key, group))
+    low = np.minimum(bars[:, 0], bars[:, 1])
+    block = (low // NODE_BLOCK).astype(np.int64)
+    low %= NODE_BLOCK
+    offset = np.abs(bars[:, 1] - bars[:, 0])
+    blocks = n_local // NODE_BLOCK + 1
+    if group is not None:
+        if int(group.max(initial=0) + 1) * blocks * NODE_BLOCK * n_local >= 1 << 63:
+            order = np.lexsort((low, offset, block, group))
+            return order
+        block += group.astype(np.int64) * blocks
+    key = block * n_local
+    key += offset
+    key *= NODE_BLOCK
+    key += low
+    order = np.argsort(key, kind="stable")
+    scattered = _scattered(key[order], block[order], LEAST_RUN)
+    if len(scattered):
+        stars = np.isin(block, scattered)
+        key[stars] = (block[stars] * NODE_BLOCK + low[stars]) * n_local + offset[stars]
+        order = np.argsort(key, kind="stable")
+    return order
+
+
+def _scattered(key: np.ndarray, block: np.ndarray, least: float) -> np.ndarray:
+    """Return the blocks whose runs of constant offset have fewer than ``least`` bars on average; all keys sorted."""
+    fresh = np.diff(key, prepend=-2) != 1
+    last = int(block[-1]) + 1 if len(block) else 0
+    return np.flatnonzero(np.bincount(block, minlength=last) < least * np.bincount(block[fresh], minlength=last))

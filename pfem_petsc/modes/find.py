@@ -146,14 +146,14 @@ def _buckling(
 ) -> Found:
     source = model.case.source
     material, geometric = buckling_bars(model, state.x)
-    largest = np.array([np.abs(geometric[:, 4]).max(initial=0.0), np.abs(material[:, 3]).max(initial=0.0)])
+    largest = np.array([np.abs(geometric[4]).max(initial=0.0), np.abs(material[3]).max(initial=0.0)])
     model.comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
     if largest[0] <= _NO_LOAD * 1e-3 * largest[1]:
         raise SimulationFailure(
             f'{source}: modes: kind = "buckling" takes the axial forces of the state as the reference load, and the '
             "state has none: give the case an analysis that loads the truss ([static] with a small load)"
         )
-    geometric[:, 3:] *= -1.0
+    geometric[3:] *= -1.0
     pencil = Pencil(
         matrices.stiffness(geometric, 0.0, springs=False),
         matrices.stiffness(material, float(largest[1])),

@@ -55,7 +55,7 @@ class Pencil:
 
 
 def bar_stiffness(model: Model, x: np.ndarray) -> np.ndarray:
-    """Return the stiffness of the bars (b, 5) at local positions (nodes, 3): direction, dN/dl - N/l, N/l [N/m].
+    """Return the stiffness of the bars (5, b) at local positions (nodes, 3): direction, dN/dl - N/l, N/l [N/m].
 
     If the law has a kink at the state, as on the yield surface, dN/dl is the larger one, that of unloading: small
     vibrations about the state do not yield further. The strain rate has no effect.
@@ -66,24 +66,24 @@ def bar_stiffness(model: Model, x: np.ndarray) -> np.ndarray:
         stored = _linearised(model, x)
         if bars.kept_names:
             around = [_linearised(model, (1.0 + sign * _LOADING) * x) for sign in (-1.0, 1.0)]
-            tangent = stored[:, 3] + stored[:, 4]
-            larger = np.maximum(*(each[:, 3] + each[:, 4] for each in around))
+            tangent = stored[3] + stored[4]
+            larger = np.maximum(*(each[3] + each[4] for each in around))
             kink = larger - tangent > _KINK * np.abs(larger)
-            stored[kink, 3] = (larger - stored[:, 4])[kink]
+            stored[3, kink] = (larger - stored[4])[kink]
     finally:
         bars.step = step
     return stored
 
 
 def buckling_bars(model: Model, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the bars (b, 5) of K0 and Kg, both on the geometry of the mesh; see :func:`bar_stiffness`.
+    """Return the bars (5, b) of K0 and Kg, both on the geometry of the mesh; see :func:`bar_stiffness`.
 
     K0: dN/dl of the unstressed bars with their virgin material, along the bar. Kg: N/l0 across it, where N is the
     axial force at the local positions ``x``.
     """
     bars, points = model.bars, model.mesh.points
     lengths = bars.lengths(x)
-    force = bar_stiffness(model, x)[:, 4] * lengths
+    force = bar_stiffness(model, x)[4] * lengths
     history, heat, rest = bars.history(), bars.heat, bars.rest
     step, bars.step = bars.step, 0.0
     try:
@@ -93,17 +93,17 @@ def buckling_bars(model: Model, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     finally:
         bars.put_history(history)
         bars.heat, bars.rest, bars.step = heat, rest, step
-    unloaded[:, 3:] *= (bars.mesh_lengths / rest)[:, None]  # dN/dl of bars that are stress-free at their rest lengths
+    unloaded[3:] *= bars.mesh_lengths / rest  # dN/dl of bars that are stress-free at their rest lengths
     geometric = unloaded.copy()
-    unloaded[:, 3] += unloaded[:, 4]
-    unloaded[:, 4] = 0.0
-    geometric[:, 4] = force / bars.mesh_lengths
-    geometric[:, 3] = -geometric[:, 4]
+    unloaded[3] += unloaded[4]
+    unloaded[4] = 0.0
+    geometric[4] = force / bars.mesh_lengths
+    geometric[3] = -geometric[4]
     return unloaded, geometric
 
 
 def _linearised(model: Model, x: np.ndarray) -> np.ndarray:
-    stored = np.zeros((len(model.mesh.bars), 5))
+    stored = np.zeros((5, len(model.mesh.bars)))
     model.bars.linearise(x, 1.0, stored)
     return stored
 
@@ -128,7 +128,7 @@ class StateMatrices:
     def stiffness(
         self, bars: np.ndarray, diagonal: float | np.ndarray, added: tuple | None = None, springs: bool = True
     ) -> PETSc.Mat:
-        """Return the matrix of bars (b, 5), with ``diagonal`` (owned,) at held components. Collective.
+        """Return the matrix of bars (5, b), with ``diagonal`` (owned,) at held components. Collective.
 
         ``springs``: whether those to the ground are part of it
         ``added``: owned nodes (m,) and blocks (m, 3, 3) [N/m] to add
@@ -160,12 +160,12 @@ class StateMatrices:
         return self.holds.taken_out(matrix.fill(fill), inertia.mass)
 
     def bounds(self, bars: np.ndarray, blocks: tuple | None = None) -> tuple[float, float]:
-        """Return bounds below and above all eigenvalues of the bars' stiffness (b, 5) and the mass [1/s2]. Collective.
+        """Return bounds below and above all eigenvalues of the bars' stiffness (5, b) and the mass [1/s2]. Collective.
 
         A bar's matrix is (a n n^T + c (I - n n^T)) times [[1, -1], [-1, 1]], which lies between 2 min(a, c, 0) and
         2 max(a, c, 0) times the identity; a consistent mass is at least a third of the lumped one.
         """
-        axial, transverse = bars[:, 3] + bars[:, 4], bars[:, 4]
+        axial, transverse = bars[3] + bars[4], bars[4]
         low = self._at_nodes(2.0 * np.minimum(np.minimum(axial, transverse), 0.0))
         high = self._at_nodes(2.0 * np.maximum(np.maximum(axial, transverse), 0.0))
         if self.model.bars.springs is not None:

@@ -99,8 +99,8 @@ def _add_bars(bars, stored, ptr, slots, values):
             at = 6 * ptr[row] + 3 * slot
             for i in range(3):
                 for j in range(3):
-                    values[at + i * width + j] += sign * stored[k, 3] * stored[k, i] * stored[k, j]
-                values[at + i * (width + 1)] += sign * stored[k, 4]
+                    values[at + i * width + j] += sign * stored[3, k] * stored[i, k] * stored[j, k]
+                values[at + i * (width + 1)] += sign * stored[4, k]
 
 
 @kernel
@@ -237,7 +237,7 @@ class HessianMatrix:
         _add_lumped(self.pattern.ptr, self.pattern.diagonal, inertia, values)
 
     def add_bars(self, stored: np.ndarray, values: np.ndarray) -> None:
-        """Add the bars' stiffness from the data of :meth:`~pfem_petsc.mechanics.bars.Bars.linearise`, (b, 5)."""
+        """Add the bars' stiffness from the data of :meth:`~pfem_petsc.mechanics.bars.Bars.linearise`, (5, b)."""
         _add_bars(self.mesh.bars, stored, self.pattern.ptr, self.pattern.slots, values)
 
     def add_blocks(self, nodes: np.ndarray, blocks: np.ndarray, values: np.ndarray) -> None:

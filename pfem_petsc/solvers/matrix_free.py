@@ -14,8 +14,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from petsc4py import PETSc
 
-from ..mechanics.compiled import kernel
+from ..mechanics.compiled import inlined, kernel
 from ..mechanics.mass import consistent_product
+from ..mechanics.rows import CHUNK
+from ..mechanics.strips import add_strips, differences
 from .outlive import outlive
 
 if TYPE_CHECKING:
@@ -26,9 +28,37 @@ __all__ = ["MatrixFreeHessian"]
 
 
 @kernel
-def _product(heads, starts, far, stored, u, out):
-    """Add K u to ``out``, run by run of a :class:`~pfem_petsc.mechanics.sweep.Sweep`."""
-    for run in range(len(heads)):
+def _product(sweep, far, stored, u, out):
+    """Add K u to ``out``, chunk by chunk of a :class:`~pfem_petsc.mechanics.sweep.Sweep`."""
+    heads, fars, starts, chunks = sweep.heads, sweep.fars, sweep.starts, sweep.chunks
+    dx, dy, dz = np.empty(CHUNK), np.empty(CHUNK), np.empty(CHUNK)
+    one = np.ones(CHUNK)
+    for chunk in range(len(sweep.diagonal)):
+        if not sweep.diagonal[chunk]:
+            _stars(chunk, heads, starts, chunks, far, stored, u, out)
+            continue
+        first = starts[chunks[chunk]]
+        n = starts[chunks[chunk + 1]] - first
+        for run in range(chunks[chunk], chunks[chunk + 1]):
+            at = starts[run]
+            differences(u, heads[run], fars[run], starts[run + 1] - at, dx, dy, dz, at - first)
+        last = first + n
+        nx, ny, nz = stored[0, first:last], stored[1, first:last], stored[2, first:last]
+        axial, across = stored[3, first:last], stored[4, first:last]
+        for i in range(n):
+            along = axial[i] * (nx[i] * dx[i] + ny[i] * dy[i] + nz[i] * dz[i])
+            dx[i] = along * nx[i] + across[i] * dx[i]
+            dy[i] = along * ny[i] + across[i] * dy[i]
+            dz[i] = along * nz[i] + across[i] * dz[i]
+        for run in range(chunks[chunk], chunks[chunk + 1]):
+            at = starts[run]
+            add_strips(out, heads[run], fars[run], starts[run + 1] - at, dx, dy, dz, one, at - first)
+
+
+@inlined
+def _stars(chunk, heads, starts, chunks, far, stored, u, out):
+    """Add the products of a chunk whose runs are stars."""
+    for run in range(chunks[chunk], chunks[chunk + 1]):
         a = heads[run]
         ux = u[a, 0]
         uy = u[a, 1]
@@ -41,11 +71,11 @@ def _product(heads, starts, far, stored, u, out):
             dx = u[b, 0] - ux
             dy = u[b, 1] - uy
             dz = u[b, 2] - uz
-            nx = stored[k, 0]
-            ny = stored[k, 1]
-            nz = stored[k, 2]
-            along = stored[k, 3] * (nx * dx + ny * dy + nz * dz)
-            across = stored[k, 4]
+            nx = stored[0, k]
+            ny = stored[1, k]
+            nz = stored[2, k]
+            along = stored[3, k] * (nx * dx + ny * dy + nz * dz)
+            across = stored[4, k]
             fx = along * nx + across * dx
             fy = along * ny + across * dy
             fz = along * nz + across * dz
@@ -64,11 +94,11 @@ def _product(heads, starts, far, stored, u, out):
 def _diagonal(bars, stored, blocks):
     """Add the diagonal blocks (local nodes, 6): xx, xy, xz, yy, yz, zz."""
     for k in range(len(bars)):
-        c = stored[k, 3]
-        g = stored[k, 4]
-        nx = stored[k, 0]
-        ny = stored[k, 1]
-        nz = stored[k, 2]
+        c = stored[3, k]
+        g = stored[4, k]
+        nx = stored[0, k]
+        ny = stored[1, k]
+        nz = stored[2, k]
         for end in range(2):
             i = bars[k, end]
             blocks[i, 0] += c * nx * nx + g
@@ -171,7 +201,7 @@ class MatrixFreeHessian:
     ----------
     mat : PETSc matrix of type python
     bounded : the matrix of steps with bounds, equal to ``mat``
-    stored : (b, 5) data of each bar for the product, see :meth:`~pfem_petsc.mechanics.bars.Bars.linearise`
+    stored : (5, b) data of each bar for the product, see :meth:`~pfem_petsc.mechanics.bars.Bars.linearise`
     """
 
     _extension: _Extension | None = None
@@ -186,7 +216,7 @@ class MatrixFreeHessian:
         self.mat.setUp()
         atexit.register(outlive, weakref.ref(self.mat))
         self.bounded = self.mat
-        self.stored = np.zeros((len(mesh.bars), 5))
+        self.stored = np.zeros((5, len(mesh.bars)))
         self._u = np.zeros((mesh.n_local, 3))
         self._out = np.zeros((mesh.n_local, 3))
         self._fixed = model.supports.fixed
@@ -206,9 +236,9 @@ class MatrixFreeHessian:
 
     def make_definite(self) -> None:
         """Drop negative eigenvalues of the bars' stiffness, due to compression or softening laws."""
-        axial = np.maximum(self.stored[:, 3] + self.stored[:, 4], 0.0)
-        np.maximum(self.stored[:, 4], 0.0, out=self.stored[:, 4])
-        np.subtract(axial, self.stored[:, 4], out=self.stored[:, 3])
+        axial = np.maximum(self.stored[3] + self.stored[4], 0.0)
+        np.maximum(self.stored[4], 0.0, out=self.stored[4])
+        np.subtract(axial, self.stored[4], out=self.stored[3])
 
     @property
     def extension(self) -> _Extension:
@@ -249,7 +279,7 @@ class MatrixFreeHessian:
                 moved = inertia.redistribution
                 out[moved.touched] += problem.balance.alpha * np.einsum("kij,kj->ki", moved.tensors, u[moved.touched])
         for block in bars.blocks:
-            _product(block.sweep.heads, block.sweep.starts, bars.far, self.stored, u, out)
+            _product(block.sweep, bars.far, self.stored, u, out)
         if bars.springs is not None:
             bars.springs.add_product(problem.balance.weight, u, out)
         problem.transform.linear(self._left, u, out)

@@ -81,7 +81,7 @@ class PseudoMotion:
         self.sums = np.zeros(WIDTH)
         self.damping = DAMPINGS[damping]()
         self._u = np.zeros((owned, 3))
-        self._stored = np.zeros((len(mesh.bars), 5))
+        self._stored = np.zeros((5, len(mesh.bars)))
         self._axial = np.empty(len(mesh.bars))
         for block in model.bars.blocks:
             part = slice(block.start, block.stop)

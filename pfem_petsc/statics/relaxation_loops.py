@@ -66,16 +66,16 @@ def node_stiffness(x, bars, stored, axial, counted, blocks, bound):
 
     The largest row sum bounds them, and so does the Frobenius norm, which does not depend on the axes. A bar counts
     with the larger of its present axial stiffness and ``axial`` (b,), that of its law at most, and with its geometric
-    stiffness N/l where it is under tension. ``stored`` (b, 5) is that of ``Bars.linearise``, ``blocks`` (local, 6) is
+    stiffness N/l where it is under tension. ``stored`` (5, b) is that of ``Bars.linearise``, ``blocks`` (local, 6) is
     workspace. Gives the sum of N.N over the bars ``counted`` here [N2].
     """
     blocks[:] = 0.0
     forces = 0.0
     for k in range(len(bars)):
         a, b = bars[k, 0], bars[k, 1]
-        n0, n1, n2 = stored[k, 0], stored[k, 1], stored[k, 2]
-        geometric = max(stored[k, 4], 0.0)
-        along = max(stored[k, 3] + stored[k, 4], axial[k]) - geometric
+        n0, n1, n2 = stored[0, k], stored[1, k], stored[2, k]
+        geometric = max(stored[4, k], 0.0)
+        along = max(stored[3, k] + stored[4, k], axial[k]) - geometric
         along = max(along, 0.0)
         for i in (a, b):
             blocks[i, 0] += along * n0 * n0 + geometric
@@ -86,7 +86,7 @@ def node_stiffness(x, bars, stored, axial, counted, blocks, bound):
             blocks[i, 5] += along * n2 * n0
         if counted[k]:
             square = (x[b, 0] - x[a, 0]) ** 2 + (x[b, 1] - x[a, 1]) ** 2 + (x[b, 2] - x[a, 2]) ** 2
-            forces += stored[k, 4] * stored[k, 4] * square
+            forces += stored[4, k] * stored[4, k] * square
     for i in range(len(bound)):
         xy, yz, zx = abs(blocks[i, 3]), abs(blocks[i, 4]), abs(blocks[i, 5])
         rows = max(blocks[i, 0] + xy + zx, blocks[i, 1] + xy + yz, blocks[i, 2] + yz + zx)

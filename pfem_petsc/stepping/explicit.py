@@ -78,7 +78,7 @@ class ExplicitStepper(Stepper):
         if supports.any:
             load = np.empty(len(supports.nodes))
             positions = supports.positions(balance.time)
-            hold(supports.nodes, supports.components, positions, balance.predictor, stiffness, u, load)
+            hold(0, len(load), 0, supports.nodes, supports.components, positions, balance.predictor, stiffness, u, load)
         walls, held, tolerance = model.contact.nothing, self._nobody, PROJECTED * model.length
         with self._faults(balance):
             state.contact = model.links.explicit(balance, state, u, stiffness, self.zero, tolerance)
@@ -93,5 +93,7 @@ class ExplicitStepper(Stepper):
                 held = nodes
         if supports.any:
             state.support = np.zeros_like(u)
-            react(supports.nodes, supports.components, load, state.contact, stiffness, u, state.support)
+            react(
+                0, len(load), 0, supports.nodes, supports.components, load, state.contact, stiffness, u, state.support
+            )
         return Solution(u, state.f, walls, contacts=model.links.count_held(held, len(u)))

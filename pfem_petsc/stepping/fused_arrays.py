@@ -6,15 +6,17 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..mechanics.sweep import Sweep
+
 __all__ = ["BarArrays", "Buffers", "ImpulseArrays", "NodeArrays", "ProbeArrays", "WallArrays"]
 
 
 class BarArrays(NamedTuple):
     """Arguments of the bar loop of a law; see :mod:`~pfem_petsc.mechanics.kernels`. ``slack``: row of the history with
-    the variable of this name, or -1."""
+    the variable of this name, or -1; ``reach``: how many blocks of nodes beyond its own the bars of a block reach."""
 
     ends: np.ndarray
-    sweep: tuple
+    sweep: Sweep
     far: np.ndarray
     rest: np.ndarray
     watched: np.ndarray
@@ -23,10 +25,13 @@ class BarArrays(NamedTuple):
     area: float | np.ndarray
     history: np.ndarray
     slack: int
+    reach: int
+    can_break: bool
 
 
 class NodeArrays(NamedTuple):
-    """Constant arrays at the nodes; ``damping`` (0,) and ``external`` (0, 3) if there are none."""
+    """Constant arrays at the nodes; ``damping`` (0,) and ``external`` (0, 3) if there are none;
+    ``support_starts`` (blocks + 1,) the first prescribed component of each block of nodes, which are sorted by node."""
 
     mass: np.ndarray
     damping: np.ndarray
@@ -34,6 +39,7 @@ class NodeArrays(NamedTuple):
     support_nodes: np.ndarray
     support_components: np.ndarray
     support_positions: np.ndarray
+    support_starts: np.ndarray
 
 
 class WallArrays(NamedTuple):

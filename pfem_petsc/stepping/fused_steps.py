@@ -10,6 +10,7 @@ from ..contact.forces import WallForces
 from ..energies import ENERGIES
 from ..errors import SimulationFailure
 from ..mechanics.bars import StrainEnergy
+from ..mesh.ordering import NODE_BLOCK
 from ..output.sums import HEAD, WALL
 from ..tolerances import PROJECTED
 from .fused_arrays import BarArrays, Buffers, ImpulseArrays, NodeArrays, ProbeArrays, WallArrays
@@ -33,7 +34,6 @@ WORTH = 1000
 
 _BROKEN = HEAD.first("broken_bars")
 _FEWEST = 8  # minimum number of steps for one call
-_NODES = 50_000  # beyond this the overhead of Python is below one percent, and memory traffic dominates
 
 
 class Batch:
@@ -49,16 +49,22 @@ class Batch:
         model = stepper.model
         self.model = model
         block = model.bars.blocks[0]
-        self._fused_loop = make_fused_loop(block.kernels.sweep_forces, *stepper.scheme.loops)
+        self._fused_loop = make_fused_loop(
+            block.kernels.sweep_part, block.kernels.sum_energies, block.kernels.work_rows, *stepper.scheme.loops
+        )
         bars = model.bars
         law = (bars.far, bars.rest, bars.watched, bars.heat, block.parameters, block.area, block.history)
-        self._bars = BarArrays(bars.ends, tuple(block.sweep), *law, block.law.slack_row)
+        self._bars = BarArrays(bars.ends, block.sweep, *law, block.law.slack_row, self._reach(), bars.can_break)
         supports, inertia, contact = model.supports, model.inertia, model.contact
         nothing = np.empty((0, 3))
         external = stepper.state.external if model.external.active else nothing
         damping = inertia.damping if inertia.damped else np.empty(0)
-        held = supports.positions(0.0)
-        self._nodes = NodeArrays(inertia.mass, damping, external, supports.nodes, supports.components, held)
+        order = np.argsort(supports.nodes, kind="stable")
+        held = supports.positions(0.0)[order]
+        nodes = supports.nodes[order]
+        limits = np.arange(0, len(inertia.mass) + NODE_BLOCK, NODE_BLOCK)
+        starts = np.searchsorted(nodes, limits).astype(np.int64)
+        self._nodes = NodeArrays(inertia.mass, damping, external, nodes, supports.components[order], held, starts)
         log = contact.log
         walls = (contact.fixed, contact.normals, contact.plane_offsets(0.0), contact.all_nodes, contact.members)
         room = np.empty(len(inertia.mass), dtype=np.int64)
@@ -68,6 +74,12 @@ class Batch:
         self._probes = ProbeArrays(*recorder.probed())
         self.sums = np.zeros((MOST, recorder.width))
         self._spare = [np.zeros_like(stepper.state.v) for _ in range(4)]
+
+    def _reach(self) -> int:
+        """Return how many blocks of nodes beyond its own the bars of a block reach."""
+        ends = self.model.bars.ends
+        blocks = ends.max(axis=1) // NODE_BLOCK - ends.min(axis=1) // NODE_BLOCK
+        return int(blocks.max(initial=0))
 
     @staticmethod
     def serves(stepper: Stepper) -> bool:
@@ -79,7 +91,6 @@ class Batch:
             # -log_view measures the methods of single steps
             not PETSc.Log.isActive()
             and model.comm.size == 1
-            and model.mesh.n_nodes <= _NODES
             and stepper.steady
             and stepper.scheme.loops is not None
             and stepper.treatment is None
@@ -87,11 +98,12 @@ class Batch:
             and all(energy.value is None for energy in ENERGIES)
         )
 
-    def make(self, count: int) -> tuple[int, np.ndarray]:
-        """Make up to ``count`` steps; return their number and the walls touched in each (steps, walls) bool.
+    def make(self, due: np.ndarray) -> tuple[int, np.ndarray]:
+        """Make up to ``len(due)`` steps; return their number and the walls touched in each (steps, walls) bool.
 
-        Fewer steps are made if a bar breaks. The same holds if a bar fails, a node is infeasible or the energy is not
-        finite; the stepper then has a fault.
+        ``due`` (count,) bool: whether a row of the history is due after each step. Fewer steps are made if a bar
+        breaks. The same holds if a bar fails, a node is infeasible or the energy is not finite; the stepper then has
+        a fault.
         """
         stepper, ledger, state = self.stepper, self.ledger, self.stepper.state
         log, scheme = self.model.contact.log, stepper.scheme
@@ -112,7 +124,7 @@ class Batch:
         ledger.sums[_BROKEN] = stepper.ruptures.count
         done, changed, failed, turned, infeasible, offsets, after, kinetic, u, touched, log.last, met = (
             self._fused_loop(
-                count,
+                len(due),
                 stepper.h,
                 state.x,
                 stepper.before,
@@ -128,6 +140,7 @@ class Batch:
                 impulses,
                 ledger.kinetic,
                 energies,
+                due,
                 self.sums,
             )
         )
@@ -206,7 +219,8 @@ class Batches:
             if self._refused:
                 return True
             self._batch = Batch(stepper, history.ledger, history.recorder)
-        made, touched = self._batch.make(count)
+        numbers = range(stepper.number + 1, stepper.number + count + 1)
+        made, touched = self._batch.make(np.array([history.due(number) for number in numbers]))
         failed = stepper.fault is not None
         contact, comm = analysis.model.contact, analysis.model.comm
         for k in range(made - failed):

@@ -27,9 +27,9 @@ from ..contact.impact import Impacts
 from ..energies import ENERGIES
 from ..output.sums import HEAD
 from .bar_changes import BarChanges
+from .book_loops import TOTALS, WORKS, book_nodes
 from .impulses import Impulses, NoImpulses, wall_shares
 from .moment import Moment, balanced, moment_of
-from .node_loops import TOTALS, WORKS, book_nodes
 from .sum_loops import add_totals, add_works
 
 if TYPE_CHECKING:

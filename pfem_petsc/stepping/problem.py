@@ -102,7 +102,7 @@ class StepProblem:
     def hessian_here(self, matrix: HessianMatrix, values: np.ndarray, stored: np.ndarray | None = None) -> None:
         """As :meth:`hessian`, at the positions :attr:`x`, ghosts included. Collective.
 
-        With ``stored`` (b, 5) the stiffness of the bars is computed from these data, see ``Bars.linearise``.
+        With ``stored`` (5, b) the stiffness of the bars is computed from these data, see ``Bars.linearise``.
         """
         inertia, balance = self.model.inertia, self.balance
         if not inertia.consistent:

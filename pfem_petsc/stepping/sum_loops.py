@@ -9,8 +9,8 @@ from __future__ import annotations
 from ..energies import BAR_ENERGIES
 from ..mechanics.compiled import kernel
 from ..output.sums import HEAD, WALL
+from .book_loops import WORKS
 from .impulses import WALLS
-from .node_loops import WORKS
 
 __all__ = ["add_totals", "add_works", "fill_bars", "fill_probes", "fill_walls"]
 
@@ -32,7 +32,7 @@ def add_works(sums, works, stored, heating, impact, friction, work, given, weigh
     Parameters
     ----------
     sums : (HEAD.width,) in the layout of :data:`~pfem_petsc.output.sums.HEAD`
-    works : (5,) see :data:`~pfem_petsc.stepping.node_loops.WORKS`
+    works : (5,) see :data:`~pfem_petsc.stepping.book_loops.WORKS`
     stored : change of the energies of nodes and bars; heating : work of changing temperatures
     impact, friction : dissipations
     work, given, weight, lost : of walls: work on the truss of those that move as prescribed and of those with mass, of
@@ -52,7 +52,7 @@ def add_works(sums, works, stored, heating, impact, friction, work, given, weigh
 
 @kernel
 def add_totals(sums, totals) -> None:
-    """Write the present totals (6, 3), see ``TOTALS`` of ``node_loops``."""
+    """Write the present totals (6, 3), see ``TOTALS`` of ``book_loops``."""
     for k in range(4):
         for c in range(3):
             sums[_TOTALS + 3 * k + c] = totals[k, c]

@@ -13,10 +13,12 @@ import pytest
 from pfem_petsc import Case, Simulation
 from pfem_petsc.case.materials import LAWS
 from pfem_petsc.integrators.central_differences import Scheme
-from pfem_petsc.mechanics.compiled import Compilation, _variant
+from pfem_petsc.mechanics import strips
+from pfem_petsc.mechanics.compiled import Compilation, _variant, code_digest
 from pfem_petsc.mechanics.kernels import make_kernels
+from pfem_petsc.mechanics.materials import elastic
 from pfem_petsc.mechanics.materials._softening import softened
-from pfem_petsc.mechanics.strain import MEASURES
+from pfem_petsc.mechanics.strain import MEASURES, engineering
 from pfem_petsc.registry import choices, lookup
 from pfem_petsc.stepping.explicit import ExplicitStepper
 from pfem_petsc.stepping.fused_loop import make_fused_loop
@@ -105,6 +107,13 @@ def test_machine_code_is_never_older_than_what_a_loop_inlines(tmp_path, monkeypa
         sys.modules.pop(name, None)
 
 
+def test_code_that_a_class_generates_is_part_of_the_digest(monkeypatch):
+    before = code_digest(make_kernels(elastic.LAW, engineering).forces.py_func)
+    assert before == code_digest(make_kernels(elastic.LAW, engineering).forces.py_func)
+    monkeypatch.setattr(strips._Strip, "store_nodes", lambda self, vectors, pointer, node: None)
+    assert code_digest(make_kernels(elastic.LAW, engineering).forces.py_func) != before
+
+
 @pytest.mark.parametrize("suffix", ["nbi", "nbc"])
 def test_damaged_machine_code_is_compiled_anew(module, tmp_path, suffix):
     assert module().outer(3.0) == 7.0
@@ -138,7 +147,9 @@ def test_every_process_finds_the_fused_loop_of_another():
         "from pfem_petsc.mechanics.materials.elastic import LAW\n"
         "from pfem_petsc.mechanics.strain import engineering\n"
         "from pfem_petsc.stepping.fused_loop import make_fused_loop\n"
-        "loop = make_fused_loop(make_kernels(LAW, engineering).sweep_forces, *Scheme.loops)\n"
+        "kernels = make_kernels(LAW, engineering)\n"
+        "parts = kernels.sweep_part, kernels.sum_energies, kernels.work_rows\n"
+        "loop = make_fused_loop(*parts, *Scheme.loops)\n"
         "print(loop._cache._index_key((), loop.targetctx.codegen()), loop._cache._cache_file._source_stamp)"
     )
     keys = set()
@@ -158,7 +169,7 @@ def test_loops_of_all_laws_have_names_of_their_own():
             for measure in MEASURES.values():
                 kernels = make_kernels(variant, measure)
                 names.append(_variant(kernels.forces.py_func))
-                fused = make_fused_loop(kernels.sweep_forces, *Scheme.loops)
+                fused = make_fused_loop(kernels.sweep_part, kernels.sum_energies, kernels.work_rows, *Scheme.loops)
                 longest = fused._cache._cache_file._data_path("x")
                 assert len(Path(longest).name) < 220
     assert len(names) > 40 and len(set(names)) == len(names)

@@ -20,7 +20,7 @@ def test_masses_keep_pseudo_steps_stable(seed):
     directions = ways / lengths[:, None]
     axial, geometric = 10.0 ** random.uniform(0, 3, len(bars)), random.normal(0.0, 2.0, len(bars))
     modulus = axial * random.choice([0.5, 2.0], len(bars))  # of a bar that yields the present stiffness is less
-    stored = np.column_stack([directions, axial - geometric, geometric])
+    stored = np.vstack([directions.T, axial - geometric, geometric])
     counted = random.random(len(bars)) < 0.5
     bound = np.empty(n)
     forces = node_stiffness(x, bars.astype(np.int32), stored, modulus, counted, np.empty((n, 6)), bound)

@@ -1,0 +1,203 @@
+"""Differences and sums over diagonal runs of bars by vector instructions, for compiled loops.
+
+The ends of a diagonal run are two strips of consecutive nodes, whose vectors (x, y, z) follow each other in memory.
+Eight nodes are loaded as three vectors of eight numbers and separated into components in registers, or the reverse. The
+last nodes of a strip are loaded and stored under a mask, so that nothing beyond is touched. LLVM splits the vectors for
+processors with shorter ones; a loop in Python over the same numbers would be compiled to gathers or scalar code.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from llvmlite import ir
+from numba.core import cgutils, types
+from numba.extending import intrinsic
+
+__all__ = ["add_strips", "differences"]
+
+_LANES = 8
+_INT, _SHORT = ir.IntType(64), ir.IntType(32)
+_NUMBERS = ir.VectorType(ir.DoubleType(), _LANES)
+_INTS = ir.VectorType(_INT, _LANES)
+_MASK = ir.VectorType(ir.IntType(1), _LANES)
+_POINTER = _NUMBERS.as_pointer()
+_ZEROS = ir.Constant(_NUMBERS, [0.0] * _LANES)
+_ALIGNED = ir.Constant(_SHORT, 8)  # bytes: the arrays are aligned to numbers, not to vectors
+# below this distance of the ends [nodes] the vectors of both overlap
+_APART = 2 * _LANES
+
+
+def _number(value: int) -> ir.Constant:
+    return ir.Constant(_INT, value)
+
+
+def _places(*values: int) -> ir.Constant:
+    return ir.Constant(ir.VectorType(_SHORT, _LANES), list(values))
+
+
+class _Strip:
+    """Loads and stores of eight numbers, or of the first ``left`` ones."""
+
+    def __init__(self, builder: Any, left: Any = None) -> None:
+        self.builder, self.left = builder, left
+
+    def _at(self, pointer: Any, index: Any) -> Any:
+        return self.builder.bitcast(self.builder.gep(pointer, [index]), _POINTER)
+
+    def _mask(self, limit: Any, first: int) -> Any:
+        """Return the mask of numbers ``first``, ``first`` + 1, ... that are below ``limit``."""
+        builder, undefined = self.builder, ir.Constant(_INTS, ir.Undefined)
+        one = builder.insert_element(undefined, limit, ir.Constant(_SHORT, 0))
+        every = builder.shuffle_vector(one, undefined, _places(*[0] * _LANES))
+        return builder.icmp_signed("<", ir.Constant(_INTS, [_number(first + j) for j in range(_LANES)]), every)
+
+    def _masked(self, name: str, result: Any, *arguments: Any) -> Any:
+        kind = ir.FunctionType(result, [argument.type for argument in arguments])
+        function = cgutils.get_or_insert_function(self.builder.module, kind, f"llvm.masked.{name}.v8f64.p0v8f64")
+        return self.builder.call(function, arguments)
+
+    def load(self, pointer: Any, index: Any, width: int = 1, part: int = 0) -> Any:
+        """Return eight numbers from ``index``, the vector ``part`` of those with ``width`` numbers for each node."""
+        at = self._at(pointer, self.builder.add(index, _number(_LANES * part)))
+        if self.left is None:
+            loaded = self.builder.load(at)
+            loaded.align = 8
+            return loaded
+        mask = self._mask(self.builder.mul(self.left, _number(width)), _LANES * part)
+        return self._masked("load", _NUMBERS, at, _ALIGNED, mask, _ZEROS)
+
+    def store(self, values: Any, pointer: Any, index: Any, width: int = 1, part: int = 0) -> None:
+        """Store eight numbers, see :meth:`load`."""
+        at = self._at(pointer, self.builder.add(index, _number(_LANES * part)))
+        if self.left is None:
+            self.builder.store(values, at).align = 8
+            return
+        mask = self._mask(self.builder.mul(self.left, _number(width)), _LANES * part)
+        self._masked("store", ir.VoidType(), values, at, _ALIGNED, mask)
+
+    def load_nodes(self, pointer: Any, node: Any) -> list[Any]:
+        """Return the vectors of eight nodes as they are in memory: x y z x y z ..."""
+        index = self.builder.mul(node, _number(3))
+        return [self.load(pointer, index, 3, part) for part in range(3)]
+
+    def store_nodes(self, vectors: list[Any], pointer: Any, node: Any) -> None:
+        """Store the vectors of eight nodes."""
+        index = self.builder.mul(node, _number(3))
+        for part in range(3):
+            self.store(vectors[part], pointer, index, 3, part)
+
+
+def _separate(builder: Any, woven: list[Any]) -> list[Any]:
+    """Return the components of eight nodes: x x x ..., y y y ..., z z z ..."""
+    found = []
+    for c in range(3):
+        places = [3 * i + c for i in range(_LANES)]
+        both = [at if at < 2 * _LANES else 0 for at in places]
+        rest = [i if at < 2 * _LANES else at - _LANES for i, at in enumerate(places)]
+        first = builder.shuffle_vector(woven[0], woven[1], _places(*both))
+        found.append(builder.shuffle_vector(first, woven[2], _places(*rest)))
+    return found
+
+
+def _weave(builder: Any, components: list[Any]) -> list[Any]:
+    """Return the reverse of :func:`_separate`."""
+    woven = []
+    for part in range(3):
+        places = [divmod(_LANES * part + j, 3) for j in range(_LANES)]
+        both = [node if c == 0 else _LANES + node if c == 1 else 0 for node, c in places]
+        rest = [_LANES + node if c == 2 else j for j, (node, c) in enumerate(places)]
+        first = builder.shuffle_vector(components[0], components[1], _places(*both))
+        woven.append(builder.shuffle_vector(first, components[2], _places(*rest)))
+    return woven
+
+
+def _for_strips(builder: Any, count: Any, body: Callable[[Any, _Strip], None]) -> None:
+    """Generate a loop over ``count`` bars, eight at a time; ``body`` gets the first one of each."""
+    whole = builder.and_(count, _number(-_LANES))
+    with cgutils.for_range_slice(builder, _number(0), whole, _number(_LANES), _INT) as (at, _):
+        body(at, _Strip(builder))
+    left = builder.sub(count, whole)
+    with builder.if_then(builder.icmp_signed(">", left, _number(0))):
+        body(whole, _Strip(builder, left))
+
+
+class _Arguments:
+    """The arguments of an intrinsic."""
+
+    def __init__(self, context: Any, builder: Any, signature: Any, values: Any) -> None:
+        self.context, self.builder, self.types, self.values = context, builder, signature.args, values
+
+    def index(self, k: int) -> Any:
+        """Return argument k as an index."""
+        return self.context.cast(self.builder, self.values[k], self.types[k], types.intp)
+
+    def numbers(self, k: int, first: Any, width: int = 1) -> Any:
+        """Return a pointer to the numbers of node or bar ``first`` in array k."""
+        data = self.context.make_array(self.types[k])(self.context, self.builder, self.values[k]).data
+        return self.builder.gep(data, [self.builder.mul(first, _number(width))])
+
+
+@intrinsic
+def differences(typingctx, x, low, high, count, dx, dy, dz, first):  # noqa: ANN001, ANN201 - Numba's types
+    """Write x[high + i] - x[low + i] for ``count`` nodes of ``x`` (n, 3) to ``dx``, ``dy``, ``dz`` from ``first``."""
+
+    def generate(context, builder, signature, values):  # noqa: ANN001, ANN202
+        given = _Arguments(context, builder, signature, values)
+        ends = [given.numbers(0, given.index(k), 3) for k in (1, 2)]
+        rows = [given.numbers(k, given.index(7)) for k in (4, 5, 6)]
+
+        def body(at: Any, strip: _Strip) -> None:
+            one, other = (strip.load_nodes(end, at) for end in ends)
+            for row, values in zip(
+                rows, _separate(builder, [builder.fsub(b, a) for a, b in zip(one, other, strict=True)]), strict=True
+            ):
+                strip.store(values, row, at)
+
+        _for_strips(builder, given.index(3), body)
+        return context.get_dummy_value()
+
+    return types.void(x, low, high, count, dx, dy, dz, first), generate
+
+
+def _add_to_both(builder: Any, ends: list[Any], distance: Any, count: Any, pull: Callable[[Any, _Strip], Any]) -> None:
+    """Generate the subtraction of what ``pull`` returns from the nodes of a strip, and the addition to the other."""
+
+    def add(strip: _Strip, at: Any, which: int, pulls: list[Any]) -> None:
+        combine = builder.fadd if which else builder.fsub
+        old = strip.load_nodes(ends[which], at)
+        strip.store_nodes([combine(a, b) for a, b in zip(old, pulls, strict=True)], ends[which], at)
+
+    def both(at: Any, strip: _Strip) -> None:
+        pulls = pull(at, strip)
+        add(strip, at, 0, pulls)
+        add(strip, at, 1, pulls)
+
+    with builder.if_else(builder.icmp_signed(">=", distance, _number(_APART))) as (apart, close):
+        with apart:
+            _for_strips(builder, count, both)
+        with close:  # a load of what has just been stored at another place would have to wait
+            for which in range(2):
+                _for_strips(builder, count, lambda at, strip, which=which: add(strip, at, which, pull(at, strip)))
+
+
+@intrinsic
+def add_strips(typingctx, f, low, high, count, dx, dy, dz, c, first):  # noqa: ANN001, ANN201
+    """Subtract c (dx, dy, dz) of ``count`` bars, from ``first`` on, from the nodes of ``f`` (n, 3) from ``low`` on, and
+    add it to those from ``high`` on."""
+
+    def generate(context, builder, signature, values):  # noqa: ANN001, ANN202
+        given = _Arguments(context, builder, signature, values)
+        low, high, first = given.index(1), given.index(2), given.index(8)
+        rows = [given.numbers(k, first) for k in (4, 5, 6, 7)]
+
+        def pull(at: Any, strip: _Strip) -> list[Any]:
+            *components, factor = (strip.load(row, at) for row in rows)
+            return _weave(builder, [builder.fmul(factor, component) for component in components])
+
+        ends = [given.numbers(0, node, 3) for node in (low, high)]
+        _add_to_both(builder, ends, builder.sub(high, low), given.index(3), pull)
+        return context.get_dummy_value()
+
+    return types.void(f, low, high, count, dx, dy, dz, c, first), generate

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from helpers.gathered import whole
 from mpi4py import MPI
 
-from pfem_petsc import Case
+from pfem_petsc import Case, cases
 from pfem_petsc.errors import InputError
 from pfem_petsc.mesh.checks import check_mesh
 from pfem_petsc.mesh.generators import lattice
@@ -168,6 +170,31 @@ def test_struts_across_a_gap_are_cut(tmp_path):
     clipped = filled(surface={"file": str(path), "cut": "clip", "shortest": 0.0}, **keys)
     faces = [np.isclose(clipped.points[:, 0], x, atol=1e-6).sum() for x in (1.0, 1.02)]
     assert faces[0] == faces[1] > 3  # a strut that passes the gap is divided into two
+
+
+def test_bracket_has_the_struts_inside_it():
+    """The surface of the built-in case: its volume, and the struts that lie in the angle and not in a hole."""
+    path = Path(cases.__file__).parent / "bracket.stl"
+    sector = 2.0 * np.pi / 48
+    polygon = 24.0 * np.sin(sector)  # area over the square of its radius
+    volume = (80.0 * 16.0 + 64.0 * 16.0) * 48.0 - polygon * (2.0 * 7.0**2 + 12.0**2) * 16.0
+    assert read_surface(path, 1e-3).volume == pytest.approx(volume * 1e-9, rel=1e-6)
+    mesh = filled(pitch=4e-3, surface={"file": str(path), "scale": 1e-3})
+
+    def outside(points, axis, centre, radius):
+        """Whether points [mm] are not in a hole, a prism with corners on a circle."""
+        apart = np.delete(points, axis, axis=-1) - centre
+        turn = np.mod(np.arctan2(apart[..., 1], apart[..., 0]), sector) - 0.5 * sector
+        return np.linalg.norm(apart, axis=-1) * np.cos(turn) >= radius * np.cos(0.5 * sector) - 1e-6
+
+    block = lattice.generate(lattice.Parameters(kind="octet", cells=(20, 12, 20), pitch=4.0), 0, 1)
+    t = np.linspace(0.0, 1.0, 41)[:, None, None]
+    points = (1.0 - t) * block.points[block.bars[:, 0]] + t * block.points[block.bars[:, 1]]
+    within = (points[..., 2] <= 16.0 + 1e-9) | (points[..., 0] <= 16.0 + 1e-9)
+    for axis, centre, radius in ((2, (36.0, 24.0), 7.0), (2, (62.0, 24.0), 7.0), (0, (24.0, 54.0), 12.0)):
+        within &= outside(points, axis, centre, radius)
+    middles = [mesh.points[mesh.bars].sum(axis=1) * 1e3, 2.0 * points[20][within.all(axis=0)]]
+    np.testing.assert_array_equal(*(rows[np.lexsort(rows.T)] for rows in map(np.round, middles)))
 
 
 def test_dangling_struts_are_removed_one_after_the_other(tmp_path):

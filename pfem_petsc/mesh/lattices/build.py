@@ -19,6 +19,7 @@ from .expressions import Expression
 from .keys import COORDINATES, checked_expression
 from .kinds import ANGLE, KINDS, auxetic
 from .mechanisms import mechanism_warning
+from .numbering import Places
 from .pruning import renumbered, without_dangling
 from .shape import cylinder_map, graded_levels, perturbation, sphere_map
 from .surface import Surface, read_surface
@@ -147,14 +148,21 @@ def build(keys: Parameters, comm: MPI.Comm, fields: Mapping[str, str], groups: C
         what = "no strut is inside the surface; use a smaller pitch" if surface else "no strut is left"
         raise InputError(f"mesh: {what}")
     wanted = wanted_groups(block, groups)
+
+    def memberships(places: Places) -> dict[str, np.ndarray]:
+        return {name: mask for name, mask in block.groups_of(places).items() if name in wanted}
+
+    def values(middles: np.ndarray) -> dict[str, np.ndarray]:
+        return {name: field_values(keys, name, middles) for name in fields}
+
     slab = renumbered(
         block,
         kept,
         region,
         comm,
         lambda places: on_faces(block, places),
-        lambda places: {name: mask for name, mask in block.groups_of(places).items() if name in wanted},
-        lambda middles: {name: field_values(keys, name, middles) for name in fields},
+        memberships if wanted else None,
+        values if fields else None,
         surface is not None,
     )
     slab.source, slab.warnings = f"generator lattice ({keys.kind})", mechanism_warning(keys.kind, block.cell)
@@ -259,7 +267,7 @@ def face_names(block: Block) -> list[str]:
     return [name for axis in (2, 0, 1) if not (axis == 0 and block.closed) for name in FACES[axis]]
 
 
-def on_faces(block: Block, places: object) -> dict[str, np.ndarray]:
+def on_faces(block: Block, places: Places) -> dict[str, np.ndarray]:
     """Return which nodes (n,) are in each node group of faces."""
     names = face_names(block)
     faces = {name: (axis, upper) for axis, pair in enumerate(FACES) for upper, name in enumerate(pair)}

@@ -9,7 +9,7 @@ from mpi4py import MPI
 
 from ..slab import slab_range
 from .block import Block
-from .numbering import Places
+from .numbering import CellByCell, Places
 from .pruning import Kept, end_points
 from .region import Region
 from .shape import random_numbers
@@ -65,13 +65,19 @@ def cut_block(block: Block, cut: Cut, longest: float, comm: MPI.Comm) -> tuple[K
 
 
 def _used_nodes(block: Block, first: int, last: int) -> tuple[int, int]:
-    """Return the range of the nodes of a range of bars."""
+    """Return a range that has the nodes of a range of bars."""
+    if first == last:
+        return 0, 0
+    if isinstance(block.nodes, CellByCell) and not block.closed:
+        # ends of a bar are in its cell and the next ones along each axis
+        _, i, j, _ = block.bars.decode(np.array([first, last - 1]))
+        return block.nodes.row(int(i[0]), int(j[0])), block.nodes.row(int(i[1]) + 1, int(j[1]) + 2)
     low, high = block.nodes.total, 0
     for _, places in block.bars.pieces(first, last):
         for which in (0, 1):
             numbers = block.end(places, which)[0]
             low, high = min(low, int(numbers.min())), max(high, int(numbers.max()) + 1)
-    return (low, high) if high else (0, 0)
+    return low, high
 
 
 def _within(
@@ -93,7 +99,8 @@ def _within(
     touching = np.flatnonzero(~clear & (inside.any(axis=1) if cut.clip else inside.all(axis=1)))
     whole = clear & inside.all(axis=1)
     starts, stops = end_points(block, Kept(numbers[touching], ends[touching]), places.chosen(touching))
-    line, span = surface.inside_parts(starts, stops)
+    strictly = (distance[touching] < -ON * longest).all(axis=1)
+    line, span = surface.inside_parts(starts, stops, strictly)
     entire = (span == (0.0, 1.0)).all(axis=1)
     whole[touching[line[entire]]] = True
     pieces = [Kept(numbers[whole], ends[whole])]

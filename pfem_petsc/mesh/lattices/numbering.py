@@ -136,6 +136,13 @@ class CellByCell(Numbering):
         rest = rest - self._along_z[cx, cy, k]
         return Places(self._items[cx, cy, self._class[2][k], rest], i, j, k)
 
+    def row(self, i: int, j: int) -> int:
+        """Return the number of the first item in the row of cells (i, j), or after the block."""
+        i, j = (i, j) if j + 1 < self._along_y.shape[1] else (i + 1, 0)
+        if i + 1 >= len(self._along_x):
+            return self.total
+        return int(self._along_x[i] + self._along_y[self._class[0][i], j])
+
 
 def _starts(counts: np.ndarray) -> np.ndarray:
     """Return sums of what comes before along the last axis, and of all."""

@@ -66,8 +66,8 @@ def renumbered(
     region: Region,
     comm: MPI.Comm,
     node_groups: Callable[[Places], Mapping[str, np.ndarray]],
-    bar_groups: Callable[[Places], Mapping[str, np.ndarray]],
-    fields: Callable[[np.ndarray], Mapping[str, np.ndarray]],
+    bar_groups: Callable[[Places], Mapping[str, np.ndarray]] | None,
+    fields: Callable[[np.ndarray], Mapping[str, np.ndarray]] | None,
     surface: bool,
 ) -> MeshSlab:
     """Return this rank's part of what is left. Collective.
@@ -76,8 +76,8 @@ def renumbered(
 
     Parameters
     ----------
-    node_groups, bar_groups : memberships (n,) by name, of nodes and bars at places of the block
-    fields : values (n,) by name, at the middles (n, 3) of bars
+    node_groups, bar_groups : memberships (n,) by name, of nodes and bars at places of the block; None: without
+    fields : values (n,) by name, at the middles (n, 3) of bars; None: without
     surface : whether there is a node group ``surface``: new nodes, and nodes that have lost a bar
     """
     first, last = slab_range(block.nodes.total, comm.rank, comm.size)
@@ -108,10 +108,13 @@ def renumbered(
     ends[~is_new] = in_region[kept.ends[~is_new] - region.first]
     bars_before, n_bars = _counted(comm, len(kept.bars))
     bars = _Moved(comm, bars_before + np.arange(len(kept.bars)), n_bars)
-    at = block.bars.decode(kept.bars)
-    found = {name: bars.members(mask) for name, mask in bar_groups(at).items()}
-    with agreed(comm):
-        values = fields(0.5 * sum(end_points(block, kept, at)))
+    found = {}
+    if bar_groups is not None:
+        found = {name: bars.members(mask) for name, mask in bar_groups(block.bars.decode(kept.bars)).items()}
+    values: Mapping[str, np.ndarray] = {}
+    if fields is not None:
+        with agreed(comm):
+            values = fields(0.5 * sum(end_points(block, kept, block.bars.decode(kept.bars))))
     return MeshSlab(
         n_nodes=n_nodes,
         n_bars=n_bars,

@@ -28,6 +28,10 @@ ON = 1e-6
 """Points nearer to the surface than this fraction of the bar lengths count as inside: those on it are inside."""
 
 
+_SAME = 1e-9
+"""Crossings of a bar closer than this fraction of it are one."""
+
+
 @dataclass
 class Surface:
     """Triangles that enclose a volume, with outward normals."""
@@ -100,12 +104,16 @@ class Surface:
         found[near] = self.distances(points[near])
         return found
 
-    def inside_parts(self, starts: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def inside_parts(
+        self, starts: np.ndarray, ends: np.ndarray, inside: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return the parts of lines that lie inside.
 
         Parameters
         ----------
         starts, ends : (n, 3) float64 [m]
+        inside : (n,) bool
+            Lines that are inside entirely if they do not meet a triangle; the others are examined.
 
         Returns
         -------
@@ -114,38 +122,46 @@ class Surface:
         span : (parts, 2) float64
             Where each part begins and ends, from 0 (start) to 1 (end).
         """
-        line, span = [np.empty(0, np.int64)], [np.empty((0, 2))]
-        for n, (a, b) in enumerate(zip(starts, ends)):
-            t = self._crossings(a, b)
-            line.append(np.full(len(t) - 1, n))
-            span.append(np.stack([t[:-1], t[1:]], axis=1))
-        lines, spans = np.concatenate(line), np.concatenate(span)
+        line, t = self._crossings(starts, ends)
+        certain = np.zeros(len(starts), bool) if inside is None else inside.copy()
+        certain[line] = False
+        n = np.arange(len(starts))
+        line, t = np.concatenate([n, line, n]), np.concatenate([np.zeros(len(n)), t, np.ones(len(n))])
+        order = np.lexsort((t, line))
+        line, t = line[order], t[order]
+        pieces = np.flatnonzero((line[1:] == line[:-1]) & (np.diff(t) > _SAME))
+        line, span = line[pieces], np.stack([t[pieces], t[pieces + 1]], axis=1)
+        # crossings next to an end or to each other are one
+        span[span <= _SAME], span[span >= 1.0 - _SAME] = 0.0, 1.0
         way = ends - starts
-        middles = starts[lines] + spans.mean(axis=1)[:, None] * way[lines]
-        inside = self.distances(middles) <= ON * np.linalg.norm(way[lines], axis=1)
-        lines, spans = lines[inside], spans[inside]
-        # parts that touch at a crossing of the surface that does not lead out of it are one
-        joined = (lines[1:] == lines[:-1]) & (spans[1:, 0] == spans[:-1, 1])
-        begins = np.concatenate([[True], ~joined])[: len(lines)]
-        stops = np.concatenate([~joined, [True]])[-len(lines) or None :] if len(lines) else begins
-        return lines[begins], np.stack([spans[begins, 0], spans[stops, 1]], axis=1)
+        examined = np.flatnonzero(~certain[line])
+        middles = starts[line[examined]] + span[examined].mean(axis=1)[:, None] * way[line[examined]]
+        kept = certain[line]
+        kept[examined] = self.distances(middles) <= ON * np.linalg.norm(way[line[examined]], axis=1)
+        line, span = line[kept], span[kept]
+        # parts that meet at a crossing that does not lead out of the surface are one
+        joined = (line[1:] == line[:-1]) & (span[1:, 0] - span[:-1, 1] <= 2.0 * _SAME)
+        first = np.flatnonzero(np.concatenate([[True], ~joined])[: len(line)])
+        last = np.append(first[1:], len(line))[: len(first)] - 1
+        return line[first], np.stack([span[first, 0], span[last, 1]], axis=1)
 
-    def _crossings(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """Return where the line from a to b meets triangles, ascending from 0 to 1 with these two."""
+    def _crossings(self, starts: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the lines that meet triangles, and where: from 0 at their start to 1 at their end."""
         from vtkmodules.vtkCommonCore import vtkIdList, vtkPoints
 
-        points, cells = vtkPoints(), vtkIdList()
+        points, cells, locator = vtkPoints(), vtkIdList(), self._locator
         points.SetDataTypeToDouble()
-        way = b - a
-        self._locator.IntersectWithLine(a, b, 0.0, points, cells)
-        t = [0.0, 1.0]
-        for k in range(points.GetNumberOfPoints()):
-            t.append(float((np.array(points.GetPoint(k)) - a) @ way / (way @ way)))
-        t = np.sort(np.clip(t, 0.0, 1.0))
-        keep = np.concatenate([[True], np.diff(t) > 1e-9])
-        t = t[keep]
-        t[-1] = 1.0
-        return t
+        lines: list[int] = []
+        places: list[tuple[float, float, float]] = []
+        for n, (a, b) in enumerate(zip(starts.tolist(), ends.tolist())):
+            locator.IntersectWithLine(a, b, 0.0, points, cells)
+            for k in range(points.GetNumberOfPoints()):
+                lines.append(n)
+                places.append(points.GetPoint(k))
+        line, place = np.array(lines, np.int64), np.array(places).reshape(-1, 3)
+        way = ends[line] - starts[line]
+        along = np.einsum("ij,ij->i", place - starts[line], way) / np.einsum("ij,ij->i", way, way)
+        return line, np.clip(along, 0.0, 1.0)
 
 
 def read_surface(path: Path, scale: float) -> Surface:

@@ -19,7 +19,7 @@ import matplotlib.pyplot as plt
 
 from pfem_petsc import Case, Simulation
 from pfem_petsc.mesh.generators import lattice
-from pfem_petsc.mesh.lattices.build import cell_of_kind
+from pfem_petsc.mesh.lattices.making import cell_of_kind
 from pfem_petsc.post.render import render
 
 ROOT = Path(__file__).resolve().parent.parent

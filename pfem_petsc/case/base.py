@@ -101,6 +101,8 @@ def with_absolute_paths(table: StrictModel, folder: Path) -> StrictModel:
         value, extra = getattr(table, name), field.json_schema_extra
         if isinstance(value, StrictModel):
             update[name] = with_absolute_paths(value, folder)
+        elif isinstance(value, dict) and any(isinstance(entry, StrictModel) for entry in value.values()):
+            update[name] = {key: with_absolute_paths(entry, folder) for key, entry in value.items()}
         elif isinstance(value, str) and isinstance(extra, dict) and extra.get("is_path"):
             update[name] = str(Path(folder, value).resolve())
     return table.model_copy(update=update) if update else table

@@ -12,7 +12,7 @@ from pfem_petsc import Case, Simulation
 from pfem_petsc.errors import InputError
 from pfem_petsc.mesh.checks import check_mesh
 from pfem_petsc.mesh.generators import lattice
-from pfem_petsc.mesh.lattices.build import cell_of_kind
+from pfem_petsc.mesh.lattices.making import cell_of_kind
 from pfem_petsc.mesh.lattices.mechanisms import periodic_mechanisms
 from pfem_petsc.mesh.lattices.numbering import CellByCell, ItemByItem
 from pfem_petsc.mesh.lattices.shape import random_numbers

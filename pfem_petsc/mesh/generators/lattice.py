@@ -9,7 +9,16 @@ from pydantic import Field, field_validator, model_validator
 
 from ...case.base import Name, NonNegativeInt, PositiveFloat, PositiveInts3, StrictModel, Vector3
 from ..lattices.build import build, generate_block
-from ..lattices.keys import CellKeys, CurvedKeys, SurfaceKeys, checked_expression, grading_factors
+from ..lattices.expressions import RESERVED
+from ..lattices.keys import (
+    COORDINATES,
+    CellKeys,
+    CurvedKeys,
+    FieldKeys,
+    SurfaceKeys,
+    checked_expression,
+    grading_factors,
+)
 from ..lattices.kinds import ANGLE
 from ..slab import MeshSlab
 
@@ -59,26 +68,36 @@ class Parameters(StrictModel):
     surface: SurfaceKeys | None = None
     """A closed surface that the lattice fills: ``file``, ``scale``, ``cut``, ``shortest``."""
     dangling: Literal["remove", "keep"] | None = None
-    """Struts that end at a node without another; default: ``remove`` with ``surface`` or ``missing``, else ``keep``."""
+    """Struts that end at a node without another; default: ``remove`` with ``surface``, ``keep`` or
+    ``missing``, else ``keep``."""
     curved: CurvedKeys | None = None
     """Map to a curved shell: ``shape``, ``radius``, ``closed``."""
+    fields: dict[Name, FieldKeys] | None = None
+    """Fields on meshes of VTK, by their names in expressions: ``file``, ``array``, ``scale``."""
+    keep: str | None = None
+    """Nodes where this expression of x, y and z [m] and ``fields`` is false are left out, with their struts."""
     bar_fields: dict[Name, str] | None = None
-    """Cell fields of the bars by name, for ``area_field``: expressions of x, y and z of their middles [m]."""
+    """Cell fields of the bars by name, for ``area_field``: expressions of x, y and z of their middles [m], and of
+    ``fields``."""
 
     @field_validator("grading")
     @classmethod
     def _factors(cls, value: Any) -> Any:
         return None if value is None else grading_factors(value)
 
-    @field_validator("bar_fields")
-    @classmethod
-    def _expressions(cls, value: dict[str, str] | None) -> dict[str, str] | None:
-        for name, text in (value or {}).items():
+    @model_validator(mode="after")
+    def _expressions(self) -> Parameters:
+        for name in self.fields or {}:
+            if not name.isidentifier() or name in RESERVED:
+                raise ValueError(f"fields.{name}: expected a name for expressions of letters, digits and underscores")
+        texts = {f"bar_fields.{name}": text for name, text in (self.bar_fields or {}).items()}
+        texts |= {"keep": self.keep} if self.keep is not None else {}
+        for key, text in texts.items():
             try:
-                checked_expression(text)
+                checked_expression(text, (*COORDINATES, *(self.fields or {})))
             except ValueError as error:
-                raise ValueError(f"{name} = {text!r}: {error}") from None
-        return value
+                raise ValueError(f"{key} = {text!r}: {error}") from None
+        return self
 
     @model_validator(mode="after")
     def _consistent(self) -> Parameters:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from mpi4py import MPI
 
+from ...parallel.agreement import agreed
 from ..slab import slab_range
 from .block import Block
 from .numbering import CellByCell, Places
@@ -31,6 +33,8 @@ class Cut:
     """Bars outside of it are left out."""
     clip: bool = False
     """Whether bars that pass the surface end there, else they are left out."""
+    keep: Callable[[np.ndarray], np.ndarray] | None = None
+    """Which nodes at points (n, 3) are kept."""
     shortest: float = 0.0
     """Fraction of its length that must be left of a bar."""
 
@@ -44,23 +48,36 @@ def cut_block(block: Block, cut: Cut, longest: float, comm: MPI.Comm) -> tuple[K
     """
     bars = slab_range(block.bars.total, comm.rank, comm.size)
     region = Region(comm, block.nodes.total, *_used_nodes(block, *bars))
-    distance = np.empty(0)
+    first, last = slab_range(block.nodes.total, comm.rank, comm.size)
+    distance = there = np.empty(0)
     if cut.surface is not None:
-        first, last = slab_range(block.nodes.total, comm.rank, comm.size)
         slab = [np.empty(0)]
         for numbers, places in block.nodes.pieces(first, last):
             slab.append(cut.surface.rough_distances(block.positions(numbers, places), longest))
         distance = region.fetch(np.concatenate(slab))
+    if cut.keep is not None:
+        slab = [np.empty(0, bool)]
+        with agreed(comm):
+            for numbers, places in block.nodes.pieces(first, last):
+                slab.append(cut.keep(block.positions(numbers, places)))
+        there = region.fetch(np.concatenate(slab))
     pieces = []
     for numbers, places in block.bars.pieces(*bars):
         if cut.missing:
-            there = random_numbers(cut.seed, _MISSING, numbers) >= cut.missing
-            numbers, places = numbers[there], places.chosen(there)
+            drawn = random_numbers(cut.seed, _MISSING, numbers) >= cut.missing
+            numbers, places = numbers[drawn], places.chosen(drawn)
         ends = np.stack([block.end(places, which)[0] for which in (0, 1)], axis=1)
-        if cut.surface is None:
-            pieces.append(Kept(numbers, ends))
-        else:
-            pieces.append(_within(block, cut, numbers, places, ends, distance[ends - region.first], longest))
+        lost = np.empty(0, np.int64)
+        if cut.keep is not None:
+            both = there[ends - region.first]
+            whole = both.all(axis=1)
+            lost = ends[both & ~whole[:, None]]
+            numbers, places, ends = numbers[whole], places.chosen(whole), ends[whole]
+        piece = Kept(numbers, ends)
+        if cut.surface is not None:
+            piece = _within(block, cut, numbers, places, ends, distance[ends - region.first], longest)
+        piece.cut = np.concatenate([piece.cut, lost])
+        pieces.append(piece)
     return _joined(pieces), region
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["Expression"]
+__all__ = ["RESERVED", "Expression"]
 
 _OPERATORS: dict[type, Callable[..., Any]] = {
     ast.Add: np.add,
@@ -45,9 +45,28 @@ _FUNCTIONS: dict[str, tuple[Callable[..., Any], int]] = {
 _CONSTANTS = {"pi": math.pi, "e": math.e}
 _LONGEST = 2000
 
+RESERVED = (
+    "x",
+    "y",
+    "z",
+    *_CONSTANTS,
+    *_FUNCTIONS,
+    "and",
+    "or",
+    "not",
+    "True",
+    "False",
+    "None",
+    "if",
+    "else",
+    "in",
+    "is",
+)
+"""Names that a variable of its own cannot have."""
+
 
 class Expression:
-    """An expression of named variables.
+    """An expression of named variables; ``used`` has the names in it.
 
     Parameters
     ----------
@@ -74,6 +93,7 @@ class Expression:
         except (RecursionError, MemoryError):
             raise ValueError("the expression is nested too deep") from None
         self._tree = tree.body
+        self.used = {node.id for node in ast.walk(tree.body) if isinstance(node, ast.Name)}
 
     def __call__(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return the values (n,) float64 at the values (n,) of the variables; not finite where it is not defined."""
@@ -108,10 +128,10 @@ class Expression:
             return _FUNCTIONS[node.func.id][0](*found)  # type: ignore[attr-defined]
         if isinstance(node, ast.Compare):
             pairs = [_OPERATORS[type(o)](a, b) for o, a, b in zip(operators, found, found[1:])]
-            return reduce(np.logical_and, pairs)
+            return _number(reduce(np.logical_and, pairs))
         if isinstance(node, ast.BoolOp):
-            return reduce(_OPERATORS[type(operators[0])], found)
-        return _OPERATORS[type(operators[0])](*found)
+            return _number(reduce(_OPERATORS[type(operators[0])], found))
+        return _number(_OPERATORS[type(operators[0])](*found))
 
 
 def _parts(node: ast.AST) -> tuple[list[ast.AST], list[ast.AST]]:
@@ -134,6 +154,11 @@ def _parts(node: ast.AST) -> tuple[list[ast.AST], list[ast.AST]]:
             raise ValueError(f"{name} takes {expected}, got {count + len(node.keywords)}")
         return [], list(node.args)
     raise ValueError(f"{ast.unparse(node)!r} is not arithmetic of numbers, variables and known functions")
+
+
+def _number(value: Any) -> Any:
+    """Return 1 and 0 for true and false."""
+    return np.asarray(value, dtype=float)
 
 
 def _finite(value: float) -> bool:

@@ -10,7 +10,7 @@ from ...case.base import FilePath, Finite, NonNegativeInt, PositiveFloat, Strict
 from .cell import UnitCell, cell_of
 from .expressions import Expression
 
-__all__ = ["COORDINATES", "CellKeys", "CurvedKeys", "SurfaceKeys", "checked_expression", "grading_factors"]
+__all__ = ["COORDINATES", "CellKeys", "CurvedKeys", "FieldKeys", "SurfaceKeys", "checked_expression", "grading_factors"]
 
 COORDINATES = ("x", "y", "z")
 
@@ -76,6 +76,17 @@ class SurfaceKeys(StrictModel):
     """``trim``: only struts that are inside entirely; ``clip``: struts end on the surface, at new nodes"""
     shortest: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.2
     """with ``clip``: what is left of a strut is dropped if it is shorter than this fraction of it"""
+
+
+class FieldKeys(StrictModel):
+    """A field on a mesh of VTK for expressions, ``[mesh.fields.NAME]``."""
+
+    file: FilePath
+    """VTK file (``.vtu``, ``.vti``, ``.vtk``, ...), relative to the case file"""
+    array: Annotated[str, Field(min_length=1)]
+    """name of an array of points or cells with one number each"""
+    scale: PositiveFloat = 1.0
+    """metres per unit of length of the file"""
 
 
 class CurvedKeys(StrictModel):

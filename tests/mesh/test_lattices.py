@@ -394,3 +394,25 @@ def test_check_tells_the_relative_density_and_takes_areas_from_an_expression(tmp
     case["section"]["s"]["area_field"] = "thick"
     with pytest.raises(InputError, match="section.s.area_field = 'thick': mesh.bar_fields has no such field"):
         Simulation(Case.from_dict(case), MPI.COMM_SELF, check_only=True)
+
+
+@pytest.mark.parametrize(
+    ("mesh", "text"),
+    [
+        ({"kind": "cell", "cell": {"points": [[0, 0, 0]]}}, "mesh.cell.struts: this key is missing (points that each"),
+        ({"curved": {"shape": "cylinder", "radus": 1.0}}, "mesh.curved.radus: unknown key, did you mean 'radius'?"),
+        ({"surface": {"scale": 1.0}}, "mesh.surface.file: this key is missing (STL, OBJ or PLY file"),
+        ({"surface": {"file": "a.stl", "cut": "trimm"}}, 'mesh.surface.cut = "trimm": unknown value, did you mean'),
+        ({"fields": {"rho": {"file": "a.vti"}}}, "mesh.fields.rho.array: this key is missing (name of an array"),
+    ],
+)
+def test_problems_in_inner_tables_name_their_keys(mesh, text):
+    case = {
+        "mesh": {"generator": "lattice", "pitch": 1.0, "cells": [1, 1, 1], **mesh},
+        "material": {"m": {"young_modulus": 1e9, "density": 1000.0}},
+        "section": {"s": {"area": 1e-6, "material": "m"}},
+        "time": {"integrator": "central_differences", "step": "auto", "end": 1e-5},
+    }
+    with pytest.raises(InputError) as refused:
+        Case.from_dict(case)
+    assert text in str(refused.value)

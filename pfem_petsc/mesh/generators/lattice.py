@@ -117,6 +117,8 @@ class Parameters(StrictModel):
 def generate(parameters: Parameters, rank: int, size: int) -> MeshSlab:
     """Generate this rank's part of a lattice from which nothing is cut, by index arithmetic and without messages.
 
+    Corners without a bar, of kinds such as ``diamond``, are still in it.
+
     Node groups: ``bottom`` and ``top`` (z faces), ``left`` and ``right`` (x faces), ``front`` and ``back`` (y faces).
     Bar groups: those of the unit cell.
     """

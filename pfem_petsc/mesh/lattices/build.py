@@ -155,10 +155,10 @@ def wanted_groups(block: Block, groups: Collection[str] | None) -> list[str]:
     """Return the bar groups to make: none, if none of those asked for is a bar group here."""
     known = list(block.cell.groups) + ["skin"] * bool(block.cell.skin)
     # a name that is not known may be misspelt: the message about it lists them all
-    return known if groups is None or any(name not in FACE_NAMES for name in groups) else []
+    return known if groups is None or any(name not in NODE_GROUPS for name in groups) else []
 
 
-FACE_NAMES = tuple(name for pair in FACES for name in pair)
+NODE_GROUPS = ("surface", *(name for pair in FACES for name in pair))
 
 
 def _joined(parts: dict[str, list[np.ndarray]]) -> dict[str, np.ndarray]:

@@ -39,6 +39,8 @@ class CellKeys(StrictModel):
     @model_validator(mode="after")
     def _joined(self) -> CellKeys:
         count = len(self.points)
+        if not self.points or not self.struts:
+            raise ValueError("expected at least one point and one strut")
         for number, strut in enumerate(self.struts):
             if len(strut) not in (2, 5) or not all(0 <= p < count for p in strut[:2]):
                 raise ValueError(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...errors import InputError
-from ..slab import check_length
+from ..slab import check_length, check_size
 from .block import Block
 from .cell import UnitCell
 from .expressions import Expression
@@ -133,6 +133,10 @@ def fit_to_surface(keys: Parameters, surface: Surface) -> Parameters:
     limit = float(np.iinfo(np.int64).max) / 16.0
     if not (count < limit).all():
         raise InputError(f"mesh.pitch = {keys.pitch!r}: too small for a surface of {high - low} m")
+    check_size(
+        int(np.prod([int(number) for number in count.tolist()], dtype=object)),
+        "mesh.pitch, with cells that cover the surface",
+    )
     cells = tuple((count.astype(np.int64) * np.array(cell.layers)).tolist())
     return keys.model_copy(update={"cells": cells, "origin": tuple((origin + first * edges).tolist())})
 

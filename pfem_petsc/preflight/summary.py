@@ -18,6 +18,9 @@ if TYPE_CHECKING:
 
 __all__ = ["summarise"]
 
+_THICK = 0.3
+"""Relative density above which struts are no lattice of slender bars (Gibson and Ashby, Cellular Solids, 1997)."""
+
 
 def summarise(case: Case, model: Model, plan: Plan) -> dict[str, str]:
     """Return label and text of the entries. Collective."""
@@ -59,7 +62,8 @@ def _density(model: Model) -> dict[str, str]:
         area = block.area if np.ndim(block.area) == 0 else block.area[: block.counted - block.start]
         own += float((area * lengths[counted]).sum())
     ratio = model.comm.allreduce(own) / mesh.volume
-    return {"relative density": f"{ratio:.4g} (volume of bars over {engineering(mesh.volume, 'm3')})"}
+    thick = "; struts so thick overlap at nodes, where this counts them more than once" if ratio > _THICK else ""
+    return {"relative density": f"{ratio:.4g} (volume of bars over {engineering(mesh.volume, 'm3')}){thick}"}
 
 
 def _described(wall: WallKeys) -> str:

@@ -197,6 +197,21 @@ def test_bracket_has_the_struts_inside_it():
     np.testing.assert_array_equal(*(rows[np.lexsort(rows.T)] for rows in map(np.round, middles)))
 
 
+def test_sides_of_points_near_edges():
+    """Around the inner edge of the bracket and the rims of a hole, where the nearest place is an edge or a corner."""
+    surface = read_surface(Path(cases.__file__).parent / "bracket.stl", 1.0)
+    random, sector = np.random.default_rng(3), 2.0 * np.pi / 48
+    points = np.vstack(
+        [random.uniform(*box, (2000, 3)) for box in (((14, -1, 14), (18, 49, 18)), ((28, 16, -1), (45, 33, 17)))]
+    )
+    inside = ((points >= 0.0) & (points <= (80.0, 48.0, 80.0))).all(axis=1)
+    inside &= (points[:, 0] <= 16.0) | (points[:, 2] <= 16.0)
+    apart = points[:, :2] - (36.0, 24.0)
+    turn = np.mod(np.arctan2(apart[:, 1], apart[:, 0]), sector) - 0.5 * sector
+    hole = np.linalg.norm(apart, axis=1) * np.cos(turn) < 7.0 * np.cos(0.5 * sector)
+    np.testing.assert_array_equal(surface.distances(points) <= 0.0, inside & ~hole)
+
+
 def test_dangling_struts_are_removed_one_after_the_other(tmp_path):
     """A chain of struts that is cut off at its end goes entirely; a loop stays."""
     path = write_stl(tmp_path / "cube.stl", CORNERS, CUBE)

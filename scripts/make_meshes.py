@@ -5,6 +5,7 @@
 - ``ring.msh`` (Gmsh 4.1): circular plane truss, X-braced, 14 bays, radii 22.83 and 22.37 m, one node towards +x.
 - ``space_truss.msh`` (Gmsh 2.2): an irregular ball of bars along the edges of a Delaunay tetrahedralisation.
 - ``bridge.msh`` (Gmsh 2.2): the plane bridge of ``docs/case_file.md``, 8 m in eight bays, 1 m high.
+- ``bracket.stl`` (in ``pfem_petsc/cases``): the closed surface of an angle bracket with three holes, in millimetres.
 - ``mast.vtu``: a square guyed-mast section of 12 bays, braced in every face and in plan.
 """
 
@@ -144,6 +145,60 @@ def make_bridge(path: Path) -> None:
     path.write_text("\n".join([*lines, "$EndElements", ""]))
 
 
+def make_bracket(path: Path) -> None:
+    """Write an angle of 80 x 48 x 80 mm, 16 mm thick, with two holes of 14 mm in its base and one of 24 mm above."""
+    width, thick, height, depth = 80.0, 16.0, 80.0, 48.0
+    turns = 2.0 * np.pi * np.arange(48) / 48
+    circle = np.stack([np.cos(turns), np.sin(turns)], axis=1)
+    base_holes = [(36.0, 24.0) + 7.0 * circle, (62.0, 24.0) + 7.0 * circle]
+    back_hole = (24.0, 54.0) + 12.0 * circle
+
+    def rectangle(low: tuple[float, float], high: tuple[float, float]) -> np.ndarray:
+        return np.array([low, (high[0], low[1]), high, (low[0], high[1])])
+
+    side = np.array([(0, 0), (width, 0), (width, thick), (thick, thick), (thick, height), (0, height)], dtype=float)
+    triangles = []
+    for axis, level, outwards, outline, holes in (
+        (2, 0.0, -1, rectangle((0, 0), (width, depth)), base_holes),
+        (2, thick, 1, rectangle((thick, 0), (width, depth)), base_holes),
+        (0, 0.0, -1, rectangle((0, 0), (depth, height)), [back_hole]),
+        (0, thick, 1, rectangle((0, thick), (depth, height)), [back_hole]),
+        (0, width, 1, rectangle((0, 0), (depth, thick)), []),
+        (2, height, 1, rectangle((0, 0), (thick, depth)), []),
+        (1, 0.0, -1, side, []),
+        (1, depth, 1, side, []),
+    ):
+        for corners in _face(outline, holes):
+            # normals of corners in the order (x, y), (y, z) are +z and +x, those of (x, z) are -y
+            turned = (outwards > 0) == (axis != 1)
+            triangles.append(np.insert(corners, axis, level, axis=1)[:: 1 if turned else -1])
+    for axis, hole in ((2, base_holes[0]), (2, base_holes[1]), (0, back_hole)):
+        low, high = (np.insert(hole, axis, level, axis=1) for level in (0.0, thick))
+        for a, b, c, d in zip(low, np.roll(low, -1, axis=0), high, np.roll(high, -1, axis=0)):
+            triangles += [np.array([a, c, b]), np.array([b, c, d])]
+    rows = np.zeros(len(triangles), np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("rest", "<u2")]))
+    rows["corners"] = triangles
+    path.write_bytes(b"angle bracket, mm".ljust(80) + np.uint32(len(rows)).tobytes() + rows.tobytes())
+
+
+def _face(outline: np.ndarray, holes: list[np.ndarray]) -> list[np.ndarray]:
+    """Return triangles (3, 2), counterclockwise, of a polygon (corners, 2), counterclockwise, with holes."""
+    import pyvista
+
+    loops = [outline, *(hole[::-1] for hole in holes)]
+    points = np.vstack(loops)
+    starts = np.cumsum([0, *map(len, loops)])
+    faces = np.concatenate(
+        [[len(loop), *range(start, start + len(loop))] for loop, start in zip(loops, starts.tolist())]
+    )
+    source = pyvista.PolyData(np.insert(points, 2, 0.0, axis=1), faces=faces)
+    found = pyvista.PolyData(source.points).delaunay_2d(edge_source=source).regular_faces
+    corners = points[found]
+    edges = corners[:, 1:] - corners[:, :1]
+    sense = edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]
+    return [each if positive else each[::-1] for each, positive in zip(corners, sense > 0.0)]
+
+
 def _array(kind: str, name: str, values: np.ndarray, components: int = 1) -> str:
     rows = np.asarray(values).reshape(-1, 3 if components == 3 else 2 if name == "connectivity" else 1)
     lines = [_numbers(row) if components == 3 else " ".join(str(v) for v in row) for row in rows]
@@ -162,3 +217,4 @@ if __name__ == "__main__":
     make_space_truss(FOLDER / "space_truss.msh")
     make_bridge(FOLDER / "bridge.msh")
     make_mast(FOLDER / "mast.vtu")
+    make_bracket(FOLDER.parent / "pfem_petsc" / "cases" / "bracket.stl")

@@ -7,12 +7,14 @@ name of the key, before any work is done. Imports pydantic only.
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
 __all__ = [
     "ConstraintKeys",
+    "FilePath",
     "Finite",
     "Name",
     "NodeSetName",
@@ -27,6 +29,7 @@ __all__ = [
     "is_finite_number",
     "listed",
     "number_or_rows",
+    "with_absolute_paths",
 ]
 
 
@@ -85,6 +88,24 @@ Vector3 = Annotated[tuple[Finite, Finite, Finite], listed]
 PositiveInts3 = Annotated[tuple[PositiveInt, PositiveInt, PositiveInt], listed]
 Name = Annotated[str, Field(min_length=1, pattern=r"^[^/\x00-\x1f\x7f-\x9f]+$"), AfterValidator(_no_path_of_its_own)]
 """A name that is part of a path in the result file: not empty, no slash, and not a single dot, which HDF5 skips."""
+
+
+FilePath = Annotated[str, Field(min_length=1, json_schema_extra={"is_path": True})]
+"""A key of a generator that names a file relative to the case file; the case has its absolute path."""
+
+
+def with_absolute_paths(table: StrictModel, folder: Path) -> StrictModel:
+    """Return a table, with those within it, whose :data:`FilePath` keys are absolute."""
+    update: dict[str, Any] = {}
+    for name, field in type(table).model_fields.items():
+        value, extra = getattr(table, name), field.json_schema_extra
+        if isinstance(value, StrictModel):
+            update[name] = with_absolute_paths(value, folder)
+        elif isinstance(value, dict) and any(isinstance(entry, StrictModel) for entry in value.values()):
+            update[name] = {key: with_absolute_paths(entry, folder) for key, entry in value.items()}
+        elif isinstance(value, str) and isinstance(extra, dict) and extra.get("is_path"):
+            update[name] = str(Path(folder, value).resolve())
+    return table.model_copy(update=update) if update else table
 
 
 NodeSetName = Annotated[str, Field(json_schema_extra={"refers_to": "node_set"})]

@@ -124,18 +124,19 @@ class Problems:
     ) -> None:
         where: Path = (*path, *item["loc"])
         kind, value, context = item["type"], item["input"], item.get("ctx", {})
-        field = model.model_fields.get(str(item["loc"][0])) if item["loc"] else None
+        inner, field = _innermost(model, item["loc"])
         about = (
             f" ({' '.join(field.description.split()).rstrip('.')})" if field is not None and field.description else ""
         )
         if kind == "extra_forbidden":
             key = str(item["loc"][-1])
-            owners = [name for name, keys in siblings().items() if key in keys] if len(item["loc"]) == 1 else []
-            text = _unknown_key(key, list(model.model_fields), known, taker, owners)
+            owners = [name for name, keys in siblings().items() if key in keys] if inner is model else []
+            taker = taker if inner is model else ""
+            text = _unknown_key(key, list(inner.model_fields), known, taker, owners)
             if taker and where not in self.overridden and any(p[:-1] == where[:-1] for p in self.overridden):
                 text += f"; --set {key_text(where)}= removes it"
             self.add(where, text)
-        elif kind == "missing" and len(item["loc"]) == 1:
+        elif kind == "missing" and isinstance(value, Mapping):
             self.add(where, f"this key is missing{about}")
         elif kind in ("missing", "too_long", "too_short") and isinstance(value, list | tuple):
             whole = where[:-1] if kind == "missing" else where
@@ -144,6 +145,20 @@ class Problems:
             self.add(where, str(context["error"]), None if isinstance(value, Mapping) else value)
         else:
             self.add(where, _expected(kind, value, context, field) + about, value)
+
+
+def _innermost(model: type[StrictModel], path: Path) -> tuple[type[StrictModel], FieldInfo | None]:
+    """Return the model of the table that a path within a table leads to, and the last of its fields on the way."""
+    field = None
+    for part in path:
+        if isinstance(part, str) and part in model.model_fields:
+            field = model.model_fields[part]
+            annotation = _plain(field.annotation)
+            if typing.get_origin(annotation) is dict:  # tables by name
+                annotation = _plain(typing.get_args(annotation)[1])
+            if isinstance(annotation, type) and issubclass(annotation, StrictModel):
+                model = annotation
+    return model, field
 
 
 def _short(value: Any, most: int = 60) -> str:

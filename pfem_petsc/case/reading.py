@@ -12,7 +12,7 @@ from ..errors import InputError
 from ..registry import choices, lookup, nearest
 from . import settings as s
 from . import tables as t
-from .base import StrictModel
+from .base import StrictModel, with_absolute_paths
 from .load_reading import read_loads, read_tabled, read_varying
 from .materials import read_materials
 from .problems import Path as KeyPath
@@ -197,7 +197,9 @@ def _mesh(data: Mapping[str, Any], folder: Path, problems: Problems) -> t.Mesh |
     parameters = problems.read(
         model, others, ("mesh",), known=["generator", "file"], taker=taker, siblings=lambda: _siblings(GENERATORS)
     )
-    return None if parameters is None else t.Mesh(generator=keys.generator, parameters=parameters)
+    if parameters is None:
+        return None
+    return t.Mesh(generator=keys.generator, parameters=with_absolute_paths(parameters, folder))
 
 
 def _initial(data: Mapping[str, Any], problems: Problems) -> list[t.Initial]:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from ..mesh.distribution import Block, DistributedMesh
     from ..mesh.slab import MeshSlab
 
-__all__ = ["area_fields", "areas_of", "bar_shapes", "check_areas", "section_of_bars"]
+__all__ = ["area_fields", "areas_of", "bar_shapes", "check_areas", "named_groups", "section_of_bars"]
 
 
 def bar_shapes(section: Section, length: np.ndarray, area: np.ndarray) -> BarShapes:
@@ -51,6 +51,14 @@ def area_fields(case: Case) -> dict[str, str]:
     """Return the cell fields of the mesh that sections take their areas from, each with the key that names it."""
     named = [(s.area_field, f"{case.source}: section.{name}.area_field") for name, s in case.section.items()]
     return {field: key for field, key in reversed(named) if field is not None}
+
+
+def named_groups(case: Case) -> set[str]:
+    """Return the names of all groups of the mesh that a case uses."""
+    names = [section.bars for section in case.section.values()]
+    names += [node_set.group for node_set in case.node_set.values()]
+    names += [entry.bars for entry in (*case.temperature, *case.remove)]
+    return {name for name in names if name is not None}
 
 
 def areas_of(section: Section, block: Block, mesh: DistributedMesh) -> float | np.ndarray:

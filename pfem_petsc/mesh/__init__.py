@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
+    from collections.abc import Collection, Mapping
 
     from mpi4py import MPI
 
@@ -15,7 +15,9 @@ if TYPE_CHECKING:
 __all__ = ["load_slab"]
 
 
-def load_slab(mesh: Any, comm: MPI.Comm, fields: Mapping[str, str] | None = None) -> MeshSlab:
+def load_slab(
+    mesh: Any, comm: MPI.Comm, fields: Mapping[str, str] | None = None, groups: Collection[str] | None = None
+) -> MeshSlab:
     """Return this rank's part of the mesh of a case after checks, with warnings in ``warnings``. Collective.
 
     Parameters
@@ -24,6 +26,7 @@ def load_slab(mesh: Any, comm: MPI.Comm, fields: Mapping[str, str] | None = None
         With ``generator`` and ``parameters``, or ``file``: the suffix chooses the reader (``.msh``, ``.vtu``,
         ``.vtkhdf``, ``.h5``).
     fields : names of cell fields to read, each with the key that asks for it, for messages
+    groups : names of the groups that are used; a generator may leave out other bar groups. None: all are
 
     Raises
     ------
@@ -38,13 +41,17 @@ def load_slab(mesh: Any, comm: MPI.Comm, fields: Mapping[str, str] | None = None
         from ..errors import InputError
 
         with agreed(comm):
-            for name, key in (fields or {}).items():
-                raise InputError(f"{key} = {name!r}: generated meshes have no cell fields; give area")
             generator = lookup("pfem_petsc.mesh.generators", mesh.generator, "mesh.generator")
-            try:
-                slab = generator.generate(mesh.parameters, comm.rank, comm.size)
-            except MemoryError:
-                raise InputError(f"mesh: the {mesh.generator} does not fit in this machine's memory") from None
+        if hasattr(generator, "generate_on"):
+            slab = generator.generate_on(mesh.parameters, comm, fields or {}, groups)
+        else:
+            with agreed(comm):
+                for name, key in (fields or {}).items():
+                    raise InputError(f"{key} = {name!r}: generator {mesh.generator} has no cell fields; give area")
+                try:
+                    slab = generator.generate(mesh.parameters, comm.rank, comm.size)
+                except MemoryError:
+                    raise InputError(f"mesh: the {mesh.generator} does not fit in this machine's memory") from None
     else:
         from .readers import read_slab
 

@@ -66,6 +66,8 @@ class DistributedMesh:
     """(b,) float64: values of local bars."""
     partitioner: str
     """The partitioner, for the log."""
+    volume: float | None = None
+    """What a lattice fills [m3]; None for other meshes."""
 
     _exchange: GhostExchange
 
@@ -129,7 +131,7 @@ def distribute(slab: MeshSlab, bar_section: np.ndarray, comm: MPI.Comm, partitio
     """
     mesh = DistributedMesh()
     mesh.comm = comm
-    mesh.n_nodes, mesh.n_bars = slab.n_nodes, slab.n_bars
+    mesh.n_nodes, mesh.n_bars, mesh.volume = slab.n_nodes, slab.n_bars, slab.volume
     bar_section = np.asarray(bar_section, dtype=np.int32)
     if comm.size == 1:
         mesh.partitioner = partition(slab, comm, partitioner)[1]

@@ -41,6 +41,8 @@ class MeshSlab:
     structured: bool = False
     warnings: list[str] = field(default_factory=list)
     """Warnings of the reader and the checks, for the log."""
+    volume: float | None = None
+    """What a lattice fills [m3], for its relative density."""
 
 
 def slab_range(n: int, rank: int, size: int) -> tuple[int, int]:

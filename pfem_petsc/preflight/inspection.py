@@ -34,14 +34,15 @@ def warnings_before(case: Case, model: Model, plan: Plan) -> list[str]:
             "them"
         )
     # generated meshes are valid by construction
-    pairs, shown = overlapping_bars(model.mesh) if case.mesh.generator is None else (0, [])
+    own = _is_own(case)
+    pairs, shown = overlapping_bars(model.mesh) if own else (0, [])
     if pairs:
         texts.append(
             f"{pairs} pair{'s' if pairs > 1 else ''} of bars overlap{'' if pairs > 1 else 's'} from a common node on: "
             f"{_list(pairs, shown)}; if a node is intended to divide the longer one, remove that bar"
         )
     # generated meshes have undivided members
-    chained, first_chained = chain_nodes(model) if case.mesh.generator is None else (0, -1)
+    chained, first_chained = chain_nodes(model) if own else (0, -1)
     if chained:
         texts.append(chain_warning(chained, first_chained))
     loose, first = unbraced_nodes(model)
@@ -69,9 +70,14 @@ def inspect(case: Case, model: Model) -> tuple[dict[str, str], list[str]]:
     entries |= far_points(case, model)
     for name, text in wall_gaps(model)[0].items():
         entries[f"wall {name}"] = text
-    if case.mesh.generator is None:
+    if _is_own(case):
         warnings += _nodes_on_bars(model.mesh, entries)
     return entries, warnings
+
+
+def _is_own(case: Case) -> bool:
+    """Whether nodes and bars come from the user: from a file, or from a unit cell of a lattice."""
+    return case.mesh.generator is None or getattr(case.mesh.parameters, "cell", None) is not None
 
 
 def _nodes_on_bars(mesh: DistributedMesh, entries: dict[str, str]) -> list[str]:

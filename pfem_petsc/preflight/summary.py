@@ -5,6 +5,8 @@ from __future__ import annotations
 import resource
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from ..modes.choice import describe_modes
 from ..output.units import engineering
 
@@ -15,6 +17,9 @@ if TYPE_CHECKING:
     from ..stepping.plan import Plan
 
 __all__ = ["summarise"]
+
+_THICK = 0.3
+"""Relative density above which struts are no lattice of slender bars (Gibson and Ashby, Cellular Solids, 1997)."""
 
 
 def summarise(case: Case, model: Model, plan: Plan) -> dict[str, str]:
@@ -32,6 +37,7 @@ def summarise(case: Case, model: Model, plan: Plan) -> dict[str, str]:
         "bars": f"{mesh.n_bars:,}",
         "ranks": ranks,
         "extent": " x ".join(engineering(float(d), "m") for d in model.high - model.low),
+        **_density(model),
         "mass": engineering(model.total_mass, "kg") + f" ({case.mass})",
         "wave speed": engineering(model.wave_speed, "m/s"),
         **plan.entries(case),
@@ -42,6 +48,22 @@ def summarise(case: Case, model: Model, plan: Plan) -> dict[str, str]:
         **({"constraints": ", ".join(f"{c.name} ({c.kind})" for c in case.constraint)} if case.constraint else {}),
         "memory": f"{engineering(peak, 'B', 3)} in use on all ranks",
     }
+
+
+def _density(model: Model) -> dict[str, str]:
+    """Return the relative density of a lattice: the volume of its bars over that of what it fills. Collective."""
+    mesh, blocks = model.mesh, model.bars.blocks
+    if mesh.volume is None:
+        return {}
+    lengths = model.bars.mesh_lengths
+    own = 0.0
+    for block in blocks:
+        counted = slice(block.start, block.counted)
+        area = block.area if np.ndim(block.area) == 0 else block.area[: block.counted - block.start]
+        own += float((area * lengths[counted]).sum())
+    ratio = model.comm.allreduce(own) / mesh.volume
+    thick = "; struts so thick overlap at nodes, where this counts them more than once" if ratio > _THICK else ""
+    return {"relative density": f"{ratio:.4g} (volume of bars over {engineering(mesh.volume, 'm3')}){thick}"}
 
 
 def _described(wall: WallKeys) -> str:

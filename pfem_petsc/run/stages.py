@@ -128,7 +128,7 @@ class Stages:
         self.analysis: Analysis
         self.columns: StageColumns | None = None
         self.fields: tuple[list[str], list[str]] | None = None
-        first = Model(self._cases[0], comm)
+        first = Model(self._cases[0], comm, later=self._cases[1:])
         if not case.stage:
             self.analysis = make_analysis(first, recorded)
             self.plan = self.analysis.plan

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,7 +18,7 @@ from ..mechanics.loads import ExternalForce
 from ..mechanics.mass import Inertia, PointInertia
 from ..mechanics.rest_lengths import RestLengths
 from ..mechanics.rows import bar_value
-from ..mechanics.sections import area_fields, check_areas, section_of_bars
+from ..mechanics.sections import area_fields, check_areas, named_groups, section_of_bars
 from ..mechanics.springs import make_springs
 from ..mechanics.supports import Supports
 from ..mechanics.temperature import Temperatures
@@ -58,12 +59,14 @@ class Model:
     start : where a stage starts from, None for the start of a run
     """
 
-    def __init__(self, case: Case, comm: MPI.Comm, mesh: DistributedMesh | None = None) -> None:
+    def __init__(
+        self, case: Case, comm: MPI.Comm, mesh: DistributedMesh | None = None, later: Sequence[Case] = ()
+    ) -> None:
         self.case = case
         self.comm = comm
         self.start: StageStart | None = None
         self.warnings: list[str] = []
-        self.mesh = mesh = self._load_mesh() if mesh is None else mesh
+        self.mesh = mesh = self._load_mesh([case, *later]) if mesh is None else mesh
         self.nodes = resolve_node_sets(case, mesh)
         adjusted = adjust_start(case, self.nodes, mesh) if case.number == 0 else 0
         if adjusted:
@@ -102,13 +105,16 @@ class Model:
         speeds = [np.sqrt(m.upper_modulus() / m.density) for m in case.material.values()]
         self.wave_speed = max(speeds)
 
-    def _load_mesh(self) -> DistributedMesh:
+    def _load_mesh(self, cases: Sequence[Case]) -> DistributedMesh:
         case, comm = self.case, self.comm
         try:
-            slab = load_slab(case.mesh, comm, area_fields(case))
+            groups = {name for each in cases for name in named_groups(each)}
+            slab = load_slab(case.mesh, comm, area_fields(case), groups)
         except InputError as error:
             # a generator knows its keys, but not the file that they are in
-            raise error if case.mesh.generator is None else InputError(f"{case.source}: {error}") from error
+            if case.mesh.generator is None or str(error).startswith(f"{case.source}: "):
+                raise
+            raise InputError(f"{case.source}: {error}") from error
         self.warnings += slab.warnings
         with agreed(comm):
             sections = section_of_bars(case, slab)

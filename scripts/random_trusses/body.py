@@ -8,10 +8,15 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from mpi4py import MPI
 
-__all__ = ["Body", "draw_body"]
+from pfem_petsc.mesh.slab import MeshSlab
+
+__all__ = ["Body", "draw_body", "generated"]
 
 CELLS = ((1, 1, 1), (2, 1, 1), (1, 2, 1), (1, 1, 2), (2, 2, 1), (2, 1, 2), (1, 2, 2), (3, 1, 1))
+PLAIN_KINDS = ("cubic", "octet", "bcc")
+OPEN_KINDS = ("fcc", "bcc_diagonals", "kelvin", "diamond", "gyroid", "auxetic", "tetrahedral_octahedral")
 
 
 @dataclass
@@ -48,10 +53,14 @@ class Body:
 def draw_body(chance: random.Random) -> Body:
     """A mesh of a generator with materials and sections."""
     table = _mesh(chance)
-    module = importlib.import_module(f"pfem_petsc.mesh.generators.{table['generator']}")
-    keys = {key: value for key, value in table.items() if key != "generator"}
-    slab = module.generate(module.Parameters(**keys), 0, 1)
-    body = Body({"mesh": table}, slab.points, np.asarray(slab.bars), slab.node_groups, bar_groups=slab.bar_groups)
+    plain = dict(table)
+    if table["generator"] == "lattice":
+        table |= _varied(table)
+    slab = generated(table)
+    groups = {name: members for name, members in slab.node_groups.items() if len(members)}
+    body = Body({"mesh": table}, slab.points, np.asarray(slab.bars), groups)
+    if table["generator"] != "lattice" or table != plain:
+        body.bar_groups = {name: members for name, members in slab.bar_groups.items() if len(members)}
     vectors = body.points[body.bars[:, 1]] - body.points[body.bars[:, 0]]
     lengths = np.linalg.norm(vectors, axis=1)
     body.length = float(lengths.min())
@@ -97,8 +106,37 @@ def _mesh(chance: random.Random) -> dict[str, Any]:
             "bracing": chance.choice(("x", "single")),
             "orientation": chance.choice(("vertex", "flat")),
         }
-    cells, shape = chance.choice(CELLS), chance.choice(("cubic", "octet", "bcc"))
+    cells, shape = chance.choice(CELLS), chance.choice(PLAIN_KINDS)
     return {"generator": "lattice", "kind": shape, "cells": cells, "pitch": chance.uniform(0.1, 0.5)}
+
+
+def generated(table: dict[str, Any]) -> MeshSlab:
+    """Return the whole mesh of a table ``[mesh]``."""
+    module = importlib.import_module(f"pfem_petsc.mesh.generators.{table['generator']}")
+    keys = module.Parameters(**{key: value for key, value in table.items() if key != "generator"})
+    if hasattr(module, "generate_on"):
+        return module.generate_on(keys, MPI.COMM_SELF, {}, None)
+    return module.generate(keys, 0, 1)
+
+
+def _varied(table: dict[str, Any]) -> dict[str, Any]:
+    """Return other keys of a quarter of the lattices, by a chance of their own: other cases stay as they were."""
+    chance = random.Random(repr(table))
+    if chance.random() < 0.75:
+        return {}
+    keys: dict[str, Any] = {}
+    if chance.random() < 0.7:
+        keys["kind"] = chance.choice(OPEN_KINDS)
+    if chance.random() < 0.4:
+        keys["perturbation"] = chance.uniform(0.005, 0.04)
+    if chance.random() < 0.3:
+        keys |= {"missing": chance.uniform(0.02, 0.15), "dangling": "keep"}
+    if chance.random() < 0.3:
+        factor = chance.uniform(0.5, 2.0)
+        keys["grading"] = chance.choice(([1, 1, factor], [1, f"1 + {factor:.3g}*y", 1]))
+    elif chance.random() < 0.2:
+        keys["curved"] = {"shape": chance.choice(("cylinder", "sphere")), "radius": chance.uniform(3.0, 5.0)}
+    return keys
 
 
 def _material(chance: random.Random, size: float) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from .body import Body, draw_body
+from .body import OPEN_KINDS, Body, draw_body
 from .laws import draw_laws
 from .points import draw_points
 from .rupture import draw_rupture
@@ -273,6 +273,9 @@ def _pair(chance: random.Random, body: Body, treatment: str) -> dict[str, Any] |
         gap = 0.0 if chance.random() < 0.6 else body.tables["mesh"]["gap"] * chance.uniform(0.2, 0.999)
         return table | {"direction": [chance.choice((1.0, 2.5)), 0.0, 0.0], "gap": gap}
     if kind == "lattice" and chance.random() < 0.12:
+        mesh = body.tables["mesh"]
+        if set(mesh) != {"generator", "kind", "cells", "pitch"} or mesh["kind"] in OPEN_KINDS:
+            return None  # nodes of its faces do not face each other
         width = body.tables["mesh"]["cells"][0] * body.tables["mesh"]["pitch"]
         gap = width * (1.0 - 10 ** chance.uniform(-4, -2))
         return {"name": "faces", "first": "g_left", "second": "g_right", "direction": [1.0, 0.0, 0.0], "gap": gap}

@@ -26,6 +26,7 @@ from pfem_petsc.contact.walls.base import WallKeys
 from pfem_petsc.stepping.model import Model
 from pfem_petsc.stepping.plan import make_plan
 
+from .body import generated
 from .loading import Loaded
 
 __all__ = ["check_result", "energy_scale"]
@@ -102,10 +103,7 @@ def _members(case: Case, name: str | None, result: Loaded) -> np.ndarray:
     if table.indices is not None:
         return np.array(table.indices)
     if table.group is not None:
-        import importlib
-
-        module = importlib.import_module(f"pfem_petsc.mesh.generators.{case.mesh.generator}")
-        return module.generate(case.mesh.parameters, 0, 1).node_groups[table.group]
+        return generated(case.to_dict()["mesh"]).node_groups[table.group]
     if table.nearest is not None:
         return np.array([np.linalg.norm(points - table.nearest, axis=1).argmin()])
     low, high = np.array(table.box)

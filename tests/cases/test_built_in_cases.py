@@ -176,6 +176,19 @@ def octet_compression(run):
 
 
 @number
+def bracket_drop(run):
+    """A third of the energy is dissipated; it leaves the floor with 11.43 m/s."""
+    history = run("bracket_drop")
+    energy = history["kinetic_energy"][0]
+    mass = 38684 * 4e-3 * np.sqrt(0.5) * 5e-8 * 4500.0  # struts inside, of equal length
+    assert energy == pytest.approx(0.5 * mass * 25.0**2, rel=1e-9)
+    assert contacts(history, "floor")[-1][1] == pytest.approx(113.0e-6, abs=0.8e-6)
+    assert history["momentum"][-1, 2] / mass == pytest.approx(11.43, abs=0.01)
+    assert history["plastic_dissipation"][-1] / energy == pytest.approx(0.3207, abs=1e-3)
+    assert abs(history["energy_imbalance"]).max() < 1e-12 * energy
+
+
+@number
 def hanging_net(run):
     """Corners carry a quarter of the weight each."""
     history = run("hanging_net")

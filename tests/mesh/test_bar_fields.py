@@ -170,7 +170,7 @@ def test_areas_too_small_for_a_tube(tmp_path):
         (
             {"area_field": "a"},
             {"generator": "rod", "length": 1.0, "elements": 1},
-            "generated meshes have no cell fields",
+            "generator rod has no cell fields",
         ),
         ({"area_field": "a"}, {"file": "ring.msh"}, "no cell field of this name"),
     ],

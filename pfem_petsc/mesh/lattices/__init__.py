@@ -1,0 +1,1 @@
+"""Lattices: unit cells repeated in a block, which is graded, disturbed, curved and cut."""

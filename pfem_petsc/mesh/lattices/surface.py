@@ -1,0 +1,282 @@
+"""A closed surface of triangles from an STL, OBJ or PLY file: what is inside, and where lines pass through it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ...errors import InputError
+
+if TYPE_CHECKING:
+    from vtkmodules.vtkCommonDataModel import vtkPolyData
+
+__all__ = ["ON", "Surface", "read_surface"]
+
+_READERS = {
+    ".stl": ("vtkmodules.vtkIOGeometry", "vtkSTLReader"),
+    ".obj": ("vtkmodules.vtkIOGeometry", "vtkOBJReader"),
+    ".ply": ("vtkmodules.vtkIOPLY", "vtkPLYReader"),
+}
+_MERGED = 1e-7
+"""Points of a file closer than this fraction of its diagonal are merged if it is not closed without that."""
+
+ON = 1e-6
+"""Points nearer to the surface than this fraction of the bar lengths count as inside: those on it are inside."""
+
+
+_SAME = 1e-9
+"""Crossings of a bar closer than this fraction of it are one."""
+
+
+@dataclass
+class Surface:
+    """Triangles that enclose a volume, with outward normals."""
+
+    points: np.ndarray
+    """(points, 3) float64 [m]."""
+    triangles: np.ndarray
+    """(triangles, 3) int64."""
+
+    @property
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper corner (3,) [m] of the box around it."""
+        return self.points.min(axis=0), self.points.max(axis=0)
+
+    @property
+    def volume(self) -> float:
+        """The volume [m3] inside, by the divergence theorem."""
+        a, b, c = (self.points[self.triangles[:, k]] - self.points.mean(axis=0) for k in range(3))
+        return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
+
+    @cached_property
+    def _data(self) -> vtkPolyData:
+        return _poly_data(self.points, self.triangles)
+
+    @cached_property
+    def _distance(self) -> Any:
+        from vtkmodules.vtkFiltersCore import vtkImplicitPolyDataDistance
+
+        function = vtkImplicitPolyDataDistance()
+        function.SetInput(self._data)
+        return function
+
+    @cached_property
+    def _locator(self) -> Any:
+        from vtkmodules.vtkCommonDataModel import vtkStaticCellLocator
+
+        locator = vtkStaticCellLocator()
+        locator.SetDataSet(self._data)
+        locator.BuildLocator()
+        return locator
+
+    def distances(self, points: np.ndarray) -> np.ndarray:
+        """Return the signed distances (n,) [m] of points (n, 3) from the surface: negative inside."""
+        from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
+        from vtkmodules.vtkCommonCore import vtkDoubleArray
+
+        found = vtkDoubleArray()
+        if len(points) == 0:
+            return np.empty(0)
+        self._distance.FunctionValue(numpy_to_vtk(np.ascontiguousarray(points)), found)
+        return vtk_to_numpy(found).copy()
+
+    def rough_distances(self, points: np.ndarray, spacing: float) -> np.ndarray:
+        """Return signed distances (n,) [m] that are exact near the surface, and elsewhere too small, never too large.
+
+        Points in one cube of 4 spacings get a bound from the distance of its middle, if that lies far enough from the
+        surface: distances of two points differ by no more than they are apart.
+        """
+        edge = 4.0 * spacing
+        reach = 0.5 * np.sqrt(3.0) * edge
+        cubes = np.floor((points - self.bounds[0]) / edge).astype(np.int64)
+        low = cubes.min(axis=0, initial=0)
+        span = cubes.max(axis=0, initial=0) - low + 1
+        key = np.ravel_multi_index(tuple((cubes - low).T), tuple(span)) if len(points) else np.empty(0, np.int64)
+        _, first, of_cube = np.unique(key, return_index=True, return_inverse=True)
+        middle = self.distances((cubes[first] + 0.5) * edge + self.bounds[0])
+        bound = np.sign(middle) * (np.abs(middle) - reach)
+        found = bound[of_cube]
+        near = np.flatnonzero((np.abs(middle) < reach + 2.0 * spacing)[of_cube])
+        found[near] = self.distances(points[near])
+        return found
+
+    def inside_parts(
+        self, starts: np.ndarray, ends: np.ndarray, inside: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the parts of lines that lie inside.
+
+        Parameters
+        ----------
+        starts, ends : (n, 3) float64 [m]
+        inside : (n,) bool
+            Lines that are inside entirely if they do not meet a triangle; the others are examined.
+
+        Returns
+        -------
+        line : (parts,) int64
+            Ascending.
+        span : (parts, 2) float64
+            Where each part begins and ends, from 0 (start) to 1 (end).
+        """
+        line, t = self._crossings(starts, ends)
+        certain = np.zeros(len(starts), bool) if inside is None else inside.copy()
+        certain[line] = False
+        n = np.arange(len(starts))
+        line, t = np.concatenate([n, line, n]), np.concatenate([np.zeros(len(n)), t, np.ones(len(n))])
+        order = np.lexsort((t, line))
+        line, t = line[order], t[order]
+        pieces = np.flatnonzero((line[1:] == line[:-1]) & (np.diff(t) > _SAME))
+        line, span = line[pieces], np.stack([t[pieces], t[pieces + 1]], axis=1)
+        # crossings next to an end or to each other are one
+        span[span <= _SAME], span[span >= 1.0 - _SAME] = 0.0, 1.0
+        way = ends - starts
+        examined = np.flatnonzero(~certain[line])
+        middles = starts[line[examined]] + span[examined].mean(axis=1)[:, None] * way[line[examined]]
+        kept = certain[line]
+        kept[examined] = self.distances(middles) <= ON * np.linalg.norm(way[line[examined]], axis=1)
+        line, span = line[kept], span[kept]
+        # parts that meet at a crossing that does not lead out of the surface are one
+        joined = (line[1:] == line[:-1]) & (span[1:, 0] - span[:-1, 1] <= 2.0 * _SAME)
+        first = np.flatnonzero(np.concatenate([[True], ~joined])[: len(line)])
+        last = np.append(first[1:], len(line))[: len(first)] - 1
+        return line[first], np.stack([span[first, 0], span[last, 1]], axis=1)
+
+    def _crossings(self, starts: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the lines that meet triangles, and where: from 0 at their start to 1 at their end."""
+        from vtkmodules.vtkCommonCore import vtkIdList, vtkPoints
+
+        points, cells, locator = vtkPoints(), vtkIdList(), self._locator
+        points.SetDataTypeToDouble()
+        lines: list[int] = []
+        places: list[tuple[float, float, float]] = []
+        for n, (a, b) in enumerate(zip(starts.tolist(), ends.tolist())):
+            locator.IntersectWithLine(a, b, 0.0, points, cells)
+            for k in range(points.GetNumberOfPoints()):
+                lines.append(n)
+                places.append(points.GetPoint(k))
+        line, place = np.array(lines, np.int64), np.array(places).reshape(-1, 3)
+        way = ends[line] - starts[line]
+        along = np.einsum("ij,ij->i", place - starts[line], way) / np.einsum("ij,ij->i", way, way)
+        return line, np.clip(along, 0.0, 1.0)
+
+
+def read_surface(path: Path, scale: float) -> Surface:
+    """Read a surface; to be called on one rank.
+
+    Raises
+    ------
+    InputError
+        If the file is not there, is not of triangles, or the surface is open.
+    """
+    import importlib
+
+    where = f"mesh.surface.file: {path}"
+    if path.suffix.lower() not in _READERS:
+        raise InputError(f"{where}: no reader for {path.suffix or 'no suffix'}; known: {', '.join(_READERS)}")
+    try:
+        with open(path, "rb"):
+            pass
+    except OSError as error:
+        raise InputError(f"{where}: cannot open: {error.strerror}") from None
+    module, name = _READERS[path.suffix.lower()]
+    reader = getattr(importlib.import_module(module), name)()
+    messages = _observed(reader)
+    reader.SetFileName(str(path))
+    reader.Update()
+    points, triangles = _triangles(reader.GetOutput(), 0.0)
+    if len(triangles) == 0 or not np.isfinite(points).all():
+        what = f" ({messages[0]})" if messages else ""
+        raise InputError(f"{where}: no surface of triangles could be read from it{what}")
+    if _open_edges(triangles)[0]:
+        points, triangles = _triangles(reader.GetOutput(), _MERGED)
+    count, edge = _open_edges(triangles)
+    if count:
+        points, triangles = _oriented(points, triangles)
+        count, edge = _open_edges(triangles)
+    if count:
+        a, b = (", ".join(f"{x:.6g}" for x in points[node]) for node in edge)
+        raise InputError(
+            f"{where}: the surface is not closed: {count} of its edges have a triangle on one side only, like that "
+            f"from ({a}) to ({b}) in the file; close it in the program that made it (PyVista: mesh.fill_holes(size))"
+        )
+    surface = Surface(scale * points, triangles)
+    if surface.volume < 0.0:
+        surface = Surface(surface.points, triangles[:, ::-1].copy())
+    return surface
+
+
+def _observed(reader: Any) -> list[str]:
+    """Return a list that gets the messages of a VTK object, which would go to stderr."""
+    messages: list[str] = []
+
+    def note(_reader: object, _event: str, text: str = "") -> None:
+        messages.append(" ".join(str(text).split())[-200:])
+
+    note.CallDataType = "string0"  # type: ignore[attr-defined]
+    for event in ("ErrorEvent", "WarningEvent"):
+        reader.AddObserver(event, note)
+    return messages
+
+
+def _triangles(data: vtkPolyData, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return points and triangles; points within the tolerance, in diagonals, are merged, flat triangles left out."""
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+    from vtkmodules.vtkFiltersCore import vtkCleanPolyData, vtkTriangleFilter
+
+    split, clean = vtkTriangleFilter(), vtkCleanPolyData()
+    split.PassLinesOff()
+    split.PassVertsOff()
+    split.SetInputData(data)
+    clean.SetInputConnection(split.GetOutputPort())
+    clean.SetTolerance(tolerance)
+    clean.Update()
+    found = clean.GetOutput()
+    if found.GetNumberOfPolys() == 0:
+        return np.empty((0, 3)), np.empty((0, 3), np.int64)
+    points = vtk_to_numpy(found.GetPoints().GetData()).astype(np.float64)
+    corners = vtk_to_numpy(found.GetPolys().GetConnectivityArray()).reshape(-1, 3).astype(np.int64)
+    return points, corners[(corners != np.roll(corners, 1, axis=1)).all(axis=1)]
+
+
+def _open_edges(triangles: np.ndarray) -> tuple[int, np.ndarray]:
+    """Return how many edges are not passed equally often in both directions, and the first of them."""
+    edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+    forward = edges[:, 0] < edges[:, 1]
+    pairs, at = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True)
+    balance = np.bincount(at.ravel(), weights=np.where(forward, 1.0, -1.0), minlength=len(pairs))
+    wrong = np.flatnonzero(balance)
+    return len(wrong), pairs[wrong[0]] if len(wrong) else np.empty(0, np.int64)
+
+
+def _oriented(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the triangles with normals of one sense."""
+    from vtkmodules.vtkFiltersCore import vtkPolyDataNormals
+
+    normals = vtkPolyDataNormals()
+    normals.SetInputData(_poly_data(points, triangles))
+    normals.ConsistencyOn()
+    normals.AutoOrientNormalsOn()
+    normals.SplittingOff()
+    normals.Update()
+    return _triangles(normals.GetOutput(), 0.0)
+
+
+def _poly_data(points: np.ndarray, triangles: np.ndarray) -> vtkPolyData:
+    from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
+    from vtkmodules.vtkCommonCore import vtkPoints
+    from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
+
+    data, nodes, cells = vtkPolyData(), vtkPoints(), vtkCellArray()
+    nodes.SetData(numpy_to_vtk(np.ascontiguousarray(points), deep=True))
+    offsets = np.arange(0, 3 * len(triangles) + 1, 3)
+    cells.SetData(
+        numpy_to_vtkIdTypeArray(offsets, deep=True),
+        numpy_to_vtkIdTypeArray(np.ascontiguousarray(triangles.ravel()), deep=True),
+    )
+    data.SetPoints(nodes)
+    data.SetPolys(cells)
+    return data

@@ -1,0 +1,303 @@
+"""Lattices that fill closed surfaces: what is inside, clipped struts, files that are refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers.gathered import whole
+from mpi4py import MPI
+
+from pfem_petsc import Case, cases
+from pfem_petsc.errors import InputError
+from pfem_petsc.mesh.checks import check_mesh
+from pfem_petsc.mesh.generators import lattice
+from pfem_petsc.mesh.lattices.surface import read_surface
+
+CORNERS = np.array([(i, j, k) for i in (0.0, 1.0) for j in (0.0, 1.0) for k in (0.0, 1.0)])
+CUBE = np.array(
+    [(0, 1, 3), (0, 3, 2), (4, 6, 7), (4, 7, 5), (0, 4, 5), (0, 5, 1), (2, 3, 7), (2, 7, 6), (0, 2, 6), (0, 6, 4)]
+    + [(1, 5, 7), (1, 7, 3)]
+)
+"""Triangles of a unit cube, with outward normals."""
+
+
+def write_stl(path, points, triangles):
+    corners = "".join(
+        "facet normal 0 0 0\nouter loop\n"
+        + "".join(f"vertex {x:.17g} {y:.17g} {z:.17g}\n" for x, y, z in points[list(triangle)])
+        + "endloop\nendfacet\n"
+        for triangle in triangles
+    )
+    path.write_text(f"solid s\n{corners}endsolid s\n")
+    return path
+
+
+def ball(path, radius=1.0, rings=24):
+    """A sphere of triangles whose corners lie on it, and its volume."""
+    angle, turn = np.pi * np.arange(1, rings) / rings, 2.0 * np.pi * np.arange(2 * rings) / (2 * rings)
+    grid = np.stack(
+        [
+            np.outer(np.sin(angle), np.cos(turn)),
+            np.outer(np.sin(angle), np.sin(turn)),
+            np.outer(np.cos(angle), np.ones_like(turn)),
+        ],
+        axis=-1,
+    ).reshape(-1, 3)
+    points = radius * np.vstack([grid, [(0, 0, 1), (0, 0, -1)]])
+    n, north, south = 2 * rings, len(grid), len(grid) + 1
+    triangles = []
+    for j in range(n):
+        k = (j + 1) % n
+        triangles += [(north, j, k), (south, (rings - 2) * n + k, (rings - 2) * n + j)]
+        for i in range(rings - 2):
+            a, b, c, d = i * n + j, i * n + k, (i + 1) * n + j, (i + 1) * n + k
+            triangles += [(a, c, d), (a, d, b)]
+    a, b, c = (points[np.array(triangles)[:, k]] for k in range(3))
+    return write_stl(path, points, triangles), float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
+
+
+def filled(comm=MPI.COMM_SELF, **keys):
+    keys = {"kind": "octet", "pitch": 0.25} | keys
+    return lattice.generate_on(lattice.Parameters(**keys), comm, {}, None)
+
+
+def lengths(mesh):
+    return np.linalg.norm(mesh.points[mesh.bars[:, 1]] - mesh.points[mesh.bars[:, 0]], axis=1)
+
+
+def degrees(mesh):
+    return np.bincount(mesh.bars.ravel(), minlength=mesh.n_nodes)
+
+
+def test_volume_and_distance_of_a_surface(tmp_path):
+    path, volume = ball(tmp_path / "ball.stl")
+    surface = read_surface(path, 2.0)
+    assert surface.volume == pytest.approx(8.0 * volume, rel=1e-6)  # the file has single precision in VTK
+    assert volume == pytest.approx(4.0 / 3.0 * np.pi, rel=0.01)
+    points = np.random.default_rng(1).uniform(-2.5, 2.5, (4000, 3))
+    exact = np.linalg.norm(points, axis=1) - 2.0
+    found = surface.distances(points)
+    assert np.abs(found - exact).max() < 0.02  # height of a triangle's corners over its middle
+    rough = surface.rough_distances(points, 0.1)
+    assert (np.sign(rough) == np.sign(found)).all()
+    assert (np.abs(rough) <= np.abs(found) + 1e-12).all()
+    near = np.abs(found) < 0.2
+    np.testing.assert_array_equal(rough[near], found[near])
+
+
+def test_parts_of_lines_inside_are_chords(tmp_path):
+    surface = read_surface(ball(tmp_path / "ball.stl", rings=60)[0], 1.0)
+    a, b = np.random.default_rng(2).uniform(-1.3, 1.3, (2, 300, 3))
+    line, span = surface.inside_parts(a, b)
+    way = b - a
+    p, q, r = (way * way).sum(axis=1), (a * way).sum(axis=1), (a * a).sum(axis=1) - 1.0
+    root = np.sqrt(np.maximum(q * q - p * r, 0.0))
+    first, last = np.clip((-q - root) / p, 0.0, 1.0), np.clip((-q + root) / p, 0.0, 1.0)
+    clear = last - first > 0.1
+    assert set(line) >= set(np.flatnonzero(clear))
+    expected = np.stack([first, last], axis=1)[line]
+    found = clear[line]
+    assert np.abs(span - expected)[found].max() < 0.03
+    assert np.abs(span - expected)[found].mean() < 1e-3
+
+
+def test_trimmed_struts_are_those_inside(tmp_path):
+    path, _ = ball(tmp_path / "ball.stl")
+    mesh = filled(surface={"file": str(path)})
+    block = lattice.generate(lattice.Parameters(kind="octet", cells=(8, 8, 8), pitch=0.25), 0, 1)
+    place = block.points - 1.0
+    # no node is between this radius and the triangles, except at six corners of these
+    inside = (np.linalg.norm(place, axis=1) < 0.99) | (np.sort(np.abs(place), axis=1) == (0.0, 0.0, 1.0)).all(axis=1)
+    bars = block.bars[inside[block.bars].all(axis=1)]
+    assert (mesh.n_nodes, mesh.n_bars) == (len(np.unique(bars)), len(bars))
+    middles = [np.round(points[ends].sum(axis=1) * 16.0) for points, ends in ((mesh.points, mesh.bars), (place, bars))]
+    np.testing.assert_array_equal(*(rows[np.lexsort(rows.T)] for rows in middles))
+    lost = degrees(mesh) < 12
+    np.testing.assert_array_equal(np.flatnonzero(lost), mesh.node_groups["surface"])
+
+
+def test_clipped_struts_end_on_the_surface(tmp_path):
+    """Total length against chords of the sphere; what has both ends outside is not part of the lattice."""
+    path, volume = ball(tmp_path / "ball.stl", rings=60)
+    mesh = filled(surface={"file": str(path), "cut": "clip", "shortest": 0.0}, dangling="keep")
+    block = lattice.generate(lattice.Parameters(kind="octet", cells=(8, 8, 8), pitch=0.25), 0, 1)
+    a, b = (block.points[block.bars[:, k]] - 1.0 for k in (0, 1))
+    way = b - a
+    p, q, r = (way * way).sum(axis=1), (a * way).sum(axis=1), (a * a).sum(axis=1) - 1.0
+    root = np.sqrt(np.maximum(q * q - p * r, 0.0))
+    part = np.clip((-q + root) / p, 0.0, 1.0) - np.clip((-q - root) / p, 0.0, 1.0)
+    inside = np.linalg.norm(np.stack([a, b], axis=1), axis=2) < 0.9999
+    expected = (part * np.sqrt(p))[inside.any(axis=1)].sum()
+    assert lengths(mesh).sum() == pytest.approx(expected, rel=2.0 * (1.0 - volume / (4.0 / 3.0 * np.pi)))
+    # within a pitch of the surface: length over volume is that of the infinite lattice
+    assert lengths(mesh).sum() / volume * 0.25**2 == pytest.approx(24.0 * np.sqrt(0.5), rel=0.04)
+    new = mesh.node_groups["surface"][degrees(mesh)[mesh.node_groups["surface"]] == 1]
+    assert len(new) > 1000
+    np.testing.assert_allclose(np.linalg.norm(mesh.points[new], axis=1), 1.0, atol=0.002)
+    assert (np.diff(new) == 1).all()  # they come last
+    assert new[-1] == mesh.n_nodes - 1
+
+
+def test_what_is_left_of_clipped_struts_is_not_short(tmp_path):
+    path, _ = ball(tmp_path / "ball.stl")
+    mesh = filled(surface={"file": str(path), "cut": "clip", "shortest": 0.3})
+    assert lengths(mesh).min() >= 0.3 * 0.25 * np.sqrt(0.5) * (1.0 - 1e-9)
+    loose = np.flatnonzero(degrees(mesh) == 1)
+    assert set(loose) <= set(mesh.node_groups["surface"])
+
+
+def test_nodes_on_the_surface_are_inside(tmp_path):
+    """A cube whose faces lie in faces of cells is filled as a block of cells is."""
+    path = write_stl(tmp_path / "cube.stl", CORNERS, CUBE)
+    for cut in ("trim", "clip"):
+        mesh = filled(kind="cubic", surface={"file": str(path), "cut": cut}, origin=[0.0, 0.0, 0.0])
+        assert (mesh.n_nodes, mesh.n_bars) == (5**3, 3 * 4 * 25 + 6 * 16 * 5)
+    assert mesh.volume == pytest.approx(1.0)
+
+
+def test_struts_across_a_gap_are_cut(tmp_path):
+    """Two boxes with a gap of a fifth of a strut: their nodes are inside, the struts between them are not."""
+    second = CORNERS + (1.02, 0.0, 0.0)
+    path = write_stl(tmp_path / "boxes.stl", np.vstack([CORNERS, second]), np.vstack([CUBE, CUBE + 8]))
+    keys = {"kind": "cubic", "pitch": 0.35, "origin": [-0.04, 0.0, 0.0]}
+    trimmed = filled(surface={"file": str(path)}, **keys)
+    crossing = (trimmed.points[trimmed.bars][:, :, 0] < 1.01).sum(axis=1) == 1
+    assert not crossing.any()
+    assert (trimmed.points[:, 0] < 1.0).any()
+    assert (trimmed.points[:, 0] > 1.02).any()
+    clipped = filled(surface={"file": str(path), "cut": "clip", "shortest": 0.0}, **keys)
+    faces = [np.isclose(clipped.points[:, 0], x, atol=1e-6).sum() for x in (1.0, 1.02)]
+    assert faces[0] == faces[1] > 3  # a strut that passes the gap is divided into two
+
+
+def test_bracket_has_the_struts_inside_it():
+    """The surface of the built-in case: its volume, and the struts that lie in the angle and not in a hole."""
+    path = Path(cases.__file__).parent / "bracket.stl"
+    sector = 2.0 * np.pi / 48
+    polygon = 24.0 * np.sin(sector)  # area over the square of its radius
+    volume = (80.0 * 16.0 + 64.0 * 16.0) * 48.0 - polygon * (2.0 * 7.0**2 + 12.0**2) * 16.0
+    assert read_surface(path, 1e-3).volume == pytest.approx(volume * 1e-9, rel=1e-6)
+    mesh = filled(pitch=4e-3, surface={"file": str(path), "scale": 1e-3})
+
+    def outside(points, axis, centre, radius):
+        """Whether points [mm] are not in a hole, a prism with corners on a circle."""
+        apart = np.delete(points, axis, axis=-1) - centre
+        turn = np.mod(np.arctan2(apart[..., 1], apart[..., 0]), sector) - 0.5 * sector
+        return np.linalg.norm(apart, axis=-1) * np.cos(turn) >= radius * np.cos(0.5 * sector) - 1e-6
+
+    block = lattice.generate(lattice.Parameters(kind="octet", cells=(20, 12, 20), pitch=4.0), 0, 1)
+    t = np.linspace(0.0, 1.0, 41)[:, None, None]
+    points = (1.0 - t) * block.points[block.bars[:, 0]] + t * block.points[block.bars[:, 1]]
+    within = (points[..., 2] <= 16.0 + 1e-9) | (points[..., 0] <= 16.0 + 1e-9)
+    for axis, centre, radius in ((2, (36.0, 24.0), 7.0), (2, (62.0, 24.0), 7.0), (0, (24.0, 54.0), 12.0)):
+        within &= outside(points, axis, centre, radius)
+    middles = [mesh.points[mesh.bars].sum(axis=1) * 1e3, 2.0 * points[20][within.all(axis=0)]]
+    np.testing.assert_array_equal(*(rows[np.lexsort(rows.T)] for rows in map(np.round, middles)))
+
+
+def test_sides_of_points_near_edges():
+    """Around the inner edge of the bracket and the rims of a hole, where the nearest place is an edge or a corner."""
+    surface = read_surface(Path(cases.__file__).parent / "bracket.stl", 1.0)
+    random, sector = np.random.default_rng(3), 2.0 * np.pi / 48
+    points = np.vstack(
+        [random.uniform(*box, (2000, 3)) for box in (((14, -1, 14), (18, 49, 18)), ((28, 16, -1), (45, 33, 17)))]
+    )
+    inside = ((points >= 0.0) & (points <= (80.0, 48.0, 80.0))).all(axis=1)
+    inside &= (points[:, 0] <= 16.0) | (points[:, 2] <= 16.0)
+    apart = points[:, :2] - (36.0, 24.0)
+    turn = np.mod(np.arctan2(apart[:, 1], apart[:, 0]), sector) - 0.5 * sector
+    hole = np.linalg.norm(apart, axis=1) * np.cos(turn) < 7.0 * np.cos(0.5 * sector)
+    np.testing.assert_array_equal(surface.distances(points) <= 0.0, inside & ~hole)
+
+
+def test_dangling_struts_are_removed_one_after_the_other(tmp_path):
+    """A chain of struts that is cut off at its end goes entirely; a loop stays."""
+    path = write_stl(tmp_path / "cube.stl", CORNERS, CUBE)
+    mesh = filled(kind="diamond", pitch=0.6, surface={"file": str(path)})
+    kept = filled(kind="diamond", pitch=0.6, surface={"file": str(path)}, dangling="keep")
+    assert degrees(kept).min() == 1
+    assert degrees(mesh).min() >= 2
+    assert mesh.n_bars < kept.n_bars
+
+
+def test_inverted_triangles_are_turned(tmp_path):
+    inside_out = write_stl(tmp_path / "out.stl", CORNERS, CUBE[:, ::-1])
+    mixed = CUBE.copy()
+    mixed[::3] = mixed[::3, ::-1]
+    for path in (inside_out, write_stl(tmp_path / "mixed.stl", CORNERS, mixed)):
+        surface = read_surface(path, 1.0)
+        assert surface.volume == pytest.approx(1.0)
+        assert surface.distances(np.array([[0.5, 0.5, 0.5], [2.0, 0.5, 0.5]])) == pytest.approx([-0.5, 1.0])
+
+
+def test_obj_and_ply_are_read(tmp_path):
+    vertices = "".join(f"{x:g} {y:g} {z:g}\n" for x, y, z in CORNERS)
+    obj = "".join(f"v {line}\n" for line in vertices.splitlines())
+    (tmp_path / "cube.obj").write_text(obj + "".join(f"f {a + 1} {b + 1} {c + 1}\n" for a, b, c in CUBE))
+    head = "ply\nformat ascii 1.0\nelement vertex 8\nproperty float x\nproperty float y\nproperty float z\n"
+    head += "element face 12\nproperty list uchar int vertex_indices\nend_header\n"
+    (tmp_path / "cube.ply").write_text(head + vertices + "".join(f"3 {a} {b} {c}\n" for a, b, c in CUBE))
+    for name in ("cube.obj", "cube.ply"):
+        assert read_surface(tmp_path / name, 0.1).volume == pytest.approx(1e-3)
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("open.stl", "the surface is not closed: 4 of its edges"),
+        ("empty.stl", "no surface of triangles"),
+        ("cube.step", "no reader for .step; known: .stl, .obj, .ply"),
+        ("absent.stl", "cannot open: No such file"),
+    ],
+)
+def test_files_that_are_refused(tmp_path, name, text):
+    write_stl(tmp_path / "open.stl", CORNERS, CUBE[:-2])
+    (tmp_path / "empty.stl").write_text("solid s\nendsolid s\n")
+    with pytest.raises(InputError, match=f"mesh.surface.file: .*{name}.*{text}|no reader"):
+        filled(surface={"file": str(tmp_path / name)})
+
+
+def test_too_coarse_a_lattice_is_refused(tmp_path):
+    path = write_stl(tmp_path / "cube.stl", CORNERS, CUBE)
+    with pytest.raises(InputError, match="no strut is inside the surface; use a smaller pitch"):
+        filled(kind="kelvin", pitch=5.0, surface={"file": str(path)})
+
+
+def test_file_is_relative_to_the_case(tmp_path):
+    write_stl(tmp_path / "cube.stl", CORNERS, CUBE)
+    case = {
+        "mesh": {"generator": "lattice", "pitch": 0.5, "surface": {"file": "cube.stl"}},
+        "material": {"m": {"young_modulus": 1e9, "density": 1000.0}},
+        "section": {"s": {"area": 1e-6, "material": "m"}},
+        "time": {"integrator": "central_differences", "step": "auto", "end": 1e-5},
+    }
+    read = Case.from_dict(case, folder=tmp_path)
+    assert read.mesh.parameters.surface.file == str((tmp_path / "cube.stl").resolve())
+    assert Case.from_toml(read.to_toml()).mesh == read.mesh
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize(
+    "keys",
+    [
+        {"surface": {"cut": "trim"}},
+        {"kind": "kelvin", "surface": {"cut": "clip"}, "perturbation": 0.02, "missing": 0.05, "seed": 2},
+        {"kind": "diamond", "pitch": 0.9, "surface": {"cut": "trim"}},
+    ],
+)
+def test_every_rank_has_its_part_of_the_same_lattice(comm, shared_tmp_path, keys):
+    if comm.rank == 0:
+        ball(shared_tmp_path / "ball.stl", rings=12)
+    comm.Barrier()
+    keys = keys | {"surface": {"file": str(shared_tmp_path / "ball.stl")} | keys["surface"]}
+    slab, alone = filled(comm, **keys), filled(MPI.COMM_SELF, **keys)
+    mesh = whole(slab, comm)
+    np.testing.assert_array_equal(mesh.points, alone.points)
+    np.testing.assert_array_equal(mesh.bars, alone.bars)
+    for kind in ("node_groups", "bar_groups"):
+        for group, members in getattr(alone, kind).items():
+            np.testing.assert_array_equal(np.sort(getattr(mesh, kind)[group]), members)
+    slab.structured, slab.warnings = False, []
+    assert check_mesh(slab, comm) == []

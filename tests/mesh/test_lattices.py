@@ -1,0 +1,418 @@
+"""Lattices: counts, joints, densities and mechanisms of the kinds; own cells; grading, perturbation and curved maps."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.gathered import stiffness_modes, whole
+from mpi4py import MPI
+from pydantic import ValidationError
+
+from pfem_petsc import Case, Simulation
+from pfem_petsc.errors import InputError
+from pfem_petsc.mesh.checks import check_mesh
+from pfem_petsc.mesh.generators import lattice
+from pfem_petsc.mesh.lattices.making import cell_of_kind
+from pfem_petsc.mesh.lattices.mechanisms import periodic_mechanisms
+from pfem_petsc.mesh.lattices.numbering import CellByCell, ItemByItem
+from pfem_petsc.mesh.lattices.shape import random_numbers
+
+SIZES = [(1, 1, 1), (2, 3, 4)]
+
+
+def generated(comm=MPI.COMM_SELF, fields=(), **keys):
+    keys = {"pitch": 0.2} | keys
+    return lattice.generate_on(lattice.Parameters(**keys), comm, dict.fromkeys(fields, "section.s"), None)
+
+
+def lengths(mesh):
+    return np.linalg.norm(mesh.points[mesh.bars[:, 1]] - mesh.points[mesh.bars[:, 0]], axis=1)
+
+
+def degrees(mesh):
+    return np.bincount(mesh.bars.ravel(), minlength=mesh.n_nodes)
+
+
+def faces(a, b, c):
+    return (a + 1) * b * c + a * (b + 1) * c + a * b * (c + 1)
+
+
+def corners(a, b, c):
+    return (a + 1) * (b + 1) * (c + 1)
+
+
+COUNTS = {  # nodes and bars of a x b x c cells
+    "octet": lambda a, b, c: (corners(a, b, c) + faces(a, b, c), 4 * faces(a, b, c) + 12 * a * b * c),
+    "fcc": lambda a, b, c: (corners(a, b, c) + faces(a, b, c), 4 * faces(a, b, c)),
+    "bcc_diagonals": lambda a, b, c: (corners(a, b, c) + a * b * c, 8 * a * b * c),
+    "kelvin": lambda a, b, c: (4 * faces(a, b, c), 4 * faces(a, b, c) + 12 * a * b * c),
+    # four corners of the block have no neighbour inside
+    "diamond": lambda a, b, c: (corners(a, b, c) + faces(a, b, c) + 4 * a * b * c - 4, 16 * a * b * c),
+    # two struts a cell pass each face of the block; the node at one corner has all of its three cut off
+    "gyroid": lambda a, b, c: (8 * a * b * c - 1, 12 * a * b * c - 2 * (a * b + b * c + c * a)),
+    "auxetic": lambda a, b, c: (
+        2 * c * (2 * a + 1) * (2 * b + 1),
+        c * ((a + 1) * (b + 1) + a * b)
+        + (c - 1) * (a * (b + 1) + (a + 1) * b)
+        + 2 * c * (2 * a * (2 * b + 1) + 2 * b * (2 * a + 1)),
+    ),
+}
+NEIGHBOURS = {  # of nodes inside
+    "cubic": {18},
+    "octet": {12},
+    "bcc": {8, 14},
+    "bcc_diagonals": {8},
+    "fcc": {4, 12},
+    "kelvin": {4},
+    "diamond": {4},
+    "gyroid": {3},
+    "auxetic": {5},
+    "tetrahedral_octahedral": {12},
+}
+
+
+@pytest.mark.parametrize("cells", SIZES)
+@pytest.mark.parametrize("kind", COUNTS)
+def test_counts(kind, cells):
+    mesh = generated(kind=kind, cells=cells)
+    assert (mesh.n_nodes, mesh.n_bars) == COUNTS[kind](*cells)
+
+
+@pytest.mark.parametrize("kind", NEIGHBOURS)
+def test_nodes_inside_have_all_their_struts(kind):
+    mesh = generated(kind=kind, cells=(4, 4, 9 if "tetra" in kind else 4), pitch=1.0)
+    middle = 0.5 * (mesh.points.max(axis=0) + mesh.points.min(axis=0))
+    inside = (np.abs(mesh.points - middle) <= 1.01).all(axis=1)
+    assert set(degrees(mesh)[inside].tolist()) == NEIGHBOURS[kind]
+    assert sum(map(len, mesh.bar_groups.values())) == mesh.n_bars
+
+
+@pytest.mark.parametrize("kind", ["octet", "kelvin", "diamond", "gyroid", "tetrahedral_octahedral", "bcc_diagonals"])
+def test_struts_join_all_pairs_at_their_length(kind):
+    mesh = generated(kind=kind, cells=(2, 2, 3), pitch=1.0)
+    length = lengths(mesh)
+    np.testing.assert_allclose(length, length[0], rtol=1e-12)
+    apart = np.linalg.norm(mesh.points[:, None] - mesh.points[None], axis=2)
+    assert mesh.n_bars == np.count_nonzero(np.abs(apart - length[0]) < 1e-9) / 2
+
+
+@pytest.mark.parametrize(
+    ("kind", "expected"),
+    [
+        # rho = C A/l^2 with bar area A and length l
+        ("octet", 6.0 * np.sqrt(2.0)),  # Deshpande, Fleck, Ashby, J. Mech. Phys. Solids 49 (2001): 6 sqrt(2) pi (r/l)^2
+        ("tetrahedral_octahedral", 6.0 * np.sqrt(2.0)),  # the same lattice
+        ("kelvin", 1.06),  # Gibson, Ashby, Cellular Solids (1997): 1.06 (t/l)^2
+        ("bcc_diagonals", 3.0 * np.sqrt(3.0)),  # sqrt(3) pi (d/a)^2, Ushijima et al., J. Sandw. Str. 13 (2011)
+        ("diamond", 3.0 * np.sqrt(3.0) / 4.0),  # 2 bars a node; 8 nodes in (4 l/sqrt(3))^3
+        ("gyroid", 3.0 * np.sqrt(2.0) / 8.0),  # 3/2 bars a node; 8 nodes in (2 sqrt(2) l)^3
+    ],
+)
+def test_relative_density(kind, expected):
+    cell = cell_of_kind(lattice.Parameters(kind=kind, cells=(1, 1, 1), pitch=1.0))
+    length = cell.lengths()
+    assert cell.density * length[0] ** 2 == pytest.approx(expected, rel=1e-3)
+    # of a large block: the surface adds its share, which falls with the size
+    mesh = generated(kind=kind, cells=(12, 12, 36 if "tetra" in kind else 12), pitch=1.0)
+    assert lengths(mesh).sum() / mesh.volume == pytest.approx(cell.density, rel=0.12)
+
+
+@pytest.mark.parametrize(
+    ("kind", "mechanism"),
+    [(kind, kind not in ("cubic", "octet", "bcc", "tetrahedral_octahedral")) for kind in NEIGHBOURS],
+)
+def test_mechanisms(kind, mechanism):
+    keys = {"kind": kind, "cells": (2, 2, 6 if "tetra" in kind else 2), "pitch": 1.0}
+    cell = cell_of_kind(lattice.Parameters(**keys))
+    assert (sum(periodic_mechanisms(cell)) > 0) == mechanism
+    mesh = generated(**keys)
+    assert ("is a mechanism" in " ".join(mesh.warnings)) == mechanism
+    assert (stiffness_modes(mesh.points, mesh.bars) > 6) == mechanism
+
+
+def test_periodic_mechanisms_of_known_lattices():
+    def modes(kind):
+        return periodic_mechanisms(cell_of_kind(lattice.Parameters(kind=kind, cells=(1, 1, 1), pitch=1.0)))
+
+    # struts along the space diagonals sense the sum of the three strains and the shears: two strains without sum remain
+    assert modes("bcc_diagonals")[0] == 2
+    # Maxwell's rule, at least: 3 x 12 - 24 + 6 strains - 3 translations in each cell
+    assert modes("kelvin")[0] >= 15
+    assert modes("octet") == (0, 0)
+
+
+def test_struts_of_the_auxetic_kind_turn_without_stretch():
+    """Wider and higher at once: with a smaller angle the same struts fill a larger cell in both directions."""
+
+    def edges(angle):
+        """Width and height of the cell with inclined struts of length 1 and vertical ones of 1.5."""
+        slope = np.radians(angle)
+        return 2.0 * np.cos(slope), 2.0 * (1.5 - np.sin(slope))
+
+    for angle in (30.0, 20.0):
+        width, height = edges(angle)
+        # of the cell of the generator, inclined struts rise by (2 h - 1)/2 of its height, where h = 1.5/height
+        own = np.degrees(np.arctan(3.0 / height - 1.0))
+        mesh = generated(kind="auxetic", cells=(2, 2, 2), pitch=1.0, angle=own, grading=[width, width, height])
+        np.testing.assert_allclose(lengths(mesh)[mesh.bar_groups["inclined"]], 1.0, rtol=1e-12)
+        np.testing.assert_allclose(lengths(mesh)[mesh.bar_groups["vertical"]], 1.5, rtol=1e-12)
+    assert all(np.array(edges(20.0)) > np.array(edges(30.0)))
+
+
+OCTET = {
+    # corners and face centres of the cube, each given on every side
+    "points": [
+        *[[i, j, k] for i in (0.0, 1.0) for j in (0.0, 1.0) for k in (0.0, 1.0)],
+        *([0.5, 0.5, 0.0], [0.5, 0.5, 1.0], [0.5, 0.0, 0.5], [0.5, 1.0, 0.5], [0.0, 0.5, 0.5], [1.0, 0.5, 0.5]),
+    ],
+}
+OCTET["struts"] = [
+    [p, q]
+    for p in range(14)
+    for q in range(p)
+    if abs(np.linalg.norm(np.subtract(OCTET["points"][p], OCTET["points"][q])) - np.sqrt(0.5)) < 1e-9
+]
+
+
+def as_sets(mesh):
+    place = [tuple(point) for point in np.round(mesh.points, 9).tolist()]
+    return set(place), {frozenset((place[a], place[b])) for a, b in mesh.bars.tolist()}
+
+
+def test_own_cell_is_merged_with_its_neighbours():
+    """36 struts of which 12 on faces are given twice make the 24 of the octet cell."""
+    own = generated(kind="cell", cells=(2, 1, 3), cell=OCTET | {"groups": {"all": list(range(36))}})
+    built_in = generated(kind="octet", cells=(2, 1, 3))
+    assert len(OCTET["struts"]) == 36
+    assert as_sets(own) == as_sets(built_in)
+    assert (own.n_nodes, own.n_bars) == (built_in.n_nodes, built_in.n_bars)
+    np.testing.assert_array_equal(own.bar_groups["all"], np.arange(own.n_bars))
+    assert own.warnings == []
+
+
+def test_own_cell_with_struts_to_the_next_cells():
+    chain = {"points": [[0.5, 0.5, 0.5]], "struts": [[0, 0, 1, 0, 0], [0, 0, 0, 1, 0]], "groups": {"x": [0], "y": [1]}}
+    mesh = generated(kind="cell", cells=(3, 4, 1), cell=chain, pitch=1.0)
+    assert (mesh.n_nodes, len(mesh.bar_groups["x"]), len(mesh.bar_groups["y"])) == (12, 8, 9)
+    np.testing.assert_array_equal(lengths(mesh), 1.0)
+    assert "is a mechanism" in mesh.warnings[0]
+
+
+def test_copies_of_a_strut_join_nodes_at_constant_offsets():
+    """What makes numbers regular: far from the faces, the difference of the ends depends on the strut alone."""
+    mesh = generated(kind="kelvin", cells=(6, 6, 6), pitch=1.0)
+    middle = 0.5 * mesh.points[mesh.bars].sum(axis=1)
+    inside = ((middle > 1.5) & (middle < 4.5)).all(axis=1)
+    assert np.count_nonzero(inside) > 500
+    assert len(np.unique(np.diff(mesh.bars[inside], axis=1))) <= 24  # struts of a cell
+
+
+@pytest.mark.parametrize("numbering", [CellByCell, ItemByItem])
+def test_numbers_are_places_in_both_directions(numbering):
+    shapes = np.array([(3, 2, 4), (2, 2, 3), (3, 3, 2), (2, 0, 3), (1, 2, 4)])
+    numbers = numbering(shapes)
+    assert numbers.total == shapes.prod(axis=1).sum()
+    places = numbers.decode(np.arange(numbers.total))
+    np.testing.assert_array_equal(numbers.encode(*places), np.arange(numbers.total))
+    for item, shape in enumerate(shapes):
+        found = np.stack(places[1:], axis=1)[places.item == item]
+        assert set(map(tuple, found.tolist())) == set(np.ndindex(*shape))
+
+
+def test_graded_pitch_follows_its_differential_equation():
+    """dx/ds = p (1 + a x) from 0 is x = (exp(a p s) - 1)/a."""
+    pitch, a = 0.1, 2.0
+    mesh = generated(kind="cubic", cells=(5, 2, 4), pitch=pitch, grading=["1 + 2*x", 3, 1])
+    x = np.unique(mesh.points[:, 0])
+    np.testing.assert_allclose(x, (np.exp(a * pitch * np.arange(6)) - 1.0) / a, rtol=1e-8)
+    np.testing.assert_allclose(np.unique(mesh.points[:, 1]), 0.3 * np.arange(3), rtol=1e-14)
+    assert mesh.volume == pytest.approx(x[-1] * 0.6 * 0.4, rel=1e-12)
+
+
+def test_perturbation_keeps_faces_and_its_bound():
+    regular, moved = (
+        generated(kind="octet", cells=(4, 4, 4), perturbation=p, seed=s) for p, s in ((None, None), (0.1, 3))
+    )
+    shift = moved.points - regular.points
+    assert 0.019 < np.abs(shift).max() <= 0.02
+    for axis, names in enumerate((("left", "right"), ("front", "back"), ("bottom", "top"))):
+        for name in names:
+            assert not shift[regular.node_groups[name], axis].any()
+    free = shift[:, 0][np.abs(regular.points[:, 0] - 0.4) < 0.35]
+    assert np.std(free) == pytest.approx(0.02 / np.sqrt(3.0), rel=0.1)
+    other = generated(kind="octet", cells=(4, 4, 4), perturbation=0.1, seed=4)
+    assert np.abs(other.points - moved.points).max() > 0.02
+
+
+def test_random_numbers_depend_on_their_number_alone():
+    values = random_numbers(7, 2, np.arange(100_000))
+    np.testing.assert_array_equal(values[77:5:-3], random_numbers(7, 2, np.arange(77, 5, -3)))
+    counts = np.histogram(values, bins=20, range=(0.0, 1.0))[0]
+    assert ((counts - 5000.0) ** 2 / 5000.0).sum() < 43.8  # chi-square, 19 degrees of freedom, 1 in 1000
+    assert abs(np.corrcoef(values[1:], values[:-1])[0, 1]) < 0.01
+    assert abs(np.corrcoef(values, random_numbers(8, 2, np.arange(100_000)))[0, 1]) < 0.01
+
+
+def test_missing_struts():
+    full = generated(kind="octet", cells=(8, 8, 8))
+    left = generated(kind="octet", cells=(8, 8, 8), missing=0.1, seed=5, dangling="keep")
+    deviation = np.sqrt(0.1 * 0.9 * full.n_bars)
+    assert abs(left.n_bars - 0.9 * full.n_bars) < 4.0 * deviation
+    assert degrees(left).min() >= 1
+    cleaned = generated(kind="octet", cells=(8, 8, 8), missing=0.6, seed=5)
+    assert degrees(cleaned).min() >= 2
+
+
+def test_cylinder_is_closed():
+    keys = {"kind": "cubic", "cells": (12, 2, 1), "pitch": 0.1}
+    ring = generated(**keys, curved={"shape": "cylinder", "radius": 0.4, "closed": True})
+    radius = np.hypot(ring.points[:, 0], ring.points[:, 2])
+    np.testing.assert_allclose(radius[ring.node_groups["bottom"]], 0.4, rtol=1e-14)
+    np.testing.assert_allclose(radius[ring.node_groups["top"]], 0.5, rtol=1e-14)
+    assert ring.n_nodes == 12 * 3 * 2
+    assert "left" not in ring.node_groups
+    # every rib of nodes around the axis is like the next
+    assert len(set(degrees(ring).reshape(12, -1).sum(axis=1).tolist())) == 1
+    chord = 2.0 * 0.4 * np.sin(np.pi / 12.0)
+    assert np.count_nonzero(np.isclose(lengths(ring), chord)) == 12 * 3
+    assert ring.volume == pytest.approx(np.pi * (0.5**2 - 0.4**2) * 0.2)
+
+
+def test_sphere_is_a_part_of_a_shell():
+    cap = generated(
+        kind="octet", cells=(6, 4, 1), pitch=0.1, curved={"shape": "sphere", "radius": 1.0}, origin=[0.0, 0.0, -1.0]
+    )
+    radius = np.linalg.norm(cap.points + [0.0, 0.0, 1.0], axis=1)
+    np.testing.assert_allclose(radius[cap.node_groups["bottom"]], 1.0, rtol=1e-14)
+    np.testing.assert_allclose(radius[cap.node_groups["top"]], 1.1, rtol=1e-14)
+    # the volume of the shell, against thin layers of a fine grid of its own
+    a, b = np.meshgrid((np.arange(400) + 0.5) / 400 * 0.6 - 0.3, (np.arange(400) + 0.5) / 400 * 0.4 - 0.2)
+    p, q = np.tan(a), np.tan(b)
+    solid = ((1 + p**2) * (1 + q**2) / (1 + p**2 + q**2) ** 1.5).mean() * 0.6 * 0.4
+    assert cap.volume == pytest.approx(solid * (1.1**3 - 1.0) / 3.0, rel=1e-5)
+
+
+CASES = {
+    "diamond": {"kind": "diamond", "cells": (3, 2, 2)},
+    "gyroid": {"kind": "gyroid", "cells": (2, 3, 2)},
+    "kelvin": {"kind": "kelvin", "cells": (1, 1, 5), "perturbation": 0.05},
+    "auxetic": {"kind": "auxetic", "cells": (3, 1, 2), "grading": [1, "1 + y", 2]},
+    "layers": {"kind": "tetrahedral_octahedral", "cells": (2, 2, 4)},
+    "missing": {"kind": "octet", "cells": (3, 3, 2), "missing": 0.3, "seed": 1, "perturbation": 0.1},
+    "ring": {"kind": "fcc", "cells": (5, 2, 1), "curved": {"shape": "cylinder", "radius": 0.3, "closed": True}},
+    "own": {"kind": "cell", "cells": (2, 1, 2), "cell": OCTET},
+}
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("name", CASES)
+def test_every_rank_makes_its_part_of_the_same_sound_lattice(comm, name):
+    keys = CASES[name] | {"bar_fields": {"area": "1e-6*(1 + x + where(z > 0.1, y, 0))"}}
+    slab = generated(comm, ["area"], **keys)
+    mesh, alone = whole(slab, comm), generated(MPI.COMM_SELF, ["area"], **keys)
+    np.testing.assert_array_equal(mesh.points, alone.points)
+    np.testing.assert_array_equal(mesh.bars, alone.bars)
+    np.testing.assert_array_equal(np.concatenate(comm.allgather(slab.bar_fields["area"])), alone.bar_fields["area"])
+    for kind in ("node_groups", "bar_groups"):
+        assert list(getattr(slab, kind)) == list(getattr(alone, kind))
+        for group, members in getattr(alone, kind).items():
+            np.testing.assert_array_equal(np.sort(getattr(mesh, kind)[group]), members)
+    middle = alone.points[alone.bars].mean(axis=1)
+    expected = 1e-6 * (1.0 + middle[:, 0] + np.where(middle[:, 2] > 0.1, middle[:, 1], 0.0))
+    if "curved" not in keys:
+        np.testing.assert_allclose(alone.bar_fields["area"], expected, rtol=1e-12)
+    slab.structured, slab.warnings = False, []
+    assert check_mesh(slab, comm) == []
+
+
+@pytest.mark.parametrize(
+    ("keys", "text"),
+    [
+        ({"kind": "cell"}, "need each other"),
+        ({"cells": None}, "the key cells is missing"),
+        ({"angle": 10.0}, 'angle belongs to kind = "auxetic"'),
+        ({"seed": 1}, "seed needs"),
+        ({"kind": "auxetic", "angle": 50.0}, "less than 45"),
+        ({"grading": [1, 1]}, "three factors"),
+        ({"grading": [1, 1, "x"]}, "unknown variable 'x'; known: z"),
+        ({"grading": [1, 1, -1.0]}, "a factor > 0"),
+        ({"bar_fields": {"area": "open('f')"}}, "unknown function 'open'"),
+        ({"kind": "cell", "cell": {"points": [[0, 0, 0.0]], "struts": [[0, 1]]}}, "two numbers of points, 0 to 0"),
+        ({"kind": "cell", "cell": {"points": [[0, 0, 2.0]], "struts": []}}, "point 0 is outside the cell"),
+        ({"kind": "cell", "cell": {"points": [[0, 0, 0.0], [1, 1, 1.0]], "struts": [[0, 0]]}}, "no length"),
+        ({"kind": "cell", "cell": {"points": [[0, 0, 0.0], [0.5, 0, 0]], "struts": [[0, 0, 1, 0, 0]]}}, "no strut"),
+        ({"curved": {"shape": "sphere", "radius": 1.0, "closed": True}}, "cylinder"),
+        ({"cells": [2, 1, 1], "curved": {"shape": "cylinder", "radius": 1.0, "closed": True}}, "3 cells or more"),
+    ],
+)
+def test_keys_are_checked(keys, text):
+    with pytest.raises(ValidationError, match=text.replace("(", r"\(")):
+        lattice.Parameters(**({"cells": [1, 1, 1], "pitch": 1.0} | keys))
+
+
+@pytest.mark.parametrize(
+    ("keys", "text"),
+    [
+        ({"grading": [1, 1, "where(z < 2, 1, -1)"]}, r"mesh.grading\[2\]: .* is -1 at z = 2"),
+        ({"perturbation": 0.3}, "choose less than 0.2041"),
+        ({"curved": {"shape": "cylinder", "radius": 0.4}}, "more than the circumference"),
+        ({"curved": {"shape": "sphere", "radius": 0.4}}, "of the sphere"),
+        ({"bar_fields": {"area": "log(x - 9)"}}, "has no finite value at"),
+    ],
+)
+def test_blocks_are_checked(keys, text):
+    with pytest.raises(InputError, match=text):
+        generated(
+            fields=list(keys.get("bar_fields", ())), **({"kind": "octet", "cells": [4, 1, 4], "pitch": 1.0} | keys)
+        )
+
+
+def test_check_tells_the_relative_density_and_takes_areas_from_an_expression(tmp_path):
+    keys = {
+        "kind": "cubic",
+        "cells": [2, 2, 2],
+        "pitch": 0.1,
+        "bar_fields": {"thin": "1e-6 + z*1e-5"},
+    }
+    case = {
+        "mesh": {"generator": "lattice", **keys},
+        "material": {"m": {"young_modulus": 1e9, "density": 1000.0}},
+        "section": {
+            "s": {"area_field": "thin", "material": "m"},
+            "e": {"area": 3e-6, "material": "m", "bars": "edges"},
+        },
+        "time": {"integrator": "central_differences", "step": "auto", "end": 1e-5},
+    }
+    resolved = Case.from_toml(Case.from_dict(case).to_toml())
+    assert resolved.mesh == Case.from_dict(case).mesh
+    simulation = Simulation(resolved, MPI.COMM_SELF, check_only=True)
+    mesh = generated(fields=["thin"], **keys)
+    area = mesh.bar_fields["thin"]
+    area[mesh.bar_groups["edges"]] = 3e-6
+    expected = (area * lengths(mesh)).sum() / 0.2**3
+    assert float(simulation.summary()["relative density"].split()[0]) == pytest.approx(expected, rel=1e-3)
+    case["section"]["s"]["area_field"] = "thick"
+    with pytest.raises(InputError, match="section.s.area_field = 'thick': mesh.bar_fields has no such field"):
+        Simulation(Case.from_dict(case), MPI.COMM_SELF, check_only=True)
+
+
+@pytest.mark.parametrize(
+    ("mesh", "text"),
+    [
+        ({"kind": "cell", "cell": {"points": [[0, 0, 0]]}}, "mesh.cell.struts: this key is missing (points that each"),
+        ({"curved": {"shape": "cylinder", "radus": 1.0}}, "mesh.curved.radus: unknown key, did you mean 'radius'?"),
+        ({"surface": {"scale": 1.0}}, "mesh.surface.file: this key is missing (STL, OBJ or PLY file"),
+        ({"surface": {"file": "a.stl", "cut": "trimm"}}, 'mesh.surface.cut = "trimm": unknown value, did you mean'),
+        ({"fields": {"rho": {"file": "a.vti"}}}, "mesh.fields.rho.array: this key is missing (name of an array"),
+    ],
+)
+def test_problems_in_inner_tables_name_their_keys(mesh, text):
+    case = {
+        "mesh": {"generator": "lattice", "pitch": 1.0, "cells": [1, 1, 1], **mesh},
+        "material": {"m": {"young_modulus": 1e9, "density": 1000.0}},
+        "section": {"s": {"area": 1e-6, "material": "m"}},
+        "time": {"integrator": "central_differences", "step": "auto", "end": 1e-5},
+    }
+    with pytest.raises(InputError) as refused:
+        Case.from_dict(case)
+    assert text in str(refused.value)

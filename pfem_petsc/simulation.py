@@ -84,7 +84,8 @@ class Simulation:
                 "Case.from_dict from tables"
             )
         self._stop = StopRequest(wall_time)
-        self.case = case
+        # later changes of the case are those of other simulations
+        self.case = case = case.copy(fixed=True)
         self.comm = comm if comm is not None else MPI.COMM_WORLD
         self.folder = Path(output) if output is not None else Path("results") / case.name
         self.quiet = quiet

@@ -21,8 +21,8 @@ def load_slab(mesh: Any, comm: MPI.Comm, fields: Mapping[str, str] | None = None
     Parameters
     ----------
     mesh : the ``[mesh]`` table of a case
-        With ``generator`` and ``parameters``, or ``file``: the suffix chooses the reader (``.msh``, ``.vtu``,
-        ``.vtkhdf``, ``.h5``).
+        With ``generator`` and ``parameters`` (arrays are one), or ``file``: the suffix chooses the reader (``.msh``,
+        ``.vtu``, ``.vtkhdf``, ``.h5``).
     fields : names of cell fields to read, each with the key that asks for it, for messages
 
     Raises
@@ -34,7 +34,9 @@ def load_slab(mesh: Any, comm: MPI.Comm, fields: Mapping[str, str] | None = None
     from ..registry import lookup
     from .checks import check_mesh
 
-    if mesh.generator is not None:
+    if mesh.generator is not None and not mesh.arranged:
+        slab = lookup("pfem_petsc.mesh.generators", mesh.generator, "").load(mesh.parameters, comm, fields or {})
+    elif mesh.generator is not None:
         from ..errors import InputError
 
         with agreed(comm):

@@ -34,14 +34,14 @@ def warnings_before(case: Case, model: Model, plan: Plan) -> list[str]:
             "them"
         )
     # generated meshes are valid by construction
-    pairs, shown = overlapping_bars(model.mesh) if case.mesh.generator is None else (0, [])
+    pairs, shown = overlapping_bars(model.mesh) if not case.mesh.arranged else (0, [])
     if pairs:
         texts.append(
             f"{pairs} pair{'s' if pairs > 1 else ''} of bars overlap{'' if pairs > 1 else 's'} from a common node on: "
             f"{_list(pairs, shown)}; if a node is intended to divide the longer one, remove that bar"
         )
     # generated meshes have undivided members
-    chained, first_chained = chain_nodes(model) if case.mesh.generator is None else (0, -1)
+    chained, first_chained = chain_nodes(model) if not case.mesh.arranged else (0, -1)
     if chained:
         texts.append(chain_warning(chained, first_chained))
     loose, first = unbraced_nodes(model)
@@ -69,7 +69,7 @@ def inspect(case: Case, model: Model) -> tuple[dict[str, str], list[str]]:
     entries |= far_points(case, model)
     for name, text in wall_gaps(model)[0].items():
         entries[f"wall {name}"] = text
-    if case.mesh.generator is None:
+    if not case.mesh.arranged:
         warnings += _nodes_on_bars(model.mesh, entries)
     return entries, warnings
 

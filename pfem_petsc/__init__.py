@@ -15,7 +15,9 @@ if TYPE_CHECKING:
     from .mesh.truss import Truss
     from .mesh.writing import write_mesh
     from .output.result import open_result
+    from .output.table import Table
     from .simulation import Simulation
+    from .studies.sweep import sweep
 
 __all__ = [
     "Case",
@@ -25,9 +27,11 @@ __all__ = [
     "PfemError",
     "Simulation",
     "SimulationFailure",
+    "Table",
     "Truss",
     "__version__",
     "open_result",
+    "sweep",
     "write_mesh",
 ]
 
@@ -38,7 +42,9 @@ _HOMES = {
     **dict.fromkeys(("EarlyStop", "InputError", "NotConverged", "PfemError", "SimulationFailure"), ".errors"),
     "Truss": ".mesh.truss",
     "Simulation": ".simulation",
+    "Table": ".output.table",
     "open_result": ".output.result",
+    "sweep": ".studies.sweep",
     "write_mesh": ".mesh.writing",
 }
 

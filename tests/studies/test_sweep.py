@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import csv
+import gc
+import os
+import shutil
 
 import numpy as np
 import pytest
+from mpi4py import MPI
 
-from pfem_petsc import Case, InputError, Truss, open_result, sweep
+from pfem_petsc import Case, InputError, Simulation, Truss, open_result, sweep
 from pfem_petsc.cli.main import main
+from pfem_petsc.mechanics.compiled import Compilation
 from pfem_petsc.output.table import Table
+from pfem_petsc.solvers import outlive
 from pfem_petsc.studies import pool, worker
 from pfem_petsc.studies.worker import Report, Task
 
@@ -156,3 +162,31 @@ def test_tables(tmp_path):
     assert table.where(table["a"] > 1)["c"].tolist() == ["<y>"]
     with pytest.raises(InputError, match="column 'b' has 1 rows, expected 2"):
         Table({"a": [1, 2], "b": [1]})
+
+
+@pytest.mark.parametrize("integrator", ["central_differences", "newmark"])
+def test_loops_over_runs_keep_nothing_and_compile_nothing(tmp_path, integrator):
+    """Neither objects nor files nor PETSc objects grow with the number of runs."""
+    case = Case.load("rod_impact", ["time.end=0.03", f"time.integrator={integrator}"])
+    compiled: list[str] = []
+
+    def run(number):
+        case.material["default"].density = 1.0 + 1e-3 * number
+        with Simulation(case, MPI.COMM_SELF, output=tmp_path / "out", quiet=True) as simulation:
+            simulation.run()
+        shutil.rmtree(tmp_path / "out")
+
+    def held():
+        gc.collect()
+        return len(gc.get_objects()), len(os.listdir("/proc/self/fd")), len(outlive._ALIVE)
+
+    for number in range(4):
+        run(number)
+    before = held()
+    with Compilation(compiled.append, lambda seconds: None):
+        for number in range(16):
+            run(number)
+    after = held()
+    assert compiled == []
+    assert after[1:] == before[1:]
+    assert after[0] - before[0] < 64  # less than four for each run: there was one for each atexit function

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from .mesh.writing import write_mesh
     from .output.result import open_result
     from .output.table import Table
+    from .post.live import LivePlot
     from .simulation import Simulation
     from .studies.sweep import sweep
 
@@ -23,6 +24,7 @@ __all__ = [
     "Case",
     "EarlyStop",
     "InputError",
+    "LivePlot",
     "NotConverged",
     "PfemError",
     "Simulation",
@@ -42,6 +44,7 @@ _HOMES = {
     **dict.fromkeys(("EarlyStop", "InputError", "NotConverged", "PfemError", "SimulationFailure"), ".errors"),
     "Truss": ".mesh.truss",
     "Simulation": ".simulation",
+    "LivePlot": ".post.live",
     "Table": ".output.table",
     "open_result": ".output.result",
     "sweep": ".studies.sweep",

@@ -10,6 +10,7 @@ from typing import Any, Unpack
 from pydantic import BaseModel
 
 from ..errors import InputError
+from ..registry import lookup
 from .builtin import built_in_cases, built_in_path
 from .checks import check_names
 from .containers import CaseTables
@@ -106,6 +107,9 @@ class Case(Editable):
 
     def __repr__(self) -> str:
         return f"<Case {self.name}: {self.title}>"
+
+    def _repr_html_(self) -> str:
+        return lookup("pfem_petsc.post", "inline", "").of_case(self)
 
     @property
     def stages(self) -> tuple[Case, ...]:

@@ -15,7 +15,7 @@ from ..errors import InputError
 if TYPE_CHECKING:
     import pandas
 
-__all__ = ["Table"]
+__all__ = ["Table", "flat_columns"]
 
 _SHOWN = 10  # rows shown at the beginning and at the end of a long table
 
@@ -116,6 +116,18 @@ class Table(Mapping[str, np.ndarray]):
         rows = "".join(f"<tr>{''.join(f'<td>{html.escape(text)}</td>' for text in line)}</tr>" for line in body)
         heading = "".join(f"<th>{html.escape(text)}</th>" for text in head)
         return f"<table><thead><tr>{heading}</tr></thead><tbody>{rows}</tbody></table><p>{self.n_rows} rows</p>"
+
+
+def flat_columns(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
+    """Return columns (rows,) of values (rows,), (rows, 3) or (rows, nodes, 3): ``name``, ``name.x``, ``name[0].x``."""
+    if values.ndim == 1:
+        return {name: values}
+    if values.ndim == 2 and values.shape[1] == 3:
+        return {f"{name}.{axis}": values[:, k] for k, axis in enumerate("xyz")}
+    found: dict[str, np.ndarray] = {}
+    for k in range(values.shape[1]):
+        found |= flat_columns(f"{name}[{k}]", values[:, k])
+    return found
 
 
 def _column(values: Sequence[Any] | np.ndarray) -> np.ndarray:

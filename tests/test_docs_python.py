@@ -28,4 +28,8 @@ def test_blocks_run(tmp_path):
     )
     assert done.returncode == 0, done.stderr
     assert not done.stderr
+    assert "run  time.step  section.legs.area  status" in done.stdout
+    difference = re.search(r"difference: (\S+) m", done.stdout)
+    assert float(difference[1]) < 1e-12
+    assert (tmp_path / "live.png").stat().st_size > 1000 and (tmp_path / "steps.csv").read_text().count("\n") == 5
     assert '\ncase: time.step = "1 ms": expected a number of seconds in SI units' in done.stdout

@@ -7,6 +7,7 @@ name of the key, before any work is done. Imports pydantic only.
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterable
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
@@ -51,6 +52,9 @@ class StrictModel(BaseModel):
             super().__setattr__(key, value)
         else:
             place.change(key, value)
+
+    def __repr_args__(self) -> Iterable[tuple[str | None, Any]]:
+        return [(key, value) for key, value in super().__repr_args__() if value is not None]
 
     def __delattr__(self, key: str) -> None:
         place = getattr(self, "_place", None)

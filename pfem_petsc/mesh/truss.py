@@ -32,7 +32,8 @@ class Truss:
 
     Without ``comm`` every rank gives the same arrays, and has them whole; that the ranks agree is checked when the mesh
     is distributed. With ``comm``, rank 0 alone gives arrays (they are ignored elsewhere, where they may be None),
-    checks them, and sends each rank its part when the mesh is distributed; the call is then collective.
+    checks them, and sends each rank its part when the mesh is distributed (a truss of up to 10,000 nodes and bars to
+    all of them at once); the call is then collective.
 
     Parameters
     ----------
@@ -45,7 +46,7 @@ class Truss:
     Attributes
     ----------
     n_nodes, n_bars : int
-    points, bars, node_groups, bar_groups, bar_fields : as given, read-only; None on other ranks than 0 with ``comm``
+    points, bars, node_groups, bar_groups, bar_fields : as given, read-only; None where another rank has them
     digest : str
         Identifies the content.
     warnings : list of str
@@ -80,12 +81,14 @@ class Truss:
         else:
             from ..parallel.agreement import on_root
 
-            about = on_root(comm, self._take_on_root, *(given if comm.rank == 0 else ()))
-            self.n_nodes, self.n_bars, self.digest, self.warnings = about
+            self.__dict__.update(on_root(comm, self._take_on_root, *(given if comm.rank == 0 else ())))
 
-    def _take_on_root(self, *given: Any) -> tuple[Any, ...]:
+    def _take_on_root(self, *given: Any) -> dict[str, Any]:
+        """Take the arrays of rank 0, and return what all ranks have: all of a small truss, which is part of texts."""
         self._take(*given)
-        return self.n_nodes, self.n_bars, self.digest, self.warnings
+        if self.n_nodes + self.n_bars <= INLINE:
+            return self.__dict__
+        return {key: self.__dict__[key] for key in ("n_nodes", "n_bars", "digest", "warnings")}
 
     def _take(self, points: Any, bars: Any, node_groups: Any, bar_groups: Any, bar_fields: Any) -> None:
         from mpi4py import MPI

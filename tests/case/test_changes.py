@@ -192,3 +192,20 @@ def test_stages_change_where_their_tables_are():
 def test_given_tables_make_the_same_case(name):
     case = Case.load(name)
     assert Case.from_dict(given_tables(case), name=name, folder=case.folder) == case
+
+
+def test_rows_of_files_stay_when_the_file_is_gone(case, case_file):
+    record = case_file.with_name("factors.csv")
+    record.write_text("t, factor\n0, 0\n1, 2\n")
+    case.update({"load[0].table": None, "load[0].table_file": "factors.csv"})
+    assert case.load[0].table == ((0.0, 0.0), (1.0, 2.0))
+    record.unlink()
+    case.time.end = 2e-3
+    assert case.load[0].table == ((0.0, 0.0), (1.0, 2.0))
+    with pytest.raises(InputError, match=r"load\[0\]: expected at most one of the keys table_file"):
+        case.load[0].table_file = "factors.csv"
+
+
+def test_tables_show_what_they_have(case):
+    assert repr(case.mesh) == "Mesh(generator='rod', parameters=Parameters(length=1.0, elements=4))"
+    assert repr(case) == "<Case rod: rod>"

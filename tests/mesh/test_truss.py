@@ -39,13 +39,18 @@ def history(case, comm, folder):
 
 
 @pytest.mark.parallel
-def test_same_results_as_from_a_file(comm, shared_tmp_path):
+def test_same_results_as_from_a_file(comm, shared_tmp_path, monkeypatch):
     path = write_mesh(shared_tmp_path / "tripod.h5", POINTS, BARS, **GROUPS, **AREAS, comm=comm)
     expected = history(Case({**TABLES, "mesh": {"file": path}}), comm, shared_tmp_path / "file")
     root = comm.rank == 0
-    of_rank_0 = Truss(POINTS if root else None, BARS if root else None, **(GROUPS | AREAS if root else {}), comm=comm)
-    assert (of_rank_0.points is None) == (comm.rank > 0) and of_rank_0 == tripod()
-    for name, truss in (("all", tripod()), ("root", of_rank_0), ("read", Truss.read(path, ["area"]))):
+    given = (POINTS, BARS) if root else (None, None)
+    small = Truss(*given, **(GROUPS | AREAS if root else {}), comm=comm)
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "INLINE", 5)
+        of_rank_0 = Truss(*given, **(GROUPS | AREAS if root else {}), comm=comm)
+    assert (of_rank_0.points is None) == (comm.rank > 0) and of_rank_0 == small == tripod()
+    assert small.table() == tripod().table()
+    for name, truss in (("all", small), ("root", of_rank_0), ("read", Truss.read(path, ["area"]))):
         case = Case(TABLES, mesh=truss, name="tripod")
         assert case.mesh.truss is truss
         found = history(case, comm, shared_tmp_path / name)
@@ -122,7 +127,7 @@ def test_arrays_in_a_case_file():
     assert again == case and again.mesh.truss == tripod()
     with pytest.raises(InputError, match="mesh: expected the keys points and bars; bars is missing"):
         Case(TABLES, mesh={"generator": "arrays", "points": POINTS})
-    with pytest.raises(InputError, match="case: mesh: Truss: 1 nodes belong to no bar: node 3"):
+    with pytest.raises(InputError, match="case: mesh: 1 nodes belong to no bar: node 3"):
         Case(TABLES, mesh={"generator": "arrays", "points": POINTS, "bars": BARS[:3]})
     with pytest.raises(InputError, match=r"mesh.length: a key of rod.*, not of generator arrays, which takes points"):
         case.mesh.length = 1.0
@@ -150,3 +155,20 @@ def test_missing_fields_and_groups_are_told():
     grouped = {**TABLES, "section": {"legs": {"bars": "leg", "area": 2e-4, "material": "steel"}}}
     with pytest.raises(InputError, match="did you mean 'legs'"):
         Simulation(Case(grouped, mesh=tripod()), MPI.COMM_SELF, check_only=True)
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("most", [5, 10_000])
+def test_restart_with_the_same_truss_only(comm, shared_tmp_path, monkeypatch, most):
+    monkeypatch.setattr(module, "INLINE", most)
+    given = (POINTS, BARS) if comm.rank == 0 else (None, None)
+    mesh = Truss(*given, **(GROUPS | AREAS if comm.rank == 0 else {}), comm=comm)
+    case = Case({**TABLES, "output": {"checkpoint_every": 5}}, mesh=mesh)
+    history(case, comm, shared_tmp_path / "out")
+    longer = case.copy({"time.end": 2e-4})
+    other = longer.copy({"mesh": Truss(1.01 * POINTS, BARS, **GROUPS, **AREAS)})
+    with pytest.raises(InputError, match=r"belongs to a different case than case: mesh\.(digest|points)"):
+        Simulation(other, comm, output=shared_tmp_path / "out", restart=True)
+    with Simulation(longer, comm, output=shared_tmp_path / "out", restart=True, quiet=True) as simulation:
+        simulation.run()
+    assert len(open_result(shared_tmp_path / "out").history["time"]) == 21

@@ -45,7 +45,10 @@ class Parameters(StrictModel):
             missing = [key for key in ("points", "bars") if self.__dict__[key] is None]
             if missing:
                 raise ValueError(f"expected the keys points and bars; {missing[0]} is missing")
-            self.__dict__["truss"] = Truss(self.points, self.bars, **lists)
+            try:
+                self.__dict__["truss"] = Truss(self.points, self.bars, **lists)
+            except InputError as error:
+                raise InputError(str(error).removeprefix("Truss: ")) from error
         elif self.truss is not None and self.digest not in (None, self.truss.digest):
             raise ValueError(
                 f"the arrays are not those that the case was made with: their digest is {self.truss.digest[:12]}..., "
@@ -78,7 +81,7 @@ def load(parameters: Parameters, comm: MPI.Comm, fields: Mapping[str, str]) -> M
             f"mesh: the arrays of rank {rank} differ from those of rank 0: give all ranks the same arrays, or rank 0 "
             "alone, by Truss(..., comm=comm)"
         )
-    if not found[0][1]:
+    if not found[0][1]:  # nobody has, or not the one that would send them
         raise InputError(
             f"mesh: the arrays of this case (digest {str(digest)[:12]}...) are not in its text, as they are large: "
             "give the truss, as in Case.from_file(path, mesh=truss)"

@@ -83,7 +83,15 @@ def _stage(case: Case, stage: Case) -> dict[str, Any]:
         keys = StageOutput.model_fields
         own = {key: value for key, value in given_table(stage.output).items() if key in keys}
         row["output"] = {key: value for key, value in own.items() if value != getattr(case.output, key)}
+    if "section" in row:  # a stage gives the prestress alone
+        named = {name: stage.section[name].prestressed for name in _stressed(stage)}
+        row["section"] = {name: {key: getattr(stage.section[name], str(key))} for name, key in named.items()}
     return row
+
+
+def _stressed(stage: Case) -> Sequence[str]:
+    """Names of the sections whose prestress a stage gives itself."""
+    return stage.__dict__.get("stressed", ())
 
 
 def _nothing(key: str) -> Any:
@@ -154,6 +162,8 @@ def merge(old: Any, new: Any) -> Any:
             old.__dict__[key] = merge(old.__dict__.get(key), value)
         object.__setattr__(old, "__pydantic_fields_set__", new.__pydantic_fields_set__)
         return old
+    if type(old) is dict:
+        return {name: merge(old.get(name), item) for name, item in new.items()}
     if isinstance(old, Tables):
         tables = {name: merge(old.get(name), table) for name, table in new.items()}
         dict.clear(old)
@@ -214,6 +224,8 @@ def settle(case: Case, attached: bool = True) -> None:
 
 def _of_stage(case: Case, k: int, key: str) -> KeyPath:
     """The place of a table that is in force in stage k: in the stage that gives it, or in the case."""
+    if key == "section":  # of which a stage gives the prestress alone
+        return (key,)
     if key in case.stage[k].given or key in (*ANALYSES, "name"):
         return "stage", k, key
     for j in range(k - 1, -1, -1) if key not in ONE_STAGE else ():
@@ -235,6 +247,10 @@ def _settle(case: Case, owner: Case | None, place: Callable[[str], KeyPath]) -> 
             content._place = None if owner is None else Place(owner, path)
         for table, where in _inside(content, path, key):
             _settle_model(table, owner, where)
+    for k in range(case.number, -1, -1) if owner is not None and owner is not case else ():
+        for name in _stressed(owner.stage[k]):
+            if case.section[name]._place.path[0] != "stage":
+                _settle_model(case.section[name], owner, ("stage", k, "section", name))
 
 
 def _inside(content: Any, path: KeyPath, key: str) -> Iterator[tuple[StrictModel, KeyPath]]:
@@ -256,6 +272,10 @@ def _settle_model(table: StrictModel, owner: Case | None, path: KeyPath) -> None
     for key, value in table.__dict__.items():
         if isinstance(value, StrictModel):
             _settle_model(value, owner, path if key in _FLAT else (*path, key))
+        elif isinstance(value, dict):
+            for name, item in value.items():
+                if isinstance(item, StrictModel):
+                    _settle_model(item, owner, (*path, key, name))
         elif isinstance(value, tuple) and value and isinstance(value[0], StrictModel):
             for i, item in enumerate(value):
                 _settle_model(item, owner, (*path, key, i))

@@ -34,19 +34,21 @@ def load_slab(mesh: Any, comm: MPI.Comm, fields: Mapping[str, str] | None = None
     from ..registry import lookup
     from .checks import check_mesh
 
-    if mesh.generator is not None and not mesh.arranged:
-        slab = lookup("pfem_petsc.mesh.generators", mesh.generator, "").load(mesh.parameters, comm, fields or {})
-    elif mesh.generator is not None:
+    if mesh.generator is not None:
         from ..errors import InputError
 
         with agreed(comm):
-            for name, key in (fields or {}).items():
-                raise InputError(f"{key} = {name!r}: generated meshes have no cell fields; give area")
             generator = lookup("pfem_petsc.mesh.generators", mesh.generator, "mesh.generator")
-            try:
-                slab = generator.generate(mesh.parameters, comm.rank, comm.size)
-            except MemoryError:
-                raise InputError(f"mesh: the {mesh.generator} does not fit in this machine's memory") from None
+        if hasattr(generator, "generate_on"):
+            slab = generator.generate_on(mesh.parameters, comm, fields or {})
+        else:
+            with agreed(comm):
+                for name, key in (fields or {}).items():
+                    raise InputError(f"{key} = {name!r}: generator {mesh.generator} has no cell fields; give area")
+                try:
+                    slab = generator.generate(mesh.parameters, comm.rank, comm.size)
+                except MemoryError:
+                    raise InputError(f"mesh: the {mesh.generator} does not fit in this machine's memory") from None
     else:
         from .readers import read_slab
 

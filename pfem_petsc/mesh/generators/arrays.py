@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,7 @@ from ..readers.scatter import WholeMesh, scattered
 from ..slab import MeshSlab, check_size, slab_range
 from ..truss import Truss
 
-__all__ = ["Parameters", "load"]
+__all__ = ["Parameters", "generate_on"]
 
 
 class Parameters(StrictModel):
@@ -64,8 +64,10 @@ class Parameters(StrictModel):
         return {"digest": self.digest} if self.truss is None else self.truss.table()
 
 
-def load(parameters: Parameters, comm: MPI.Comm, fields: Mapping[str, str]) -> MeshSlab:
-    """Return this rank's part of the truss, with the named bar fields. Collective.
+def generate_on(
+    parameters: Parameters, comm: MPI.Comm, fields: Mapping[str, str], groups: Collection[str] | None = None
+) -> MeshSlab:
+    """Return this rank's part of the truss, with the named bar fields and all groups. Collective.
 
     Raises
     ------

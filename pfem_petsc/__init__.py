@@ -1,6 +1,6 @@
 """Dynamics of large trusses that fly, hit things, buckle and yield: positional finite elements on PETSc over MPI.
 
-``from pfem_petsc import Case, Simulation, open_result, write_mesh``; nothing heavy is imported before one of
+``from pfem_petsc import Case, Simulation, Truss, open_result, write_mesh``; nothing heavy is imported before one of
 them is used.
 """
 
@@ -11,18 +11,43 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from .case.schema import Case
+    from .errors import EarlyStop, InputError, NotConverged, PfemError, SimulationFailure
+    from .mesh.truss import Truss
     from .mesh.writing import write_mesh
     from .output.result import open_result
+    from .output.table import Table
+    from .post.live import LivePlot
     from .simulation import Simulation
+    from .studies.sweep import sweep
 
-__all__ = ["Case", "Simulation", "__version__", "open_result", "write_mesh"]
+__all__ = [
+    "Case",
+    "EarlyStop",
+    "InputError",
+    "LivePlot",
+    "NotConverged",
+    "PfemError",
+    "Simulation",
+    "SimulationFailure",
+    "Table",
+    "Truss",
+    "__version__",
+    "open_result",
+    "sweep",
+    "write_mesh",
+]
 
 __version__ = "0.2.0"
 
 _HOMES = {
     "Case": ".case.schema",
+    **dict.fromkeys(("EarlyStop", "InputError", "NotConverged", "PfemError", "SimulationFailure"), ".errors"),
+    "Truss": ".mesh.truss",
     "Simulation": ".simulation",
+    "LivePlot": ".post.live",
+    "Table": ".output.table",
     "open_result": ".output.result",
+    "sweep": ".studies.sweep",
     "write_mesh": ".mesh.writing",
 }
 

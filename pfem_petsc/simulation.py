@@ -30,6 +30,7 @@ from .run.outputs import Outputs
 from .run.stages import Stages
 from .run.stop import StopRequest
 from .run.synchroniser import Synchroniser
+from .statics.equations import WithEquations
 from .stepping.fused_steps import WORTH, Batches
 from .stepping.model import Model
 from .stepping.stepper import Stepper
@@ -37,7 +38,7 @@ from .stepping.stepper import Stepper
 __all__ = ["Simulation", "Step"]
 
 
-class Simulation:
+class Simulation(WithEquations):
     """The simulation of a case on a communicator; a context manager that closes it.
 
     Only one run at a time writes into an output folder: the folder is locked from :meth:`start` to the end of the
@@ -84,7 +85,8 @@ class Simulation:
                 "Case.from_dict from tables"
             )
         self._stop = StopRequest(wall_time)
-        self.case = case
+        # later changes of the case are those of other simulations
+        self.case = case = case.copy(fixed=True)
         self.comm = comm if comm is not None else MPI.COMM_WORLD
         self.folder = Path(output) if output is not None else Path("results") / case.name
         self.quiet = quiet
@@ -143,6 +145,7 @@ class Simulation:
         try:
             self._finish("stopped")
         finally:
+            self._free_equations()
             self.analysis.close()
 
     def _usable(self) -> None:

@@ -33,7 +33,7 @@ FLOORS = (
     ("run",),
     ("simulation",),
     ("__init__",),  # the public interface
-    ("bench", "post"),
+    ("bench", "post", "studies"),
     ("cli",),
     ("__main__",),
 )

@@ -7,6 +7,7 @@ name of the key, before any work is done. Imports pydantic only.
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -26,6 +27,7 @@ __all__ = [
     "StrictModel",
     "Vector3",
     "WallParameters",
+    "WithParameters",
     "is_finite_number",
     "listed",
     "number_or_rows",
@@ -34,14 +36,55 @@ __all__ = [
 
 
 class StrictModel(BaseModel):
-    """A table of a case file: no unknown keys, values of the stated type only, finite numbers only, frozen.
+    """A table of a case file: no unknown keys, values of the stated type only, finite numbers only.
 
-    An integer is accepted as a float; a string or a boolean is never accepted as a number.
+    An integer is accepted as a float; a string or a boolean is never accepted as a number. A table of a case has its
+    place there: a key that is set is validated with the whole case (:mod:`pfem_petsc.case.editing`). Any other is
+    frozen.
     """
+
+    __slots__ = ("_place",)
 
     model_config = ConfigDict(
         extra="forbid", frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True
     )
+
+    def __setattr__(self, key: str, value: Any) -> None:
+        place = getattr(self, "_place", None)
+        if place is None or key.startswith("_"):
+            super().__setattr__(key, value)
+        else:
+            place.change(key, value)
+
+    def __repr_args__(self) -> Iterable[tuple[str | None, Any]]:
+        return [(key, value) for key, value in super().__repr_args__() if value is not None]
+
+    def __delattr__(self, key: str) -> None:
+        place = getattr(self, "_place", None)
+        if place is None:
+            super().__delattr__(key)
+        else:
+            place.change(key, None)
+
+
+class WithParameters(StrictModel):
+    """A table with the keys of a scheme, generator or method, which is found by name, among its own."""
+
+    __slots__ = ()
+
+    @property
+    def _others(self) -> StrictModel | None:
+        return self.__dict__.get("scheme") or self.__dict__.get("parameters")
+
+    def __getattr__(self, key: str) -> Any:
+        others = None if key.startswith("_") else self._others
+        if others is not None and key in type(others).model_fields:
+            return getattr(others, key)
+        return super().__getattr__(key)  # type: ignore[misc]
+
+    def __dir__(self) -> list[str]:
+        others = self._others
+        return sorted({*super().__dir__(), *(type(others).model_fields if others is not None else ())})
 
 
 def _tuple_from_list(value: Any) -> Any:

@@ -9,11 +9,15 @@ from typing import Any
 
 from ..errors import InputError
 
-__all__ = ["apply_overrides", "split_key"]
+__all__ = ["apply_overrides", "put", "split_key", "take_out"]
 
 LISTS = {
     ("load",),
     ("support",),
+    ("mass",),
+    ("spring",),
+    ("dashpot",),
+    ("remove",),
     ("temperature",),
     ("wall",),
     ("contact_pair",),
@@ -58,9 +62,9 @@ def apply_overrides(data: dict[str, Any], overrides: Iterable[str]) -> list[tupl
         if not equals or parts is None:
             raise InputError(f"--set {text}: expected KEY=VALUE, like time.step=1e-5 or wall.0.point=[1.0, 0.0, 0.0]")
         if not value.strip():
-            _take_out(data, parts)
+            take_out(data, parts)
             continue
-        paths.append(_put(data, parts, _value(value.strip()), f"--set {text}"))
+        paths.append(put(data, parts, _value(value.strip()), f"--set {text}"))
     return paths
 
 
@@ -91,7 +95,8 @@ def split_key(key: str) -> list[str] | None:
     return parts if parts and all(parts) else None
 
 
-def _take_out(data: dict[str, Any], parts: list[str]) -> None:
+def take_out(data: dict[str, Any], parts: list[str]) -> None:
+    """Remove the value at the parts of a key, if it is there."""
     here: Any = data
     for k, part in enumerate(parts):
         key = int(part) if isinstance(here, list) and _is_place(part) else part
@@ -107,7 +112,14 @@ def _is_place(part: str) -> bool:
     return part.isascii() and part.isdigit() and len(part) <= 18
 
 
-def _put(data: dict[str, Any], parts: list[str], value: Any, where: str) -> tuple[str | int, ...]:
+def put(data: dict[str, Any], parts: list[str], value: Any, where: str) -> tuple[str | int, ...]:
+    """Set the value at the parts of a key, and return its path; missing tables are created.
+
+    Raises
+    ------
+    InputError
+        Beginning with ``where``, if the key leads through a value, or beyond the end of a list.
+    """
     path: tuple[str | int, ...] = ()
     here: Any = data
     for k, part in enumerate(parts):

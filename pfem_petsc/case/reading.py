@@ -179,6 +179,8 @@ def _siblings(package: str) -> dict[str, list[str]]:
 
 
 def _mesh(data: Mapping[str, Any], folder: Path, problems: Problems) -> t.Mesh | None:
+    if hasattr(data.get("mesh"), "mesh_table"):  # a truss from arrays
+        data = {"mesh": data["mesh"].mesh_table}
     table = _required(data, "mesh", problems)
     if table is None:
         return None
@@ -305,7 +307,7 @@ def _time(data: Mapping[str, Any], problems: Problems) -> s.Time | None:
         problems.add(("time", "step"), message, "auto")
     if keys is None or scheme is None:
         return None
-    return s.Time(**keys.model_dump(), scheme=scheme)
+    return s.Time(**keys.model_dump(exclude_unset=True), scheme=scheme)
 
 
 def _output(data: Any, problems: Problems) -> s.Output | None:
@@ -313,5 +315,6 @@ def _output(data: Any, problems: Problems) -> s.Output | None:
         problems.add(("output",), "expected a table", data)
         return None
     probes = _listed(s.Probe, data.get("probe"), ("output", "probe"), problems)
+    given = {"probe": tuple(probes)} if probes else {}
     keys = problems.read(s.OutputKeys, {k: v for k, v in data.items() if k != "probe"}, ("output",))
-    return None if keys is None else s.Output(**keys.model_dump(), probe=tuple(probes))
+    return None if keys is None else s.Output(**keys.model_dump(exclude_unset=True), **given)

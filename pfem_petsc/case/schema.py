@@ -5,13 +5,17 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 from pydantic import BaseModel
 
 from ..errors import InputError
+from ..registry import lookup
 from .builtin import built_in_cases, built_in_path
 from .checks import check_names
+from .containers import CaseTables
+from .editable import Editable
+from .editing import attribute_of, settle
 from .overrides import apply_overrides
 from .problems import Problems
 from .reading import KEYS, parse_toml, read_tables
@@ -21,8 +25,17 @@ from .toml import plain, table_text
 __all__ = ["Case"]
 
 
-class Case:
-    """A validated case, immutable. Created by :meth:`load`, :meth:`from_toml` or :meth:`from_dict`.
+class Case(Editable):
+    """A validated case. Created by :meth:`from_file` (or :meth:`load`), from its text, or from tables.
+
+    ``Case(mesh=..., material={...}, section={...}, time={...})`` takes the tables of a case file, all at once as nested
+    tables (``Case({...}, mesh=truss)``), or by name; the mesh may be a :class:`~pfem_petsc.mesh.truss.Truss`. NumPy
+    numbers and arrays, tuples and paths are accepted for the TOML types.
+
+    Its tables can be changed: ``case.time.step = 1e-5``, ``case.material["steel"].young_modulus = 2e11``,
+    ``case.wall.append({...})``, ``case.gravity = None`` (no gravity). Each change is validated with the whole case; an
+    :class:`~pfem_petsc.errors.InputError` with the message of a case file leaves the case as it was. :meth:`update`
+    makes changes that are valid only together. A simulation has a copy of its case.
 
     Attributes
     ----------
@@ -44,22 +57,47 @@ class Case:
     given : tables that a stage gives itself, and does not have from the stages before
     removes_bars : whether bars are removed, in this or another stage
 
+    Raises
+    ------
+    InputError
+        Names all invalid keys.
+
     Notes
     -----
-    ``Case.load`` is the constructor, ``case.load`` the list of loads: an instance's attribute hides the classmethod.
+    ``Case.load`` is a constructor, ``case.load`` the list of loads: an instance's attribute hides the classmethod.
     """
 
-    def __init__(self, attributes: Mapping[str, Any], *, name: str, source: str, folder: Path) -> None:
-        for key in KEYS:
-            attribute = "point_mass" if key == "mass" else key
-            self.__dict__[attribute] = attributes.get(key, ()) if key == "stage" else attributes[key]
-        self.__dict__.update(name=name, source=source, folder=Path(folder), overrides=(), number=0, given=())
-        self.__dict__["removes_bars"] = any(entry.bars is not None for entry in self.remove)
+    def __init__(
+        self,
+        tables: Mapping[str, Any] | None = None,
+        /,
+        *,
+        name: str | None = None,
+        source: str = "case",
+        folder: str | Path = ".",
+        overrides: Iterable[str] = (),
+        **named: Unpack[CaseTables],
+    ) -> None:
+        given = {key: value for key, value in named.items() if value is not None}
+        data = {} if tables is None else tables
+        if isinstance(data, Mapping):
+            mesh = given.pop("mesh", None)
+            data = {**data, **given}
+            made = Case.from_dict(data, name=name, source=source, folder=folder, overrides=overrides, mesh=mesh)
+        else:
+            made = Case.from_dict(data, source=source)
+        self.__dict__.update(made.__dict__)
+        settle(self)
 
-    def __setattr__(self, key: str, value: Any) -> None:
-        raise AttributeError(
-            f"a case cannot be changed after it has been checked; pass {key} to Case.load as an override"
-        )
+    @classmethod
+    def _of(cls, attributes: Mapping[str, Any], *, name: str, source: str, folder: Path) -> Case:
+        """The case of tables that were read."""
+        case = cls.__new__(cls)
+        for key in KEYS:
+            case.__dict__[attribute_of(key)] = attributes.get(key, ()) if key == "stage" else attributes[key]
+        case.__dict__.update(name=name, source=source, folder=Path(folder), overrides=(), number=0, given=())
+        case.__dict__.update(removes_bars=any(entry.bars is not None for entry in case.remove), fixed=False)
+        return case
 
     def __eq__(self, other: object) -> bool:
         """Compare the content, without name, source and folder."""
@@ -69,6 +107,9 @@ class Case:
 
     def __repr__(self) -> str:
         return f"<Case {self.name}: {self.title}>"
+
+    def _repr_html_(self) -> str:
+        return lookup("pfem_petsc.post", "inline", "").of_case(self)
 
     @property
     def stages(self) -> tuple[Case, ...]:
@@ -106,13 +147,14 @@ class Case:
         return (self.modes is not None and self.modes.mass) or "lumped"
 
     @classmethod
-    def load(cls, path_or_name: str | Path, overrides: Iterable[str] = ()) -> Case:
+    def load(cls, path_or_name: str | Path, overrides: Iterable[str] = (), *, mesh: Any = None) -> Case:
         """Read a case file, or a built-in case by its name.
 
         Parameters
         ----------
         path_or_name : TOML file, or name of a built-in case
         overrides : texts such as ``"time.step=1e-5"`` that override values of the file
+        mesh : Truss instead of the mesh of the file
 
         Raises
         ------
@@ -120,7 +162,10 @@ class Case:
             Names all invalid keys.
         """
         path = built_in_path(str(path_or_name)) or Path(path_or_name)
-        return cls.from_toml(_read_text(path), path.parent, name=path.stem, source=str(path), overrides=overrides)
+        named: dict[str, Any] = {"name": path.stem, "source": str(path), "overrides": overrides, "mesh": mesh}
+        return cls.from_toml(_read_text(path), path.parent, **named)
+
+    from_file = load
 
     @classmethod
     def from_toml(
@@ -131,9 +176,11 @@ class Case:
         name: str = "case",
         source: str = "case",
         overrides: Iterable[str] = (),
+        mesh: Any = None,
     ) -> Case:
         """Read the text of a case; see :meth:`load`. The path of its mesh file is relative to ``folder``."""
-        return cls.from_dict(parse_toml(text, source), name=name, source=source, folder=folder, overrides=overrides)
+        data = parse_toml(text, source)
+        return cls.from_dict(data, name=name, source=source, folder=folder, overrides=overrides, mesh=mesh)
 
     @classmethod
     def from_dict(
@@ -144,6 +191,7 @@ class Case:
         source: str = "case",
         folder: str | Path = ".",
         overrides: Iterable[str] = (),
+        mesh: Any = None,
     ) -> Case:
         """Validate a case given as nested tables with the keys of the case file; see :meth:`load`.
 
@@ -158,6 +206,8 @@ class Case:
         try:
             overrides = tuple(overrides)
             data = plain(dict(data), copied=bool(overrides))
+            if mesh is not None:
+                data["mesh"] = _with_arrays(data.get("mesh"), plain(mesh))
         except RecursionError as error:
             raise InputError(f"{source}: this is not a case: its lists or tables are nested too deep") from error
         problems = Problems(source, apply_overrides(data, overrides))
@@ -171,17 +221,18 @@ class Case:
         problems.raise_if_any()
         name = Path(source).stem if name is None else name
         attributes["title"] = name if attributes["title"] is None else attributes["title"]
-        case = cls(attributes, name=name, source=source, folder=Path(folder))
+        case = cls._of(attributes, name=name, source=source, folder=Path(folder))
         case.__dict__["overrides"] = overrides
         made = []
         for k, (stage, tables) in enumerate(stages):
-            each = cls(tables, name=stage.name, source=f"{source}: stage[{k}]", folder=Path(folder))
+            each = cls._of(tables, name=stage.name, source=f"{source}: stage[{k}]", folder=Path(folder))
             made.append(each)
             each.__dict__.update(title=attributes["title"], number=k, given=stage.given, overrides=overrides)
         case.__dict__["stage"] = tuple(made)
         removes = any(each.removes_bars for each in (case, *made))
         for each in (case, *made):
             each.__dict__["removes_bars"] = removes
+        settle(case)
         return case
 
     def to_dict(self) -> dict[str, Any]:
@@ -204,10 +255,11 @@ class Case:
         everywhere = [entry for entry in self.initial if entry.node_set is None]
         initial = _table(everywhere[0]) if everywhere else {}
         on = [_table(entry) for entry in self.initial if entry.node_set is not None]
-        mesh = _table(self.mesh)
+        parameters = self.mesh.parameters
+        mesh = parameters.table() if hasattr(parameters, "table") else _table(parameters)
         return {
             "title": self.title,
-            "mesh": {**mesh, **_table(self.mesh.parameters)},
+            "mesh": {**_table(self.mesh), **mesh},
             "node_set": {name: _table(entry) for name, entry in self.node_set.items()},
             "material": {name: _table(entry) for name, entry in self.material.items()},
             "section": {name: _table(entry) for name, entry in self.section.items()},
@@ -242,6 +294,13 @@ def _table(model: BaseModel | None) -> dict[str, Any]:
         return {}
     data = model.model_dump(exclude_none=True, exclude={"scheme", "parameters"})
     return {key: str(value) if isinstance(value, Path) else value for key, value in data.items()}
+
+
+def _with_arrays(table: Any, mesh: Any) -> Any:
+    """The table [mesh] with a truss instead of what it had; the truss must be that of its digest, if it has one."""
+    if isinstance(table, Mapping) and "digest" in table and hasattr(mesh, "mesh_table"):
+        return {**mesh.mesh_table, "digest": table["digest"]}
+    return mesh
 
 
 def _read_text(path: Path) -> str:

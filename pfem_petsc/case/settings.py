@@ -14,6 +14,7 @@ from .base import (
     PositiveFloat,
     PositiveInt,
     StrictModel,
+    WithParameters,
     is_finite_number,
     listed,
 )
@@ -82,7 +83,7 @@ def _computable(seconds: float) -> float:
     return seconds
 
 
-class Time(TimeKeys):
+class Time(TimeKeys, WithParameters):
     """The time integration: scheme, its parameters, step and end."""
 
     scheme: InstanceOf[StrictModel]
@@ -95,7 +96,7 @@ class StaticKeys(StrictModel):
     """name of a method that finds equilibria"""
 
 
-class Static(StaticKeys):
+class Static(StaticKeys, WithParameters):
     """The static analysis: method and its parameters."""
 
     parameters: InstanceOf[StrictModel]

@@ -14,7 +14,7 @@ from ..registry import nearest
 from .base import Name, NonNegativeInt, PositiveInt, StrictModel
 from .problems import Path, Problems
 
-__all__ = ["ANALYSES", "TABLES", "StageTables", "stages_of"]
+__all__ = ["ANALYSES", "ONE_STAGE", "TABLES", "StageOutput", "StageTables", "stages_of"]
 
 ANALYSES = ("time", "static")
 """Tables of which a stage has exactly one."""
@@ -35,7 +35,7 @@ TABLES = (
 """Tables that a stage may give."""
 
 
-_OF_ONE_STAGE = ("initial", "remove")
+ONE_STAGE = ("initial", "remove")
 """Tables that are in force in the stage alone that gives them."""
 
 
@@ -108,7 +108,7 @@ def stages_of(data: Mapping[str, Any], problems: Problems) -> list[StageTables]:
         tables = {key: row[key] for key in given}
         if "output" in tables:
             tables["output"] = _output(tables["output"], common.get("output", {}), k, problems)
-        for key in _OF_ONE_STAGE if k else ():
+        for key in ONE_STAGE if k else ():
             common.pop(key, None)
         common |= tables
         owner |= dict.fromkeys((*given, *ANALYSES), k)

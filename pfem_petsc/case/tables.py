@@ -17,6 +17,7 @@ from .base import (
     PositiveFloat,
     StrictModel,
     Vector3,
+    WithParameters,
     listed,
     number_or_rows,
 )
@@ -25,6 +26,7 @@ from .point_tables import Dashpot, NodalMass, Spring
 from .rows import FileName, Table4, increasing
 
 __all__ = [
+    "ARRAYS",
     "ContactPair",
     "Dashpot",
     "Gravity",
@@ -49,6 +51,10 @@ __all__ = [
 Indices = Annotated[tuple[NonNegativeInt, ...], listed]
 
 
+ARRAYS = "arrays"
+"""The generator of meshes that are given as arrays, or in the case file itself."""
+
+
 PRESTRESSES = ("pretension", "prestress", "rest_length")
 """Keys of a section that prescribe rest lengths."""
 
@@ -69,12 +75,17 @@ class MeshKeys(StrictModel):
         return self
 
 
-class Mesh(StrictModel):
+class Mesh(WithParameters):
     """Source of the mesh: a generator with its parameters, or a file."""
 
     generator: str | None = None
     file: Path | None = None
     parameters: InstanceOf[StrictModel] | None = None
+
+    @property
+    def arranged(self) -> bool:
+        """Whether a generator computes the mesh, which is then free of mistakes."""
+        return self.generator not in (None, ARRAYS)
 
 
 class NodeSet(StrictModel):

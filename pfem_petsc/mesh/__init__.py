@@ -23,8 +23,8 @@ def load_slab(
     Parameters
     ----------
     mesh : the ``[mesh]`` table of a case
-        With ``generator`` and ``parameters``, or ``file``: the suffix chooses the reader (``.msh``, ``.vtu``,
-        ``.vtkhdf``, ``.h5``).
+        With ``generator`` and ``parameters`` (arrays are one), or ``file``: the suffix chooses the reader (``.msh``,
+        ``.vtu``, ``.vtkhdf``, ``.h5``).
     fields : names of cell fields to read, each with the key that asks for it, for messages
     groups : names of the groups that are used; a generator may leave out other bar groups. None: all are
 

@@ -3,18 +3,72 @@
 from __future__ import annotations
 
 import os
+from html import escape
+from math import inf
+from time import monotonic
 from typing import TextIO
 
-__all__ = ["ProgressBar", "is_terminal"]
+__all__ = ["NotebookBar", "ProgressBar", "is_notebook", "is_terminal"]
 
 # Open MPI gives rank 0 a pseudo-terminal, so isatty() alone would draw a bar into the line-wise forwarding of mpirun.
 _LAUNCHERS = ("OMPI_COMM_WORLD_SIZE", "PMI_RANK", "PMIX_RANK", "SLURM_PROCID")
+
+NOTEBOOK_REFRESH = 0.5  # seconds between two updates of a bar in a notebook
 
 
 def is_terminal(stream: TextIO) -> bool:
     """Return whether a bar can be drawn into a stream: not into files, pipes, or the output of a launcher."""
     launched = any(name in os.environ for name in _LAUNCHERS)
     return stream.isatty() and not launched and os.environ.get("TERM", "dumb") != "dumb"
+
+
+def is_notebook(stream: TextIO) -> bool:
+    """Return whether a stream is the output of a cell of a notebook."""
+    return type(stream).__module__.partition(".")[0] == "ipykernel"
+
+
+class NotebookBar:
+    """A bar below the cell of a notebook, in place of lines; the same interface as :class:`ProgressBar`.
+
+    Parameters
+    ----------
+    title : str
+    stream : TextIO
+        The output of the cell.
+    """
+
+    def __init__(self, title: str, stream: TextIO) -> None:
+        from IPython.display import HTML, display
+
+        self._html, self._title, self._stream = HTML, title, stream
+        self._drawn = -inf
+        self._last = 0.0, ""
+        self._handle = display(HTML(self._text()), display_id=True)
+
+    def _text(self) -> str:
+        done, state = self._last
+        return (
+            f'<progress value="{done:.4f}" max="1" style="width: 20em"></progress> {100 * done:.0f} % '
+            f"<code>{escape(state)}</code> {escape(self._title)}"
+        )
+
+    def draw(self, done: float, state: str) -> None:
+        """Redraw the bar, twice a second at most."""
+        self._last = done, state
+        if monotonic() - self._drawn >= NOTEBOOK_REFRESH:
+            self._show()
+
+    def _show(self) -> None:
+        self._drawn = monotonic()
+        self._handle.update(self._html(self._text()))
+
+    def print(self, text: str, style: str | None = None) -> None:
+        """Print a line below the cell."""
+        print(text, file=self._stream, flush=True)
+
+    def stop(self) -> None:
+        """Draw the last state, which remains."""
+        self._show()
 
 
 class ProgressBar:

@@ -6,12 +6,13 @@ import contextlib
 import os
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Self, TextIO
 
 from ..parallel.agreement import agreed
-from .bar import ProgressBar, is_terminal
+from .bar import NotebookBar, ProgressBar, is_notebook, is_terminal
 from .log import LogFile
 from .units import TIME, Axis, duration
 
@@ -32,9 +33,9 @@ def _speed(rate: float) -> str:
 class Progress:
     """Progress report of a run. Rank 0 writes; on the other ranks every call returns at once.
 
-    On a terminal a bar is drawn; elsewhere (files, pipes, under ``mpirun``) a line is printed after 2 s and then at
-    intervals that grow to 10 s. ``log.txt`` gets the lines in any case, each with date and level; an existing log is
-    continued. Between two reports :meth:`update` costs a few additions and one reading of the clock.
+    On a terminal and in a notebook a bar is drawn; elsewhere (files, pipes, under ``mpirun``) a line is printed after
+    2 s and then at intervals that grow to 10 s. ``log.txt`` gets the lines in any case, each with date and level; an
+    existing log is continued. Between two reports :meth:`update` costs a few additions and one reading of the clock.
 
     A log that cannot be opened at the start is an :class:`~pfem_petsc.errors.InputError` on all ranks (the constructor
     is collective); for a log that is lost during the run see :class:`~pfem_petsc.output.log.LogFile`. If the reader of
@@ -71,7 +72,7 @@ class Progress:
         self._axis = axis
         self._title, self._n_steps, self._end_time = title, n_steps, end_time
         self._stream = None if quiet else (stream or sys.stdout)
-        self._bar: ProgressBar | None = None
+        self._bar: NotebookBar | ProgressBar | None = None
         self._log: LogFile | None = None
         self._clock = clock
         with agreed(comm):
@@ -87,8 +88,9 @@ class Progress:
         self._next_line = self._due = self._begin + FIRST_LINE
         self._closed = False
         self._compiling = 0.0
-        if self._root and self._stream is not None and is_terminal(self._stream):
-            self._bar = ProgressBar(title, self._stream)
+        if self._root and self._stream is not None and (is_notebook(self._stream) or is_terminal(self._stream)):
+            kind = NotebookBar if is_notebook(self._stream) else ProgressBar
+            self._bar = kind(title, self._stream)
             self._due = self._begin + BAR_REFRESH
 
     def __enter__(self) -> Self:
@@ -98,12 +100,13 @@ class Progress:
         self.close("done" if kind is None else "stopped")
 
     def summary(self, entries: dict[str, str]) -> None:
-        """Print the start-up block: label and text of each entry, aligned."""
+        """Print the start-up block: label and text of each entry, aligned; in a notebook it goes to the log alone."""
         if not self._root:
             return
         width = max((len(label) for label in entries), default=0)
+        write = self._write if not isinstance(self._bar, NotebookBar) else partial(self._log_line, level="INFO")
         for line in [self._title, *(f"  {label:<{width}}  {text}" for label, text in entries.items())]:
-            self._write(line)
+            write(line)
 
     def update(
         self,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -12,12 +12,13 @@ import h5py
 import numpy as np
 
 from ..errors import InputError
-from ..registry import nearest
+from ..registry import lookup, nearest
 from .hdf5 import HDF5_ERRORS, dataset_names
 from .history import EVENT
 from .layout import complete_rows, complete_snapshots
 from .modes import MODES, NAMES, complete_modes
 from .provenance import read_attributes
+from .table import Table, flat_columns
 from .units import AXES, TIME, Axis
 
 if TYPE_CHECKING:
@@ -184,6 +185,38 @@ class Result:
             grid.cell_data[name] = self.field(name, i)
         grid.field_data["TimeValue"] = [self.times[i]]
         return grid
+
+    grid = mesh
+
+    def table(self, names: Iterable[str] | None = None) -> Table:
+        """Return columns of the history as a table, with the times.
+
+        Vectors (rows, 3) become three columns, ``momentum.x``, ``momentum.y``, ``momentum.z``; those of nodes have the
+        number of the node in the set before, ``probe/tip/position[0].x``.
+
+        Parameters
+        ----------
+        names : of columns, or of groups of them as ``wall/floor``; default: all but those of events
+
+        Raises
+        ------
+        InputError
+            If there is no such column.
+        """
+        known = [name for name in self._columns if not name.startswith(f"{EVENT}/")]
+        chosen = known if names is None else [name for name in ("step", "time") if name in known]
+        for name in () if names is None else names:
+            found = [column for column in known if column == name or column.startswith(f"{name}/")]
+            if not found:
+                raise InputError(f"{self.path}: history has no {name}{nearest(name, known)}")
+            chosen += [column for column in found if column not in chosen]
+        columns: dict[str, np.ndarray] = {}
+        for name in chosen:
+            columns |= flat_columns(name, self.history[name])
+        return Table(columns)
+
+    def _repr_html_(self) -> str:
+        return lookup("pfem_petsc.post", "inline", "").of_result(self)
 
     def _snapshot(self, name: str, i: int, n_rows: int) -> np.ndarray:
         if not -len(self.times) <= i < len(self.times):

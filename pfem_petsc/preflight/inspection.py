@@ -76,8 +76,8 @@ def inspect(case: Case, model: Model) -> tuple[dict[str, str], list[str]]:
 
 
 def _is_own(case: Case) -> bool:
-    """Whether nodes and bars come from the user: from a file, or from a unit cell of a lattice."""
-    return case.mesh.generator is None or getattr(case.mesh.parameters, "cell", None) is not None
+    """Whether nodes and bars come from the user: from a file, arrays, or from a unit cell of a lattice."""
+    return not case.mesh.arranged or getattr(case.mesh.parameters, "cell", None) is not None
 
 
 def _nodes_on_bars(mesh: DistributedMesh, entries: dict[str, str]) -> list[str]:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..output.checkpoint import NAME
 from ..output.checkpoint_writer import write_checkpoint
+from ..output.provenance import installed_version
 from .compare import check_mesh_is_the_same, mesh_mark
 from .folder import Restart
 from .state import STATE_VERSION, RunState
@@ -79,7 +79,7 @@ class Checkpoints:
             return
         attributes = {
             "state_version": STATE_VERSION,
-            "pfem_petsc": _version(),
+            "pfem_petsc": installed_version(),
             "name": self.case.name,
             "overrides": list(self.case.overrides),
             "case": self.case.to_dict(),
@@ -105,10 +105,3 @@ class Checkpoints:
         if restart.continues:
             self.last_step = restart.step
         return checkpoint
-
-
-def _version() -> str:
-    try:
-        return metadata.version("pfem_petsc")
-    except metadata.PackageNotFoundError:
-        return "not installed"

@@ -8,7 +8,6 @@ modes that multigrid needs, and a change of the active set requires no set-up.
 
 from __future__ import annotations
 
-import atexit
 import weakref
 from typing import TYPE_CHECKING
 
@@ -18,6 +17,7 @@ from petsc4py import PETSc
 from .linear import set_preconditioner
 from .matrix import HessianMatrix
 from .matrix_free import MatrixFreeHessian
+from .outlive import at_exit
 
 if TYPE_CHECKING:
     from ..stepping.model import Model
@@ -239,7 +239,7 @@ class Preconditioning:
         self.solver = weakref.ref(solver)
         self.snes = weakref.ref(snes)
         self.bounded = bounded
-        atexit.register(_let_go, self.snes)
+        at_exit(_let_go, snes)
 
     def setUp(self, pc: PETSc.PC) -> None:  # noqa: N802 - PETSc's name
         """Handle a change of the operator; called by PETSc."""

@@ -6,7 +6,6 @@ reads a quarter of the memory. Contact problems use the restriction of the opera
 
 from __future__ import annotations
 
-import atexit
 import weakref
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
@@ -18,7 +17,7 @@ from ..mechanics.compiled import inlined, kernel
 from ..mechanics.mass import consistent_product
 from ..mechanics.rows import CHUNK
 from ..mechanics.strips import add_strips, differences
-from .outlive import outlive
+from .outlive import at_exit, outlive
 
 if TYPE_CHECKING:
     from ..stepping.model import Model
@@ -176,7 +175,7 @@ class _Extension:
         self.mat.setBlockSize(3)
         self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         self.mat.setUp()
-        atexit.register(outlive, weakref.ref(self.mat))
+        at_exit(outlive, self.mat)
 
     def mult(self, mat: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Y = H x; called by PETSc."""
@@ -214,7 +213,7 @@ class MatrixFreeHessian:
         self.mat = PETSc.Mat().createPython(((local, total), (local, total)), _Context(self), comm=mesh.comm)
         self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         self.mat.setUp()
-        atexit.register(outlive, weakref.ref(self.mat))
+        at_exit(outlive, self.mat)
         self.bounded = self.mat
         self.stored = np.zeros((5, len(mesh.bars)))
         self._u = np.zeros((mesh.n_local, 3))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import atexit
 import re
 import weakref
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ from .lagged import LaggedPreconditioner, Preconditioning
 from .linear import LinearChoice, configure
 from .matrix import HessianMatrix
 from .matrix_free import MatrixFreeHessian
-from .outlive import outlive
+from .outlive import at_exit, outlive
 from .reasons import linear_reason, newton_reason
 
 if TYPE_CHECKING:
@@ -246,7 +245,7 @@ class NewtonSolver:
             # options are global to the process, but the next model has another length
             options.delValue("snes_vi_zero_tolerance")
         self._solvers[key] = snes
-        atexit.register(outlive, weakref.ref(snes))
+        at_exit(outlive, snes)
         return snes
 
     def _residual(self, snes: PETSc.SNES, u: PETSc.Vec, g: PETSc.Vec) -> None:

@@ -2,11 +2,34 @@
 
 from __future__ import annotations
 
+import atexit
+import itertools
 import weakref
+from collections.abc import Callable
 
 from petsc4py import PETSc
 
-__all__ = ["outlive"]
+__all__ = ["at_exit", "outlive"]
+
+_NUMBERS = itertools.count()
+_ALIVE: dict[int, tuple[Callable[[weakref.ref], None], weakref.ref]] = {}
+
+
+def at_exit(function: Callable[[weakref.ref], None], thing: object) -> None:
+    """Call a function with a reference to a PETSc object when Python exits, if the object still exists then.
+
+    Unlike ``atexit.register``, it keeps nothing of an object that is gone, of which a program that makes many runs has
+    many.
+    """
+    number = next(_NUMBERS)
+    if not number:
+        atexit.register(_call_all)
+    _ALIVE[number] = function, weakref.ref(thing, lambda _: _ALIVE.pop(number, None))
+
+
+def _call_all() -> None:
+    for function, reference in reversed(list(_ALIVE.values())):
+        function(reference)
 
 
 def outlive(reference: weakref.ref) -> None:

@@ -9,7 +9,6 @@ solver can be used.
 
 from __future__ import annotations
 
-import atexit
 import weakref
 from typing import TYPE_CHECKING
 
@@ -21,6 +20,7 @@ from ..contact.transform import Transform
 from ..errors import NotConverged
 from ..solvers.lagged import LaggedPreconditioner
 from ..solvers.linear import LinearChoice, configure
+from ..solvers.outlive import at_exit
 from ..solvers.reasons import linear_reason
 from ..stepping.problem import StepProblem
 
@@ -86,7 +86,7 @@ class BorderedSystem:
             self._ksp.setTolerances(rtol=_RTOL, max_it=2000)
         self._ksp.setOperators(hessian.mat, hessian.mat)
         self._ksp.setFromOptions()
-        atexit.register(_let_go, weakref.ref(self._ksp))
+        at_exit(_let_go, self._ksp)
         self.problem: StepProblem | None = None
 
     def begin(self, state: State) -> None:

@@ -47,7 +47,7 @@ def read_slab(path: Path, comm: MPI.Comm, fields: Mapping[str, str] | None = Non
     return importlib.import_module(f"{__name__}.{reader}").read(path, comm, fields or {})
 
 
-def missing_field(path: Path, fields: Mapping[str, str], known: Iterable[str]) -> str | None:
+def missing_field(path: Path | str, fields: Mapping[str, str], known: Iterable[str]) -> str | None:
     """Return the message about the first of ``fields`` that is not among the ``known`` cell fields of a file."""
     known = sorted(known)
     for name, key in fields.items():

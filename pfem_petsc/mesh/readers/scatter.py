@@ -13,7 +13,7 @@ from ...errors import InputError
 from ...parallel.agreement import agreed
 from ..slab import MeshSlab, check_size, slab_range
 
-__all__ = ["WholeMesh", "read_and_scatter"]
+__all__ = ["WholeMesh", "read_and_scatter", "scattered"]
 
 
 @dataclass
@@ -46,12 +46,17 @@ def read_and_scatter(read: Callable[[Path], WholeMesh], path: Path, comm: MPI.Co
                 whole = read(path)
             except MemoryError:
                 raise InputError(f"{path}: the mesh does not fit in memory; write it as .h5 for many ranks") from None
+    return scattered(whole, str(path), comm)
+
+
+def scattered(whole: WholeMesh | None, source: str, comm: MPI.Comm) -> MeshSlab:
+    """Send every rank its slab of the mesh that rank 0 has; None on the others. Collective."""
     head = None
     if whole is not None:
         names = [list(named) for named in (whole.node_groups, whole.bar_groups, whole.bar_fields)]
         head = (len(whole.points), len(whole.bars), *names, whole.warnings)
     n_nodes, n_bars, node_names, bar_names, field_names, warnings = comm.bcast(head)
-    check_size(n_nodes, str(path))
+    check_size(n_nodes, source)
     points = _scatter(comm, whole.points if whole else np.empty((0, 3)), n_nodes)
     bars = _scatter(comm, whole.bars if whole else np.empty((0, 2), np.int64), n_bars)
     return MeshSlab(
@@ -67,7 +72,7 @@ def read_and_scatter(read: Callable[[Path], WholeMesh], path: Path, comm: MPI.Co
             name: _scatter(comm, whole.bar_fields[name][:, None] if whole else np.empty((0, 1)), n_bars)[:, 0]
             for name in field_names
         },
-        source=str(path),
+        source=source,
         warnings=warnings,
     )
 

@@ -1,0 +1,79 @@
+"""Run a case for all combinations of values of some keys, and write a table."""
+
+from __future__ import annotations
+
+import argparse
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from ..errors import InputError, printable
+from .parser import PROGRAM, add_case, seconds
+
+RANKS = "one"
+
+EXAMPLE = f"""\
+examples:
+  {PROGRAM} sweep rod_impact --vary time.step=0.005,0.01,0.02
+  {PROGRAM} sweep my_case.toml --vary "initial.velocity=[1,0,0],[2,0,0]" --vary section.leg.area=1e-4,2e-4 --processes 4
+
+exit status: 0 all runs are done, 3 some are not (see the column status of the table)"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of the verb."""
+    add_case(parser)
+    parser.add_argument(
+        "--vary",
+        metavar="KEY=VALUES",
+        nargs="+",
+        action="extend",
+        required=True,
+        help="values of a key, with commas between them; several keys: all combinations",
+    )
+    parser.add_argument(
+        "-o", "--output", metavar="DIR", type=Path, help="output folder; default: results/NAME OF THE CASE-sweep"
+    )
+    parser.add_argument("--processes", metavar="N", type=int, default=1, help="number of runs at a time; default: 1")
+    parser.add_argument(
+        "--results", metavar="NAME", nargs="+", help="columns of the history whose last values the table has"
+    )
+    parser.add_argument("--remove", action="store_true", help="remove the results of the runs, and keep the table only")
+    parser.add_argument("--wall-time", metavar="TIME", type=seconds, help="stop a run after this time")
+    parser.add_argument("--quiet", action="store_true", help="no progress on the screen")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Make the runs, and print the table and the name of its file."""
+    from ..case.schema import Case
+    from ..studies.sweep import sweep
+
+    case = Case.load(arguments.case, arguments.overrides)
+    output = arguments.output or Path("results") / f"{case.name}-sweep"
+    table = sweep(
+        case,
+        dict(_values(text) for text in arguments.vary),
+        processes=arguments.processes,
+        results={name: name for name in arguments.results} if arguments.results else None,
+        output=output,
+        keep=not arguments.remove,
+        wall_time=arguments.wall_time,
+        quiet=arguments.quiet,
+    )
+    print(printable(str(table)))
+    print(output / "sweep.csv")
+    return 3 if table["status"].any() else 0
+
+
+def _values(text: str) -> tuple[str, list[Any]]:
+    """Return key and values of ``KEY=VALUE,VALUE``; values are TOML, or else plain texts."""
+    key, equals, values = text.partition("=")
+    if not equals or not values.strip():
+        raise InputError(f"--vary {text}: expected KEY=VALUES, like time.step=1e-5,2e-5")
+    try:
+        found = tomllib.loads(f"values = [{values}]")
+    except (ValueError, RecursionError):
+        return key.strip(), [value.strip() for value in values.split(",")]
+    if len(found) != 1:
+        raise InputError(f"--vary {text}: expected KEY=VALUES, like time.step=1e-5,2e-5")
+    return key.strip(), found["values"]

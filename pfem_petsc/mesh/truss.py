@@ -1,0 +1,212 @@
+"""Trusses from arrays, as meshes of cases."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..errors import InputError
+from ..registry import lookup
+from .arrays import slab_from_arrays
+
+if TYPE_CHECKING:
+    import pyvista
+    from mpi4py import MPI
+    from numpy.typing import ArrayLike
+
+    from .slab import MeshSlab
+
+__all__ = ["INLINE", "Truss"]
+
+INLINE = 10_000
+"""Number of nodes and bars up to which the text of a case has the arrays; beyond, it has their digest."""
+
+
+class Truss:
+    """Nodes and bars as the mesh of a case: ``Case(mesh=truss, ...)``.
+
+    Without ``comm`` every rank gives the same arrays, and has them whole; that the ranks agree is checked when the mesh
+    is distributed. With ``comm``, rank 0 alone gives arrays (they are ignored elsewhere, where they may be None),
+    checks them, and sends each rank its part when the mesh is distributed (a truss of up to 10,000 nodes and bars to
+    all of them at once); the call is then collective.
+
+    Parameters
+    ----------
+    points : (nodes, 3) positions [m]
+    bars : (bars, 2) integers, the nodes at the ends of each bar, numbered from 0
+    node_groups, bar_groups : numbers of the members, or a boolean mask, for each name
+    bar_fields : (bars,) numbers for each name, such as areas [m2] for ``area_field`` of sections
+    comm : whose rank 0 gives the arrays; default: all ranks give the same
+
+    Attributes
+    ----------
+    n_nodes, n_bars : int
+    points, bars, node_groups, bar_groups, bar_fields : as given, read-only; None where another rank has them
+    digest : str
+        Identifies the content.
+    warnings : list of str
+        About bars that are far shorter than the others.
+
+    Raises
+    ------
+    InputError
+        For arrays of wrong shape or type, and for a mesh that cannot be simulated: coordinates that are not finite,
+        bars of zero length, two bars between the same nodes, nodes without bars. With ``comm`` on all ranks.
+    """
+
+    points: np.ndarray | None = None
+    bars: np.ndarray | None = None
+    node_groups: Mapping[str, np.ndarray] | None = None
+    bar_groups: Mapping[str, np.ndarray] | None = None
+    bar_fields: Mapping[str, np.ndarray] | None = None
+
+    def __init__(
+        self,
+        points: ArrayLike | None,
+        bars: ArrayLike | None,
+        *,
+        node_groups: Mapping[str, ArrayLike] | None = None,
+        bar_groups: Mapping[str, ArrayLike] | None = None,
+        bar_fields: Mapping[str, ArrayLike] | None = None,
+        comm: MPI.Comm | None = None,
+    ) -> None:
+        given = points, bars, node_groups or {}, bar_groups or {}, bar_fields or {}
+        if comm is None:
+            self._take(*given)
+        else:
+            from ..parallel.agreement import on_root
+
+            self.__dict__.update(on_root(comm, self._take_on_root, *(given if comm.rank == 0 else ())))
+
+    def _take_on_root(self, *given: Any) -> dict[str, Any]:
+        """Take the arrays of rank 0, and return what all ranks have: all of a small truss, which is part of texts."""
+        self._take(*given)
+        if self.n_nodes + self.n_bars <= INLINE:
+            return self.__dict__
+        return {key: self.__dict__[key] for key in ("n_nodes", "n_bars", "digest", "warnings")}
+
+    def _take(self, points: Any, bars: Any, node_groups: Any, bar_groups: Any, bar_fields: Any) -> None:
+        from mpi4py import MPI
+
+        from .checks import check_mesh
+
+        slab = slab_from_arrays("Truss", points, bars, node_groups, bar_groups, bar_fields)
+        self.warnings = check_mesh(slab, MPI.COMM_SELF)
+        self.points, self.bars = _kept(slab.points), _kept(slab.bars)
+        self.node_groups = {name: _kept(members) for name, members in slab.node_groups.items()}
+        self.bar_groups = {name: _kept(members) for name, members in slab.bar_groups.items()}
+        self.bar_fields = {name: _kept(values) for name, values in slab.bar_fields.items()}
+        self.n_nodes, self.n_bars = slab.n_nodes, slab.n_bars
+        self.digest = _digest(slab)
+
+    @classmethod
+    def read(cls, path: Path | str, bar_fields: Iterable[str] = ()) -> Truss:
+        """Read a mesh file (``.msh``, ``.vtu``, ``.vtkhdf``, ``.h5``) with its groups and the named bar fields.
+
+        Raises
+        ------
+        InputError
+            As for the mesh file of a case.
+        """
+        from mpi4py import MPI
+
+        from .readers import read_slab
+
+        slab = read_slab(Path(path), MPI.COMM_SELF, dict.fromkeys(bar_fields, "bar_fields"))
+        return cls(
+            slab.points,
+            slab.bars,
+            node_groups=slab.node_groups,
+            bar_groups=slab.bar_groups,
+            bar_fields=slab.bar_fields,
+        )
+
+    def write(self, path: Path | str) -> Path:
+        """Write the truss to an HDF5 file for ``mesh.file``; see :func:`~pfem_petsc.mesh.writing.write_mesh`."""
+        from mpi4py import MPI
+
+        from .writing import write_mesh
+
+        self._require("written")
+        groups: dict[str, Any] = {"node_groups": self.node_groups, "bar_groups": self.bar_groups}
+        return write_mesh(path, self.points, self.bars, **groups, bar_fields=self.bar_fields, comm=MPI.COMM_SELF)
+
+    @cached_property
+    def lengths(self) -> np.ndarray:
+        """Lengths of the bars (bars,) [m]."""
+        self._require("measured")
+        return np.linalg.norm(self.points[self.bars[:, 1]] - self.points[self.bars[:, 0]], axis=1)
+
+    @property
+    def mesh_table(self) -> dict[str, Any]:
+        """The table ``[mesh]`` of a case that has this truss."""
+        return {"generator": "arrays", "truss": self}
+
+    def table(self) -> dict[str, Any]:
+        """Return the truss as nested lists with the keys of ``[mesh]``; a large one by its digest."""
+        if self.points is None or self.n_nodes + self.n_bars > INLINE:
+            return {"digest": self.digest}
+        tables = {"node_groups": self.node_groups, "bar_groups": self.bar_groups, "bar_fields": self.bar_fields}
+        lists = {key: {name: rows.tolist() for name, rows in table.items()} for key, table in tables.items() if table}
+        return {"points": self.points.tolist(), "bars": self.bars.tolist(), **lists}
+
+    def grid(self) -> pyvista.UnstructuredGrid:
+        """Return a pyvista grid of lines with the bar fields; groups are ``group/NAME``, 1 for members."""
+        import pyvista
+
+        self._require("drawn")
+        cells = np.column_stack([np.full(self.n_bars, 2), self.bars]).ravel()
+        grid = pyvista.UnstructuredGrid(cells, np.full(self.n_bars, pyvista.CellType.LINE, dtype=np.uint8), self.points)
+        for name, values in self.bar_fields.items():
+            grid.cell_data[name] = values
+        for groups, data, n in (
+            (self.node_groups, grid.point_data, self.n_nodes),
+            (self.bar_groups, grid.cell_data, self.n_bars),
+        ):
+            for name, members in groups.items():
+                mask = np.zeros(n, np.uint8)
+                mask[members] = 1
+                data[f"group/{name}"] = mask
+        return grid
+
+    def _require(self, what: str) -> None:
+        if self.points is None:
+            raise InputError(f"Truss: only rank 0 has the arrays of this truss, which cannot be {what} elsewhere")
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Truss) and self.digest == other.digest
+
+    def __hash__(self) -> int:
+        return hash(self.digest)
+
+    def _repr_html_(self) -> str:
+        return lookup("pfem_petsc.post", "inline", "").of_truss(self)
+
+    def __repr__(self) -> str:
+        groups = [*(self.node_groups or ()), *(self.bar_groups or ())]
+        named = f", groups {', '.join(groups)}" if groups else ""
+        return f"<Truss of {self.n_nodes} nodes and {self.n_bars} bars{named}>"
+
+
+def _kept(array: np.ndarray) -> np.ndarray:
+    kept = array.copy()
+    kept.flags.writeable = False
+    return kept
+
+
+def _digest(slab: MeshSlab) -> str:
+    """Return a digest of all arrays with their names."""
+    found = hashlib.sha256()
+    for array in (slab.points, slab.bars):
+        found.update(repr(array.shape).encode())
+        found.update(np.ascontiguousarray(array))
+    for kind, arrays in (("node", slab.node_groups), ("bar", slab.bar_groups), ("field", slab.bar_fields)):
+        for name, array in arrays.items():
+            found.update(repr((kind, name, array.shape)).encode())
+            found.update(np.ascontiguousarray(array))
+    return found.hexdigest()

@@ -1,0 +1,153 @@
+"""Tables: named columns of one length, for pandas, NumPy, CSV files and notebooks."""
+
+from __future__ import annotations
+
+import csv
+import html
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..errors import InputError
+
+if TYPE_CHECKING:
+    import pandas
+
+__all__ = ["Table", "flat_columns"]
+
+_SHOWN = 10  # rows shown at the beginning and at the end of a long table
+
+
+class Table(Mapping[str, np.ndarray]):
+    """Named columns of one length: ``table["time"]`` is an array (rows,).
+
+    Parameters
+    ----------
+    columns : arrays (rows,) by name, in order
+    """
+
+    def __init__(self, columns: Mapping[str, Sequence[Any] | np.ndarray]) -> None:
+        self._columns = {name: _column(values) for name, values in columns.items()}
+        self.n_rows = len(next(iter(self._columns.values()), ()))
+        for name, values in self._columns.items():
+            if len(values) != self.n_rows:
+                raise InputError(f"table: column {name!r} has {len(values)} rows, expected {self.n_rows}")
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        return self._columns[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._columns)
+
+    def __len__(self) -> int:
+        return len(self._columns)
+
+    @property
+    def rows(self) -> list[dict[str, Any]]:
+        """The rows as dictionaries."""
+        return [{name: values[i] for name, values in self.items()} for i in range(self.n_rows)]
+
+    def where(self, rows: np.ndarray) -> Table:
+        """Return a table of some rows, given by numbers or as a boolean mask (rows,)."""
+        return Table({name: values[rows] for name, values in self.items()})
+
+    def to_structured(self) -> np.ndarray:
+        """Return a structured array (rows,) with a field for each column."""
+        made = np.empty(self.n_rows, [(name, values.dtype) for name, values in self.items()])
+        for name, values in self.items():
+            made[name] = values
+        return made
+
+    def to_pandas(self) -> pandas.DataFrame:
+        """Return a data frame.
+
+        Raises
+        ------
+        InputError
+            If pandas is not installed.
+        """
+        try:
+            import pandas
+        except ImportError as error:
+            raise InputError("to_pandas needs pandas: pip install pandas; to_csv and to_structured do not") from error
+        return pandas.DataFrame(dict(self))
+
+    def to_csv(self, path: Path | str) -> Path:
+        """Write the table with a heading, numbers exact to the last digit; an earlier file is replaced.
+
+        Raises
+        ------
+        InputError
+            If the file cannot be written.
+        """
+        path = Path(path)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with path.open("w", newline="", encoding="utf-8") as file:
+                writer = csv.writer(file)
+                writer.writerow(self)
+                lists = [values.tolist() for values in self.values()]
+                writer.writerows(zip(*lists, strict=True))
+        except OSError as error:
+            raise InputError(f"{path}: the table cannot be written: {error.strerror}") from error
+        return path
+
+    def _texts(self) -> list[list[str]]:
+        """The heading and the shown rows as texts."""
+        shown = list(range(self.n_rows))
+        if self.n_rows > 2 * _SHOWN:
+            shown = [*shown[:_SHOWN], -1, *shown[-_SHOWN:]]
+        lines = [list(self)]
+        lines += [["…"] * len(self) if i < 0 else [_text(values[i]) for values in self.values()] for i in shown]
+        return lines
+
+    def __str__(self) -> str:
+        lines = self._texts()
+        widths = [max(len(line[k]) for line in lines) for k in range(len(self))]
+        return "\n".join("  ".join(f"{text:>{w}}" for text, w in zip(line, widths, strict=True)) for line in lines)
+
+    def __repr__(self) -> str:
+        return f"<Table of {self.n_rows} rows: {', '.join(self)}>"
+
+    def _repr_html_(self) -> str:
+        head, *body = self._texts()
+        rows = "".join(f"<tr>{''.join(f'<td>{html.escape(text)}</td>' for text in line)}</tr>" for line in body)
+        heading = "".join(f"<th>{html.escape(text)}</th>" for text in head)
+        return f"<table><thead><tr>{heading}</tr></thead><tbody>{rows}</tbody></table><p>{self.n_rows} rows</p>"
+
+
+def flat_columns(name: str, values: np.ndarray) -> dict[str, np.ndarray]:
+    """Return columns (rows,) of values (rows,), (rows, 3) or (rows, nodes, 3): ``name``, ``name.x``, ``name[0].x``."""
+    if values.ndim == 1:
+        return {name: values}
+    if values.ndim == 2 and values.shape[1] == 3:
+        return {f"{name}.{axis}": values[:, k] for k, axis in enumerate("xyz")}
+    found: dict[str, np.ndarray] = {}
+    for k in range(values.shape[1]):
+        found |= flat_columns(f"{name}[{k}]", values[:, k])
+    return found
+
+
+def _column(values: Sequence[Any] | np.ndarray) -> np.ndarray:
+    """Return values as an array (rows,), of objects where they are none of numbers and texts."""
+    if isinstance(values, np.ndarray) and values.ndim == 1:
+        return values
+    values = list(values)
+    if all(isinstance(value, bool | np.bool_) for value in values):
+        return np.array(values, dtype=bool)
+    if all(isinstance(value, int | np.integer) and not isinstance(value, bool) for value in values):
+        return np.array(values, dtype=np.int64)
+    if all(isinstance(value, int | float | np.number) and not isinstance(value, bool) for value in values):
+        return np.array(values, dtype=np.float64)
+    if all(isinstance(value, str) for value in values):
+        return np.array(values, dtype=np.str_)
+    made = np.empty(len(values), dtype=object)
+    made[:] = values
+    return made
+
+
+def _text(value: Any) -> str:
+    text = f"{value:.6g}" if isinstance(value, float | np.floating) else str(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."

@@ -1,0 +1,222 @@
+"""Sweeps: runs of a case for all combinations of values of some of its keys, as a table."""
+
+from __future__ import annotations
+
+import itertools
+import shutil
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..case.schema import Case
+from ..energies import LOST, STORED, SUPPLIED
+from ..errors import InputError
+from ..output.result import Result, open_result
+from ..output.table import Table
+from .pool import performed
+from .progress import SweepProgress
+from .worker import Report, Task
+
+__all__ = ["sweep"]
+
+_OWN = ("run", "status", "message", "wall_time", "steps")
+"""Columns that a table has besides parameters and results."""
+
+ResultFunction = Callable[[Result], Any]
+
+
+def sweep(
+    case: Case,
+    vary: Mapping[str, Sequence[Any]] | Sequence[Mapping[str, Any]],
+    *,
+    processes: int = 1,
+    results: ResultFunction | Mapping[str, ResultFunction | str] | None = None,
+    output: Path | str | None = None,
+    keep: bool = True,
+    wall_time: float | None = None,
+    quiet: bool = False,
+) -> Table:
+    """Run a case for all combinations of values of some keys, and return a table with a row for each.
+
+    Each run is made on one rank, in a process other than this one. A run that is refused, fails or crashes is a row
+    with its status and message, and the sweep goes on. Rows are in the order of the combinations, and are also written
+    to ``sweep.csv`` in the output folder as soon as they are there.
+
+    Parameters
+    ----------
+    case : Case
+    vary : values by key, ``{"time.step": [1e-5, 2e-5], "material.steel.young_modulus": [2e11]}``: all combinations, the
+        last key varying fastest; or a list of changes, each as of :meth:`Case.copy`, one for each run
+    processes : number of runs at a time
+    results : columns of results: a function of the finished :class:`Result` for each name, or a column of the history,
+        whose last value is taken; or one function that returns values by name. Functions are called in this process;
+        what they raise is the message of the row, whose status is 1. Default: the last values of time and of the
+        energies that occur [J], and the largest forces of walls and supports [N]
+    output : folder of the results, which are in folders ``0000``, ``0001``, ... in it; default:
+        ``results/<case name>-sweep``. An existing one is moved aside
+    keep : whether the results of the runs are kept, or removed as soon as their row is there (those of status 0)
+    wall_time : limit for each run [s]; a run that reaches it has status 4
+    quiet : print no progress
+
+    Returns
+    -------
+    Table with the columns ``run``, one for each key, ``status`` (0: done, 2: refused, 3: failed, 4: stopped, 1 or
+    negative: an unexpected error or signal), ``message``, ``wall_time`` [s], ``steps``, and the results (nan for runs
+    without).
+
+    Raises
+    ------
+    InputError
+        If no combination makes a valid case, or the output folder cannot be written.
+    """
+    changes = _combinations(vary)
+    if not isinstance(processes, int) or isinstance(processes, bool) or processes < 1:
+        raise InputError(f"sweep: processes = {processes!r}: give a positive whole number")
+    _require_one_rank()
+    folder = Path(output) if output is not None else Path("results") / f"{case.name}-sweep"
+    cases, refused = _cases(case, changes)
+    columns = _Columns(results)
+    folder = _prepared(folder)
+    progress = SweepProgress(len(changes), quiet)
+    rows: list[dict[str, Any]] = [{} for _ in changes]
+    tasks = {number: Task(each, folder / f"{number:04d}", wall_time) for number, each in cases.items()}
+    numbers = list(tasks)
+    for number, report in itertools.chain(
+        ((number, Report(2, text, 0.0, 0)) for number, text in refused.items()),
+        ((numbers[k], report) for k, report in performed([tasks[number] for number in numbers], processes)),
+    ):
+        row: dict[str, Any] = {"run": number, **_shown(changes[number]), **report._asdict()}
+        row |= columns.of(folder / f"{number:04d}", report)
+        rows[number] = row
+        if not keep and row["status"] == 0:
+            shutil.rmtree(folder / f"{number:04d}", ignore_errors=True)
+        progress.done(row)
+        _table([row for row in rows if row], columns).to_csv(folder / "sweep.csv")
+    progress.close()
+    return _table(rows, columns)
+
+
+def _combinations(vary: Any) -> list[dict[str, Any]]:
+    """Return the changes of each run."""
+    if isinstance(vary, Mapping):
+        for key, values in vary.items():
+            if isinstance(values, str | bytes | Mapping) or not hasattr(values, "__len__"):
+                raise InputError(f"sweep: {key} = {values!r:.60}: expected a list of values")
+        found = [dict(zip(vary, values, strict=True)) for values in itertools.product(*vary.values())]
+    else:
+        found = [dict(changes) for changes in vary]
+    if not found:
+        raise InputError("sweep: there is nothing to run: give values, as {'time.step': [1e-5, 2e-5]}")
+    for key in {key for changes in found for key in changes}:
+        if key in _OWN:
+            raise InputError(f"sweep: {key}: this is a column of the table, not a key of a case")
+    return found
+
+
+def _require_one_rank() -> None:
+    from mpi4py import MPI
+
+    if MPI.COMM_WORLD.size > 1:
+        raise InputError("sweep: makes each run in a process of its own, on one rank: start it without mpirun")
+
+
+def _cases(case: Case, changes: list[dict[str, Any]]) -> tuple[dict[int, Case], dict[int, str]]:
+    """Return the valid cases and the messages about the others, by number."""
+    cases: dict[int, Case] = {}
+    refused: dict[int, str] = {}
+    for number, each in enumerate(changes):
+        try:
+            cases[number] = case.copy(each)
+        except InputError as error:
+            refused[number] = str(error)
+    if not cases:
+        raise InputError(refused[0])
+    return cases, refused
+
+
+def _prepared(folder: Path) -> Path:
+    """Create the output folder, after an existing one was moved aside to a numbered name."""
+    try:
+        if folder.exists() and any(folder.iterdir()):
+            free = next(
+                name for n in itertools.count(1) if not (name := folder.with_name(f"{folder.name}.{n}")).exists()
+            )
+            folder.rename(free)
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot write the results of a sweep there: {error.strerror}") from error
+    return folder.absolute()
+
+
+def _shown(changes: Mapping[str, Any]) -> dict[str, Any]:
+    """The values of a row; those that are no numbers or texts as texts."""
+    return {
+        key: value if isinstance(value, str | int | float | np.number) else str(value) for key, value in changes.items()
+    }
+
+
+def _table(rows: list[dict[str, Any]], columns: _Columns) -> Table:
+    """Make the table of rows; results that a row lacks are nan, and energies that never occur are left out."""
+    names = list(dict.fromkeys(name for row in rows for name in row if name not in columns.names))
+    names += [name for name in columns.names if not columns.usual or any(row.get(name) for row in rows)]
+    return Table({name: [row.get(name, float("nan")) for row in rows] for name in names})
+
+
+class _Columns:
+    """The columns of results.
+
+    Attributes
+    ----------
+    names : of those that have occurred, in order
+    usual : whether they are those that nobody has chosen
+    """
+
+    def __init__(self, results: Any) -> None:
+        self.names: list[str] = []
+        if results is not None and not callable(results) and not isinstance(results, Mapping):
+            raise InputError(f"sweep: results = {results!r:.60}: expected a function, or functions by name")
+        for name in results if isinstance(results, Mapping) else ():
+            if name in _OWN:
+                raise InputError(f"sweep: results: the table has a column {name!r} already")
+        self._results, self.usual = results, results is None
+
+    def of(self, folder: Path, report: Report) -> dict[str, Any]:
+        """Return the results of a run by name; none for runs that were not finished."""
+        if report.status:
+            return {}
+        try:
+            found = dict(self._values(open_result(folder)))
+        except Exception as error:  # noqa: BLE001 - of a user's function; the other runs go on
+            return {"status": 1, "message": f"results: {type(error).__name__}: {error}"}
+        self.names += [name for name in found if name not in self.names]
+        return found
+
+    def _values(self, result: Result) -> Iterator[tuple[str, Any]]:
+        if self._results is None:
+            yield from _default_results(result)
+        elif isinstance(self._results, Mapping):
+            for name, what in self._results.items():
+                yield name, what(result) if callable(what) else _last(result, what)
+        else:
+            values = self._results(result)
+            yield from values.items() if isinstance(values, Mapping) else [("result", values)]
+
+
+def _last(result: Result, name: str) -> Any:
+    try:
+        return result.history[name][-1]
+    except KeyError as error:
+        raise InputError(f"sweep: results: {error.args[0]}") from error
+
+
+def _default_results(result: Result) -> Iterator[tuple[str, Any]]:
+    """Yield name and value of the last time, of the last energies, and of the largest forces [N]."""
+    history = result.history
+    for name in ("time", *STORED, *LOST, *SUPPLIED, "energy_imbalance"):
+        if name in history:
+            yield f"final_{name}", float(history[name][-1])
+    for name in history:
+        if (name.startswith("wall/") and name.endswith("/force")) or name == "support_force":
+            yield f"peak_{name}", float(np.linalg.norm(history[name], axis=1).max())

@@ -8,6 +8,7 @@ import numpy as np
 from mpi4py import MPI
 
 from ..contact.contact import Contact
+from ..contact.inclined import refuse_inclined
 from ..contact.sources import make_links
 from ..contact.start import adjust_start
 from ..errors import InputError
@@ -82,6 +83,8 @@ class Model:
         self.contact = Contact(case, self.nodes, mesh, self.supports.fixed)
         self.links, self.pairs = make_links(case, self.nodes, mesh, self.supports.fixed, self.contact)
         self.can_touch = self.contact.any or bool(self.links)
+        if self.supports.inclined is not None:
+            refuse_inclined(case.source, mesh, self.supports.inclined.nodes, self.contact, self.links)
 
         points = mesh.points[: mesh.n_owned]
         low, high = points.min(axis=0, initial=np.inf), points.max(axis=0, initial=-np.inf)

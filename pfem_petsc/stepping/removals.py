@@ -135,9 +135,9 @@ class Removals:
         stepper.energy = stepper.energy._replace(energies=tuple(energies.tolist()))
 
     def _remove_support(self, entry: Remove, now: float) -> None:
-        mask = self._mask([entry.supports])
         column = self._columns[entry.supports]
-        self.released[:, column : column + 3] = np.where(mask, self._stepper.state.support, 0.0)
+        freed = self._model.supports.freed([entry.supports], self._stepper.state.support)
+        self.released[:, column : column + 3] = freed
         self._replace(entry, now)
         self.gone.append(entry.supports)
         self._release([entry.supports])
@@ -149,14 +149,7 @@ class Removals:
             external.reactions.append((self.released[:, column : column + 3], begin, entry.duration))
             external.active = True
 
-    def _mask(self, names: list[str]) -> np.ndarray:
-        supports = self._model.supports
-        mask = np.zeros_like(supports.fixed)
-        for name in names:
-            mask |= supports.of_name(name)
-        return mask & supports.fixed
-
     def _release(self, names: list[str]) -> None:
         if names:
-            self._model.supports.release(self._mask(names))
+            self._model.supports.release(names)
             self._stepper.supports_changed()

@@ -133,6 +133,7 @@ class Removals:
         change = release(self._model.bars, stepper.state.x, members, share)
         energies = np.array(stepper.energy.energies) + change
         stepper.energy = stepper.energy._replace(energies=tuple(energies.tolist()))
+        stepper.bars_removed()
 
     def _remove_support(self, entry: Remove, now: float) -> None:
         column = self._columns[entry.supports]

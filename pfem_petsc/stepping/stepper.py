@@ -40,7 +40,7 @@ class Stepper(ABC):
     fault : a failure that only this rank knows; raised on all ranks at the next synchronisation
     h : the case's time step [s]; ``part`` the size of the current part, ``smallest`` the smallest part of the last step
     treatment : of impact, None for the scheme's own formulas
-    booking : called after each part of a step
+    booking : called after each part of a step; bars_removed : after bars are removed between steps
     before : (local, 3) positions at the start of the last part, with ghosts [m]
     massless : MasslessNodes if contact nodes are massless along their walls' normals, else None
     closed : (owned, walls) bool, nodes that have touched a wall and not left it since
@@ -79,6 +79,7 @@ class Stepper(ABC):
         self.h = self.part = self.smallest = h
         self.treatment = None  # of impact; see pfem_petsc.contact.treatments
         self.booking: Callable[[], None] = lambda: None
+        self.bars_removed: Callable[[], None] = lambda: None
         mesh = model.mesh
         owned = mesh.n_owned
         self.energy = StrainEnergy()

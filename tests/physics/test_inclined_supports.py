@@ -165,7 +165,6 @@ def test_stages(analysis, comm, shared_tmp_path):
     plain, turned = both(shared_tmp_path, comm, 1e-10, stage=stages)
 
 
-@pytest.mark.parallel
 @pytest.mark.parametrize("integrator", ["central_differences", "hulbert_chung", "houbolt", "generalized_alpha"])
 def test_restart_is_bitwise(integrator, comm, shared_tmp_path):
     removal = [{"supports": "roller", "time": 1e-3, "duration": 1e-3}]

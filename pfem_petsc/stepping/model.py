@@ -14,6 +14,7 @@ from ..contact.start import adjust_start
 from ..errors import InputError
 from ..mechanics.bars import Bars
 from ..mechanics.compiled import kernel
+from ..mechanics.connectors import add_connectors, connected, with_connectors
 from ..mechanics.loads import ExternalForce
 from ..mechanics.mass import Inertia, PointInertia
 from ..mechanics.rest_lengths import RestLengths
@@ -70,7 +71,7 @@ class Model:
         if adjusted:
             self.warnings.append(f"{adjusted} node{'s' * (adjusted > 1)} that started beyond walls moved onto them")
         with agreed(comm):
-            self.bars = Bars(mesh, case)
+            self.bars = Bars(mesh, with_connectors(case))
         self.bars.springs = make_springs(case, self.nodes, mesh)
         self.inertia = Inertia(mesh, self.bars, case.mass == "consistent", PointInertia(case, self.nodes, mesh))
         if case.time is not None:
@@ -116,7 +117,12 @@ class Model:
         with agreed(comm):
             sections = section_of_bars(case, slab)
             check_areas(case, slab, sections)
-        return distribute(slab, sections, comm)
+        mesh = distribute(slab, sections, comm)
+        if connected(case):
+            slab, sections = add_connectors(case, resolve_node_sets(case, mesh), mesh, slab, sections)
+            mesh.close()
+            mesh = distribute(slab, sections, comm)
+        return mesh
 
     @property
     def first_step(self) -> int:

@@ -121,13 +121,15 @@ def _pairs(
         order = np.argsort(numbers)
         found.append((numbers[order], points[order]))
     (first, places), (second, points) = found
-    if len(first) == len(second) == 1 and first[0] == second[0]:
-        raise InputError(f"{key}: both node sets are node {first[0]}; give two nodes")
     pairs, lengths = np.empty((len(second), 2), dtype=np.int64), np.empty(len(second))
     for k, (number, point) in enumerate(zip(second, points, strict=True)):
         away = np.where(first == number, np.inf, np.linalg.norm(places - point, axis=1))
         at = int(away.argmin())
-        if not 0.0 < away[at] < np.inf:
+        if away[at] == np.inf:
+            raise InputError(
+                f"{key}: node {number} is all that {between[0]!r} has, and in {between[1]!r}; give two nodes"
+            )
+        if not away[at] > 0.0:
             raise InputError(
                 f"{key}: node {number} of {between[1]!r} and node {first[at]} of {between[0]!r} are at the same place, "
                 "so that no line leads from one to the other; take nodes that are apart"

@@ -35,6 +35,7 @@ def check_names(case: Mapping[str, Any], data: Mapping[str, Any], problems: Prob
         )
     _unique("section", [(name, s.bars) for name, s in case["section"].items()], problems)
 
+    _between(case, node_sets, problems)
     on = [entry for entry in case["initial"] if entry.node_set is not None]
     for key in ("support", "mass", "spring", "dashpot", "load", "wall"):
         for i, entry in enumerate(case[key]):
@@ -61,6 +62,14 @@ def check_names(case: Mapping[str, Any], data: Mapping[str, Any], problems: Prob
                 problems.add(("output", "fields", i), f"there is no field of this name{nearest(name, known)}", name)
             elif name in output.fields[:i]:
                 problems.add(("output", "fields", i), "this field is listed twice", name)
+
+
+def _between(case: Mapping[str, Any], node_sets: list[str], problems: Problems) -> None:
+    """Check the names of node sets that springs and dashpots connect."""
+    for key in ("spring", "dashpot"):
+        for i, entry in enumerate(case[key]):
+            for name in entry.between or ():
+                problems.refer((key, i, "between"), name, node_sets, "node set")
 
 
 def _ruptures(case: Mapping[str, Any], problems: Problems) -> None:

@@ -1,10 +1,12 @@
-"""The tables of a case file with what acts on single nodes: masses, springs and dashpots (SI units)."""
+"""The tables of a case file with what acts on nodes: masses, springs and dashpots (SI units)."""
 
 from __future__ import annotations
 
-from pydantic import field_validator
+from typing import Annotated, Any
 
-from .base import NonNegativeFloat, StrictModel, Vector3
+from pydantic import ValidationInfo, field_validator, model_validator
+
+from .base import NonNegativeFloat, StrictModel, is_finite_number, listed
 
 __all__ = ["Dashpot", "NodalMass", "Spring"]
 
@@ -18,26 +20,53 @@ class NodalMass(StrictModel):
     """mass of each node of the set [kg]"""
 
 
-class Spring(StrictModel):
-    """Spring from each node of a node set to the ground, without force at the position in the mesh."""
+Between = Annotated[tuple[str, str], listed]
 
-    node_set: str
-    """name of a node set"""
-    stiffness: Vector3
-    """stiffness [kx, ky, kz] of each node of the set along the axes [N/m]"""
+
+class _GroundOrNodes(StrictModel):
+    """From each node of a node set to the ground, or between the nodes of two node sets."""
+
+    node_set: str | None = None
+    """name of a node set, whose nodes are connected with the ground"""
+    between: Between | None = None
+    """instead: names of two node sets; each node of the second is connected with the nearest of the first"""
+
+    @model_validator(mode="after")
+    def _one_of_both(self) -> _GroundOrNodes:
+        if (self.node_set is None) == (self.between is None):
+            raise ValueError("expected exactly one of the keys node_set, between")
+        return self
+
+
+class Spring(_GroundOrNodes):
+    """Spring without force at the positions in the mesh."""
+
+    stiffness: Any
+    """stiffness [kx, ky, kz] of each node of the set along the axes, or k along the line between two nodes [N/m]"""
 
     @field_validator("stiffness")
     @classmethod
-    def _not_negative(cls, value: Vector3) -> Vector3:
+    def _as_many_as_directions(cls, value: Any, info: ValidationInfo) -> Any:
+        if info.data.get("between") is not None:
+            if not is_finite_number(value) or not value > 0.0:
+                raise ValueError("between nodes expected one number > 0 [N/m], along the line from one to the other")
+            return float(value)
+        if not isinstance(value, list | tuple) or len(value) != 3 or not all(map(is_finite_number, value)):
+            raise ValueError("to the ground expected three numbers [kx, ky, kz] [N/m]")
         if min(value) < 0.0:
             raise ValueError("expected values >= 0")
-        return value
+        return tuple(map(float, value))
 
 
-class Dashpot(StrictModel):
-    """Dashpot from each node of a node set to the ground."""
+class Dashpot(_GroundOrNodes):
+    """Dashpot to the ground, or between nodes."""
 
-    node_set: str
-    """name of a node set"""
     coefficient: NonNegativeFloat
-    """force over velocity of each node of the set, in any direction [N s/m]"""
+    """force over velocity [N s/m]: of each node of the set, in any direction, or along the line between two nodes"""
+
+    @field_validator("coefficient")
+    @classmethod
+    def _acts(cls, value: float, info: ValidationInfo) -> float:
+        if info.data.get("between") is not None and not value:
+            raise ValueError("between nodes expected a number > 0")
+        return value

@@ -55,6 +55,7 @@ class Case(Editable):
     stages : the same, or the case itself
     number : of a stage among those of its case, from 0
     given : tables that a stage gives itself, and does not have from the stages before
+    stressed : names of the sections whose prestress a stage gives itself
     removes_bars : whether bars are removed, in this or another stage
 
     Raises
@@ -95,7 +96,9 @@ class Case(Editable):
         case = cls.__new__(cls)
         for key in KEYS:
             case.__dict__[attribute_of(key)] = attributes.get(key, ()) if key == "stage" else attributes[key]
-        case.__dict__.update(name=name, source=source, folder=Path(folder), overrides=(), number=0, given=())
+        case.__dict__.update(
+            name=name, source=source, folder=Path(folder), overrides=(), number=0, given=(), stressed=()
+        )
         case.__dict__.update(removes_bars=any(entry.bars is not None for entry in case.remove), fixed=False)
         return case
 
@@ -228,6 +231,7 @@ class Case(Editable):
             each = cls._of(tables, name=stage.name, source=f"{source}: stage[{k}]", folder=Path(folder))
             made.append(each)
             each.__dict__.update(title=attributes["title"], number=k, given=stage.given, overrides=overrides)
+            each.__dict__["stressed"] = stage.stressed
         case.__dict__["stage"] = tuple(made)
         removes = any(each.removes_bars for each in (case, *made))
         for each in (case, *made):
@@ -247,6 +251,8 @@ class Case(Editable):
         """Return name, analysis and given tables of a stage, as its case has them."""
         tables = self._tables()
         tables["output"] = {key: tables["output"][key] for key in ("fields_every", "history_every")}
+        named = {name: self.section[name].prestressed for name in self.stressed}
+        tables["section"] = {name: {key: tables["section"][name][key]} for name, key in named.items()}
         analysis = "time" if self.time is not None else "static"
         return {"name": self.name, **{key: tables[key] for key in (*self.given, analysis)}}
 

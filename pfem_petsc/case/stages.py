@@ -1,8 +1,9 @@
 """Stages of a case: each is a case of its own, made of the tables in force, so that all checks of a case serve.
 
 A table that a stage gives replaces that table from this stage on; the others stay in force. ``initial`` and ``remove``
-are the exceptions: velocities are added at the start of the stage that gives them, and at no later one, and what a
-stage removes is gone in later ones, which may not even know the supports.
+are exceptions: velocities are added at the start of the stage that gives them, and at no later one, and what a
+stage removes is gone in later ones, which may not even know the supports. ``section`` has the prestress of the sections
+that a stage stresses; all else of a section is the same in all stages.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from typing import Any, NamedTuple
 from ..registry import nearest
 from .base import Name, NonNegativeInt, PositiveInt, StrictModel
 from .problems import Path, Problems
+from .tables import PRESTRESSES
 
 __all__ = ["ANALYSES", "ONE_STAGE", "TABLES", "StageOutput", "StageTables", "stages_of"]
 
@@ -31,6 +33,7 @@ TABLES = (
     "contact",
     "output",
     "solver",
+    "section",
 )
 """Tables that a stage may give."""
 
@@ -59,13 +62,14 @@ class StageTables(NamedTuple):
     ----------
     name : of the stage
     data : the tables of the case that are in force
-    given : the tables that the stage gives itself
+    given : the tables that the stage gives itself; stressed : names of the sections whose prestress it gives
     problems : takes what is wrong with them
     """
 
     name: str
     data: dict[str, Any]
     given: tuple[str, ...]
+    stressed: tuple[str, ...]
     problems: Problems
 
 
@@ -108,6 +112,8 @@ def stages_of(data: Mapping[str, Any], problems: Problems) -> list[StageTables]:
         tables = {key: row[key] for key in given}
         if "output" in tables:
             tables["output"] = _output(tables["output"], common.get("output", {}), k, problems)
+        if "section" in tables:
+            tables["section"] = _sections(tables["section"], common.get("section"), k, problems)
         for key in ONE_STAGE if k else ():
             common.pop(key, None)
         common |= tables
@@ -121,7 +127,8 @@ def stages_of(data: Mapping[str, Any], problems: Problems) -> list[StageTables]:
         here = {**common, chosen[0]: row[chosen[0]]}
         if k == last and "modes" in data:
             here["modes"] = data["modes"]
-        found.append(StageTables(name, here, given, _Located(problems, owner)))
+        stressed = tuple(row["section"]) if isinstance(row.get("section"), Mapping) else ()
+        found.append(StageTables(name, here, given, stressed, _Located(problems, owner)))
     return found
 
 
@@ -136,6 +143,24 @@ def _refuse_unknown(row: Mapping[str, Any], k: int, problems: Problems) -> None:
     for key in row:
         if key not in known:
             problems.add(("stage", k, key), f"unknown key of a stage{nearest(key, known)}")
+
+
+def _sections(given: Any, common: Any, k: int, problems: Problems) -> Any:
+    """The sections of a stage: those of the case, with the prestress that it gives."""
+    if not isinstance(given, Mapping) or not isinstance(common, Mapping):
+        problems.add(("stage", k, "section"), "expected tables by the names of sections", given)
+        return common
+    merged = dict(common)
+    for name, table in given.items():
+        path = ("stage", k, "section", str(name))
+        if not isinstance(common.get(name), Mapping):
+            problems.add(path, f"there is no section of this name{nearest(str(name), list(common))}")
+        elif not isinstance(table, Mapping) or len(table) != 1 or not set(table) <= set(PRESTRESSES):
+            problems.add(path, f"a stage changes the prestress of a section: expected one of {', '.join(PRESTRESSES)}")
+        else:
+            kept = {key: value for key, value in common[name].items() if key not in PRESTRESSES}
+            merged[name] = {**kept, **table}
+    return merged
 
 
 def _output(given: Any, common: Any, k: int, problems: Problems) -> Any:

@@ -23,7 +23,8 @@ from .base import (
 )
 from .load_tables import Gravity, Load, LoadFile, Temperature, VaryingGravity, VaryingWind, Wind
 from .point_tables import Dashpot, NodalMass, Spring
-from .rows import FileName, Table4, increasing
+from .rows import increasing
+from .support_tables import Support
 
 __all__ = [
     "ARRAYS",
@@ -219,52 +220,6 @@ class Initial(StrictModel):
     def _centre_turns(self) -> Initial:
         if self.centre is not None and not any(self.angular_velocity):
             raise ValueError("centre needs an angular_velocity [rad/s] other than zero")
-        return self
-
-
-class Support(StrictModel):
-    """Fixed or prescribed position components of a node set."""
-
-    name: Name | None = None
-    """name, by which [[remove]] refers to the support; unique"""
-    node_set: str
-    """name of a node set"""
-    fix: str
-    """the fixed components: any of x, y, z"""
-    motion: Table4 | None = None
-    """rows [t, dx, dy, dz]: displacement from the mesh [s, m], at rest before the first and after the last row"""
-    velocity: Vector3 | None = None
-    """constant velocity of the fixed components [m/s]"""
-    acceleration: Table4 | None = None
-    """rows [t, ax, ay, az] [s, m/s2]: linear between rows, zero outside; the fixed components start from rest"""
-    motion_file: FileName | None = None
-    """the rows of ``motion`` from the columns of a CSV or NPZ file: its name, or a table of :class:`TableFile`"""
-    acceleration_file: FileName | None = None
-    """the rows of ``acceleration`` from a file in the same way"""
-    interpolation: Literal["smooth", "linear"] = "smooth"
-    """interpolation of ``motion`` between its rows: a cubic spline, or straight lines with velocity jumps at rows"""
-
-    @field_validator("fix")
-    @classmethod
-    def _components(cls, fix: str) -> str:
-        if not fix or set(fix) - set("xyz") or len(set(fix)) < len(fix):
-            raise ValueError('expected any of the components x, y, z, each once, like "xz"')
-        return fix
-
-    @model_validator(mode="after")
-    def _moves_what_it_fixes(self) -> Support:
-        keys = [key for key in ("motion", "velocity", "acceleration") if getattr(self, key) is not None]
-        if len(keys) > 1:
-            raise ValueError(
-                f"expected at most one of the keys motion, velocity, acceleration, acceleration_file; got {keys}"
-            )
-        if self.interpolation == "linear" and self.motion is None:
-            raise ValueError('interpolation = "linear" goes with motion: accelerations are linear between rows anyway')
-        for k, axis in enumerate("xyz"):
-            rows = self.motion or self.acceleration or ()
-            moves = any(row[1 + k] != 0.0 for row in rows) or (self.velocity is not None and self.velocity[k] != 0.0)
-            if moves and axis not in self.fix:
-                raise ValueError(f'{axis} is given a motion, but fix = "{self.fix}" leaves it free')
         return self
 
 

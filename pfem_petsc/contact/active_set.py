@@ -169,7 +169,7 @@ class ActiveSet:
         u = self.feasible(trial, u, stiffness)
         for _ in range(_DESCENTS):
             problem.imbalance(u, g)
-            g[model.supports.fixed] = 0.0
+            model.supports.clear(g)
             u = self.feasible(trial, u - g / stiffness[:, None], stiffness)
         return u
 

@@ -61,9 +61,10 @@ class PointInertia:
             self.mass = np.zeros(mesh.n_owned)
             for entry in case.point_mass:
                 self.mass[nodes[entry.node_set]] += entry.value
-        if case.dashpot:
+        grounded = [entry for entry in case.dashpot if entry.node_set is not None]
+        if grounded:
             self.damping = np.zeros(mesh.n_owned)
-            for entry in case.dashpot:
+            for entry in grounded:
                 self.damping[nodes[entry.node_set]] += entry.coefficient
 
     @property

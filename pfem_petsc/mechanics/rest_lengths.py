@@ -52,7 +52,10 @@ class RestLengths:
     def __init__(self, case: Case, bars: Bars) -> None:
         given = {name: section.prestressed for name, section in case.section.items()}
         self.any = any(key is not None for key in given.values())
-        self._bars, self._held = bars, case.number > 0
+        # in later stages they stay as they are, unless the stage gives those of a section
+        held = {name for name in given if case.number > 0 and name not in case.stressed}
+        self._bars = bars
+        self._held = [slice(block.start, block.stop) for block in bars.blocks if block.section in held]
         self._entries: list[_Entry] = []
         if not self.any:
             self.varying = False
@@ -78,18 +81,25 @@ class RestLengths:
             for _, each in rows:
                 for block in blocks:  # refuses what the law cannot bear
                     _stretches(block, bar, key, each, where)
+            entries = [_Entry(block, bar, key, rows, where) for block in blocks]
+            if name in held:
+                for entry in entries:
+                    entry.apply(bars, math.inf)
+                continue
             varies |= len(rows) > 1
-            self._entries += [_Entry(block, bar, key, rows, where) for block in blocks]
-        # in later stages they stay as they are
-        self.varying = varies and not self._held
-        self.apply(math.inf if self._held else 0.0)
+            self._entries += entries
+        self.varying = varies
+        self.apply(0.0)
         if self.varying:
             bars.rest_at_start = bars.rest.copy()
 
     def hold(self, rest: np.ndarray) -> None:
         """Take the rest lengths (b,) [m] of the stage before, where they stay."""
-        if self.any and self._held:
-            self._bars.rest[:] = rest
+        if self.any:
+            for part in self._held:
+                self._bars.rest[part] = rest[part]
+            if self.varying:
+                self._bars.rest_at_start = self._bars.rest.copy()
 
     def apply(self, time: float) -> None:
         """Set the rest lengths at a time [s], or at a load factor."""

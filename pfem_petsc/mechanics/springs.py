@@ -59,10 +59,11 @@ class Springs:
 
 def make_springs(case: Case, nodes: dict[str, np.ndarray], mesh: DistributedMesh) -> Springs | None:
     """Return the springs of ``[[spring]]``, None if the case has none. A node in several gets the sum of stiffness."""
-    if not case.spring:
+    grounded = [entry for entry in case.spring if entry.node_set is not None]
+    if not grounded:
         return None
     stiffness = np.zeros((mesh.n_owned, 3))
-    for entry in case.spring:
+    for entry in grounded:
         stiffness[nodes[entry.node_set]] += entry.stiffness
     held = np.flatnonzero(stiffness.any(axis=1))
     return Springs(held, stiffness[held], mesh.points[held].copy())

@@ -71,6 +71,8 @@ class Wind:
         self._bars, self._mesh, self._rate = bars, mesh, 0.0
         self._factor = np.zeros(len(mesh.bars))
         for block in bars.blocks:
+            if block.section not in case.section:  # springs and dashpots
+                continue
             section, part = case.section[block.section], slice(block.start, block.stop)
             rest = bars.rest[part]
             diameter = section.diameter

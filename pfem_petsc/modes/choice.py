@@ -48,7 +48,7 @@ def describe_modes(model: Model) -> dict[str, str]:
     case = model.case
     if case.modes is None:
         return {}
-    free = 3 * model.mesh.n_nodes - model.comm.allreduce(int(model.supports.fixed.sum()))
+    free = 3 * model.mesh.n_nodes - model.comm.allreduce(model.supports.number)
     name = choose(case.modes, free, case.source)
     what = "natural vibrations" if case.modes.kind == "vibration" else "buckling modes"
     mass = f", {case.modes.mass or case.mass} mass" if case.modes.kind == "vibration" else ""

@@ -19,6 +19,7 @@ from ..tolerances import BEYOND, RANK
 
 if TYPE_CHECKING:
     from ..integrators.base import State
+    from ..mechanics.directions import Directions
     from ..stepping.model import Model
 
 __all__ = ["Holds"]
@@ -41,7 +42,8 @@ class Holds:
 
     Attributes
     ----------
-    held : (owned, 3) bool, components in the local axes of each node, which are x, y, z except for nodes at walls
+    held : (owned, 3) bool, components in the local axes of each node, which are x, y, z except for nodes at walls and
+        with supports along other directions
     number : of held components in the whole model
     at_walls : number of nodes of the whole model in contact with walls
     curvature : owned nodes (m,) and blocks (m, 3, 3) [N/m] that forces of curved walls add to the stiffness; None if
@@ -66,9 +68,11 @@ class Holds:
         if walls is not None:
             self._take(walls)
         self.at_walls = model.comm.allreduce(len(self._nodes))
+        if model.supports.inclined is not None:
+            self._take_directions(model.supports.inclined)
         self.number = model.comm.allreduce(int(self.held.sum()))
         self._turn: PETSc.Mat | None = None
-        if self.at_walls:
+        if self.at_walls or model.supports.inclined is not None:
             self._turn = self._turning()
 
     def _take(self, walls: _Walls) -> None:
@@ -80,6 +84,13 @@ class Holds:
         self.held[nodes] = values > RANK * values[:, :1]
         if model_wide(self._comm, len(walls.curved[0])):
             self.curvature = walls.curved
+
+    def _take_directions(self, directions: Directions) -> None:
+        """Add the nodes with supports along directions that are no axes; walls do not touch them."""
+        values, turns = np.linalg.eigh(directions.free)  # held directions first
+        self._nodes = np.append(self._nodes, directions.nodes)
+        self._turns = np.concatenate([self._turns, turns.transpose(0, 2, 1)])
+        self.held[directions.nodes] = values < 0.5
 
     def _turning(self) -> PETSc.Mat:
         """Return the block-diagonal matrix from the local axes of nodes to x, y, z."""

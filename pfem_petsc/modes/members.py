@@ -29,6 +29,8 @@ def weakest_member(model: Model, x: np.ndarray) -> tuple[float, int] | None:
     sections = list(model.case.section.values())
     force = model.bars.fields(x)["axial_force"]
     for block in mesh.blocks:
+        if block.section >= len(sections):  # springs and dashpots
+            continue
         section = sections[block.section]
         if section.shape is None and section.second_moment is None:
             continue

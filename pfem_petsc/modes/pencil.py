@@ -133,7 +133,7 @@ class StateMatrices:
         ``springs``: whether those to the ground are part of it
         ``added``: owned nodes (m,) and blocks (m, 3, 3) [N/m] to add
         """
-        matrix = HessianMatrix(self.model.mesh, self.model.supports.fixed, False)
+        matrix = HessianMatrix(self.model.mesh)
 
         def fill(values: np.ndarray) -> None:
             matrix.add_bars(bars, values)
@@ -149,7 +149,7 @@ class StateMatrices:
         mesh, inertia = self.model.mesh, self.inertia
         if not inertia.consistent:
             return _diagonal(mesh.comm, np.repeat(inertia.mass, 3))
-        matrix = HessianMatrix(mesh, self.model.supports.fixed, False)
+        matrix = HessianMatrix(mesh)
 
         def fill(values: np.ndarray) -> None:
             coefficients = inertia.coefficients(1.0, 0.0)

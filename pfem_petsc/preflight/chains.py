@@ -31,7 +31,7 @@ def chain_nodes(model: Model) -> tuple[int, int]:
     np.add.at(leaving, mesh.bars[:, 0], way)
     np.subtract.at(leaving, mesh.bars[:, 1], way)
     found = (degree == 2) & (np.linalg.norm(leaving[:owned], axis=1) < _STRAIGHT)
-    found &= ~model.supports.fixed.any(axis=1)
+    found &= ~model.supports.spans().any(axis=(1, 2))
     ids = mesh.node_ids[:owned][found]
     first = min(model.comm.allgather(min(ids.tolist(), default=mesh.n_nodes)))
     return model.comm.allreduce(len(ids)), first

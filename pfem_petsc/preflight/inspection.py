@@ -12,7 +12,7 @@ from .parts import count_parts
 from .reach import bars_larger_than_walls
 from .rigidity import global_rigidity, model_directions, unbraced_nodes
 from .sanity import far_points, odd_numbers
-from .walls import wall_gaps
+from .walls import idle_walls, wall_gaps
 
 if TYPE_CHECKING:
     from ..case.schema import Case
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from ..stepping.model import Model
     from ..stepping.plan import Plan
 
-__all__ = ["inspect", "warnings_before"]
+__all__ = ["inspect", "warnings_before", "warnings_of_stage"]
 
 
 def warnings_before(case: Case, model: Model, plan: Plan) -> list[str]:
@@ -45,13 +45,30 @@ def warnings_before(case: Case, model: Model, plan: Plan) -> list[str]:
     chained, first_chained = chain_nodes(model) if own else (0, -1)
     if chained:
         texts.append(chain_warning(chained, first_chained))
+    return texts + _loose_nodes(model, chained)
+
+
+def _loose_nodes(model: Model, chained: int) -> list[str]:
+    """Warn of nodes that can move freely, besides those within ``chained`` bars. Collective."""
     loose, first = unbraced_nodes(model)
-    if loose > chained:
-        texts.append(
-            f"{loose} node{'s' if loose > 1 else ''} can move freely, to first order: bars and supports hold too few "
-            f"directions there; the first is node {first}"
-        )
-    return texts
+    if loose <= chained:
+        return []
+    return [
+        f"{loose} node{'s' if loose > 1 else ''} can move freely, to first order: bars and supports hold too few "
+        f"directions there; the first is node {first}"
+    ]
+
+
+def warnings_of_stage(case: Case, model: Model, plan: Plan) -> list[str]:
+    """Return warnings of the checks whose outcome depends on the tables of a stage, without its source. Collective.
+
+    Positions and velocities at the start of a later stage are not known before, so that gaps to its walls are not
+    checked.
+    """
+    texts = odd_numbers(case, model) + memory_warning(case, model, plan) + idle_walls(model)
+    texts += jumping_motions(case, plan) + bars_larger_than_walls(case, model)
+    chained, _ = chain_nodes(model) if case.mesh.generator is None else (0, -1)
+    return [text.removeprefix(f"{case.source}: ") for text in texts + _loose_nodes(model, chained)]
 
 
 def inspect(case: Case, model: Model) -> tuple[dict[str, str], list[str]]:

@@ -64,7 +64,7 @@ def unbraced_nodes(model: Model) -> tuple[int, int]:
     mesh, owned = model.mesh, model.mesh.n_owned
     held = np.zeros((owned, 3, 3))
     _directions(mesh.points, mesh.bars, owned, held)
-    held += np.eye(3) * model.supports.fixed[:, :, None]
+    held += model.supports.spans()
     span = model_directions(model)
     inside = np.einsum("ri,nij,sj->nrs", span, held, span)
     # det / trace^(r-1) is a lower bound of the smallest eigenvalue; if it is well above zero, no more work is needed
@@ -90,31 +90,30 @@ def global_rigidity(model: Model) -> Rigidity | None:
     owned = mesh.n_owned
     ends = [(int(n), int(a), int(b)) for n, (a, b) in zip(mesh.bar_ids, mesh.node_ids[mesh.bars], strict=True)]
     bars = sorted({bar for some in comm.allgather(ends) for bar in some})
-    points, fixed = np.zeros((mesh.n_nodes, 3)), np.zeros((mesh.n_nodes, 3))
+    points, held = np.zeros((mesh.n_nodes, 3)), np.zeros((mesh.n_nodes, 3, 3))
     points[mesh.node_ids[:owned]] = mesh.points[:owned]
-    fixed[mesh.node_ids[:owned]] = model.supports.fixed
-    points, fixed = comm.allreduce(points), comm.allreduce(fixed)
+    held[mesh.node_ids[:owned]] = model.supports.spans()
+    points, held = comm.allreduce(points), comm.allreduce(held)
     matrix = np.zeros((mesh.n_nodes, 3, len(bars)))
     for column, (_, a, b) in enumerate(bars):
         direction = (points[b] - points[a]) / np.linalg.norm(points[b] - points[a])
         matrix[a, :, column], matrix[b, :, column] = -direction, direction
     # unknowns: directions within the span that are not prescribed
-    bases = [_free(span, fixed[node]) for node in range(mesh.n_nodes)]
+    bases = [_free(span, held[node]) for node in range(mesh.n_nodes)]
     reduced = np.concatenate([basis @ rows for basis, rows in zip(bases, matrix, strict=True)])
     rank = int(np.linalg.matrix_rank(reduced, tol=_RANK)) if reduced.size else 0
-    rigid = _rigid_motions(points - points.mean(axis=0), fixed, span)
+    rigid = _rigid_motions(points - points.mean(axis=0), held, span)
     return Rigidity(len(reduced), rank, rigid, len(reduced) - rank - rigid, len(bars) - rank)
 
 
-def _free(span: np.ndarray, fixed: np.ndarray) -> np.ndarray:
-    """Return orthonormal directions within the span that supports leave free at a node."""
-    held = np.diag(fixed) @ span.T
-    _, values, vectors = np.linalg.svd(held, full_matrices=True)
+def _free(span: np.ndarray, held: np.ndarray) -> np.ndarray:
+    """Return orthonormal directions within the span that supports with the projection ``held`` leave free."""
+    _, values, vectors = np.linalg.svd(held @ span.T, full_matrices=True)
     rank = int((values > 1e-12).sum())
     return vectors[rank:] @ span
 
 
-def _rigid_motions(arms: np.ndarray, fixed: np.ndarray, span: np.ndarray) -> int:
+def _rigid_motions(arms: np.ndarray, held: np.ndarray, span: np.ndarray) -> int:
     """Return the number of unsupported rigid-body motions within the span."""
     size = max(float(np.abs(arms).max()), np.finfo(float).tiny)
     axes = np.eye(3)
@@ -122,7 +121,7 @@ def _rigid_motions(arms: np.ndarray, fixed: np.ndarray, span: np.ndarray) -> int
         [np.tile(axis, (len(arms), 1)) for axis in axes] + [np.cross(axis, arms / size) for axis in axes], axis=2
     )
     outside = np.einsum("ij,njk->nik", axes - span.T @ span, motions)
-    stopped = np.concatenate([outside, fixed[:, :, None] * motions]).reshape(-1, 6)
+    stopped = np.concatenate([outside, held @ motions]).reshape(-1, 6)
     _, values, vectors = np.linalg.svd(stopped, full_matrices=True)
     allowed = vectors[int((values > 1e-9).sum()) :].T
     return int(np.linalg.matrix_rank(motions.reshape(-1, 6) @ allowed, tol=1e-9)) if allowed.size else 0

@@ -87,7 +87,7 @@ def _slender(case: Case, model: Model) -> Iterator[str]:
     worst = np.zeros((len(case.section), 3))  # length over thickness, length, area
     for block, bars in zip(mesh.blocks, model.bars.blocks, strict=True):
         lengths = model.bars.mesh_lengths[block.start : block.counted]
-        if len(lengths):
+        if len(lengths) and block.section < len(worst):  # others are springs and dashpots
             areas = np.broadcast_to(bars.counted_area, lengths.shape)
             ratios = lengths / np.sqrt(areas)
             k = int(np.lexsort((lengths, ratios))[-1])

@@ -11,14 +11,24 @@ from ..output.units import engineering
 if TYPE_CHECKING:
     from ..stepping.model import Model
 
-__all__ = ["wall_gaps"]
+__all__ = ["idle_walls", "wall_gaps"]
+
+
+def idle_walls(model: Model) -> list[str]:
+    """Warn of walls that apply to no node. Collective."""
+    members = model.comm.allreduce(model.contact.members.sum(axis=0))
+    return [
+        f"wall {name!r} applies to no node: name a node_set that has nodes, or omit node_set"
+        for name, count in zip(model.contact.names, members, strict=True)
+        if not count
+    ]
 
 
 def wall_gaps(model: Model) -> tuple[dict[str, str], list[str]]:
     """Return, by wall name, nearest node, gap and approach velocity at the start; and warnings. Collective."""
     contact, mesh, comm = model.contact, model.mesh, model.comm
     told: dict[str, str] = {}
-    warnings: list[str] = []
+    warnings = idle_walls(model)
     if not contact.any:
         return told, warnings
     points = mesh.points[: mesh.n_owned]
@@ -42,7 +52,6 @@ def wall_gaps(model: Model) -> tuple[dict[str, str], list[str]]:
         closing = -min(comm.allgather(float(np.nanmin(rate[:, k], initial=np.inf))))
         if not np.isfinite(gap):
             told[name] = "applies to no node"
-            warnings.append(f"wall {name!r} applies to no node: name a node_set that has nodes, or omit node_set")
             continue
         told[name] = f"gap {engineering(gap, 'm')} at node {node}"
         if closing > 0.0:

@@ -63,7 +63,7 @@ class History(Observer):
         self.contact_watch = ContactWatch(model, warn, plan) if inertial else NoContactWatch()
         self.row: dict[str, Any] | None = None
         self.writer: ResultWriter | None = None
-        stepper.booking = self._book
+        stepper.booking, stepper.bars_removed = self._book, self.ledger.follow_removal
         self.rows = None if columns is None else StageRows(columns, model.case.number, self.recorder.layout)
         self.columns, self.types = (columns or self.recorder).columns, (columns or self.recorder).types
 

@@ -92,7 +92,8 @@ def carried_sums(recorder: Recorder, last: Mapping[str, Any], kick: tuple[float,
     Energies stay balanced, and momentum that of its impulses. Work and momentum of velocities that the stage adds count
     as external; kinetic energy that is lost, when a static stage or a support stops nodes, as numerical dissipation,
     what supports that begin to move give as external work, momentum that either changes as impulse of supports. What
-    other temperatures change at once is thermal work. Collective.
+    other temperatures change at once is thermal work, also together with another prestress, which does prestress work.
+    Collective.
 
     Parameters
     ----------
@@ -106,10 +107,12 @@ def carried_sums(recorder: Recorder, last: Mapping[str, Any], kick: tuple[float,
     gained = first["kinetic_energy"] - last["kinetic_energy"] - work
     change["external_work"] += work + max(gained, 0.0) + first["wall_kinetic_energy"] - last["wall_kinetic_energy"]
     change["numerical_dissipation"] += max(-gained, 0.0)
-    if "temperature" in recorder.model.case.given:
+    case = recorder.model.case
+    if "temperature" in case.given or case.stressed:
         # dissipation too: bars may be damaged or break by it at once
         of_bars = [name for name in BAR_ENERGIES if name in layout.places]
-        change["thermal_work"] += sum(first[name] - last[name] for name in of_bars)
+        work_of = "thermal_work" if "temperature" in case.given else "prestress_work"
+        change[work_of] += sum(first[name] - last[name] for name in of_bars)
     change["external_impulse"] += momentum
     change["support_impulse"] += first["momentum"] - last["momentum"] - momentum
     carried = np.zeros(layout.width)

@@ -13,6 +13,7 @@ from ..contact.start import check_start
 from ..errors import InputError, SimulationFailure
 from ..output.units import TIME as AXIS
 from ..output.units import Axis
+from ..preflight.inspection import warnings_of_stage
 from ..recording.fields import Fields
 from ..recording.recorder import Recorder
 from ..recording.stages import StageColumns
@@ -137,7 +138,7 @@ class Stages:
         self.events: dict[str, Any] = {}
         records = [None] * len(case.stage) if recorded is None else recorded["stages"]
         self.columns = StageColumns()
-        plans, warnings = [], []
+        plans, warnings, told = [], [], []
         points, cells = {}, {}
         for k, (stage, record) in enumerate(zip(self._cases, records, strict=True)):
             model = first if k == 0 else Model(stage, comm, first.mesh)
@@ -149,6 +150,11 @@ class Stages:
             points |= dict.fromkeys(fields.points)
             cells |= dict.fromkeys(fields.cells)
             warnings += [f"stage {stage.name!r}: {text}" for text in model.warnings]
+            if k >= number:
+                found = warnings_of_stage(stage, model, analysis.plan)
+                new = [text for text in found if text not in told]
+                warnings += [f"stage {stage.name!r}: {text}" for text in new if k > number]
+                told += new
             if k == number:
                 self.analysis = analysis
             else:

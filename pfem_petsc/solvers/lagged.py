@@ -69,7 +69,7 @@ class LaggedPreconditioner:
         # for symmetric schemes: the stiffness of the bars and its products
         self.product = MatrixFreeHessian(model) if definite else None
         self._smooth = matrix_free and kind == "gamg"
-        self.matrix = HessianMatrix(mesh, model.supports.fixed, model.supports.any, symmetric)
+        self.matrix = HessianMatrix(mesh, model.supports, symmetric)
         self.bars = model.bars
         self.remembers = len(model.bars.kept_names) > 0
         self.outlasts = not model.bars_vary and not model.inertia.varies
@@ -78,7 +78,7 @@ class LaggedPreconditioner:
         self.count = [0.0] * 6
         self.carried = False
         self._inner: PETSc.PC | None = None
-        self._fixed = np.flatnonzero(model.supports.fixed)
+        self._supports = model.supports
         self._problem = None
         self._kept: np.ndarray | None = None
         self._right, self._left = self.matrix.mat.createVecs()
@@ -217,9 +217,9 @@ class LaggedPreconditioner:
 
     def _hold(self, y: PETSc.Vec) -> None:
         """Set prescribed components to zero, which coarse corrections of multigrid would otherwise move."""
-        if len(self._fixed):
+        if self._supports.number:
             with y as out:
-                out[self._fixed] = 0.0
+                self._supports.clear(out.reshape(-1, 3))
 
     def destroy(self) -> None:
         """Free the PETSc objects."""

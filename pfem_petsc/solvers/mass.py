@@ -31,8 +31,8 @@ class MassSolver:
     """
 
     def __init__(self, model: Model) -> None:
-        self._fixed = model.supports.fixed
-        self._matrix = matrix = HessianMatrix(model.mesh, self._fixed, model.supports.any)
+        self._supports = model.supports
+        self._matrix = matrix = HessianMatrix(model.mesh, model.supports)
 
         def add(values: np.ndarray) -> None:
             coefficients = model.inertia.coefficients(1.0, 0.0)
@@ -60,7 +60,7 @@ class MassSolver:
             On all ranks, if the solver does not converge.
         """
         right = load.copy()
-        right[self._fixed] = 0.0
+        self._supports.clear(right)
         self._right.array[:] = right.ravel()
         self._ksp.solve(self._right, self._left)
         reason = self._ksp.getConvergedReason()
@@ -69,7 +69,9 @@ class MassSolver:
                 f"the initial acceleration: no convergence after {self._ksp.getIterationNumber()} iterations with the "
                 f"consistent mass matrix: {linear_reason(reason)}; check options -{_PREFIX}..., the densities and areas"
             )
-        return self._left.array.reshape(load.shape).copy()
+        a = self._left.array.reshape(load.shape).copy()
+        self._supports.clear(a)
+        return a
 
     def destroy(self) -> None:
         """Free the PETSc objects."""

@@ -10,9 +10,11 @@ import numpy as np
 from petsc4py import PETSc
 
 from ..mechanics.compiled import kernel
+from .projection import Projection
 
 if TYPE_CHECKING:
     from ..contact.transform import Transform
+    from ..mechanics.supports import Supports
     from ..mesh.distribution import DistributedMesh
     from ..stepping.problem import StepProblem
 
@@ -132,7 +134,8 @@ def _constrain_columns(ptr, local_columns, diagonal, fixed, values):
 class HessianMatrix:
     """Assembled Hessian of the owned rows; one interface to the two ways of setting values in a fixed PETSc pattern.
 
-    ``fill(callback)`` zeroes the values, lets the callback add to them, and passes them to PETSc.
+    ``supports`` are those that :meth:`constrain` takes into account. ``fill(callback)`` zeroes the values, lets the
+    callback add to them, and passes them to PETSc.
 
     Attributes
     ----------
@@ -140,7 +143,7 @@ class HessianMatrix:
     bounded : the matrix of steps with bounds: ``mat``, or T^T mat T with coordinates of links
     """
 
-    def __init__(self, mesh: DistributedMesh, fixed: np.ndarray, any_fixed: bool, symmetric: bool = True) -> None:
+    def __init__(self, mesh: DistributedMesh, supports: Supports | None = None, symmetric: bool = True) -> None:
         self.mesh = mesh
         self.pattern = BlockPattern(mesh)
         pointers, columns = self.pattern.scalar_rows()
@@ -161,11 +164,14 @@ class HessianMatrix:
         self.bounded = self.mat
         self._chain: list[tuple[object, PETSc.Mat, PETSc.Mat]] = []  # coordinates, T, and the product with T
         self._symmetric = symmetric
-        self.any_fixed = any_fixed
-        if any_fixed:
+        self.any_fixed = supports is not None and supports.any
+        self._projection: Projection | None = None
+        if self.any_fixed:
             self._fixed = np.zeros((mesh.n_local, 3))
-            self._fixed[: mesh.n_owned] = fixed
+            self._fixed[: mesh.n_owned] = supports.fixed
             mesh.update_ghosts(self._fixed)
+            if supports.inclined is not None:
+                self._projection = Projection(mesh, supports.inclined)
 
     @cached_property
     def local_columns(self) -> np.ndarray:
@@ -253,6 +259,9 @@ class HessianMatrix:
         """Replace rows and columns of prescribed components by ``scale`` on the diagonal."""
         if self.any_fixed:
             self.hold(self._fixed, scale, values)
+        if self._projection is not None:
+            self._projection.project(self.pattern.ptr, self.local_columns, values)
+            self.add_blocks(self._projection.nodes, scale * self._projection.held, values)
 
     def hold(self, held: np.ndarray, scale: float, values: np.ndarray) -> None:
         """Replace rows and columns of components (local nodes, 3) by ``scale`` on the diagonal."""

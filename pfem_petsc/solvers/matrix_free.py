@@ -218,7 +218,6 @@ class MatrixFreeHessian:
         self.stored = np.zeros((5, len(mesh.bars)))
         self._u = np.zeros((mesh.n_local, 3))
         self._out = np.zeros((mesh.n_local, 3))
-        self._fixed = model.supports.fixed
         self._problem = None
 
     def update(self, problem: StepProblem, w: np.ndarray) -> None:
@@ -257,10 +256,10 @@ class MatrixFreeHessian:
         """Apply H to the owned rows of :attr:`_u`, and write those of :attr:`_out`. Collective."""
         problem, owned = self._problem, self.mesh.n_owned
         u, out = self._u, self._out
-        fixed = self._fixed if self.model.supports.any else None
-        if fixed is not None:
-            held = problem.scale * u[:owned][fixed]
-            u[:owned][fixed] = 0.0
+        supports = self.model.supports
+        if supports.any:
+            held = problem.scale * supports.get(u)
+            supports.clear(u[:owned])
         problem.transform.forward(u)
         self.mesh.update_ghosts(u)
         inertia, bars = self.model.inertia, self.model.bars
@@ -282,8 +281,8 @@ class MatrixFreeHessian:
         if bars.springs is not None:
             bars.springs.add_product(problem.balance.weight, u, out)
         problem.transform.linear(self._left, u, out)
-        if fixed is not None:
-            out[:owned][fixed] = held
+        if supports.any:
+            supports.put(out, held)
 
     def diagonal(self) -> np.ndarray:
         """Return the diagonal of H (owned, 3)."""
@@ -304,8 +303,13 @@ class MatrixFreeHessian:
                 nodal += inertia.points.nodal(problem.balance.alpha, problem.balance.eta) / 3.0
         diagonal = blocks[:owned][:, [0, 3, 5]] + nodal[:, None]
         problem.transform.diagonal(self._left, lambda nodes: self._blocks(blocks, nodal, nodes), diagonal)
-        if self.model.supports.any:
-            diagonal[self._fixed] = problem.scale
+        supports = self.model.supports
+        if supports.any:
+            diagonal[supports.fixed] = problem.scale
+        if supports.inclined is not None:
+            at, free = supports.inclined.nodes, supports.inclined.free
+            full = free @ self._blocks(blocks, nodal, at) @ free + problem.scale * (np.eye(3) - free)
+            diagonal[at] = np.einsum("mii->mi", full)
         return diagonal
 
     @staticmethod

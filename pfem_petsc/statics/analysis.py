@@ -125,7 +125,7 @@ def _check(model: Model) -> None:
             f'{source}: contact.treatment = "{case.contact.treatment}" treats impacts, and a static analysis has none; '
             "remove the key"
         )
-    if case.spring and case.static.method != "newton":
+    if model.bars.springs is not None and case.static.method != "newton":
         raise InputError(
             f'{source}: spring: static.method = "{case.static.method}" does not have springs to the ground; take '
             '"newton", or bars to supported nodes as springs'

@@ -103,7 +103,10 @@ class BorderedSystem:
         """Set the prescribed components of displacements (owned, 3)."""
         supports = self.model.supports
         if supports.any:
-            u[supports.at] = supports.positions(load_factor) - self.problem.balance.predictor[supports.at]
+            values = supports.lacking(self.problem.balance.predictor, load_factor)
+            supports.put(u, values)
+            if self.problem.target is not None:
+                self.problem.target = values
 
     def imbalance(self, u: np.ndarray, load_factor: float, g: np.ndarray) -> None:
         """Compute g = f_int - f_ext (owned, 3) [N], including reactions of supports. Collective."""
@@ -116,15 +119,15 @@ class BorderedSystem:
         """Compute :meth:`imbalance` with zeros at prescribed components. Collective."""
         self.imbalance(u, load_factor, g)
         if self.model.supports.any:
-            g[self.model.supports.fixed] = 0.0
+            self.model.supports.clear(g)
 
     def rate(self, u: np.ndarray, load_factor: float) -> np.ndarray:
         """Return -dg/d(load factor) (owned, 3) [N] at free components, by central differences. Collective."""
         h = _SHARE * max(abs(load_factor), self._unit)
         model = self.model
-        if not (model.bars_vary or model.supports.moving):
+        if not (model.bars_vary or model.supports.moves):
             q = (self.external(load_factor + h) - self.external(load_factor - h)) / (2.0 * h)
-            q[model.supports.fixed] = 0.0
+            model.supports.clear(q)
             return q
         ends = []
         for end in (load_factor + h, load_factor - h):
@@ -132,6 +135,7 @@ class BorderedSystem:
             self.prescribe(there, end)
             self.residual(there, end, g)
             ends.append(g)
+        self.prescribe(u.copy(), load_factor)
         if model.bars_vary:
             model.change_bars(load_factor)
         return (ends[1] - ends[0]) / (2.0 * h)
@@ -151,7 +155,7 @@ class BorderedSystem:
         """
         self._b.array[:] = b.ravel()
         if self.model.supports.any:
-            self._b.array[self.model.supports.fixed.ravel()] = 0.0
+            self.model.supports.clear(self._b.array.reshape(-1, 3))
         reason = self._attempt()
         if reason < 0 and self.lagged is not None and self.lagged.carried:
             self.lagged.drop()
@@ -168,9 +172,9 @@ class BorderedSystem:
         """Return du/d(load factor) (owned, 3) with the last stiffness, including moving supports. Collective."""
         v = self.solve(self.rate(u, load_factor))
         supports = self.model.supports
-        if supports.moving:
+        if supports.moves:
             h = _SHARE * max(abs(load_factor), self._unit)
-            v[supports.at] = (supports.positions(load_factor + h) - supports.positions(load_factor - h)) / (2.0 * h)
+            supports.put(v, (supports.positions(load_factor + h) - supports.positions(load_factor - h)) / (2.0 * h))
         return v
 
     def _attempt(self) -> int:

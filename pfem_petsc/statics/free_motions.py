@@ -33,7 +33,7 @@ def free_motions(model: Model, state: State) -> str:
     """
     if model.can_touch or 3 * model.mesh.n_nodes > LARGEST:
         return ""
-    matrix = HessianMatrix(model.mesh, model.supports.fixed, model.supports.any)
+    matrix = HessianMatrix(model.mesh, model.supports)
     problem = StepProblem(model, state, Equilibrium().balance(state, 0.0), state.external, Transform(model))
     matrix.update(problem, np.zeros_like(state.position))
     scale = model.comm.allreduce(float(model.nodal_stiffness.max(initial=0.0)), op=MPI.MAX)

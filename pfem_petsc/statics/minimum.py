@@ -34,7 +34,7 @@ class MinimumCheck:
         self._stability: Stability | None = None
         self.refusal: str | None = f"the model has more than {LARGEST:,} unknowns"
         if 3 * model.mesh.n_nodes <= LARGEST:
-            self._matrix = HessianMatrix(model.mesh, model.supports.fixed, model.supports.any)
+            self._matrix = HessianMatrix(model.mesh, model.supports)
             self._stability = Stability(model, self._matrix)
             self.refusal = self._stability.refusal
         self._scale = max(model.comm.allgather(float(model.nodal_stiffness.max(initial=0.0))))

@@ -37,7 +37,7 @@ def check_path(model: Model, keys: PathKeys) -> None:
             f'{case.source}: static.method = "{case.static.method}" follows paths without contact; remove walls, '
             'contact pairs and constraints, or take static.method = "newton", with static.stabilise beyond limit points'
         )
-    if not (model.external.active or model.supports.moving or model.bars_vary):
+    if not (model.external.active or model.supports.moves or model.bars_vary):
         raise InputError(f"{case.source}: static: nothing depends on the load factor; give a [[load]] or a table")
     if keys.node_set is not None and not model.comm.allreduce(len(model.nodes[keys.node_set])):
         raise InputError(f"{case.source}: static.node_set = {keys.node_set!r} has no nodes")

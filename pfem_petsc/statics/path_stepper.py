@@ -178,11 +178,10 @@ class PathStepper(StaticStepper):
 
     def solve(self, balance: Balance) -> Solution:
         """Return the point found as the solution of the step."""
-        point, fixed = self._point, self.model.supports.fixed
+        point = self._point
         g = np.empty_like(point.u)
         self.system.imbalance(point.u, point.load_factor, g)
-        self.state.support = np.zeros_like(g)
-        self.state.support[fixed] = g[fixed]
+        self.state.support = self.model.supports.part(g)
         walls = self.model.contact.nothing
         return Solution(point.u, self.system.problem.f, walls, point.newton, self.system.linear)
 

@@ -71,7 +71,7 @@ class PointSolver:
         self._own: HessianMatrix | None = None
         if looks:
             if not isinstance(system.hessian, HessianMatrix):
-                self._own = HessianMatrix(model.mesh, model.supports.fixed, model.supports.any)
+                self._own = HessianMatrix(model.mesh, model.supports)
             self.stability = Stability(model, self._own or system.hessian)
 
     @property

@@ -101,7 +101,7 @@ class PseudoMotion:
         owned, supports = self.model.mesh.n_owned, self.model.supports
         self.x[:owned] = state.position
         self.time, self.external, self.steps = time, external, 0
-        self._lead_supports(state.position[supports.at], supports.positions(time))
+        self._lead_supports(supports.coordinates(state.position), supports.positions(time))
         self.v[:] = 0.0
         self._external_norm = float(np.sqrt(self.model.comm.allreduce(float((external**2).sum()))))
         self.damping.begin(self)
@@ -112,14 +112,14 @@ class PseudoMotion:
         supports = self.model.supports
         self._start, self._end, self._arrival = start, end, 0
         if supports.any:
-            needed = float((np.abs(end - start) / self._reach[supports.nodes]).max(initial=0.0))
+            needed = float((np.abs(end - start) / self._reach[supports.every_node]).max(initial=0.0))
             self._arrival = int(np.ceil(_UNHURRIED * self.model.comm.allreduce(needed, op=MPI.MAX)))
             self._place_supports()
 
     def _place_supports(self) -> None:
         part = min(self.steps / self._arrival, 1.0) if self._arrival else 1.0
         places = self._end if part == 1.0 else self._start + part * (self._end - self._start)
-        self.x[: self.model.mesh.n_owned][self.model.supports.at] = places
+        self.model.supports.place(self.x[: self.model.mesh.n_owned], places)
 
     @property
     def load(self) -> float:
@@ -190,6 +190,9 @@ class PseudoMotion:
             self._estimate()
         sums[BARS] = self._bar_forces
         sums[SUPPORTS] = free_residual(self.external, self.f, model.supports.fixed, self.residual)
+        if model.supports.inclined is not None:
+            sums[SUPPORTS] += (model.supports.inclined.get(self.residual) ** 2).sum()
+            model.supports.inclined.clear(self.residual)
         if model.contact.any:
             u = self.residual / self.mass[:, None]
             self._project(u)

@@ -38,7 +38,7 @@ def hold_detached(stepper: StaticStepper) -> None:
     model, owned = stepper.model, stepper.model.mesh.n_owned
     left = np.zeros(model.mesh.n_local, dtype=bool)
     left[model.mesh.bars[np.abs(model.bars.rupture()) < 1.0].ravel()] = True
-    loose = np.flatnonzero(~left[:owned] & ~model.supports.fixed.all(axis=1))
+    loose = np.flatnonzero(~left[:owned] & ~model.supports.held_nodes())
     if not model.links and model.comm.allreduce(len(loose)):
         model.supports.hold_nodes(loose, stepper.state.position)
         stepper.supports_changed()

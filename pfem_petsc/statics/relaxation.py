@@ -156,10 +156,9 @@ class RelaxationStepper(StaticStepper):
     def _relaxed(self, balance: Balance) -> Solution:
         """Return the relaxed positions as the solution."""
         state, model, motion = self.state, self.model, self.motion
-        owned, fixed = model.mesh.n_owned, model.supports.fixed
+        owned = model.mesh.n_owned
         state.contact = motion.contact.copy()
-        state.support = np.zeros_like(state.contact)
-        state.support[fixed] = (motion.f[:owned] - state.external - state.contact)[fixed]
+        state.support = model.supports.part(motion.f[:owned] - state.external - state.contact)
         pushed = (motion.contact[motion.held] != 0.0).any(axis=1)
         self.held = np.zeros_like(self.held)
         self.held[motion.held[pushed]] = True

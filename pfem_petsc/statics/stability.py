@@ -54,7 +54,7 @@ class Stability:
 
     def __init__(self, model: Model, matrix: HessianMatrix) -> None:
         self.mesh, self.comm, self._mat = model.mesh, model.comm, matrix.mat
-        self._fixed = model.supports.fixed
+        self._supports, self._fixed = model.supports, model.supports.fixed
         unknowns = 3 * self.mesh.n_nodes
         self.dense = unknowns <= DENSE
         self.refusal: str | None = None
@@ -97,7 +97,7 @@ class Stability:
         if shift:
             self._mat.shift(shift)
         self._factorise()
-        unknowns = self.comm.allreduce(int(np.count_nonzero(~self._fixed)))
+        unknowns = 3 * self.mesh.n_nodes - self.comm.allreduce(self._supports.number)
         values, vectors = self._near(min(count, unknowns))
         return values - shift, vectors
 
@@ -167,7 +167,8 @@ class Stability:
         """Eigenvalues nearest to zero, and vectors (count, owned, 3), by inverse iteration with the factorisation."""
         ids = 3 * self.mesh.node_ids[: self.mesh.n_owned, None] + np.arange(3)
         block = np.stack([np.cos((k + 1.0) * (ids + 0.5) ** 1.5) for k in range(count)])
-        block[:, self._fixed] = 0.0
+        for vectors in block:
+            self._supports.clear(vectors)
         b, x = self._mat.createVecs()
         values = np.zeros(count)
         for _ in range(_SWEEPS):

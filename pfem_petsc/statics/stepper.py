@@ -244,5 +244,5 @@ class StaticStepper(ImplicitStepper):
         guess = self.scheme.expected_move(self.state, balance.time - self.state.time)
         supports = self.model.supports
         if supports.any:
-            guess[supports.at] = supports.positions(balance.time) - balance.predictor[supports.at]
+            supports.put(guess, supports.lacking(balance.predictor, balance.time))
         return guess

@@ -33,7 +33,7 @@ def tell_collapse(stepper: Stepper, bar: int) -> str:
     past = stepper.before[b] - stepper.before[a]
     speed = float(np.linalg.norm(way - past)) / stepper.part
     block = next(block for block in model.bars.blocks if block.start <= bar < block.stop)
-    wave = float(np.sqrt(block.modulus / block.density))
+    wave = float(np.sqrt(block.modulus / block.density)) if block.density else model.wave_speed
     return (
         f"{when}: {name} has {how}, from {rest:.3g} m; it had {float(np.linalg.norm(past)) / rest:.3g} of its length a "
         f"step before, and its ends moved at {engineering(speed, 'm/s')} towards each other, waves in it at "

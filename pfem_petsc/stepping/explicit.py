@@ -45,7 +45,7 @@ class ExplicitStepper(Stepper):
 
     def accelerate(self, load: np.ndarray) -> np.ndarray:
         a = load / self.model.inertia.mass[:, None]
-        a[self.model.supports.fixed] = 0.0
+        self.model.supports.clear(a)
         return a
 
     @contextmanager
@@ -77,7 +77,9 @@ class ExplicitStepper(Stepper):
         state.contact = self.zero
         if supports.any:
             load = np.empty(len(supports.nodes))
-            positions = supports.positions(balance.time)
+            if supports.inclined is not None:
+                others = self._hold(balance, stiffness, u)
+            positions = supports.positions(balance.time)[: len(supports.nodes)]
             hold(0, len(load), 0, supports.nodes, supports.components, positions, balance.predictor, stiffness, u, load)
         walls, held, tolerance = model.contact.nothing, self._nobody, PROJECTED * model.length
         with self._faults(balance):
@@ -96,4 +98,15 @@ class ExplicitStepper(Stepper):
             react(
                 0, len(load), 0, supports.nodes, supports.components, load, state.contact, stiffness, u, state.support
             )
+            if supports.inclined is not None:
+                state.support[supports.inclined.nodes] = others - supports.inclined.part(state.contact)
         return Solution(u, state.f, walls, contacts=model.links.count_held(held, len(u)))
+
+    def _hold(self, balance: Balance, stiffness: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Set components of ``u`` (owned, 3) along directions to their values; return the forces (m, 3) that do so."""
+        supports = self.model.supports
+        inclined = supports.inclined
+        before = u[inclined.nodes]
+        inclined.clear(u)
+        inclined.add(u, supports.lacking(balance.predictor, balance.time)[len(supports.nodes) :])
+        return stiffness[inclined.nodes, None] * (u[inclined.nodes] - before)

@@ -68,7 +68,7 @@ class ImplicitStepper(Stepper):
         if choice.matrix_free:
             self.hessian = MatrixFreeHessian(model)
         else:
-            self.hessian = HessianMatrix(model.mesh, model.supports.fixed, model.supports.any, symmetric)
+            self.hessian = HessianMatrix(model.mesh, model.supports, symmetric)
         self.lagged = None
         if choice.lagged:
             self.lagged = LaggedPreconditioner(
@@ -183,7 +183,7 @@ class ImplicitStepper(Stepper):
             if inertia.redistribution is not None:
                 at = inertia.redistribution.touched
                 a[at] = np.einsum("kij,kj->ki", inertia.redistribution.inverse(inertia.mass, fixed), load[at])
-            a[fixed] = 0.0
+            self.model.supports.clear(a)
             return a
         if self._mass is None:
             self._mass = MassSolver(self.model)
@@ -280,9 +280,7 @@ class ImplicitStepper(Stepper):
             self._keep_momentum(problem, u, g)
         state.contact, walls, self.held = active_set.forces(outcome, u)
         held = model.links.count_held(np.flatnonzero(self.held), len(u))
-        state.support = np.zeros_like(u)
-        fixed = model.supports.fixed
-        state.support[fixed] = g[fixed] - state.contact[fixed]
+        state.support = model.supports.part(g - state.contact)
         internal = problem.f if balance.weight else state.f
         return Solution(u, internal, walls, newton, linear, held)
 
@@ -305,8 +303,7 @@ class ImplicitStepper(Stepper):
         guess = self.state.a / balance.alpha
         supports = self.model.supports
         if supports.any:
-            at = (supports.nodes, supports.components)
-            guess[at] = supports.positions(balance.time) - balance.predictor[at]
+            supports.put(guess, supports.lacking(balance.predictor, balance.time))
         return guess
 
 

@@ -110,10 +110,10 @@ class Impulses:
         load = self.forces(totals, walls, self.links.totals())
         u = (load if balance.a_hat is None else load - balance.a_hat) / balance.alpha
         stepper.scheme.finish(state, balance, u, stepper.part)
-        inertia, at = stepper.model.inertia, stepper.model.supports.at if stepper.prescribed.change else None
+        inertia = stepper.model.inertia
         for name, change in stepper.prescribed.change.items():
             every = np.zeros((len(inertia.mass), 3))
-            every[at] = change
+            stepper.model.supports.put(every, change)
             particles = getattr(state, name) if name in ("v", "a") else state.memory[name]
             particles[SUPPORT] += inertia.mass_times(every, np.empty_like(every)).sum(axis=0)
 

@@ -254,6 +254,11 @@ class Ledger:
             v[jump.nodes] *= self.model.inertia.damping[jump.nodes, None]
         return replace(after, a=a, v=v, contact=self.stepper.state.contact), jump.energy
 
+    def follow_removal(self) -> None:
+        """Start the next step from the energies and stresses of the bars after some were removed, as a restart does."""
+        self._before.energy = self.stepper.energy
+        self._changes.keep()
+
     def resume(self, kinetic: float) -> None:
         """Continue from the present state with its kinetic energy [J] after the fused loop updated :attr:`sums`."""
         self._before = moment_of(self.stepper)

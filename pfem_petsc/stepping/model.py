@@ -9,11 +9,13 @@ import numpy as np
 from mpi4py import MPI
 
 from ..contact.contact import Contact
+from ..contact.inclined import refuse_inclined
 from ..contact.sources import make_links
 from ..contact.start import adjust_start
 from ..errors import InputError
 from ..mechanics.bars import Bars
 from ..mechanics.compiled import kernel
+from ..mechanics.connectors import add_connectors, connected, with_connectors
 from ..mechanics.loads import ExternalForce
 from ..mechanics.mass import Inertia, PointInertia
 from ..mechanics.rest_lengths import RestLengths
@@ -72,7 +74,7 @@ class Model:
         if adjusted:
             self.warnings.append(f"{adjusted} node{'s' * (adjusted > 1)} that started beyond walls moved onto them")
         with agreed(comm):
-            self.bars = Bars(mesh, case)
+            self.bars = Bars(mesh, with_connectors(case))
         self.bars.springs = make_springs(case, self.nodes, mesh)
         self.inertia = Inertia(mesh, self.bars, case.mass == "consistent", PointInertia(case, self.nodes, mesh))
         if case.time is not None:
@@ -85,6 +87,8 @@ class Model:
         self.contact = Contact(case, self.nodes, mesh, self.supports.fixed)
         self.links, self.pairs = make_links(case, self.nodes, mesh, self.supports.fixed, self.contact)
         self.can_touch = self.contact.any or bool(self.links)
+        if self.supports.inclined is not None:
+            refuse_inclined(case.source, mesh, self.supports.inclined.nodes, self.contact, self.links)
 
         points = mesh.points[: mesh.n_owned]
         low, high = points.min(axis=0, initial=np.inf), points.max(axis=0, initial=-np.inf)
@@ -119,7 +123,12 @@ class Model:
         with agreed(comm):
             sections = section_of_bars(case, slab)
             check_areas(case, slab, sections)
-        return distribute(slab, sections, comm)
+        mesh = distribute(slab, sections, comm)
+        if connected(case):
+            slab, sections = add_connectors(case, resolve_node_sets(case, mesh), mesh, slab, sections)
+            mesh.close()
+            mesh = distribute(slab, sections, comm)
+        return mesh
 
     @property
     def first_step(self) -> int:

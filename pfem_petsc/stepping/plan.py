@@ -13,6 +13,7 @@ from mpi4py import MPI
 from ..case.materials import law_name, law_of
 from ..errors import InputError
 from ..integrators.base import Scheme
+from ..mechanics.connectors import viscous_rate
 from ..output.units import TIME as AXIS
 from ..output.units import Axis, engineering
 from ..registry import lookup
@@ -119,7 +120,8 @@ def make_plan(model: Model, recorded: Mapping[str, Any] | None = None) -> Plan:
             f"{case.source}: time: {time.integrator} with these parameters is unstable at any step; take gamma >= 1/2"
         )
     betas = [case.material[section.material].stiffness_damping for section in case.section.values()]
-    critical = _stable_step(scheme, safe, frequency.upper, max(betas))
+    viscous = viscous_rate(case, model.bars, model.inertia.mass, model.inertia.consistent)
+    critical = _stable_step(scheme, safe, frequency.upper, max(betas), viscous)
     certain = _stable_step(scheme, limit, frequency.lower, min(betas))
     if recorded is not None:
         step = float(recorded["step"])
@@ -178,15 +180,18 @@ def dashpot_rate(model: Model) -> float:
     return factor * model.comm.allreduce(float((inertia.points.damping / inertia.mass).max(initial=0.0)), op=MPI.MAX)
 
 
-def _stable_step(scheme: Scheme, limit: float, frequency: float, beta: float) -> float:
+def _stable_step(scheme: Scheme, limit: float, frequency: float, beta: float, viscous: float = 0.0) -> float:
     """Return the stable step [s] at an angular frequency [rad/s], from the limit of Omega without damping C = beta K.
+
+    ``viscous`` is the largest eigenvalue of other damping C over M by rates of strain [1/s], like beta w^2.
 
     In explicit steps the rate of strain is that of the step before. Schemes become unstable by an eigenvalue -1, with
     which this rate is 2/h times the strain: as with the stiffness K (1 + 2 beta/h), hence h^2 + 2 beta h = (limit/w)^2.
     """
     if not frequency > 0.0:
-        return np.inf
+        return 0.5 * limit * limit / viscous if viscous and scheme.explicit else np.inf
     step = limit / frequency
+    beta += viscous / (frequency * frequency)
     if not scheme.explicit or not beta:
         return step
     return step * step / (beta + float(np.hypot(beta, step)))

@@ -32,7 +32,7 @@ class PrescribedMotion:
     def place(self, end: float) -> None:
         """Set prescribed components of the positions to their values at a time [s]."""
         if self.moving:
-            self.stepper.state.position[self.supports.at] = self.supports.positions(end)
+            self.supports.place(self.stepper.state.position, self.supports.positions(end))
 
     def prescribe(self, balance: Balance) -> None:
         """Set exact positions, velocities and accelerations of prescribed components in a balance; their increments are
@@ -42,11 +42,11 @@ class PrescribedMotion:
         v, a = supports.rates(forces_hold, self.stepper.part)
         self._ruled = self._by_rule(balance, a)
         balance.predictor = balance.predictor.copy()
-        balance.predictor[supports.at] = supports.positions(balance.time)
+        supports.place(balance.predictor, supports.positions(balance.time))
         balance.v_hat = np.zeros_like(self.stepper.state.v) if balance.v_hat is None else balance.v_hat.copy()
-        balance.v_hat[supports.at] = v
+        supports.put(balance.v_hat, v)
         balance.a_hat = np.zeros_like(self.stepper.state.v) if balance.a_hat is None else balance.a_hat.copy()
-        balance.a_hat[supports.at] = a
+        supports.put(balance.a_hat, a)
 
     def _by_rule(self, balance: Balance, a: np.ndarray) -> State:
         """Return the state of prescribed components (k, 1) if the scheme advanced them with accelerations (k,).
@@ -56,7 +56,7 @@ class PrescribedMotion:
         supports, state = self.supports, self.stepper.state
 
         def pick(array: np.ndarray | None) -> np.ndarray | None:
-            return None if array is None else array[supports.at][:, None]
+            return None if array is None else supports.get(array)[:, None]
 
         memory = {name: pick(state.memory[name]) for name in self.stepper.scheme.remembers if name in state.memory}
         fields = (pick(array) for array in (state.position, state.v, state.a))
@@ -70,14 +70,29 @@ class PrescribedMotion:
     def take_rates(self, time: float) -> None:
         """Set velocity, acceleration and scheme memory of prescribed components at a time [s]."""
         supports, state = self.supports, self.stepper.state
-        state.v[supports.at], state.a[supports.at] = supports.rates(time, self.stepper.part)
-        self.stepper.scheme.restart(state, supports.at, self.stepper.part)
+        for array, values in zip((state.v, state.a), supports.rates(time, self.stepper.part), strict=True):
+            supports.put(array, values)
+        self._restart()
         if self.stepper.scheme.solves_next_position:
-            way = supports.positions(self.stepper.balance.time) - state.position[supports.at]
-            state.memory["half_velocity"][supports.at] = way / self.stepper.part
+            way = supports.positions(self.stepper.balance.time) - supports.positions(time)
+            supports.put(state.memory["half_velocity"], way / self.stepper.part)
         ruled, given = self._ruled, {"v": state.v, "a": state.a, **state.memory}
         made = {"v": ruled.v, "a": ruled.a, **ruled.memory}
-        self.change = {name: given[name][supports.at] - array[:, 0] for name, array in made.items()}
+        self.change = {name: supports.get(given[name]) - array[:, 0] for name, array in made.items()}
+
+    def _restart(self) -> None:
+        """Make the memory of the scheme consistent with the new velocities and accelerations."""
+        supports, state, scheme = self.supports, self.stepper.state, self.stepper.scheme
+        if supports.inclined is None:
+            scheme.restart(state, supports.at, self.stepper.part)
+            return
+        names = [name for name in scheme.remembers if name in state.memory]
+        fields = (supports.get(array)[:, None] for array in (state.position, state.v, state.a))
+        memory = {name: supports.get(state.memory[name])[:, None] for name in names}
+        along = State(*fields, *(np.zeros((supports.number, 1)) for _ in range(4)), memory=memory)
+        scheme.restart(along, np.arange(supports.number), self.stepper.part)
+        for name in names:
+            supports.put(state.memory[name], memory[name][:, 0])
 
 
 class NoRates(PrescribedMotion):

@@ -21,6 +21,11 @@ class StepProblem:
 
     Friction is part of g (see :mod:`pfem_petsc.contact.sliding`) and makes its derivative unsymmetric. Prescribed
     components have a zero residual and a unit row; the guess contains their values.
+
+    Attributes
+    ----------
+    target : (k,) prescribed components of u where some are along no axis: these are mixed into unknowns that linear
+        solvers change, and components of w along them are ignored
     """
 
     def __init__(
@@ -52,11 +57,15 @@ class StepProblem:
         if balance.weight < 1.0:
             known = known + (1.0 - balance.weight) * state.f[: mesh.n_owned]
         self.known = known
+        supports = model.supports
+        self.target = None if supports.inclined is None else supports.lacking(balance.predictor, balance.time)
 
     def increment(self, w: np.ndarray) -> np.ndarray:
         """Return u (owned, 3) for w. Collective."""
         self.u[:] = w
         self.transform.forward(self.u)
+        if self.target is not None:
+            self.model.supports.put(self.u, self.target)
         return self.u
 
     def coordinates(self, u: np.ndarray) -> np.ndarray:
@@ -92,7 +101,7 @@ class StepProblem:
         self.imbalance(self.increment(w), g)
         self.transform.residual(self.balance.predictor, self.u, g)
         if self.model.supports.any:
-            g[self.model.supports.fixed] = 0.0
+            self.model.supports.clear(g)
 
     def hessian(self, w: np.ndarray, matrix: HessianMatrix, values: np.ndarray) -> None:
         """Add dg/dw, without the coordinates of links, to the values of an assembled matrix. Collective."""

@@ -133,11 +133,12 @@ class Removals:
         change = release(self._model.bars, stepper.state.x, members, share)
         energies = np.array(stepper.energy.energies) + change
         stepper.energy = stepper.energy._replace(energies=tuple(energies.tolist()))
+        stepper.bars_removed()
 
     def _remove_support(self, entry: Remove, now: float) -> None:
-        mask = self._mask([entry.supports])
         column = self._columns[entry.supports]
-        self.released[:, column : column + 3] = np.where(mask, self._stepper.state.support, 0.0)
+        freed = self._model.supports.freed([entry.supports], self._stepper.state.support)
+        self.released[:, column : column + 3] = freed
         self._replace(entry, now)
         self.gone.append(entry.supports)
         self._release([entry.supports])
@@ -149,14 +150,7 @@ class Removals:
             external.reactions.append((self.released[:, column : column + 3], begin, entry.duration))
             external.active = True
 
-    def _mask(self, names: list[str]) -> np.ndarray:
-        supports = self._model.supports
-        mask = np.zeros_like(supports.fixed)
-        for name in names:
-            mask |= supports.of_name(name)
-        return mask & supports.fixed
-
     def _release(self, names: list[str]) -> None:
         if names:
-            self._model.supports.release(self._mask(names))
+            self._model.supports.release(names)
             self._stepper.supports_changed()

@@ -42,14 +42,15 @@ def highest_frequency(model: Model, x: np.ndarray, steps: int = 60, accuracy: fl
     """
     mesh, comm = model.mesh, model.comm
     owned = mesh.n_owned
-    free = ~model.supports.fixed
+    supports = model.supports
     with np.errstate(divide="ignore"):
-        scale = np.where(free, 1.0 / np.sqrt(model.inertia.mass)[:, None], 0.0)
+        scale = np.where(supports.fixed, 0.0, 1.0 / np.sqrt(model.inertia.mass)[:, None])
     # the start vector is a hash of node and component: independent of the number of ranks, with all wave lengths
     ids = mesh.node_ids[:owned, None].astype(np.uint64) * np.uint64(3) + np.arange(3, dtype=np.uint64)
     hashed = (ids + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
     hashed ^= hashed >> np.uint64(29)
-    q = np.where(free, (hashed >> np.uint64(11)).astype(np.float64) / 2.0**53 - 0.5, 0.0)
+    q = (hashed >> np.uint64(11)).astype(np.float64) / 2.0**53 - 0.5
+    supports.clear(q)
 
     def norm(u: np.ndarray) -> float:
         return float(np.sqrt(comm.allreduce(float((u * u).sum()))))
@@ -71,6 +72,7 @@ def highest_frequency(model: Model, x: np.ndarray, steps: int = 60, accuracy: fl
         mesh.update_ghosts(local)
         model.bars.product(x, local, product)
         w = scale * product[:owned]
+        supports.clear(w)
         alpha = comm.allreduce(float((w * q).sum()))
         w -= alpha * q
         if beside:

@@ -24,8 +24,8 @@ def start_in_motion(stepper: Stepper) -> None:
     state.v = velocity if model.start is None else state.v + velocity
     supports = model.supports
     if supports.any:
-        state.position[supports.at] = supports.positions(0.0)
-        state.v[supports.at] = supports.rates(0.0, 0.0)[0]
+        supports.place(state.position, supports.positions(0.0))
+        supports.put(state.v, supports.rates(0.0, 0.0)[0])
     if model.external.state_forces:
         model.external.follow(state.position, state.v)
     if stepper.massless is not None and stepper.massless.settle(state.x, 0.0, 0.0) > BEYOND * model.length:
@@ -49,8 +49,7 @@ def start_in_motion(stepper: Stepper) -> None:
         stepper.solution.contacts = int(stepper.solution.walls.touching.sum())
     if supports.any:
         inertial = model.inertia.mass_times(state.a, np.empty_like(state.a))
-        state.support = np.zeros_like(state.v)
-        state.support[supports.fixed] = (inertial - load - state.contact)[supports.fixed]
+        state.support = supports.part(inertial - load - state.contact)
     stepper.totals_at_start = stepper.totals()
     stepper.walls_at_start = stepper.solution.walls.force
     stepper.links_at_start = model.links.totals()
@@ -73,7 +72,7 @@ def start_at_zero(stepper: Stepper) -> None:
     state.v = np.zeros_like(stepper.zero)
     state.a = np.zeros_like(stepper.zero)
     if model.supports.any:
-        state.position[model.supports.at] = model.supports.positions(0.0)
+        model.supports.place(state.position, model.supports.positions(0.0))
     stepper.evaluate(commit=True)
     if model.external.active:
         state.external = model.external.at(0.0, np.empty_like(state.v))

@@ -40,7 +40,7 @@ class Stepper(ABC):
     fault : a failure that only this rank knows; raised on all ranks at the next synchronisation
     h : the case's time step [s]; ``part`` the size of the current part, ``smallest`` the smallest part of the last step
     treatment : of impact, None for the scheme's own formulas
-    booking : called after each part of a step
+    booking : called after each part of a step; bars_removed : after bars are removed between steps
     before : (local, 3) positions at the start of the last part, with ghosts [m]
     massless : MasslessNodes if contact nodes are massless along their walls' normals, else None
     closed : (owned, walls) bool, nodes that have touched a wall and not left it since
@@ -79,6 +79,7 @@ class Stepper(ABC):
         self.h = self.part = self.smallest = h
         self.treatment = None  # of impact; see pfem_petsc.contact.treatments
         self.booking: Callable[[], None] = lambda: None
+        self.bars_removed: Callable[[], None] = lambda: None
         mesh = model.mesh
         owned = mesh.n_owned
         self.energy = StrainEnergy()
@@ -134,11 +135,13 @@ class Stepper(ABC):
             load += load_now(self, state.time)
         if model.inertia.damped:
             load -= model.inertia.damping_times(state.v, np.empty_like(load))
-        held = model.supports.fixed | (state.contact != 0.0).any(axis=1)[:, None]
+        touched = (state.contact != 0.0).any(axis=1)[:, None]
+        known = np.where(touched, state.a, model.supports.part(state.a))
         if model.inertia.consistent:
-            known = np.where(held, state.a, 0.0)
             load += state.contact - model.inertia.mass_times(known, np.empty_like(load))
-        return np.where(held, state.a, self.accelerate(load))
+        a = self.accelerate(load)
+        model.supports.put(a, model.supports.get(known))
+        return np.where(touched, state.a, a)
 
     def totals(self) -> np.ndarray:
         """Return this rank's sums (3, 3) of support, external and damping force [N] at the state."""
@@ -285,9 +288,9 @@ class Stepper(ABC):
         if not supports.moving:
             return self.accelerate(load)
         carried = np.zeros_like(load)
-        carried[supports.at] = supports.rates(self.state.time, 0.0)[1]
+        supports.put(carried, supports.rates(self.state.time, 0.0)[1])
         a = self.accelerate(load - self.model.inertia.mass_times(carried, np.empty_like(load)))
-        a[supports.at] = carried[supports.at]
+        supports.put(a, supports.get(carried))
         return a
 
     def remarks(self) -> list[str]:

@@ -13,6 +13,8 @@ from typing import Any
 import numpy as np
 
 from .body import OPEN_KINDS, Body, draw_body
+from .connectors import draw_connectors
+from .inclined import draw_inclined
 from .laws import draw_laws
 from .points import draw_points
 from .rupture import draw_rupture
@@ -74,6 +76,8 @@ def draw_case(seed: int) -> dict[str, Any]:
     _stiffness_damping(random.Random(f"stiffness damping {seed}"), case, body.limit)
     draw_rupture(random.Random(f"rupture {seed}"), case, motion.end)
     draw_points(random.Random(f"points {seed}"), case, body.size)
+    draw_inclined(random.Random(f"inclined {seed}"), case)
+    draw_connectors(random.Random(f"connectors {seed}"), case, body.size)
     return _plain(case)
 
 

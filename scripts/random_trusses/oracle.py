@@ -72,6 +72,8 @@ def _walls(result: Loaded, case: Case, history: dict[str, np.ndarray]) -> Faults
     # supports that prescribe all components of a node carry it where they say: walls do not count
     fixed = np.zeros(start.shape, dtype=bool)
     for support in case.support:
+        if support.fix is None or support.frame is not None:
+            continue  # no wall stops its nodes
         fixed[np.ix_(_members(case, support.node_set, result), ["xyz".index(c) for c in support.fix])] = True
     carried = np.flatnonzero(fixed.all(axis=1))
     for wall in case.wall:

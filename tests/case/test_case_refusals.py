@@ -200,7 +200,6 @@ def test_missing_table(case_text, table):
         ("end = 1e-3\n", "time.end"),
         ("length = 1.0\n", "mesh.length"),
         ("normal = [-1.0, 0.0, 0.0]\n", "wall[0].normal"),
-        ('fix = "yz"\n', "support[0].fix"),
     ],
 )
 def test_missing_key(case_text, line, key):

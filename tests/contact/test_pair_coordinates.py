@@ -147,7 +147,7 @@ def test_both_operators_are_the_congruent_matrix(model, comm, beside=False):
     coupled = StepProblem(model, state, balance, state.external, Transform(model, frames, [link]))
     w = coupled.coordinates(u)
     np.testing.assert_allclose(coupled.increment(w), u, atol=1e-17)
-    assembled, free = HessianMatrix(model.mesh, model.supports.fixed, model.supports.any), MatrixFreeHessian(model)
+    assembled, free = HessianMatrix(model.mesh, model.supports), MatrixFreeHessian(model)
     assembled.update(plain, plain.coordinates(u))
     hessian = dense(assembled.mat, comm)
     mat = pairs.matrix()

@@ -121,7 +121,7 @@ def test_matrix_adjoint_inverse_and_both_operators(model, comm):
     size = np.sqrt(rows.along(rows.gradients(x) ** 2, rows.free))
     counted = comm.allreduce((rows.values(x) / size)[rows.counted].tolist())
     np.testing.assert_allclose(slack, np.sort(counted), rtol=1e-12)
-    assembled, free = HessianMatrix(model.mesh, model.supports.fixed, model.supports.any), MatrixFreeHessian(model)
+    assembled, free = HessianMatrix(model.mesh, model.supports), MatrixFreeHessian(model)
     assembled.update(plain, plain.coordinates(u))
     expected = matrix.T @ dense(assembled.mat, comm) @ matrix
     assembled.couple([link])

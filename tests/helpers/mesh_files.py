@@ -19,7 +19,7 @@ def case_of(tmp_path, comm, points, bars, fixed=(), **tables):
         "section": {"default": {"area": 1e-4, "material": "steel"}},
         **tables,
     }
-    if "static" not in tables:
+    if "static" not in tables and "stage" not in tables:
         data = {"time": {"integrator": "newmark", "step": 1e-4, "end": 1e-2}} | data
     if fixed:
         data["node_set"] = {"base": {"indices": list(fixed)}}

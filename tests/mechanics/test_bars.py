@@ -136,7 +136,7 @@ def test_matrix_product_and_derivative_of_forces_agree(law, truss):
     model.bars.product(local(model, x), local(model, u), out)
     assert np.abs(whole(model, out) - expected).max() < 1e-12 * size
 
-    hessian = HessianMatrix(mesh, model.supports.fixed, model.supports.any)
+    hessian = HessianMatrix(mesh, model.supports)
     inertia = [0.0] * len(model.bars.blocks)
     matrix = hessian.fill(lambda values: model.bars.tangents(local(model, x), 1.0, inertia, hessian.pattern, values))
     right, left = matrix.createVecs()

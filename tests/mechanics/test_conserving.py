@@ -85,7 +85,7 @@ def test_tangent_is_the_derivative_of_the_force(strain, hardening):
     past = model.bars.history()
     x = x0 + random.uniform(-2e-3, 2e-3, x0.shape)
     way = random.uniform(-1.0, 1.0, x0.shape)
-    hessian = HessianMatrix(mesh, model.supports.fixed, model.supports.any)
+    hessian = HessianMatrix(mesh, model.supports)
     inertia = [0.0] * len(model.bars.blocks)
     matrix = hessian.fill(lambda values: model.bars.step_tangents(x0, x, 1.0, inertia, hessian.pattern, values))
     right, left = matrix.createVecs()

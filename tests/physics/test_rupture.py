@@ -20,6 +20,7 @@ INTEGRATORS = {
     "souza_moura": {},
     "hulbert_chung": {},
     "energy_momentum": {},
+    "generalized_alpha": {},
 }
 
 

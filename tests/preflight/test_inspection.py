@@ -279,3 +279,34 @@ def test_a_node_far_from_the_point_it_is_asked_for_is_told(comm, shared_tmp_path
     text = simulation.inspect()[0].get("node set top", "")
     assert bool(text) == told
     assert not told or text.startswith("the nearest node is node 4, 2.500 m away from the point: farther than")
+
+
+@pytest.mark.parallel
+def test_warnings_of_later_stages(comm):
+    """What depends on the tables of a stage is reported for each, and what does not for the first alone."""
+    time = {"integrator": "newmark", "step": 1e-4, "end": 1e-3, "beta": 0.25, "gamma": 0.5}
+    jumps = [[0.0, 0.0, 0.0, 0.0], [0.5, 0.1, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0]]
+    base = {"node_set": "base", "fix": "x"}
+    case = {
+        "mesh": {"generator": "rod", "length": 1.0, "elements": 4},
+        "node_set": {"base": {"indices": [0]}, "all": {"all": True}},
+        "material": {"m": {"young_modulus": 1e6, "density": 0.01}},
+        "section": {"s": {"area": 1e-2, "material": "m"}},
+        "support": [{"node_set": "all", "fix": "yz"}, base],
+        "stage": [
+            {"name": "one", "time": time},
+            {"name": "two", "time": time, "initial": {"velocity": [1e5, 0.0, 0.0]}},
+            {
+                "name": "three",
+                "time": time,
+                "support": [{"node_set": "all", "fix": "yz"}, base | {"motion": jumps, "interpolation": "linear"}],
+            },
+        ],
+    }
+    simulation = Simulation(Case.from_dict(case), comm, check_only=True)
+    _, told = simulation.inspect()
+    assert sum("density = 0.01" in text for text in told) == 1
+    (two,) = [text for text in told if text.startswith("stage 'two': ")]
+    assert "faster than waves" in two
+    (three,) = [text for text in told if text.startswith("stage 'three': ")]
+    assert "support[1]" in three and "the velocity jumps" in three

@@ -96,6 +96,10 @@ def redistribute(model: Model) -> Redistribution:
         )
     if model.bars.springs is not None:
         raise InputError(f"{key}: a node without mass cannot have a [[spring]]; take another contact.treatment")
+    if model.supports.inclined is not None:
+        raise InputError(
+            f"{key}: does not know a [[support]] with a normal or frame along no axis; take another contact.treatment"
+        )
     if model.external.state_forces:
         raise InputError(
             f"{key}: a node without mass cannot follow [wind], whose force depends on its velocity; take another "

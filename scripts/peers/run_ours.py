@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 
 import model as m
+from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation
 
@@ -88,12 +89,16 @@ def run(cells: int, mode: str, steps: int, operator: str, folder: str) -> tuple[
 def main() -> None:
     """Run and report."""
     cells, mode, steps, operator = m.arguments()
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory() as own:
+        folder = MPI.COMM_WORLD.bcast(own)
         if mode.startswith("explicit"):
             run(1, mode, 1000, operator, folder + "/first")  # all loops are compiled and loaded
         simulation, times, linear = run(cells, mode, steps, operator, folder + "/timed")
         top = simulation.row["probe/top/position"][0]
         top = top[0] if mode == "static" else top[2] - cells * m.PITCH
+        MPI.COMM_WORLD.Barrier()
+        if MPI.COMM_WORLD.rank:
+            return
         m.report(times, simulation.mesh.n_bars, float(top), linear=linear / (steps + 1))
 
 

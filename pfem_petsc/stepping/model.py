@@ -126,8 +126,10 @@ class Model:
         mesh = distribute(slab, sections, comm)
         if connected(case):
             slab, sections = add_connectors(case, resolve_node_sets(case, mesh), mesh, slab, sections)
+            bars = mesh.n_bars
             mesh.close()
             mesh = distribute(slab, sections, comm)
+            mesh.n_connectors = mesh.n_bars - bars
         return mesh
 
     @property

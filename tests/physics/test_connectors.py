@@ -256,3 +256,16 @@ def test_beside_heat_wind_yield_and_removals(scheme, comm, tmp_path):
     names = ("rupture_dissipation", "viscous_dissipation", "plastic_dissipation", "thermal_work")
     assert all(np.abs(history[name]).max() > 1e-6 * scale for name in names)
     assert np.abs(history["energy_imbalance"]).max() < 1e-9 * scale
+
+
+@pytest.mark.parallel
+def test_they_are_no_overlapping_bars(comm, shared_tmp_path):
+    """A spring with a dashpot beside it, both along a bar and over a node, is what it should be; they join parts."""
+    connections = {
+        "spring": [{"between": ["root", "far"], "stiffness": K}, {"between": ["root", "a"], "stiffness": K}],
+        "dashpot": [{"between": ["root", "far"], "coefficient": C}],
+    }
+    simulation = Simulation(two_bars(shared_tmp_path, comm, connections, "newmark"), comm, check_only=True)
+    entries, told = simulation.inspect()
+    assert entries["parts"] == "all bars are connected"
+    assert not [text for text in told if "overlap" in text or "lies on" in text or "lie on" in text]

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.errors import InputError
+from pfem_petsc.preflight.rigidity import unbraced_nodes
 
 TURN = Rotation.from_rotvec([0.4, -0.9, 0.7]).as_matrix()
 POINTS = np.array(
@@ -163,6 +164,42 @@ def test_stages(analysis, comm, shared_tmp_path):
     second = {"name": "two", **in_time("newmark" if analysis == "static" else analysis)}
     stages = [second, first] if analysis == "static" else [first, second]
     plain, turned = both(shared_tmp_path, comm, 1e-10, stage=stages)
+
+
+@pytest.mark.parametrize("integrator", ["central_differences", "energy_momentum"])
+def test_restart_in_a_stage_without_a_removed_support(integrator, comm, tmp_path):
+    """A support that an earlier stage has removed stays away, in the turned tower as in the other; and in a restart."""
+    time = in_time(integrator, end=2e-3)
+    removal = [{"supports": "guide", "time": 1e-3, "duration": 5e-4}]
+    stages = [{"name": "one", **time, "remove": removal}, {"name": "two", **time}]
+    both(tmp_path, comm, stage=stages)
+    output = {"fields_every": 0, "checkpoint_every": 30, "probe": [{"name": "every", "node_set": "every"}]}
+    case = tower(tmp_path, comm, True, stage=stages, output=output)
+    whole = run(case, tmp_path / "whole", comm)
+    with Simulation(case, comm, tmp_path / "part", quiet=True) as first:
+        for made in first:
+            if made.step == 30:
+                break
+    with Simulation(case, comm, tmp_path / "part", True, quiet=True) as rest:
+        assert [made.step for made in rest][0] == 31
+    history = open_result(tmp_path / "part").history
+    for column in whole:
+        np.testing.assert_array_equal(history[column], whole[column], err_msg=column)
+
+
+@pytest.mark.parallel
+def test_reports_before_a_run(comm, shared_tmp_path):
+    """Mechanisms, rigid motions and free directions are those of the tower that is not turned."""
+    found = []
+    for turned in (False, True):
+        case = tower(shared_tmp_path, comm, turned, **in_time("newmark"), modes={"count": 3})
+        simulation = Simulation(case, comm, check_only=True)
+        entries, warnings = simulation.inspect()
+        loose = unbraced_nodes(simulation.model)
+        found.append((entries["rigidity"], simulation.summary()["modes"], loose, warnings, simulation.plan.frequency))
+    assert found[0][:4] == found[1][:4]
+    np.testing.assert_allclose(found[0][4], found[1][4], rtol=1e-3)
+    assert "17 free directions, 0 rigid motions" in found[0][0]
 
 
 @pytest.mark.parametrize("integrator", ["central_differences", "hulbert_chung", "houbolt", "generalized_alpha"])

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import re
+import tomllib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,10 +13,12 @@ from helpers.gathered import whole
 from mpi4py import MPI
 from pydantic import ValidationError
 
-from pfem_petsc import Case
+from pfem_petsc import Case, Simulation
 from pfem_petsc.errors import InputError
 from pfem_petsc.mesh.generators import lattice
 from pfem_petsc.mesh.lattices.expressions import Expression
+
+ROOT = Path(__file__).parents[2]
 
 
 def generated(comm=MPI.COMM_SELF, wanted=(), **keys):
@@ -158,6 +163,28 @@ def test_file_of_a_field_is_relative_to_the_case(tmp_path):
     read = Case.from_dict(case, folder=tmp_path)
     assert read.mesh.parameters.fields["rho"].file == str((tmp_path / "grid.vti").resolve())
     assert Case.from_toml(read.to_toml()).mesh == read.mesh
+
+
+BLOCKS = re.findall(r"^```toml\n(.*?)^```$", (ROOT / "docs" / "lattices.md").read_text(), re.MULTILINE | re.DOTALL)
+
+
+@pytest.mark.parametrize("block", range(len(BLOCKS)))
+def test_examples_of_the_page_about_lattices_are_read(tmp_path, block):
+    """Each block as it is printed, with fewer cells, and what it leaves out of a case."""
+    import pyvista
+
+    grid = pyvista.ImageData(dimensions=(3, 3, 3), spacing=(100.0, 50.0, 25.0))  # in millimetres
+    grid.point_data["rho"] = np.full(27, 0.5)
+    grid.save(tmp_path / "density.vti")
+    case = tomllib.loads(BLOCKS[block])
+    case["mesh"]["cells"] = [3, 3, 3]
+    case.setdefault("section", {"strut": {"area": 1e-7, "material": "titanium"}})
+    if "area" in case["mesh"].get("bar_fields", {}):
+        case["section"]["strut"] = {"area_field": "area", "material": "titanium"}
+    case["material"] = {"titanium": {"young_modulus": 110e9, "density": 4500.0}}
+    case["time"] = {"integrator": "central_differences", "step": "auto", "end": 1e-6}
+    simulation = Simulation(Case.from_dict(case, folder=tmp_path), MPI.COMM_SELF, check_only=True)
+    assert simulation.mesh.n_bars > 100
 
 
 @pytest.mark.parallel

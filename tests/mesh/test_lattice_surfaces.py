@@ -285,6 +285,12 @@ def test_file_is_relative_to_the_case(tmp_path):
         {"surface": {"cut": "trim"}},
         {"kind": "kelvin", "surface": {"cut": "clip"}, "perturbation": 0.02, "missing": 0.05, "seed": 2},
         {"kind": "diamond", "pitch": 0.9, "surface": {"cut": "trim"}},
+        {
+            "cells": (12, 10, 2),
+            "origin": (0.1, -1.2, 0.0),
+            "surface": {"cut": "clip"},
+            "curved": {"shape": "cylinder", "radius": 0.6, "closed": True},
+        },
     ],
 )
 def test_every_rank_has_its_part_of_the_same_lattice(comm, shared_tmp_path, keys):

@@ -80,8 +80,7 @@ def cell_of(
     places = np.asarray(points, dtype=float).reshape(-1, 3)
     whole = np.floor(places + _SAME).astype(np.int64)
     inside = np.where(places - whole < _SAME, 0.0, places - whole)
-    same = np.abs(inside[:, None] - inside[None]).max(axis=2) < _SAME
-    first = np.argmax(same, axis=1)
+    first = np.array([np.argmax(np.abs(inside - place).max(axis=1) < _SAME) for place in inside], dtype=np.int64)
     kept = np.unique(first)
     number = np.searchsorted(kept, first)
 

@@ -11,7 +11,8 @@ from .cell import UnitCell
 __all__ = ["mechanism_warning", "periodic_mechanisms"]
 
 _ZERO = 1e-8
-_LARGEST = 200
+_LARGEST = 100
+"""Points of a cell up to which the matrices are so small that every run can afford them."""
 
 
 def periodic_mechanisms(cell: UnitCell) -> tuple[int, int]:

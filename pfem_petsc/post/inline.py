@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+import math
 import tempfile
 from collections.abc import Mapping
 from html import escape
@@ -157,9 +158,12 @@ def _mesh_of(case: Case) -> Any:
     elif not mesh.arranged:
         few = mesh.truss is not None and mesh.truss.points is not None and mesh.truss.n_bars <= MOST_BARS
     else:
-        # a small part of the mesh has the number of all bars
         generator = lookup("pfem_petsc.mesh.generators", mesh.generator, "")
-        few = hasattr(generator, "generate") and generator.generate(mesh.parameters, 0, 1000).n_bars <= MOST_BARS
+        cells = getattr(mesh.parameters, "cells", None)
+        if hasattr(generator, "generate_on"):
+            few = cells is not None and math.prod(cells) <= MOST_BARS // 50
+        else:  # a small part of the mesh has the number of all bars
+            few = generator.generate(mesh.parameters, 0, 1000).n_bars <= MOST_BARS
     return load_slab(mesh, MPI.COMM_SELF) if few else None
 
 

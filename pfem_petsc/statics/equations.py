@@ -42,7 +42,7 @@ class Equations:
         x = stepper.state.position.copy()
         supports = stepper.model.supports
         if supports.any:
-            x[supports.at] = supports.positions(at)
+            supports.place(x, supports.positions(at))
         made = self._vector()
         made.array[:] = x.ravel()
         return made
@@ -76,7 +76,7 @@ class Equations:
                 model.change_bars(state.time)
         supports = model.supports
         if supports.any:
-            g[supports.at] = problem.scale * (place[supports.at] - supports.positions(at))
+            supports.put(g, problem.scale * (supports.coordinates(place) - supports.positions(at)))
         out = self._vector() if out is None else out
         out.setArray(g.ravel())
         return out
@@ -136,8 +136,7 @@ class Equations:
         stepper = self.stepper
         if self._hessian is None or self._hessian[0] != stepper.support_changes:
             self.destroy()
-            supports = stepper.model.supports
-            made = HessianMatrix(stepper.model.mesh, supports.fixed, supports.any, True)
+            made = HessianMatrix(stepper.model.mesh, stepper.model.supports)
             self._hessian = stepper.support_changes, made
         return self._hessian[1]
 

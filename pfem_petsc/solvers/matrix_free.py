@@ -25,13 +25,16 @@ if TYPE_CHECKING:
 
 __all__ = ["MatrixFreeHessian"]
 
+_2, _3 = 2 * CHUNK, 3 * CHUNK
+
 
 @kernel
 def _product(sweep, far, stored, u, out):
     """Add K u to ``out``, chunk by chunk of a :class:`~pfem_petsc.mechanics.sweep.Sweep`."""
     heads, fars, starts, chunks = sweep.heads, sweep.fars, sweep.starts, sweep.chunks
-    dx, dy, dz = np.empty(CHUNK), np.empty(CHUNK), np.empty(CHUNK)
-    one = np.ones(CHUNK)
+    # parts of one array, so that the compiler need not check whether they overlap
+    work = np.ones(4 * CHUNK)
+    dx, dy, dz, one = work[:CHUNK], work[CHUNK:_2], work[_2:_3], work[_3:]
     for chunk in range(len(sweep.diagonal)):
         if not sweep.diagonal[chunk]:
             _stars(chunk, heads, starts, chunks, far, stored, u, out)

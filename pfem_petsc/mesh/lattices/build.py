@@ -18,7 +18,8 @@ from .making import fit_to_surface, longest_bar, make_block
 from .mechanisms import mechanism_warning
 from .numbering import Places
 from .pruning import renumbered, without_dangling
-from .surface import Surface, read_surface
+from .surface import Surface
+from .surface_files import read_surface
 
 if TYPE_CHECKING:
     from mpi4py import MPI

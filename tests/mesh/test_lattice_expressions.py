@@ -15,6 +15,7 @@ from pydantic import ValidationError
 
 from pfem_petsc import Case, Simulation
 from pfem_petsc.errors import InputError
+from pfem_petsc.mesh.checks import check_mesh
 from pfem_petsc.mesh.generators import lattice
 from pfem_petsc.mesh.lattices.expressions import Expression
 
@@ -185,6 +186,46 @@ def test_examples_of_the_page_about_lattices_are_read(tmp_path, block):
     case["time"] = {"integrator": "central_differences", "step": "auto", "end": 1e-6}
     simulation = Simulation(Case.from_dict(case, folder=tmp_path), MPI.COMM_SELF, check_only=True)
     assert simulation.mesh.n_bars > 100
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("more", [{}, {"keep": "x + y + z < 1.5"}, {"kind": "diamond"}])
+def test_nodes_go_where_the_map_says(comm, more):
+    keys = {"map": ["x*(1 - 0.5*z)", "y + 0.1*sin(x)", "z"], "origin": [0.0, 0.0, 0.2], **more}
+    slab = generated(comm, **keys)
+    mesh, alone, block = whole(slab, comm), generated(**keys), generated(origin=[0.0, 0.0, 0.2])
+    np.testing.assert_array_equal(mesh.points, alone.points)
+    np.testing.assert_array_equal(mesh.bars, alone.bars)
+    assert check_mesh(slab, comm)[1:] == []
+    if not more:
+        x, y, z = block.points.T
+        np.testing.assert_allclose(
+            mesh.points, np.stack([x * (1 - 0.5 * z), y + 0.1 * np.sin(x), z], axis=1), rtol=1e-14
+        )
+    with pytest.raises(InputError, match=r"mesh.map\[1\] = 'sqrt\(x - 0.5\)' has no finite value at"):
+        generated(comm, **(more | {"map": ["x", "sqrt(x - 0.5)", "z"]}))
+
+
+def test_a_map_that_makes_nodes_meet_is_refused():
+    from pfem_petsc.case.tables import Mesh
+    from pfem_petsc.mesh import load_slab
+
+    keys = lattice.Parameters(kind="cubic", cells=(2, 2, 2), pitch=0.5, map=("x", "y", "max(z, 0.5)"))
+    with pytest.raises(InputError, match="bars have a length that is zero"):
+        load_slab(Mesh(generator="lattice", parameters=keys), MPI.COMM_SELF)
+
+
+def test_a_mapped_block_is_cut_to_a_surface(tmp_path):
+    """Struts that a shear makes longer than those of the cell: none reaches out of the surface."""
+    import pyvista
+
+    pyvista.Box((0.0, 1.0, 0.0, 1.0, 0.0, 1.0)).triangulate().save(tmp_path / "box.stl")
+    keys = {"surface": {"file": str(tmp_path / "box.stl")}, "map": ["x + 2*z - 0.5", "y", "z"], "dangling": "keep"}
+    mesh = generated(cells=(8, 4, 4), **keys)
+    block = generated(cells=(8, 4, 4))
+    x = block.points @ [1.0, 0.0, 2.0] - 0.5
+    inside = (x >= 0.0) & (x <= 1.0)
+    assert mesh.n_bars == np.count_nonzero(inside[block.bars].all(axis=1)) > 100
 
 
 @pytest.mark.parallel

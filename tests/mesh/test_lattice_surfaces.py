@@ -13,7 +13,7 @@ from pfem_petsc import Case, cases
 from pfem_petsc.errors import InputError
 from pfem_petsc.mesh.checks import check_mesh
 from pfem_petsc.mesh.generators import lattice
-from pfem_petsc.mesh.lattices.surface import read_surface
+from pfem_petsc.mesh.lattices.surface_files import read_surface
 
 CORNERS = np.array([(i, j, k) for i in (0.0, 1.0) for j in (0.0, 1.0) for k in (0.0, 1.0)])
 CUBE = np.array(
@@ -257,6 +257,33 @@ def test_files_that_are_refused(tmp_path, name, text):
     (tmp_path / "empty.stl").write_text("solid s\nendsolid s\n")
     with pytest.raises(InputError, match=f"mesh.surface.file: .*{name}.*{text}|no reader"):
         filled(surface={"file": str(tmp_path / name)})
+
+
+def test_damaged_files_are_refused(tmp_path, capfd):
+    """With one message, and nothing from VTK beside it."""
+    good = (Path(cases.__file__).parent / "bracket.stl").read_bytes()
+    random = np.random.default_rng(4)
+    for number in range(24):
+        data = bytearray(good)
+        if number % 3 == 0:
+            data = random.bytes(int(random.integers(0, 4000)))
+        elif number % 3 == 1:
+            data = good[: int(random.integers(0, len(good) - 50))]
+        else:
+            data[random.integers(84, len(data))] ^= 0xFF
+            for place in random.integers(84, len(data), 20):
+                data[place] = int(random.integers(0, 256))
+        path = tmp_path / f"damaged{number}{('.stl', '.ply', '.obj')[number // 3 % 3]}"
+        path.write_bytes(bytes(data))
+        with pytest.raises(InputError, match="no surface of triangles|is not closed|encloses no volume"):
+            read_surface(path, 1e-3)
+    assert capfd.readouterr().err == ""
+
+
+def test_a_surface_without_volume_is_refused(tmp_path):
+    flat = write_stl(tmp_path / "flat.stl", CORNERS, [(0, 1, 3), (0, 3, 1)])
+    with pytest.raises(InputError, match="encloses no volume"):
+        read_surface(flat, 1.0)
 
 
 def test_too_coarse_a_lattice_is_refused(tmp_path):

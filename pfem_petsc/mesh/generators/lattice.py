@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from ...case.base import Name, NonNegativeInt, PositiveFloat, PositiveInts3, StrictModel, Vector3
+from ...case.base import Name, NonNegativeInt, PositiveFloat, PositiveInts3, StrictModel, Vector3, listed
 from ..lattices.build import build, generate_block
 from ..lattices.expressions import RESERVED
 from ..lattices.keys import (
@@ -74,6 +74,8 @@ class Parameters(StrictModel):
     """Map to a curved shell: ``shape``, ``radius``, ``closed``."""
     fields: dict[Name, FieldKeys] | None = None
     """Fields on meshes of VTK, by their names in expressions: ``file``, ``array``, ``scale``."""
+    map: Annotated[tuple[str, str, str], listed] | None = None
+    """Three expressions of x, y and z [m] and ``fields``: where each node goes."""
     keep: str | None = None
     """Nodes where this expression of x, y and z [m] and ``fields`` is false are left out, with their struts."""
     bar_fields: dict[Name, str] | None = None
@@ -92,6 +94,7 @@ class Parameters(StrictModel):
                 raise ValueError(f"fields.{name}: expected a name for expressions of letters, digits and underscores")
         texts = {f"bar_fields.{name}": text for name, text in (self.bar_fields or {}).items()}
         texts |= {"keep": self.keep} if self.keep is not None else {}
+        texts |= {f"map[{axis}]": text for axis, text in enumerate(self.map or ())}
         for key, text in texts.items():
             try:
                 checked_expression(text, (*COORDINATES, *(self.fields or {})))
@@ -101,7 +104,9 @@ class Parameters(StrictModel):
 
     @model_validator(mode="after")
     def _consistent(self) -> Parameters:
-        if self.cells is None and (self.surface is None or self.curved is not None):
+        if self.map is not None and self.curved is not None:
+            raise ValueError("map and the table [mesh.curved] exclude each other: give one of them")
+        if self.cells is None and (self.surface is None or self.curved is not None or self.map is not None):
             raise ValueError("the key cells is missing: number of cells along x, y and z")
         if (self.kind == "cell") != (self.cell is not None):
             raise ValueError('kind = "cell" and the table [mesh.cell] with points and struts need each other')

@@ -18,7 +18,8 @@ from .making import fit_to_surface, longest_bar, make_block
 from .mechanisms import mechanism_warning
 from .numbering import Places
 from .pruning import renumbered, without_dangling
-from .surface import Surface, read_surface
+from .surface import Surface
+from .surface_files import read_surface
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -41,10 +42,13 @@ def build(keys: Parameters, comm: MPI.Comm, fields: Mapping[str, str], groups: C
         partial = bool(keys.missing or surface or keys.keep is not None)
         block, volume = make_block(fitted, plain=not partial)
         bare = block.has_bare_nodes()
+        if keys.map is not None:
+            block.moves.append(expressions.mapped)
+            _try_places(block, comm.rank, comm.size)
     if not (partial or bare or keys.dangling == "remove"):
         with agreed(comm):
             try:
-                return generate_block(keys, comm.rank, comm.size, fields, groups)
+                return _generated(keys, block, volume, comm.rank, comm.size, fields, groups)
             except MemoryError:
                 raise InputError("mesh: the lattice does not fit in this machine's memory") from None
     cut = Cut(missing=keys.missing or 0.0, seed=keys.seed or 0, surface=surface)
@@ -52,7 +56,8 @@ def build(keys: Parameters, comm: MPI.Comm, fields: Mapping[str, str], groups: C
         cut.clip, cut.shortest = keys.surface.cut == "clip", keys.surface.shortest
     if keys.keep is not None:
         cut.keep = expressions.kept
-    kept, region = cut_block(block, cut, longest_bar(block, keys), comm)
+    longest = longest_bar(block, keys) if keys.map is None else _longest_of_all(block, comm)
+    kept, region = cut_block(block, cut, longest, comm)
     if keys.dangling == "remove" or (keys.dangling is None and partial):
         kept = without_dangling(kept, region, comm)
     if comm.allreduce(len(kept.bars)) == 0:
@@ -77,9 +82,25 @@ def build(keys: Parameters, comm: MPI.Comm, fields: Mapping[str, str], groups: C
         surface is not None or keys.keep is not None,
     )
     slab.source, slab.warnings = f"generator lattice ({keys.kind})", mechanism_warning(keys.kind, block.cell)
-    if keys.keep is None:  # else it is not known what the lattice fills
+    slab.structured = keys.map is None
+    if keys.keep is None and keys.map is None:  # else it is not known what the lattice fills
         slab.volume = surface.volume if surface is not None else volume
     return slab
+
+
+def _try_places(block: Block, rank: int, size: int) -> None:
+    """Compute the positions of this rank's nodes, so that what cannot be computed is found before anything is sent."""
+    for numbers, places in block.nodes.pieces(*slab_range(block.nodes.total, rank, size)):
+        block.positions(numbers, places)
+
+
+def _longest_of_all(block: Block, comm: MPI.Comm) -> float:
+    """Return a length [m] that no bar exceeds, from all bars. Collective."""
+    longest = 0.0
+    for _, places in block.bars.pieces(*slab_range(block.bars.total, comm.rank, comm.size)):
+        one, two = (block.positions(*block.end(places, which)) for which in (0, 1))
+        longest = max(longest, float(np.linalg.norm(two - one, axis=1).max()))
+    return max(comm.allgather(longest)) * (1.0 + 1e-9)
 
 
 def _surface(keys: Parameters, comm: MPI.Comm) -> Surface | None:
@@ -89,15 +110,23 @@ def _surface(keys: Parameters, comm: MPI.Comm) -> Surface | None:
     return on_root(comm, read_surface, Path(keys.surface.file), keys.surface.scale)
 
 
-def generate_block(
-    keys: Parameters,
-    rank: int,
-    size: int,
-    fields: Collection[str] = (),
-    groups: Collection[str] | None = None,
-) -> MeshSlab:
+def generate_block(keys: Parameters, rank: int, size: int) -> MeshSlab:
     """Return a rank's part of a block of which nothing is left out, without messages."""
     block, volume = make_block(keys, plain=True)
+    if keys.map is not None:
+        block.moves.append(Fields(keys).mapped)
+    return _generated(keys, block, volume, rank, size, (), None)
+
+
+def _generated(
+    keys: Parameters,
+    block: Block,
+    volume: float,
+    rank: int,
+    size: int,
+    fields: Collection[str],
+    groups: Collection[str] | None,
+) -> MeshSlab:
     expressions = Fields(keys)
     first_node, last_node = slab_range(block.nodes.total, rank, size)
     first_bar, last_bar = slab_range(block.bars.total, rank, size)
@@ -133,9 +162,9 @@ def generate_block(
         bar_groups=_joined(members),
         bar_fields=values,
         source=f"generator lattice ({keys.kind})",
-        structured=True,
+        structured=keys.map is None,  # a map may make nodes of a bar meet
         warnings=mechanism_warning(keys.kind, block.cell),
-        volume=volume,
+        volume=volume if keys.map is None else None,
     )
 
 

@@ -11,6 +11,7 @@ from ...errors import InputError
 from .expressions import Expression
 from .keys import COORDINATES
 from .mesh_fields import MeshField
+from .numbering import Places
 
 if TYPE_CHECKING:
     from ..generators.lattice import Parameters
@@ -31,6 +32,7 @@ class Fields:
         names = (*COORDINATES, *self._fields)
         self._of_bars = {name: Expression(text, names) for name, text in (keys.bar_fields or {}).items()}
         self._keep = Expression(keys.keep, names) if keys.keep is not None else None
+        self._map = [Expression(text, names) for text in keys.map or ()]
 
     def of_bars(self, name: str, middles: np.ndarray) -> np.ndarray:
         """Return the values (n,) of a cell field at the middles (n, 3) [m] of bars."""
@@ -41,6 +43,11 @@ class Fields:
         if self._keep is None:
             return np.ones(len(points), bool)
         return _values(self._keep, self._fields, points, "mesh.keep") != 0.0
+
+    def mapped(self, points: np.ndarray, _numbers: np.ndarray, _places: Places) -> np.ndarray:
+        """Return where nodes at points (n, 3) [m] go: a move of a block."""
+        moved = [_values(text, self._fields, points, f"mesh.map[{axis}]") for axis, text in enumerate(self._map)]
+        return np.stack(moved, axis=1)
 
 
 def _values(expression: Expression, fields: Mapping[str, MeshField], points: np.ndarray, key: str) -> np.ndarray:

@@ -189,7 +189,22 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
     def sum_energies(work, energies):
         """Add the sums of ``work`` to ``energies``, see :data:`~pfem_petsc.energies.BAR_ENERGIES` [J]."""
         for j in range(n_energies):
-            energies[places[j]] += work[(4 + j) * CHUNK : (5 + j) * CHUNK].sum()
+            s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = 0.0  # additions that do not wait for each other
+            for i in range((4 + j) * CHUNK, (5 + j) * CHUNK, 8):
+                s0 += work[i]
+                s1 += work[i + 1]
+                s2 += work[i + 2]
+                s3 += work[i + 3]
+                s4 += work[i + 4]
+                s5 += work[i + 5]
+                s6 += work[i + 6]
+                s7 += work[i + 7]
+            energies[places[j]] += ((s0 + s1) + (s2 + s3)) + ((s4 + s5) + (s6 + s7))
+
+    @inlined
+    def clear_energies(work):
+        """Set the sums of ``work`` to zero."""
+        work[_4 : _4 + n_energies * CHUNK] = 0.0
 
     @kernel
     def forces(x, sweep, far, rest, heat, p, area, step, history, commit, f, energies):
@@ -199,7 +214,8 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
 
         ``sweep``: a :class:`~pfem_petsc.mechanics.sweep.Sweep`; ``far`` (b,) the upper end of each bar.
         """
-        work = np.zeros((4 + n_energies + n_rows) * CHUNK)
+        work = np.empty((4 + n_energies + n_rows) * CHUNK)
+        clear_energies(work)
         failed = -1
         shortened = False
         broke = 0
@@ -388,6 +404,7 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
         forces=forces,
         sweep_part=sweep_part,
         sum_energies=sum_energies,
+        clear_energies=clear_energies,
         work_rows=4 + n_energies + n_rows,
         tangents=tangents,
         product=product,

@@ -17,7 +17,7 @@ BITS = 21
 NODE_BLOCK = 512
 """Number of nodes whose bars and node loops follow each other, so that their data stay in the cache."""
 
-LEAST_RUN = 4
+LEAST_RUN = 8
 """Mean number of bars of the runs of constant offset from which a block goes by these: shorter loops do not pay."""
 
 # Number of points processed at a time, so that temporary arrays stay in the cache.

@@ -196,12 +196,22 @@ def sum_lanes(lanes, n, whole, totals, works):
 
 @inlined
 def _sum(lanes, first, wide):
-    x = y = z = 0.0
-    for j in range(first, first + wide, 3):
-        x += lanes[j]
-        y += lanes[j + 1]
-        z += lanes[j + 2]
-    return x, y, z
+    """Return the sums of each component, of four nodes at a time, so that additions do not wait for each other."""
+    x0 = x1 = x2 = x3 = y0 = y1 = y2 = y3 = z0 = z1 = z2 = z3 = 0.0
+    for j in range(first, first + wide, 12):  # beyond ``wide`` is zero
+        x0 += lanes[j]
+        y0 += lanes[j + 1]
+        z0 += lanes[j + 2]
+        x1 += lanes[j + 3]
+        y1 += lanes[j + 4]
+        z1 += lanes[j + 5]
+        x2 += lanes[j + 6]
+        y2 += lanes[j + 7]
+        z2 += lanes[j + 8]
+        x3 += lanes[j + 9]
+        y3 += lanes[j + 10]
+        z3 += lanes[j + 11]
+    return (x0 + x1) + (x2 + x3), (y0 + y1) + (y2 + y3), (z0 + z1) + (z2 + z3)
 
 
 @kernel

@@ -35,9 +35,12 @@ _SLACK = HEAD.first("slack_bars")
 
 @cache
 def make_fused_loop(
-    forces: Callable, sum_energies: Callable, work_rows: int, drift: Callable, kick: Callable
+    forces: Callable, sum_energies: Callable, clear_energies: Callable, work_rows: int, drift: Callable, kick: Callable
 ) -> Callable:
-    """Return the fused loop for the bar loop ``forces`` of a law and strain measure, and the loops of a scheme.
+    """Return the fused loop for a law and strain measure, and a scheme.
+
+    ``forces`` is the bar loop over a part of a sweep, with the functions for its energies and the number of its working
+    arrays, see :func:`~pfem_petsc.mechanics.kernels.make_kernels`; ``drift`` and ``kick`` are the loops of the scheme.
 
     Its arguments are the maximum number of steps; the step [s]; positions, positions of the previous step, and
     velocities at half steps (n, 3); arrays of bars, nodes, walls, probes and buffers; nodes (m,) that touch walls;
@@ -113,7 +116,7 @@ def make_fused_loop(
             for i in pressed:
                 contact[i] = 0.0
             energies1[:] = 0.0
-            work[:] = 0.0
+            clear_energies(work)
             clear_lanes(lanes, n)
             failed, shortened, changed = -1, False, 0
             infeasible = -1

@@ -50,7 +50,11 @@ class Batch:
         self.model = model
         block = model.bars.blocks[0]
         self._fused_loop = make_fused_loop(
-            block.kernels.sweep_part, block.kernels.sum_energies, block.kernels.work_rows, *stepper.scheme.loops
+            block.kernels.sweep_part,
+            block.kernels.sum_energies,
+            block.kernels.clear_energies,
+            block.kernels.work_rows,
+            *stepper.scheme.loops,
         )
         bars = model.bars
         law = (bars.far, bars.rest, bars.watched, bars.heat, block.parameters, block.area, block.history)

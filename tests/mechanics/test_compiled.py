@@ -148,7 +148,7 @@ def test_every_process_finds_the_fused_loop_of_another():
         "from pfem_petsc.mechanics.strain import engineering\n"
         "from pfem_petsc.stepping.fused_loop import make_fused_loop\n"
         "kernels = make_kernels(LAW, engineering)\n"
-        "parts = kernels.sweep_part, kernels.sum_energies, kernels.work_rows\n"
+        "parts = kernels.sweep_part, kernels.sum_energies, kernels.clear_energies, kernels.work_rows\n"
         "loop = make_fused_loop(*parts, *Scheme.loops)\n"
         "print(loop._cache._index_key((), loop.targetctx.codegen()), loop._cache._cache_file._source_stamp)"
     )
@@ -169,7 +169,9 @@ def test_loops_of_all_laws_have_names_of_their_own():
             for measure in MEASURES.values():
                 kernels = make_kernels(variant, measure)
                 names.append(_variant(kernels.forces.py_func))
-                fused = make_fused_loop(kernels.sweep_part, kernels.sum_energies, kernels.work_rows, *Scheme.loops)
+                fused = make_fused_loop(
+                    kernels.sweep_part, kernels.sum_energies, kernels.clear_energies, kernels.work_rows, *Scheme.loops
+                )
                 longest = fused._cache._cache_file._data_path("x")
                 assert len(Path(longest).name) < 220
     assert len(names) > 40 and len(set(names)) == len(names)

@@ -18,6 +18,8 @@ from pfem_petsc.mechanics.compiled import Compilation, _variant, code_digest
 from pfem_petsc.mechanics.kernels import make_kernels
 from pfem_petsc.mechanics.materials import elastic
 from pfem_petsc.mechanics.materials._softening import softened
+from pfem_petsc.mechanics.materials._stiffness_damping import damped
+from pfem_petsc.mechanics.rupture import breakable
 from pfem_petsc.mechanics.strain import MEASURES, engineering
 from pfem_petsc.registry import choices, lookup
 from pfem_petsc.stepping.explicit import ExplicitStepper
@@ -175,3 +177,10 @@ def test_loops_of_all_laws_have_names_of_their_own():
                 longest = fused._cache._cache_file._data_path("x")
                 assert len(Path(longest).name) < 220
     assert len(names) > 40 and len(set(names)) == len(names)
+
+
+def test_loops_of_a_law_with_and_without_damping_have_their_own_files():
+    """Otherwise each overwrites the machine code of the other, and both are compiled at each start."""
+    laws = [elastic.LAW, damped(elastic.LAW), breakable(elastic.LAW), breakable(damped(elastic.LAW))]
+    found = {make_kernels(law, MEASURES["green"]).forces._cache._cache_file._index_path for law in laws}
+    assert len(found) == len(laws)

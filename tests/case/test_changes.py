@@ -209,3 +209,15 @@ def test_rows_of_files_stay_when_the_file_is_gone(case, case_file):
 def test_tables_show_what_they_have(case):
     assert repr(case.mesh) == "Mesh(generator='rod', parameters=Parameters(length=1.0, elements=4))"
     assert repr(case) == "<Case rod: rod>"
+
+
+def test_prestress_of_a_stage_is_changed_in_the_stage():
+    case = Case.from_toml(STAGED + "section = { all = { pretension = 1e3 } }\n")
+    assert Case.from_dict(given_tables(case)) == case
+    case.stage[1].section["all"].pretension = 2e3
+    case.stage[0].section["all"].area = 2e-4  # of the case
+    assert [each.section["all"].area for each in (case, *case.stages)] == [2e-4] * 3
+    assert [each.section["all"].pretension for each in (case, *case.stages)] == [None, None, 2e3]
+    with pytest.raises(InputError, match=r"stage\[1\]\.section\.all.*: a stage changes the prestress"):
+        case.stage[1].section["all"].area = 1.0
+    assert Case.from_toml(case.to_toml()) == case

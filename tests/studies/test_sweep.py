@@ -184,6 +184,8 @@ def test_tables(tmp_path):
     assert table.to_csv(tmp_path / "a" / "t.csv").read_text().splitlines()[2] == f"2,{1 / 3!r},<y>,1"
     assert "<td>&lt;y&gt;</td>" in table._repr_html_() and str(table).splitlines()[0].split() == list("abcd")
     assert table.where(table["a"] > 1)["c"].tolist() == ["<y>"]
+    with pytest.raises(KeyError, match="table has no column 'aa', did you mean 'a'"):
+        table["aa"]
     with pytest.raises(InputError, match="column 'b' has 1 rows, expected 2"):
         Table({"a": [1, 2], "b": [1]})
 

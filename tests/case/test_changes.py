@@ -180,6 +180,12 @@ def test_stages_change_where_their_tables_are():
     assert [stage.load[0].force[0] for stage in case.stages] == [2e3, 2e3]
     assert case.stage[0].gravity.acceleration == case.stage[1].gravity.acceleration == (0.0, 0.0, -9.81)
     assert case.gravity is None and case.stage[0].given == ("load", "gravity")
+    case.stage[1].name = "swinging"
+    assert case.to_dict()["stage"][1]["name"] == "swinging"
+    with pytest.raises(InputError, match="another stage has this name"):
+        case.stage[1].name = "pull"
+    case.name = "two"
+    assert repr(case) == "<Case two: case>"
     case.output.history_every = 3
     assert [stage.output.history_every for stage in case.stages] == [3, 3]
     assert [stage.output.fields_every for stage in case.stages] == [10, 5]

@@ -69,7 +69,10 @@ class Editable:
     editor: tuple[Self, Callable[[str], KeyPath]]
 
     def __setattr__(self, key: str, value: Any) -> None:
-        if key == "name" and self.editor[0] is self and isinstance(value, str):
+        if key == "name" and self.editor[0] is not self:
+            self._edit({("name",): value})
+            return
+        if key == "name" and isinstance(value, str) and not self.fixed:
             self.__dict__[key] = value
             return
         known = [attribute_of(table) for table in KEYS]

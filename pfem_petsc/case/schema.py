@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Unpack
@@ -11,7 +10,7 @@ from pydantic import BaseModel
 
 from ..errors import InputError
 from ..registry import lookup
-from .builtin import built_in_cases, built_in_path
+from .builtin import built_in_path, read_text
 from .checks import check_names
 from .containers import CaseTables
 from .editable import Editable
@@ -166,7 +165,7 @@ class Case(Editable):
         """
         path = built_in_path(str(path_or_name)) or Path(path_or_name)
         named: dict[str, Any] = {"name": path.stem, "source": str(path), "overrides": overrides, "mesh": mesh}
-        return cls.from_toml(_read_text(path), path.parent, **named)
+        return cls.from_toml(read_text(path), path.parent, **named)
 
     from_file = load
 
@@ -307,22 +306,3 @@ def _with_arrays(table: Any, mesh: Any) -> Any:
     if isinstance(table, Mapping) and "digest" in table and hasattr(mesh, "mesh_table"):
         return {**mesh.mesh_table, "digest": table["digest"]}
     return mesh
-
-
-def _read_text(path: Path) -> str:
-    try:
-        return path.read_bytes().decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = error.object[: error.start].count(b"\n") + 1
-        raise InputError(f"{path}: line {line}: a case file is TOML text in UTF-8, and this is not") from error
-    except FileNotFoundError as error:
-        names = built_in_cases()
-        near = difflib.get_close_matches(str(path), names, n=1)
-        hint = f"did you mean '{near[0]}'?" if near else f"the built-in cases are {', '.join(names)}"
-        raise InputError(f"{path}: there is no such case file or built-in case; {hint}") from error
-    except IsADirectoryError as error:
-        raise InputError(
-            f"{path}: this is a folder; name a case file or a built-in case, and the folder of its results by -o"
-        ) from error
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: this case file cannot be read: {error}") from error

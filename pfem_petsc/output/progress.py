@@ -171,6 +171,7 @@ class Progress:
         step, time, *_ = self._last
         if self._bar is not None:
             self._draw_bar()
+        in_notebook = isinstance(self._bar, NotebookBar)
         if self._bar is not None:
             try:
                 self._bar.stop()
@@ -178,7 +179,7 @@ class Progress:
             except OSError:
                 self._let_go_of_stdout()
         if step > self._marked[1]:
-            self._write(self._line(now))
+            (self._log_line if in_notebook else self._write)(self._line(now), "INFO")
         wall, steps = now - self._begin, step - self._start[0]
         text = f"{outcome}: {steps:,} steps in {duration(wall)}"
         if self._compiling >= 0.1:

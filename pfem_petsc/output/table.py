@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import InputError
+from ..registry import nearest
 
 if TYPE_CHECKING:
     import pandas
@@ -36,6 +37,8 @@ class Table(Mapping[str, np.ndarray]):
                 raise InputError(f"table: column {name!r} has {len(values)} rows, expected {self.n_rows}")
 
     def __getitem__(self, name: str) -> np.ndarray:
+        if name not in self._columns:
+            raise KeyError(f"table has no column {name!r}{nearest(str(name), list(self))}")
         return self._columns[name]
 
     def __iter__(self) -> Iterator[str]:
@@ -71,7 +74,9 @@ class Table(Mapping[str, np.ndarray]):
         try:
             import pandas
         except ImportError as error:
-            raise InputError("to_pandas needs pandas: pip install pandas; to_csv and to_structured do not") from error
+            raise InputError(
+                f"to_pandas needs pandas: pip install pandas ({error}); to_csv and to_structured do not"
+            ) from error
         return pandas.DataFrame(dict(self))
 
     def to_csv(self, path: Path | str) -> Path:

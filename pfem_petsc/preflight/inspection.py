@@ -67,7 +67,7 @@ def warnings_of_stage(case: Case, model: Model, plan: Plan) -> list[str]:
     """
     texts = odd_numbers(case, model) + memory_warning(case, model, plan) + idle_walls(model)
     texts += jumping_motions(case, plan) + bars_larger_than_walls(case, model)
-    chained, _ = chain_nodes(model) if case.mesh.generator is None else (0, -1)
+    chained, _ = chain_nodes(model) if _is_own(case) else (0, -1)
     return [text.removeprefix(f"{case.source}: ") for text in texts + _loose_nodes(model, chained)]
 
 

@@ -169,12 +169,12 @@ class _Columns:
 
     Attributes
     ----------
-    names : of those that have occurred, in order
+    names : of those that were asked for or have occurred, in order
     usual : whether they are those that nobody has chosen
     """
 
     def __init__(self, results: Any) -> None:
-        self.names: list[str] = []
+        self.names: list[str] = list(results) if isinstance(results, Mapping) else []
         if results is not None and not callable(results) and not isinstance(results, Mapping):
             raise InputError(f"sweep: results = {results!r:.60}: expected a function, or functions by name")
         for name in results if isinstance(results, Mapping) else ():
@@ -189,7 +189,8 @@ class _Columns:
         try:
             found = dict(self._values(open_result(folder)))
         except Exception as error:  # noqa: BLE001 - of a user's function; the other runs go on
-            return {"status": 1, "message": f"results: {type(error).__name__}: {error}"}
+            text = error.args[0] if isinstance(error, KeyError) and error.args else error
+            return {"status": 1, "message": f"results: {type(error).__name__}: {text}"}
         self.names += [name for name in found if name not in self.names]
         return found
 

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import os
 import pickle
+import signal
 import sys
+import threading
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -16,6 +18,8 @@ if TYPE_CHECKING:
     from ..case.schema import Case
 
 __all__ = ["Report", "Task", "perform"]
+
+_WATCH = 1.0  # seconds between two looks for the parent process
 
 
 class Task(NamedTuple):
@@ -59,8 +63,17 @@ def perform(task: Task) -> Report:
     return Report(status, message, time.perf_counter() - begin, steps)
 
 
+def follow_parent() -> None:
+    """Stop the run in progress, with a checkpoint, when the process that makes the sweep has gone. Runs in a thread."""
+    parent = os.getppid()
+    while os.getppid() == parent:
+        time.sleep(_WATCH)
+    os.kill(os.getpid(), signal.SIGTERM)
+
+
 def main() -> None:
-    """Perform tasks until there are no more."""
+    """Perform tasks until there are no more, or nobody is there to give them."""
+    threading.Thread(target=follow_parent, daemon=True).start()
     replies = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     while True:

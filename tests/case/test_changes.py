@@ -180,6 +180,12 @@ def test_stages_change_where_their_tables_are():
     assert [stage.load[0].force[0] for stage in case.stages] == [2e3, 2e3]
     assert case.stage[0].gravity.acceleration == case.stage[1].gravity.acceleration == (0.0, 0.0, -9.81)
     assert case.gravity is None and case.stage[0].given == ("load", "gravity")
+    case.stage[1].name = "swinging"
+    assert case.to_dict()["stage"][1]["name"] == "swinging"
+    with pytest.raises(InputError, match="another stage has this name"):
+        case.stage[1].name = "pull"
+    case.name = "two"
+    assert repr(case) == "<Case two: case>"
     case.output.history_every = 3
     assert [stage.output.history_every for stage in case.stages] == [3, 3]
     assert [stage.output.fields_every for stage in case.stages] == [10, 5]
@@ -209,3 +215,15 @@ def test_rows_of_files_stay_when_the_file_is_gone(case, case_file):
 def test_tables_show_what_they_have(case):
     assert repr(case.mesh) == "Mesh(generator='rod', parameters=Parameters(length=1.0, elements=4))"
     assert repr(case) == "<Case rod: rod>"
+
+
+def test_prestress_of_a_stage_is_changed_in_the_stage():
+    case = Case.from_toml(STAGED + "section = { all = { pretension = 1e3 } }\n")
+    assert Case.from_dict(given_tables(case)) == case
+    case.stage[1].section["all"].pretension = 2e3
+    case.stage[0].section["all"].area = 2e-4  # of the case
+    assert [each.section["all"].area for each in (case, *case.stages)] == [2e-4] * 3
+    assert [each.section["all"].pretension for each in (case, *case.stages)] == [None, None, 2e3]
+    with pytest.raises(InputError, match=r"stage\[1\]\.section\.all.*: a stage changes the prestress"):
+        case.stage[1].section["all"].area = 1.0
+    assert Case.from_toml(case.to_toml()) == case

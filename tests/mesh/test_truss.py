@@ -172,3 +172,15 @@ def test_restart_with_the_same_truss_only(comm, shared_tmp_path, monkeypatch, mo
     with Simulation(longer, comm, output=shared_tmp_path / "out", restart=True, quiet=True) as simulation:
         simulation.run()
     assert len(open_result(shared_tmp_path / "out").history["time"]) == 21
+
+
+def test_checks_of_a_users_mesh_apply(tmp_path):
+    """Generated meshes are free of overlapping bars, and those from arrays are not."""
+    points = [[0, 0, 0], [1, 0, 0], [2, 0, 0], [1, 1, 0]]
+    mesh = Truss(points, [[0, 1], [1, 2], [0, 2], [0, 3], [2, 3], [1, 3]])
+    tables = {key: TABLES[key] for key in ("material", "time")} | {
+        "section": {"s": {"area": 1e-4, "material": "steel"}}
+    }
+    with Simulation(Case(tables, mesh=mesh), MPI.COMM_SELF, tmp_path, check_only=True) as simulation:
+        _, warnings = simulation.inspect()
+    assert any("pair" in text and "overlap" in text for text in warnings)

@@ -6,6 +6,10 @@ import csv
 import gc
 import os
 import shutil
+import subprocess
+import sys
+import time
+import types
 
 import numpy as np
 import pytest
@@ -120,6 +124,26 @@ def test_leaving_ends_the_runs(rod, tmp_path):
     runs.close()  # ends the long run, of 10^6 steps
 
 
+def test_a_killed_sweep_leaves_no_run_behind(tmp_path):
+    command = ["sweep", "rod_impact", "--vary", "time.end=1e4", "-o", str(tmp_path / "out"), "--quiet"]
+    environment = pool.environment()
+    sweeping = subprocess.Popen([sys.executable, "-m", "pfem_petsc", *command], env=environment)
+    lock = tmp_path / "out" / "0000.lock"
+    wait_for(lock.exists)
+    sweeping.kill()
+    sweeping.wait()
+    wait_for(lambda: not lock.exists())
+    # the lock is given back by a run that has stopped with a checkpoint
+    assert (tmp_path / "out" / "0000" / "checkpoint.h5").exists()
+
+
+def wait_for(condition, seconds=60.0):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.05)
+
+
 def test_worker_reports_what_it_does_not_know(tmp_path):
     report = worker.perform(Task(3, tmp_path, None))
     assert isinstance(report, Report) and report.status == 2
@@ -160,6 +184,8 @@ def test_tables(tmp_path):
     assert table.to_csv(tmp_path / "a" / "t.csv").read_text().splitlines()[2] == f"2,{1 / 3!r},<y>,1"
     assert "<td>&lt;y&gt;</td>" in table._repr_html_() and str(table).splitlines()[0].split() == list("abcd")
     assert table.where(table["a"] > 1)["c"].tolist() == ["<y>"]
+    with pytest.raises(KeyError, match="table has no column 'aa', did you mean 'a'"):
+        table["aa"]
     with pytest.raises(InputError, match="column 'b' has 1 rows, expected 2"):
         Table({"a": [1, 2], "b": [1]})
 
@@ -190,3 +216,14 @@ def test_loops_over_runs_keep_nothing_and_compile_nothing(tmp_path, integrator):
     assert compiled == []
     assert after[1:] == before[1:]
     assert after[0] - before[0] < 64  # less than four for each run: there was one for each atexit function
+
+
+def test_pandas_is_not_needed(monkeypatch):
+    table = Table({"a": [1, 2]})
+    monkeypatch.setitem(sys.modules, "pandas", None)
+    with pytest.raises(InputError, match="to_pandas needs pandas"):
+        table.to_pandas()
+    pandas = types.ModuleType("pandas")
+    pandas.DataFrame = dict
+    monkeypatch.setitem(sys.modules, "pandas", pandas)
+    assert table.to_pandas()["a"].tolist() == [1, 2]

@@ -50,7 +50,19 @@ def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
         file.__class__ = _CacheFile
         file._function = function
         file._variant = _variant(function)
+    _distinguish(function)
     return compiled
+
+
+def _distinguish(function: Callable[..., Any]) -> None:
+    """Give a closure a name of its own.
+
+    The names of functions in machine code are made of module, name, types and a count in the process that has compiled
+    them. Closures of one place, such as the loops of two laws, could then have the same name in machine code of two
+    processes. A third one that loads both from the cache would call one for the other.
+    """
+    if "<locals>" in function.__qualname__:
+        function.__qualname__ += f".{code_digest(function)[:16]}"
 
 
 @functools.cache
@@ -90,6 +102,7 @@ def _variant(function: Callable[..., Any]) -> str:
 
 def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a function into the loops that call it, with the options of :func:`kernel`."""
+    _distinguish(function)
     return register_jitable(fastmath=_FAST, error_model="numpy")(function)
 
 
@@ -135,7 +148,8 @@ class _CacheFile(IndexDataCacheFile):
     def _source_stamp(self) -> str:
         # computed late: when the loop is defined, functions below it in its file do not exist yet
         if self._digest is None:
-            self._digest = code_digest(self._function)
+            # the name distinguishes machine code from that of versions whose closures had names in common
+            self._digest = f"{self._function.__qualname__} {code_digest(self._function)}"
         return self._digest
 
     @_source_stamp.setter

@@ -21,7 +21,7 @@ from types import SimpleNamespace
 
 from numba.extending import register_jitable
 
-from .compiled import kernel
+from .compiled import inlined, kernel
 from .kernels import COLLAPSED_STRETCH, last_row, no_bar_data, no_variables
 from .materials.base import Law
 from .rows import bar_value, extend, take
@@ -74,7 +74,7 @@ def make_conserving_kernels(law: Law, measure: Callable) -> SimpleNamespace:
     ratio, of_bar, n_rows = _RATIOS[measure], no_bar_data(law), len(law.rows)
     can_break, gone = law.rupture >= 0, max(law.rupture, 0)
 
-    @register_jitable
+    @inlined
     def pair(ox, oy, oz, dx, dy, dz, rest0, rest1, shift0, shift, warmth0, warmth, p, area, step, kept, q):
         """Return the coefficient c = A l0 S R [N/m], dc/dl1 [N/m2] and 1/l1; c is NaN for a collapsed bar."""
         if can_break:  # noqa: SIM102 - not compiled otherwise

@@ -13,7 +13,6 @@ from functools import cache
 from types import SimpleNamespace
 
 import numpy as np
-from numba.extending import register_jitable
 
 from ..energies import BAR_ENERGIES
 from .compiled import inlined, kernel
@@ -231,7 +230,7 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
             broke += more
         return failed, shortened, broke
 
-    @register_jitable
+    @inlined
     def stiffness(dx, dy, dz, rest, shift, warmth, p, area, step, before, q):
         """Return dN/dl [N/m], N/l [N/m] and 1/l of one bar."""
         if can_break:  # noqa: SIM102 - not compiled otherwise

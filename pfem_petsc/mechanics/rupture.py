@@ -26,7 +26,7 @@ import numpy as np
 from numba.extending import register_jitable
 
 from ..energies import STORED
-from .compiled import kernel
+from .compiled import inlined, kernel
 from .kernels import no_bar_data, no_variables
 from .materials.base import Law
 from .rows import bar_value, blend, extend, keep_where, put, sum_where, sum_with, take
@@ -158,7 +158,7 @@ def _response(
     by_plastic, by_damage = plastic >= 0, damage >= 0
     plastic, damage = max(plastic, 0), max(damage, 0)
 
-    @register_jitable
+    @inlined
     def response(strain, rate, step, temperature, p, q):
         state = q[count]
         left = 1.0 - abs(state)
@@ -187,7 +187,7 @@ def _response(
 def _mean_stress(law: Callable[..., Any], count: int) -> Callable[..., Any]:
     of_law = _OF_LAW
 
-    @register_jitable
+    @inlined
     def mean_stress(stress0, strain0, strain, rate, step, temperature, p, q):
         left = 1.0 - abs(q[count])
         if left <= 0.0:

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import FunctionType
 
 import numba
 import numpy as np
@@ -16,7 +17,7 @@ from pfem_petsc.integrators.central_differences import Scheme
 from pfem_petsc.mechanics import strips
 from pfem_petsc.mechanics.compiled import Compilation, _variant, code_digest
 from pfem_petsc.mechanics.kernels import make_kernels
-from pfem_petsc.mechanics.materials import elastic
+from pfem_petsc.mechanics.materials import elastic, elastoplastic
 from pfem_petsc.mechanics.materials._softening import softened
 from pfem_petsc.mechanics.materials._stiffness_damping import damped
 from pfem_petsc.mechanics.rupture import breakable
@@ -184,3 +185,66 @@ def test_loops_of_a_law_with_and_without_damping_have_their_own_files():
     laws = [elastic.LAW, damped(elastic.LAW), breakable(elastic.LAW), breakable(damped(elastic.LAW))]
     found = {make_kernels(law, MEASURES["green"]).forces._cache._cache_file._index_path for law in laws}
     assert len(found) == len(laws)
+
+
+OF_ONE_LAW = """
+import sys
+import numpy as np
+from pfem_petsc.mechanics.kernels import make_kernels
+from pfem_petsc.mechanics.materials import elastic, elastoplastic
+from pfem_petsc.mechanics.strain import engineering
+from pfem_petsc.mechanics.sweep import make_sweep
+
+def energies(law, p):
+    bars = np.array([[0, 1]], dtype=np.int32)
+    x, far = np.array([[0.0, 0, 0], [1.5, 0, 0]]), np.array([1], dtype=np.uint32)
+    sums = np.zeros(16)
+    given = (np.ones(1), np.empty((2, 0)), p, 1.0, 0.0, np.zeros((len(law.rows), 1)), True, np.zeros((2, 3)), sums)
+    make_kernels(law, engineering).forces(x, make_sweep(bars, 0, 1, 1), far, *given)
+    return float(sums.sum())
+
+PARAMETERS = {"elastic": (elastic.LAW, (2.0,)), "elastoplastic": (elastoplastic.LAW, (2.0, 0.5, 0.0, 0.0, 0.5))}
+print(*(energies(*PARAMETERS[name]) for name in sys.argv[1:]))
+"""
+
+
+def test_machine_code_of_two_processes_does_not_mix_laws(tmp_path):
+    """Each law is compiled by a process of its own, then a third one loads both."""
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+
+    def run(*laws):
+        command = [sys.executable, "-c", OF_ONE_LAW, *laws]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+        return [float(word) for word in done.stdout.split()]
+
+    assert run("elastic") == [pytest.approx(0.25)]
+    # yields at 0.25, then 0.5 along the rest of the strain
+    assert run("elastoplastic") == [pytest.approx(0.0625 + 0.125)]
+    assert run("elastic", "elastoplastic") == [pytest.approx(0.25), pytest.approx(0.1875)]
+    assert run("elastoplastic", "elastic") == [pytest.approx(0.1875), pytest.approx(0.25)]
+
+
+def closures(function, found):
+    """Collect a function and all functions in its closure."""
+    function = getattr(function, "py_func", function)
+    if isinstance(function, FunctionType) and function not in found:
+        found.add(function)
+        for cell in function.__closure__ or ():
+            closures(cell.cell_contents, found)
+
+
+def test_functions_of_one_name_have_the_same_code():
+    """Machine code of several processes is told apart by names of functions."""
+    found = set()
+    for law in (elastic.LAW, elastoplastic.LAW, softened(elastic.LAW), softened(elastoplastic.LAW)):
+        for measure in MEASURES.values():
+            kernels = make_kernels(law, measure)
+            parts = kernels.sweep_part, kernels.sum_energies, kernels.clear_energies, kernels.work_rows
+            loops = [value for value in vars(kernels).values() if not isinstance(value, int)]
+            for loop in (*loops, make_fused_loop(*parts, *Scheme.loops)):
+                closures(loop, found)
+    digests = {}
+    for function in found:
+        name = function.__module__, function.__qualname__
+        assert digests.setdefault(name, code_digest(function)) == code_digest(function), name
+    assert len(digests) > 50

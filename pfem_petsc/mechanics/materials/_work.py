@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from numba.extending import register_jitable
+from ..compiled import inlined
 
 __all__ = ["SMALL", "mean_of_work"]
 
@@ -19,7 +19,7 @@ def mean_of_work(response: Callable[..., Any]) -> Callable[..., Any]:
     stress over the strain.
     """
 
-    @register_jitable
+    @inlined
     def mean_stress(stress0, strain0, strain, rate, step, temperature, p, q):
         stress, tangent, _, after = response(strain, rate, step, temperature, p, q)
         change = strain - strain0

@@ -22,7 +22,8 @@ from types import SimpleNamespace
 from numba.extending import register_jitable
 
 from .compiled import inlined, kernel
-from .kernels import COLLAPSED_STRETCH, last_row, no_bar_data, no_variables
+from .force_kernels import COLLAPSED_STRETCH
+from .law_rows import last_row, no_bar_data, no_variables
 from .materials.base import Law
 from .rows import bar_value, extend, take
 from .strain import engineering, green, logarithmic

@@ -18,7 +18,8 @@ import numpy as np
 
 from ..case.materials import law_of
 from ..errors import InputError
-from .kernels import COLLAPSED_STRETCH, no_variables
+from .force_kernels import COLLAPSED_STRETCH
+from .law_rows import no_variables
 from .rupture import intact
 from .strain import MEASURES
 from .time_tables import Table

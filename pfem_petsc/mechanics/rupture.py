@@ -27,7 +27,7 @@ from numba.extending import register_jitable
 
 from ..energies import STORED
 from .compiled import inlined, kernel
-from .kernels import no_bar_data, no_variables
+from .law_rows import no_bar_data, no_variables
 from .materials.base import Law
 from .rows import bar_value, blend, extend, keep_where, put, sum_where, sum_with, take
 

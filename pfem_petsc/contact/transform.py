@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..mechanics.compiled import kernel
+from ..solvers.node_blocks import turn_blocks
 from .frames import NodalFrames
 from .links import BlocksOf, LinkCoordinates
 from .sliding import Sliding
@@ -23,36 +23,6 @@ if TYPE_CHECKING:
     from ..stepping.model import Model
 
 __all__ = ["Transform"]
-
-
-@kernel
-def _turn_blocks(ptr, local_columns, frame_of, left, inverse, values):
-    """Apply H <- L H B^-1 to the rows and columns of nodes with a frame (index -1: none)."""
-    block = np.zeros((3, 3))
-    for row in range(len(ptr) - 1):
-        width = 3 * (ptr[row + 1] - ptr[row])
-        r = frame_of[row]
-        for k in range(ptr[row], ptr[row + 1]):
-            c = frame_of[local_columns[k]]
-            if r < 0 and c < 0:
-                continue
-            at = 6 * ptr[row] + 3 * k
-            for i in range(3):
-                for j in range(3):
-                    block[i, j] = values[at + i * width + j]
-            if r >= 0:
-                for j in range(3):
-                    x, y, z = block[0, j], block[1, j], block[2, j]
-                    for i in range(3):
-                        block[i, j] = left[r, i, 0] * x + left[r, i, 1] * y + left[r, i, 2] * z
-            if c >= 0:
-                for i in range(3):
-                    x, y, z = block[i, 0], block[i, 1], block[i, 2]
-                    for j in range(3):
-                        block[i, j] = x * inverse[c, 0, j] + y * inverse[c, 1, j] + z * inverse[c, 2, j]
-            for i in range(3):
-                for j in range(3):
-                    values[at + i * width + j] = block[i, j]
 
 
 class Transform:
@@ -158,4 +128,4 @@ class Transform:
             return
         matrix.add_blocks(self.sliding.nodes, self.sliding.stiffness, values)
         left = self.left()
-        _turn_blocks(matrix.pattern.ptr, matrix.local_columns, self._frame_of, left, self._inverse, values)
+        turn_blocks(matrix.pattern.ptr, matrix.local_columns, self._frame_of, left, self._inverse, values)

@@ -6,43 +6,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..mechanics.compiled import kernel
+from .node_blocks import turn_blocks
 
 if TYPE_CHECKING:
     from ..mechanics.directions import Directions
     from ..mesh.distribution import DistributedMesh
 
 __all__ = ["Projection"]
-
-
-@kernel
-def _project_blocks(ptr, local_columns, place, free, values):
-    """Multiply blocks by the projections ``free`` (m, 3, 3) of their row and column nodes; ``place`` -1: none."""
-    block = np.zeros((3, 3))
-    for row in range(len(ptr) - 1):
-        width = 3 * (ptr[row + 1] - ptr[row])
-        r = place[row]
-        for k in range(ptr[row], ptr[row + 1]):
-            c = place[local_columns[k]]
-            if r < 0 and c < 0:
-                continue
-            at = 6 * ptr[row] + 3 * k
-            for i in range(3):
-                for j in range(3):
-                    block[i, j] = values[at + i * width + j]
-            if r >= 0:
-                for j in range(3):
-                    x, y, z = block[0, j], block[1, j], block[2, j]
-                    for i in range(3):
-                        block[i, j] = free[r, i, 0] * x + free[r, i, 1] * y + free[r, i, 2] * z
-            if c >= 0:
-                for i in range(3):
-                    x, y, z = block[i, 0], block[i, 1], block[i, 2]
-                    for j in range(3):
-                        block[i, j] = x * free[c, 0, j] + y * free[c, 1, j] + z * free[c, 2, j]
-            for i in range(3):
-                for j in range(3):
-                    values[at + i * width + j] = block[i, j]
 
 
 class Projection:
@@ -66,4 +36,4 @@ class Projection:
 
     def project(self, ptr: np.ndarray, local_columns: np.ndarray, values: np.ndarray) -> None:
         """Project the values of a matrix, without its new diagonal blocks."""
-        _project_blocks(ptr, local_columns, self._place, self._free, values)
+        turn_blocks(ptr, local_columns, self._place, self._free, self._free, values)

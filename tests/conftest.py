@@ -99,18 +99,18 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 def thinned(items: list[pytest.Item], ranks: int) -> list[pytest.Item]:
     """Return all tests except the thorough ones, with some of their sets of parameters.
 
-    Tests with more than two sets (one on several ranks) run with every sixth, eighth or twelfth of them on 1, 2 and 3
-    ranks, slow tests with a quarter of these. Of the parallel tests one half runs on two ranks, the other on three.
+    Tests with several sets run with every eighth of them (every twelfth on three ranks), slow tests with a quarter of
+    these. Of the parallel tests one half runs on two ranks, the other on three.
     """
     sets: dict[tuple[Path, str], list[pytest.Item]] = {}
     for item in items:
         if item.get_closest_marker("thorough") is None:
             sets.setdefault((item.path, getattr(item, "originalname", item.name)), []).append(item)
-    most, stride = {1: (2, 6), 2: (1, 8)}.get(ranks, (1, 12))
+    stride = 12 if ranks > 2 else 8
     chosen: set[pytest.Item] = set()
     for group in list(sets.values())[ranks % 2 :: 2] if ranks > 1 else list(sets.values()):
         slow = group[0].get_closest_marker("slow") is not None
-        if slow or len(group) > most:
+        if len(group) > 1:
             every = 4 * stride if slow else stride
             group = group[(ranks - 1) % min(every, len(group)) :: every]
         chosen |= set(group)

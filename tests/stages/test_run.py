@@ -81,6 +81,7 @@ def test_a_later_stage_that_cannot_run_is_found_before_the_first_step(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.thorough
 def test_paths_in_stages_and_restarts_in_them(tmp_path):
     assert run(DOME, MPI.COMM_SELF, tmp_path / "whole") > 30
     result = open_result(tmp_path / "whole")

@@ -22,9 +22,9 @@ FLOOR = {"name": "floor", "type": "plane", "point": [0, 0, -1e-5], "normal": [0.
 SIDE = {"name": "side", "type": "plane", "point": [0.0201, 0, 0], "normal": [-1.0, 0.0, 0.0], "node_set": "foot"}
 
 CASES = {
+    "yielding": {"material": {"it": LATTICE["material"]["it"] | PLASTIC}, "wall": [FLOOR]},
     "flying": {},
     "walls": {"wall": [FLOOR, SIDE]},
-    "yielding": {"material": {"it": LATTICE["material"]["it"] | PLASTIC}, "wall": [FLOOR]},
     "held": {"support": [{"node_set": "foot", "fix": "xz"}], "gravity": {"acceleration": [0.0, 0.0, -1e4]}},
     "held and loaded": {
         "support": [{"node_set": "foot", "fix": "z"}],

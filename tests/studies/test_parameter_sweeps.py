@@ -171,7 +171,8 @@ def test_command_line(tmp_path, capsys):
     ]
     assert main([*words, "--results", "kinetic_energy", "--quiet"]) == 3
     printed = capsys.readouterr().out
-    assert "time.step ..." in printed and printed.strip().endswith("sweep.csv")
+    assert "0.5       2  " in printed and "..." in printed and printed.strip().endswith("sweep.csv")
+    assert "time.step = 0.5" in (tmp_path / "out" / "sweep.csv").read_text()
     assert main(["sweep", "rod_impact", "--vary", "time.step"]) == 2
     assert "--vary time.step: expected KEY=VALUES" in capsys.readouterr().err
 
@@ -190,6 +191,7 @@ def test_tables(tmp_path):
         Table({"a": [1, 2], "b": [1]})
 
 
+@pytest.mark.thorough
 @pytest.mark.parametrize("integrator", ["central_differences", "newmark"])
 def test_loops_over_runs_keep_nothing_and_compile_nothing(tmp_path, integrator):
     """Neither objects nor files nor PETSc objects grow with the number of runs."""

@@ -178,7 +178,9 @@ def make_force_kernels(law: Law, measure: Callable) -> dict[str, Any]:
     @inlined
     def clear_energies(work):
         """Set the sums of ``work`` to zero."""
-        work[_4 : _4 + n_energies * CHUNK] = 0.0
+        sums = work[_4:]
+        for i in range(n_energies * CHUNK):  # much faster than an assignment to a slice
+            sums[i] = 0.0
 
     @kernel
     def forces(x, sweep, far, rest, heat, p, area, step, history, commit, f, energies):

@@ -17,14 +17,13 @@ from .linear import LinearChoice, configure
 from .matrix import HessianMatrix
 from .matrix_free import MatrixFreeHessian
 from .outlive import at_exit, outlive
-from .reasons import linear_reason, newton_reason
+from .reasons import is_failed_factorisation, linear_reason, newton_reason
 
 if TYPE_CHECKING:
     from ..mesh.distribution import DistributedMesh
 
 __all__ = ["NewtonReport", "NewtonSolver", "Problem", "zero_tolerance"]
 
-_EXTERNAL_LIBRARY = 76  # PETSC_ERR_LIB
 _STAGNATION = 100.0  # a residual within this many rounding floors that no longer falls has converged
 
 
@@ -169,8 +168,7 @@ class NewtonSolver:
         try:
             snes.solve(None, self._u)
         except PETSc.Error as error:
-            # MUMPS on several ranks: PETSc 3.18 goes on to solve with what could not be factorised
-            if error.ierr != _EXTERNAL_LIBRARY or "MUMPS" not in str(error):
+            if not is_failed_factorisation(error):
                 raise
             why = "a linear solve failed; linear solver: MUMPS could not factorise the matrix (a singular matrix)"
             report = NewtonReport(False, snes.getIterationNumber(), 0, self._g.norm(), why)

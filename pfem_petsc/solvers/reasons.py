@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from petsc4py import PETSc
 
-__all__ = ["linear_reason", "newton_reason"]
+__all__ = ["is_failed_factorisation", "linear_reason", "newton_reason"]
+
+_EXTERNAL_LIBRARY = 76  # PETSC_ERR_LIB
 
 _NEWTON = {
     "DIVERGED_FUNCTION_DOMAIN": "the positions left the domain of the model (a collapsed bar)",
@@ -49,3 +51,11 @@ def newton_reason(reason: int) -> str:
 def linear_reason(reason: int) -> str:
     """Describe a KSP converged reason."""
     return _words(PETSc.KSP.ConvergedReason, _LINEAR, reason)
+
+
+def is_failed_factorisation(error: PETSc.Error) -> bool:
+    """Return whether MUMPS could not factorise a matrix: on several ranks PETSc 3.18 goes on to solve with the remains.
+
+    The solver is then in the middle of a solve, and must be made anew.
+    """
+    return error.ierr == _EXTERNAL_LIBRARY and "MUMPS" in str(error)

@@ -21,7 +21,7 @@ from ..errors import NotConverged
 from ..solvers.lagged import LaggedPreconditioner
 from ..solvers.linear import LinearChoice, configure
 from ..solvers.outlive import at_exit
-from ..solvers.reasons import linear_reason
+from ..solvers.reasons import is_failed_factorisation, linear_reason
 from ..stepping.problem import StepProblem
 
 if TYPE_CHECKING:
@@ -76,18 +76,21 @@ class BorderedSystem:
         mesh = model.mesh
         self._b = PETSc.Vec().createMPI((3 * mesh.n_owned, 3 * mesh.n_nodes), bsize=3, comm=mesh.comm)
         self._x = self._b.duplicate()
-        self._ksp = PETSc.KSP().create(mesh.comm)
-        self._ksp.setOptionsPrefix(_PREFIX)
         # beyond a critical point the stiffness is indefinite
-        own = choice if self.direct else LinearChoice("gmres", choice.preconditioner, "indefinite")
-        ours = None if lagged is None else _Preconditioning(self)
-        configure(self._ksp, own, False, ours)
-        if not self.direct:
-            self._ksp.setTolerances(rtol=_RTOL, max_it=2000)
-        self._ksp.setOperators(hessian.mat, hessian.mat)
-        self._ksp.setFromOptions()
-        at_exit(_let_go, self._ksp)
+        self._choice = choice if self.direct else LinearChoice("gmres", choice.preconditioner, "indefinite")
+        self._ksp = self._solver()
         self.problem: StepProblem | None = None
+
+    def _solver(self) -> PETSc.KSP:
+        ksp = PETSc.KSP().create(self.model.mesh.comm)
+        ksp.setOptionsPrefix(_PREFIX)
+        configure(ksp, self._choice, False, None if self.lagged is None else _Preconditioning(self))
+        if not self.direct:
+            ksp.setTolerances(rtol=_RTOL, max_it=2000)
+        ksp.setOperators(self.hessian.mat, self.hessian.mat)
+        ksp.setFromOptions()
+        at_exit(_let_go, ksp)
+        return ksp
 
     def begin(self, state: State) -> None:
         """Start a step: displacements are relative to the positions of a state. Collective."""
@@ -178,7 +181,14 @@ class BorderedSystem:
         return v
 
     def _attempt(self) -> int:
-        self._ksp.solve(self._b, self._x)
+        try:
+            self._ksp.solve(self._b, self._x)
+        except PETSc.Error as error:
+            if not is_failed_factorisation(error):
+                raise
+            self._ksp.destroy()
+            self._ksp = self._solver()
+            return PETSc.KSP.ConvergedReason.DIVERGED_PCSETUP_FAILED
         self.linear += self._ksp.getIterationNumber()
         reason = self._ksp.getConvergedReason()
         if reason < 0 and not self.direct and self._ksp.getResidualNorm() <= _USABLE * self._b.norm():

@@ -3,11 +3,13 @@
 import numpy as np
 import pytest
 from mpi4py import MPI
+from petsc4py import PETSc
 
 import pfem_petsc.statics.stability
 from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.errors import InputError, SimulationFailure
 from pfem_petsc.solvers.linear import has_mumps
+from pfem_petsc.statics.bordered import BorderedSystem
 
 
 def von_mises(static=None, **tables):
@@ -161,3 +163,39 @@ def test_linear_solvers_find_the_same_path(solver, comm, shared_tmp_path):
     if comm.rank == 0:
         history = open_result(shared_tmp_path / "a").history
         assert history["event/load_factor"] == pytest.approx([0.09565880620, -0.09612898292], rel=1e-8)
+
+
+class MumpsError(PETSc.Error):
+    """As PETSc 3.18 raises it on several ranks; which matrices provoke it depends on their order."""
+
+    def __str__(self):
+        return "error code 76\nError reported by MUMPS in solve phase: INFOG(1)=-3"
+
+
+def test_a_factorisation_that_fails_within_a_solve_shortens_the_step(tmp_path, monkeypatch):
+    def attempt(system):
+        if len(attempts) == 3:
+            attempts.append(system._ksp)
+            given, system._ksp = system._ksp, Failing(system._ksp)
+            try:
+                return whole(system)
+            finally:
+                assert system._ksp is not given
+        attempts.append(system._ksp)
+        return whole(system)
+
+    class Failing:
+        def __init__(self, ksp):
+            self.destroy = ksp.destroy
+
+        def solve(self, b, x):
+            raise MumpsError(76)
+
+    attempts = []
+    whole = BorderedSystem._attempt
+    monkeypatch.setattr(BorderedSystem, "_attempt", attempt)
+    case = von_mises({"method": "arc_length", "step": 0.05, "max_points": 4})
+    with Simulation(case, MPI.COMM_SELF, output=tmp_path / "a", quiet=True) as simulation:
+        simulation.run()
+    assert len(attempts) > 4 and attempts[4] is not attempts[3]
+    assert open_result(tmp_path / "a").history["step"][-1] == 4

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -100,17 +101,17 @@ def check_length(value: float, where: str) -> None:
 def slab_of_whole(
     points: np.ndarray,
     bars: np.ndarray,
-    node_groups: dict[str, np.ndarray],
-    bar_groups: dict[str, np.ndarray],
+    node_groups: Mapping[str, np.ndarray],
+    bar_groups: Mapping[str, np.ndarray],
     source: str,
     rank: int,
     size: int,
 ) -> MeshSlab:
-    """A rank's part of a small mesh that every rank has made: points (nodes, 3) [m], bars (bars, 2), members."""
+    """A rank's part of a mesh that every rank has whole: points (nodes, 3) [m], bars (bars, 2), members."""
     first_node, last_node = slab_range(len(points), rank, size)
     first_bar, last_bar = slab_range(len(bars), rank, size)
 
-    def within(groups: dict[str, np.ndarray], first: int, last: int) -> dict[str, np.ndarray]:
+    def within(groups: Mapping[str, np.ndarray], first: int, last: int) -> dict[str, np.ndarray]:
         found = {name: np.asarray(members, dtype=np.int64) for name, members in groups.items()}
         return {name: members[(members >= first) & (members < last)] for name, members in found.items()}
 
@@ -120,7 +121,7 @@ def slab_of_whole(
         first_node=first_node,
         points=np.array(points[first_node:last_node], dtype=np.float64).reshape(-1, 3),
         first_bar=first_bar,
-        bars=np.asarray(bars, dtype=index_type(len(points)))[first_bar:last_bar].reshape(-1, 2),
+        bars=np.asarray(bars[first_bar:last_bar], dtype=index_type(len(points))).reshape(-1, 2),
         node_groups=within(node_groups, first_node, last_node),
         bar_groups=within(bar_groups, first_bar, last_bar),
         source=source,

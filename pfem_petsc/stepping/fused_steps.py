@@ -224,7 +224,8 @@ class Batches:
                 return True
             self._batch = Batch(stepper, history.ledger, history.recorder)
         numbers = range(stepper.number + 1, stepper.number + count + 1)
-        made, touched = self._batch.make(np.array([history.due(number) for number in numbers]))
+        due = np.array([history.due(number) for number in numbers])
+        made, touched = self._batch.make(due)
         failed = stepper.fault is not None
         contact, comm = analysis.model.contact, analysis.model.comm
         for k in range(made - failed):
@@ -234,7 +235,7 @@ class Batches:
                 contact.log.note(touched[k], stepper.h, comm)
                 contact.log.changes += int(sums[HEAD.width])
                 sums[HEAD.width] = contact.log.changes
-            if history.due(stepper.number):
+            if due[k]:
                 history.take(history.recorder.row_of(sums))
         if failed:
             state.step, state.time = begin + made, (begin + made) * stepper.h

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from dataclasses import replace
 from typing import Any
 
-import numpy as np
 from mpi4py import MPI
 from pydantic import model_validator
 
@@ -14,7 +14,7 @@ from ...errors import InputError
 from ...parallel.agreement import agreed
 from ..readers import missing_field
 from ..readers.scatter import WholeMesh, scattered
-from ..slab import MeshSlab, check_size, slab_range
+from ..slab import MeshSlab, check_size, slab_of_whole, slab_range
 from ..truss import Truss
 
 __all__ = ["Parameters", "generate_on"]
@@ -104,21 +104,7 @@ def generate_on(
 
 
 def _own_part(truss: Truss, rank: int, size: int, fields: Mapping[str, str]) -> MeshSlab:
-    first_node, last_node = slab_range(truss.n_nodes, rank, size)
-    first_bar, last_bar = slab_range(truss.n_bars, rank, size)
-
-    def within(groups: Mapping[str, np.ndarray], first: int, last: int) -> dict[str, np.ndarray]:
-        return {name: members[slice(*np.searchsorted(members, (first, last)))] for name, members in groups.items()}
-
-    return MeshSlab(
-        n_nodes=truss.n_nodes,
-        n_bars=truss.n_bars,
-        first_node=first_node,
-        points=truss.points[first_node:last_node],
-        first_bar=first_bar,
-        bars=truss.bars[first_bar:last_bar],
-        node_groups=within(truss.node_groups, first_node, last_node),
-        bar_groups=within(truss.bar_groups, first_bar, last_bar),
-        bar_fields={name: truss.bar_fields[name][first_bar:last_bar] for name in fields},
-        source="mesh",
-    )
+    slab = slab_of_whole(truss.points, truss.bars, truss.node_groups, truss.bar_groups, "mesh", rank, size)
+    first, last = slab_range(truss.n_bars, rank, size)
+    own = {name: truss.bar_fields[name][first:last] for name in fields}
+    return replace(slab, bar_fields=own, structured=False)

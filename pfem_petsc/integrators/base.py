@@ -96,8 +96,9 @@ class Scheme(ABC):
     solves_end : the position solved for is x_{n+1}
     discrete_gradient : the internal force of its balances is that of the step (``Balance.discrete_gradient``)
     force_acts_once : a contact force affects only its own step if its acceleration is removed
-    loops : ``inlined`` functions that move nodes and finish a step, for the fused loop (``stepping/fused_loop.py``);
-        None: steps are made one by one
+    loops : of leapfrog schemes, ``inlined`` functions that move nodes by velocities at half steps, advance these, and
+        compute the velocities of the balance, for the fused loop (``stepping/fused_loop.py``); None for other schemes,
+        whose steps are made one by one
     symmetric : whether the Hessian is symmetric
     remembers : names of the scheme's nodal arrays in the state's memory, which are linear in the motion
     dissipates : whether the scheme dissipates energy at high frequencies
@@ -114,7 +115,7 @@ class Scheme(ABC):
     solves_end = True
     discrete_gradient = False
     force_acts_once = False
-    loops: tuple[Callable, Callable] | None = None
+    loops: tuple[Callable, Callable, Callable] | None = None
     symmetric = True
     remembers: tuple[str, ...] = ()
     dissipates = True

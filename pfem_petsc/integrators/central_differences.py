@@ -14,7 +14,7 @@ import numpy as np
 from ..mechanics.compiled import inlined, kernel
 from .base import Balance, ExplicitScheme, NoParameters, State
 
-__all__ = ["Parameters", "Scheme", "drift", "kick"]
+__all__ = ["Parameters", "Scheme"]
 
 Parameters = NoParameters
 
@@ -29,22 +29,27 @@ def move(x, h, half, moved):
 
 
 @inlined
-def finish(u, alpha, eta, h, half, a, v):
-    """Compute acceleration and velocity of the balance, and ``half`` half a step later."""
+def push(u, alpha, h, half):
+    """Advance the velocities ``half`` by a step with the acceleration of the balance, alpha u."""
     for i in range(len(u)):
-        a[i] = alpha * u[i]
-        v[i] = half[i] + eta * u[i]
-        half[i] += u[i] / h
+        half[i] += h * (alpha * u[i])
 
 
-drift, kick = kernel(move), kernel(finish)
+@inlined
+def centre(u, eta, half, v):
+    """Compute velocities of the balance from the increments and the velocities half a step later."""
+    for i in range(len(u)):
+        v[i] = half[i] - eta * u[i]
+
+
+drift, kick, settle = kernel(move), kernel(push), kernel(centre)
 
 
 class Scheme(ExplicitScheme):
     """Central differences (explicit)."""
 
     solves_next_position = True
-    loops = (move, finish)
+    loops = (move, push, centre)
     remembers = ("half_velocity",)
     dissipates = False
 
@@ -76,6 +81,7 @@ class Scheme(ExplicitScheme):
         )
 
     def finish(self, state: State, balance: Balance, u: np.ndarray, h: float) -> None:
-        state.a, state.v = np.empty_like(u), np.empty_like(u)
-        half, a, v = (array.reshape(-1) for array in (state.memory["half_velocity"], state.a, state.v))
-        kick(u.reshape(-1), balance.alpha, balance.eta, h, half, a, v)
+        state.a, state.v = balance.alpha * u, np.empty_like(u)
+        half, increments = state.memory["half_velocity"].reshape(-1), u.reshape(-1)
+        kick(increments, balance.alpha, h, half)
+        settle(increments, balance.eta, half, state.v.reshape(-1))

@@ -10,7 +10,7 @@ import numpy as np
 from ..analysis import Step
 from ..output.row import Row
 from ..output.vtkhdf import ResultWriter
-from ..stepping.ledger import Ledger
+from ..stepping.leapfrog_ledger import make_ledger
 from .blowup import BlowUp
 from .contact_watch import ContactWatch, NoContactWatch
 from .observer import NEVER, Observer
@@ -56,7 +56,7 @@ class History(Observer):
         model = stepper.model
         self.every = model.case.output.history_every
         self._stepper, self._synchroniser, self._model = stepper, synchroniser, model
-        self.ledger = Ledger(stepper)
+        self.ledger = make_ledger(stepper)
         self.recorder = Recorder(stepper, self.ledger)
         self.blow_up = BlowUp(model)
         inertial = stepper.scheme.inertial

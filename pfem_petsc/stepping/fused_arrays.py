@@ -8,7 +8,7 @@ import numpy as np
 
 from ..mechanics.sweep import Sweep
 
-__all__ = ["BarArrays", "Buffers", "ImpulseArrays", "NodeArrays", "ProbeArrays", "WallArrays"]
+__all__ = ["BarArrays", "ImpulseArrays", "NodeArrays", "ProbeArrays", "StateArrays", "WallArrays"]
 
 
 class BarArrays(NamedTuple):
@@ -75,19 +75,13 @@ class ProbeArrays(NamedTuple):
     starts: np.ndarray
 
 
-class Buffers(NamedTuple):
-    """Arrays (n, 3) used alternately: those of the last step, and those that the next step fills.
-
-    The arrays of wall forces are zero except for the entries that the last step has set in the first one.
-    """
+class StateArrays(NamedTuple):
+    """Arrays (n, 3) of the state, and the energies of the bars [J]. Wall forces are zero except at the nodes that touch
+    walls; support forces are written at prescribed components alone."""
 
     f: np.ndarray
-    f_next: np.ndarray
     a: np.ndarray
-    a_next: np.ndarray
     v: np.ndarray
-    v_next: np.ndarray
     support: np.ndarray
-    support_next: np.ndarray
     contact: np.ndarray
-    contact_next: np.ndarray
+    energies: np.ndarray

@@ -13,8 +13,9 @@ from ..mechanics.bars import StrainEnergy
 from ..mesh.ordering import NODE_BLOCK
 from ..output.sums import HEAD, WALL
 from ..tolerances import PROJECTED
-from .fused_arrays import BarArrays, Buffers, ImpulseArrays, NodeArrays, ProbeArrays, WallArrays
+from .fused_arrays import BarArrays, ImpulseArrays, NodeArrays, ProbeArrays, StateArrays, WallArrays
 from .fused_loop import make_fused_loop
+from .leapfrog_ledger import LeapfrogLedger
 from .solution import Solution
 
 if TYPE_CHECKING:
@@ -44,7 +45,7 @@ class Batch:
     sums : (:data:`MOST`, width) for each step, the sums that :meth:`~pfem_petsc.recording.recorder.Recorder.row` uses
     """
 
-    def __init__(self, stepper: Stepper, ledger: Ledger, recorder: Recorder) -> None:
+    def __init__(self, stepper: Stepper, ledger: LeapfrogLedger, recorder: Recorder) -> None:
         self.stepper, self.ledger = stepper, ledger
         model = stepper.model
         self.model = model
@@ -77,7 +78,6 @@ class Batch:
         self._walls = WallArrays(*walls, PROJECTED * model.length, *work, *impact)
         self._probes = ProbeArrays(*recorder.probed())
         self.sums = np.zeros((MOST, recorder.width))
-        self._spare = [np.zeros_like(stepper.state.v) for _ in range(4)]
 
     def _reach(self) -> int:
         """Return how many blocks of nodes beyond its own the bars of a block reach."""
@@ -86,8 +86,8 @@ class Batch:
         return int(blocks.max(initial=0))
 
     @staticmethod
-    def serves(stepper: Stepper) -> bool:
-        """Return whether the fused loop applies to the steps of this run."""
+    def serves(stepper: Stepper, ledger: Ledger) -> bool:
+        """Return whether the fused loop applies to the steps of this run or stage."""
         from petsc4py import PETSc
 
         model = stepper.model
@@ -95,9 +95,7 @@ class Batch:
             # -log_view measures the methods of single steps
             not PETSc.Log.isActive()
             and model.comm.size == 1
-            and stepper.steady
-            and stepper.scheme.loops is not None
-            and stepper.treatment is None
+            and isinstance(ledger, LeapfrogLedger)
             and model.steady
             and all(energy.value is None for energy in ENERGIES)
         )
@@ -113,45 +111,34 @@ class Batch:
         log, scheme = self.model.contact.log, stepper.scheme
         begin = state.step
         walls = len(self.model.contact.walls)
-        a_next, v_next, support_next, contact_next = self._spare
-        contact_next[:] = 0.0
-        last = [state.a, state.v, state.support, state.contact]
-        support, contact = (np.zeros_like(state.v) if array is stepper.zero else array for array in last[2:])
-        buffers = Buffers(
-            state.f, stepper.other_force, last[0], a_next, last[1], v_next, support, support_next, contact, contact_next
+        support, contact = (
+            np.zeros_like(state.v) if array is stepper.zero else array for array in (state.support, state.contact)
         )
         energies = np.array(stepper.energy.energies)
+        arrays = StateArrays(state.f, state.a, state.v, support, contact, energies)
         half = state.memory["half_velocity"]
         pushed = ledger.impulses.state
         impulses = ImpulseArrays(pushed.memory["half_velocity"], pushed.a, pushed.v)
-        ledger.take_pending()
         ledger.sums[_BROKEN] = stepper.ruptures.count
-        done, changed, failed, turned, infeasible, offsets, after, kinetic, u, touched, log.last, met = (
-            self._fused_loop(
-                len(due),
-                stepper.h,
-                state.x,
-                stepper.before,
-                half,
-                self._bars,
-                self._nodes,
-                self._walls,
-                self._probes,
-                buffers,
-                log.last,
-                ledger.impacts.met,
-                ledger.sums,
-                impulses,
-                ledger.kinetic,
-                energies,
-                due,
-                self.sums,
-            )
+        done, changed, failed, turned, infeasible, offsets, kinetic, u, touched, log.last, met = self._fused_loop(
+            len(due),
+            stepper.h,
+            state.x,
+            stepper.before,
+            half,
+            self._bars,
+            self._nodes,
+            self._walls,
+            self._probes,
+            arrays,
+            log.last,
+            ledger.impacts.met,
+            ledger.sums,
+            ledger.powers,
+            impulses,
+            due,
+            self.sums,
         )
-        state.f, stepper.other_force, state.a, a_next, state.v, v_next, support, support_next, contact, contact_next = (
-            after
-        )
-        self._spare = [a_next, v_next, support_next, contact_next]
         state.support = support if self.model.supports.any else stepper.zero
         state.contact = contact if len(touched[3]) else stepper.zero
         stepper.energy = StrainEnergy(tuple(energies.tolist()), failed)
@@ -219,7 +206,7 @@ class Batches:
             self._changes, self._batch = stepper.support_changes, None
             return True
         if self._batch is None:
-            self._refused = not Batch.serves(stepper)
+            self._refused = not Batch.serves(stepper, history.ledger)
             if self._refused:
                 return True
             self._batch = Batch(stepper, history.ledger, history.recorder)

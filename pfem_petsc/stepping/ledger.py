@@ -264,12 +264,6 @@ class Ledger:
         self._before = moment_of(self.stepper)
         self._before.kinetic = kinetic
 
-    def take_pending(self) -> None:
-        """Add the dissipation of a step solved in advance, before steps of the fused loop."""
-        self.sums[_AT["impact_dissipation"]] += self._pending[0]
-        self.sums[_AT["numerical_dissipation"]] -= self._pending[0]
-        self._pending = [0.0, 0.0]
-
     def kept(self) -> dict[str, Any]:
         """Return this rank's share for a checkpoint: numbers that can be summed over ranks."""
         return {"sums": self.sums.tolist(), "pending": list(self._pending), "impulses": self.impulses.kept()}

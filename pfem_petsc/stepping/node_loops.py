@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from ..mechanics.compiled import kernel
 
-__all__ = ["explicit_increments", "hold", "leave_positions", "react"]
+__all__ = ["accelerations", "explicit_increments", "hold", "hold_still", "react"]
 
 
 @kernel
@@ -47,12 +47,10 @@ def explicit_increments(external, f, mass, damping, alpha, eta, a_hat, v_hat, st
 
 
 @kernel
-def leave_positions(x, before, f):
-    """Copy positions to ``before``, and set forces to zero; arrays (3 n,)."""
-    for j in range(len(x)):
-        before[j] = x[j]
-    for j in range(len(f)):
-        f[j] = 0.0
+def accelerations(u, alpha, a):
+    """Compute ``a`` = alpha u; arrays (3 n,)."""
+    for j in range(len(u)):
+        a[j] = alpha * u[j]
 
 
 @kernel
@@ -63,6 +61,18 @@ def hold(begin, end, origin, nodes, components, positions, predictor, stiffness,
         i, c = nodes[k] - origin, components[k]
         load[k] = stiffness[i] * u[i, c]
         u[i, c] = positions[k] - predictor[i, c]
+
+
+@kernel
+def hold_still(begin, end, origin, nodes, components, positions, x, half, h, stiffness, u, load, held):
+    """Like :func:`hold` for a scheme that predicts ``x`` + ``h half``, arrays (n, 3) of all nodes; the increments are
+    written to ``held`` (k,) too."""
+    for k in range(begin, end):
+        node, c = nodes[k], components[k]
+        i = node - origin
+        load[k] = stiffness[i] * u[i, c]
+        held[k] = positions[k] - (x[node, c] + h * half[node, c])
+        u[i, c] = held[k]
 
 
 @kernel

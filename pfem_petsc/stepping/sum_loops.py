@@ -12,7 +12,7 @@ from ..output.sums import HEAD, WALL
 from .book_loops import WORKS
 from .impulses import WALLS
 
-__all__ = ["add_totals", "add_works", "fill_bars", "fill_probes", "fill_walls"]
+__all__ = ["add_totals", "add_works", "fill_bars", "fill_probes", "fill_walls", "fill_works"]
 
 _BARS = tuple(HEAD.first(name) for name in BAR_ENERGIES)
 _EXTERNAL, _CONTACT = HEAD.first("external_work"), HEAD.first("contact_work")
@@ -48,6 +48,23 @@ def add_works(sums, works, stored, heating, impact, friction, work, given, weigh
     # the work of contact on nodes in excess of the work of walls and the losses by friction and impact
     left = works[_BY_CONTACT] + jumped - work - given + friction
     sums[_NUMERICAL] += works[_BY_INERTIA] + works[_BY_BARS] + heating - stored - left - impact + lost
+
+
+@kernel
+def fill_works(sums, powers, ends, held) -> None:
+    """Write the works and dissipations of a leapfrog scheme up to the end of a step [J].
+
+    Parameters
+    ----------
+    sums : (HEAD.width,) of a row; those of impact are complete
+    powers : (5,) of the balances before, see :class:`~pfem_petsc.stepping.leapfrog_ledger.LeapfrogLedger`
+    ends : (5,) of the last balance, see :func:`~pfem_petsc.stepping.balance_loops.book_row`
+    held : energies of the bars
+    """
+    sums[_EXTERNAL] = powers[_BY_EXTERNAL] + ends[_BY_EXTERNAL]
+    sums[_DAMPING] = powers[_BY_DAMPING] + ends[_BY_DAMPING]
+    bars, contact = powers[_BY_BARS] + ends[_BY_BARS], powers[_BY_CONTACT] + ends[_BY_CONTACT]
+    sums[_NUMERICAL] = (bars - held) + powers[_BY_INERTIA] - ends[_BY_INERTIA] - contact - sums[_IMPACT]
 
 
 @kernel

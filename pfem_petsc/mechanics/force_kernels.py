@@ -191,20 +191,19 @@ def make_force_kernels(law: Law, measure: Callable) -> dict[str, Any]:
         ``sweep``: a :class:`~pfem_petsc.mechanics.sweep.Sweep`; ``far`` (b,) the upper end of each bar.
         """
         work = np.empty((4 + n_energies + n_rows) * CHUNK)
-        clear_energies(work)
         failed = -1
         shortened = False
         broke = 0
-        limits = (0, sweep.counted, len(sweep.diagonal))
-        for side in range(2):
+        limits = (sweep.counted, len(sweep.diagonal), 0, sweep.counted)
+        for side in range(0, 4, 2):  # first the bars that are counted on other ranks
+            clear_energies(work)
             at, short, more = sweep_part(
                 x, sweep, limits[side], limits[side + 1], far, rest, heat, p, area, step, history, commit, f, work
             )
-            if side == 0:  # the remaining bars are counted on other ranks
-                sum_energies(work, energies)
             failed = at if failed < 0 else failed
             shortened = shortened or short
             broke += more
+        sum_energies(work, energies)
         return failed, shortened, broke
 
     return {

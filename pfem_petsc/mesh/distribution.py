@@ -9,7 +9,7 @@ import numpy as np
 from mpi4py import MPI
 
 from ..parallel.natural import NaturalOrder
-from .exchange import GhostExchange, Router
+from .exchange import GhostExchange, Messages, Router
 from .ordering import bar_order, node_order, sweep_keys
 from .partition import partition
 from .slab import MeshSlab, index_type, slab_of
@@ -107,6 +107,10 @@ class DistributedMesh:
     def end_update(self, array: np.ndarray) -> None:
         """Finish the update that :meth:`begin_update` started on the same array."""
         self._exchange.end(array)
+
+    def messages(self) -> Messages | None:
+        """Return the messages that update ghosts of positions, for compiled loops; None if loops cannot call MPI."""
+        return self._exchange.messages()
 
     def close(self) -> None:
         """Free the message requests (optional at the end of a program)."""

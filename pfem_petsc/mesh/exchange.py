@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import ctypes
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from mpi4py import MPI
 
-__all__ = ["GhostExchange", "Router", "swap"]
+__all__ = ["GhostExchange", "Messages", "Router", "swap"]
 
 # First tag of the ghost messages; the number of columns is added, so that exchanges of different widths can be in
 # progress at the same time.
@@ -83,6 +85,41 @@ class _Buffers:
     requests: list[MPI.Prequest]
 
 
+class Messages(NamedTuple):
+    """The messages of an exchange of three columns for compiled loops, which call MPI themselves.
+
+    Attributes
+    ----------
+    rows : (r,) owned rows that are sent; leaving : (r, 3), arriving : (g, 3) buffers
+    count : number of requests; requests, statuses : their handles, and room for as many statuses, as bytes
+    start_all, wait_all : addresses of ``MPI_Startall`` and ``MPI_Waitall``
+    """
+
+    rows: np.ndarray
+    leaving: np.ndarray
+    arriving: np.ndarray
+    count: int
+    requests: np.ndarray
+    statuses: np.ndarray
+    start_all: int
+    wait_all: int
+
+
+def _addresses() -> tuple[int, int] | None:
+    """Return the addresses of ``MPI_Startall`` and ``MPI_Waitall``; None if they cannot be found."""
+    try:
+        library = ctypes.CDLL(MPI.__file__)
+        text, length = ctypes.create_string_buffer(MPI.MAX_LIBRARY_VERSION_STRING), ctypes.c_int()
+        library.MPI_Get_library_version(text, ctypes.byref(length))
+        # a library of another MPI than mpi4py's would not know its requests
+        if text.value.decode().strip() != MPI.Get_library_version().strip("\0 \n"):
+            return None
+        found = [ctypes.cast(getattr(library, name), ctypes.c_void_p).value for name in ("MPI_Startall", "MPI_Waitall")]
+    except (OSError, AttributeError):
+        return None
+    return found[0], found[1]
+
+
 class GhostExchange:
     """Sends owned rows to the ranks that have them as ghosts. Construction is collective, updates are point to point.
 
@@ -156,6 +193,24 @@ class GhostExchange:
         if width not in self._buffers:
             self._prepare(width)
         return self._buffers[width]
+
+    def messages(self) -> Messages | None:
+        """Return the messages of arrays with three columns for compiled loops, valid until :meth:`close`.
+
+        None if the functions of MPI cannot be called by loops. One rank has none, and needs no functions.
+        """
+        addresses = (0, 0) if self._comm.size == 1 else _addresses()
+        if addresses is None:
+            return None
+        if 3 not in self._buffers:
+            self._prepare(3)
+        buffers = self._buffers[3]
+        handle, status = MPI._sizeof(MPI.Request), MPI._sizeof(MPI.Status)
+        handles = [ctypes.string_at(MPI._addressof(request), handle) for request in buffers.requests]
+        requests = np.frombuffer(b"".join(handles), dtype=np.uint8).copy()
+        statuses = np.zeros(max(len(handles), 1) * status, dtype=np.uint8)
+        rows = self._rows.astype(np.int64)
+        return Messages(rows, buffers.leaving, buffers.arriving, len(handles), requests, statuses, *addresses)
 
     def begin(self, array: np.ndarray) -> None:
         """Start sending the owned rows of ``array`` (n_local, k) float64 to their ghosts on other ranks."""

@@ -6,9 +6,11 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from mpi4py import MPI
 
 from ..analysis import Step
 from ..output.row import Row
+from ..output.sums import HEAD
 from ..output.vtkhdf import ResultWriter
 from ..stepping.leapfrog_ledger import make_ledger
 from .blowup import BlowUp
@@ -120,6 +122,17 @@ class History(Observer):
         if self.recorder.alarmed:
             self._synchroniser.synchronise()
         self.take(row)
+
+    def take_sums(self, sums: np.ndarray) -> bool:
+        """Take the row of this rank's sums (width,) at the state's step and time, unless a rank has a fault; return
+        whether none has. Collective."""
+        if self._model.comm.size > 1:
+            sums = sums.copy()
+            self._model.comm.Allreduce(MPI.IN_PLACE, sums)
+            if sums[HEAD.first("alarm")] > 0.0:
+                return False
+        self.take(self.recorder.row_of(sums))
+        return True
 
     def take(self, row: Row) -> None:
         """Check a row, store it and add it to the history."""

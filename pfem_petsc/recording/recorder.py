@@ -96,11 +96,17 @@ class Recorder:
         """Number of sums in a row."""
         return len(self._sums)
 
-    def probed(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the nodes of all probes in the order of their columns, on one rank, and the start of each probe."""
-        nodes = [local[np.argsort(place)] for _, local, place in self._probes]
-        starts = np.cumsum([0, *(len(part) for part in nodes)])
-        return np.concatenate(nodes or [np.empty(0)]).astype(np.int64), starts.astype(np.int64)
+    def probed(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return this rank's nodes of all probes; where their positions are among the sums of probes; and the number of
+        nodes of their probe on all ranks. Arrays (m,) int64."""
+        nodes, places, counts, begin = [], [], [], 0
+        for name, local, place in self._probes:
+            size = len(self.probe_nodes[name])
+            nodes.append(local)
+            places.append(begin + 3 * place)
+            counts.append(np.full(len(local), size))
+            begin += 12 * size
+        return tuple(np.concatenate([np.empty(0), *parts]).astype(np.int64) for parts in (nodes, places, counts))
 
     def count(self, newton: int, linear: int) -> None:
         """Add the iterations of a step to those of the next row."""

@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 
 __all__ = ["STATE_VERSION", "RunState"]
 
-STATE_VERSION = 6
+STATE_VERSION = 7
 """Changed with the meaning of what is saved."""
 
 _MEMORY = "memory."

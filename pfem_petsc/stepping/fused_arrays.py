@@ -13,7 +13,8 @@ __all__ = ["BarArrays", "ImpulseArrays", "NodeArrays", "ProbeArrays", "StateArra
 
 class BarArrays(NamedTuple):
     """Arguments of the bar loop of a law; see :mod:`~pfem_petsc.mechanics.kernels`. ``slack``: row of the history with
-    the variable of this name, or -1; ``reach``: how many blocks of nodes beyond its own the bars of a block reach."""
+    the variable of this name, or -1; ``counted``: columns of the history that belong to counted bars; ``reach``: how
+    many blocks of nodes beyond its own the bars of a block reach."""
 
     ends: np.ndarray
     sweep: Sweep
@@ -25,6 +26,7 @@ class BarArrays(NamedTuple):
     area: float | np.ndarray
     history: np.ndarray
     slack: int
+    counted: int
     reach: int
     can_break: bool
 
@@ -69,10 +71,11 @@ class ImpulseArrays(NamedTuple):
 
 
 class ProbeArrays(NamedTuple):
-    """Nodes (m,) of all probes, concatenated, and the start of each probe (probes + 1,)."""
+    """Nodes of all probes, see :meth:`~pfem_petsc.recording.recorder.Recorder.probed`."""
 
     nodes: np.ndarray
-    starts: np.ndarray
+    places: np.ndarray
+    counts: np.ndarray
 
 
 class StateArrays(NamedTuple):

@@ -1,8 +1,11 @@
 """The fused loop: many steps of central differences in one compiled call, if nothing between them needs Python.
 
-It applies to one rank, lumped mass, bars of one section, no walls or flat walls at rest, and constant loads and
+It applies to lumped mass, bars of one section on each rank, no walls or flat walls at rest, and constant loads and
 supports. It calls the loops of single steps in the same order, so the results are bitwise identical. For a few thousand
 bars a step takes about as long as the calls from Python to its loops, which the fused loop avoids.
+
+With several ranks the loop itself exchanges the positions of ghosts. A rank on which a step fails keeps its state and
+goes on exchanging, because the others do not know of it before the next row.
 """
 
 from __future__ import annotations
@@ -16,7 +19,7 @@ from ..contact.flat import press_planes
 from ..contact.impact_loops import join_nodes, plane_gaps, stop_nodes, unpressed
 from ..contact.log import compare_contacts
 from ..mechanics.bar_geometry import first_inverted
-from ..mechanics.compiled import kernel
+from ..mechanics.compiled import inlined, kernel
 from ..mechanics.rows import CHUNK
 from ..mesh.ordering import NODE_BLOCK
 from ..output.sums import HEAD
@@ -37,6 +40,7 @@ from .balance_loops import (
     sum_balance,
 )
 from .book_loops import WORKS, new_lanes
+from .ghost_loops import trade_positions
 from .impulses import WALLS, fill_impulses
 from .node_loops import accelerations, explicit_increments, hold_still, react
 from .sum_loops import add_totals, fill_bars, fill_probes, fill_walls, fill_works
@@ -66,24 +70,52 @@ def make_fused_loop(
     the scheme.
 
     Its arguments are the maximum number of steps; the step [s]; positions, positions of the previous step, which are
-    computed for the last step alone, and velocities at half steps (n, 3); arrays of bars, nodes, walls, probes and of
-    the state; nodes (m,) that touch walls; nodes (k,) that have touched walls and not left them; the ledger's sums and
-    its works of balances; its particles; whether a row of the history is ``due`` (count,) after each step; and ``sums``
-    (count, width), which receives the sums of the rows that are due, and for each step the changes of contacts.
-    Velocities, accelerations, momenta and energies are computed only where a row is due, and after the last step.
+    computed for the last step alone, and velocities at half steps (n, 3); arrays of bars, nodes, walls, probes,
+    messages, and of the state; nodes (m,) that touch walls; nodes (k,) that have touched walls and not left them; the
+    ledger's sums and its works of balances; its particles; whether a row of the history is ``due`` (count,) after each
+    step; and ``sums`` (count, width), which receives the sums of the rows that are due, and for each step the changes
+    of contacts. Velocities, accelerations, momenta and energies are computed only where a row is due, and after the
+    last step.
 
-    It returns the number of steps made; for the last step, which is the last one too if bars change their state of
-    rupture there, the number of these bars, the first bar that collapsed and the first that went through zero length,
-    or -1, and the infeasible node, or -1, with the offsets of its planes; the kinetic energy [J]; increments (n, 3); the
-    results of :func:`~pfem_petsc.contact.flat.press_planes` for nodes and walls; and the nodes that touch walls, and
-    those that have touched them.
+    It returns the number of steps made, and MPI's error code; for the last step, which is the last one too if bars
+    change their state of rupture there, the number of these bars, the first bar that collapsed and the first that went
+    through zero length, or -1, and the infeasible node, or -1, with the offsets of its planes; the kinetic energy [J];
+    increments (n, 3); the results of :func:`~pfem_petsc.contact.flat.press_planes` for nodes and walls; and the nodes
+    that touch walls, and those that have touched them.
     """
+
+    @inlined
+    def move_block(block, n, x, h, half, f):
+        """Move the nodes of a block, and set their forces to zero."""
+        first = NODE_BLOCK * block
+        last = min(first + NODE_BLOCK, n)
+        where, sums = x[first:last].reshape(-1), f[first:last].reshape(-1)
+        drift(where, h, half[first:last].reshape(-1), where)
+        for j in range(len(sums)):
+            sums[j] = 0.0
 
     @kernel
     def fused_loop(
-        count, h, x, before, half, bars, nodes, walls, probes, state, touched, met, ledger, powers, impulses, due, sums
+        count,
+        h,
+        x,
+        before,
+        half,
+        bars,
+        nodes,
+        walls,
+        probes,
+        messages,
+        state,
+        touched,
+        met,
+        ledger,
+        powers,
+        impulses,
+        due,
+        sums,
     ):
-        n = len(x)
+        n = len(half)
         n_walls = len(walls.offsets)
         f, a, v, support, contact = state.f, state.a, state.v, state.support, state.contact
         energies = state.energies
@@ -118,15 +150,48 @@ def make_fused_loop(
         changed = 0
         done = 0
         kinetic = 0.0
+        several = len(x) > n or messages.count > 0
+        lost = 0  # error code of MPI
         for step in range(count):
+            row = sums[step]
+            row[_ALARM] = 0.0
+            if failed >= 0 or turned >= 0 or infeasible >= 0:
+                # the other ranks still need messages, until all know of the failure
+                row[_ALARM] = 1.0
+                lost = trade_positions(messages, x, before, False)
+                continue
             for i in pressed:
                 contact[i] = 0.0
-            clear_energies(work)
             clear_forces(lanes, n, supported, loaded, damped)
-            failed, shortened, changed = -1, False, 0
-            infeasible = -1
+            shortened, changed = False, 0
             changes = 0
             moved = 0
+            if several:
+                while moved < n_blocks:
+                    move_block(moved, n, x, h, half, f)
+                    moved += 1
+                for i in range(n, len(x)):
+                    f[i, 0] = f[i, 1] = f[i, 2] = 0.0
+                lost = trade_positions(messages, x, before, True)
+                if lost != 0:
+                    break
+                failed, shortened, changed = forces(
+                    x,
+                    bars.sweep,
+                    bars.sweep.counted,
+                    len(bars.sweep.diagonal),
+                    bars.far,
+                    bars.rest,
+                    bars.heat,
+                    bars.parameters,
+                    bars.area,
+                    h,
+                    bars.history,
+                    True,
+                    f,
+                    work,
+                )
+            clear_energies(work)
             # Blocks of nodes pass once through the cache: each moves shortly before its first bar, and is finished
             # after its last one, which belongs to its own block or to one before. Walls take all nodes in between.
             for stage in range(2):
@@ -161,12 +226,7 @@ def make_fused_loop(
                     ahead = half[first:last].reshape(-1)
                     if stage == 0:
                         while moved < min(block + 1 + bars.reach, n_blocks):
-                            low = NODE_BLOCK * moved
-                            high = min(low + NODE_BLOCK, n)
-                            where, forces_there = x[low:high].reshape(-1), f[low:high].reshape(-1)
-                            drift(where, h, half[low:high].reshape(-1), where)
-                            for j in range(len(forces_there)):
-                                forces_there[j] = 0.0
+                            move_block(moved, n, x, h, half, f)
                             moved += 1
                         if block < len(bars.sweep.parts) - 1:
                             at, short, broke = forces(
@@ -281,7 +341,6 @@ def make_fused_loop(
                     push_u[k, c] = pushes[k, c] / alpha
             kick(push_u.reshape(-1), alpha, h, impulses.half.reshape(-1))
             ledger[_IMPACT] += impact
-            row = sums[step]
             at = _HEAD
             if n_walls > 0:
                 row[at] = changes
@@ -291,7 +350,7 @@ def make_fused_loop(
             if due[step] or shortened or wrong or step == count - 1:
                 if not kept:
                     explicit_increments(
-                        nodes.external, f, nodes.mass, nodes.damping, alpha, eta, nothing, nothing, stiffness, u
+                        nodes.external, f[:n], nodes.mass, nodes.damping, alpha, eta, nothing, nothing, stiffness, u
                     )
                     for k in range(len(held)):
                         u[nodes.support_nodes[k], nodes.support_components[k]] = held[k]
@@ -299,7 +358,7 @@ def make_fused_loop(
                 centre(u.reshape(-1), eta, half.reshape(-1), v.reshape(-1))
                 accelerations(u.reshape(-1), alpha, a.reshape(-1))
                 if shortened or wrong or step == count - 1:
-                    start_of_step(x.reshape(-1), h, v.reshape(-1), a.reshape(-1), before.reshape(-1))
+                    start_of_step(x[:n].reshape(-1), h, v.reshape(-1), a.reshape(-1), before[:n].reshape(-1))
                 if failed < 0 and shortened:
                     turned = first_inverted(x, before, bars.ends, bars.watched)
                 wrong = wrong or turned >= 0
@@ -312,7 +371,19 @@ def make_fused_loop(
                     stored += energies[k]
                 pushed = contact if len(near) > 0 else nothing
                 kinetic = book_row(
-                    x, nodes.mass, v, a, f, nodes.external, nodes.damping, pushed, h, row_lanes, room, totals, ends
+                    x[:n],
+                    nodes.mass,
+                    v,
+                    a,
+                    f[:n],
+                    nodes.external,
+                    nodes.damping,
+                    pushed,
+                    h,
+                    row_lanes,
+                    room,
+                    totals,
+                    ends,
                 )
                 fill_works(ledger, powers, ends, stored)
                 add_totals(ledger, totals)
@@ -322,21 +393,23 @@ def make_fused_loop(
                 ledger[_KINETIC] = kinetic
                 row[:_HEAD] = ledger
                 fill_bars(row, energies)
-                row[_CONTACTS], row[_ALARM] = len(near), 0.0
+                row[_CONTACTS] = len(near)
+                row[_ALARM] = 1.0 if failed >= 0 or turned >= 0 or infeasible >= 0 else 0.0
                 if bars.slack >= 0:
                     slack = 0.0
-                    for k in range(bars.history.shape[1]):
+                    for k in range(bars.counted):
                         slack += bars.history[bars.slack, k]
                     row[_SLACK] = slack
                 if n_walls > 0:
                     at = fill_walls(row, _HEAD + 1, force, moment, impulses.v, contacts, walls.releases)
                 reaction = support if supported else nothing
-                fill_probes(row, at, probes.nodes, probes.starts, x, v, a, contact, reaction)
+                fill_probes(row, at, probes.nodes, probes.places, probes.counts, x, v, a, contact, reaction)
             powers[:] = after
-            if wrong:
+            if wrong and not several:
                 break
         return (
             done,
+            lost,
             changed,
             failed,
             turned,

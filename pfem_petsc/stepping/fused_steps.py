@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from mpi4py import MPI
 
 from ..contact.forces import WallForces
 from ..energies import ENERGIES
@@ -33,7 +34,7 @@ MOST = 512
 WORTH = 1000
 """Minimum number of steps of a run for which the fused loop is compiled, which takes some seconds once."""
 
-_BROKEN = HEAD.first("broken_bars")
+_BROKEN, _ALARM = HEAD.first("broken_bars"), HEAD.first("alarm")
 _FEWEST = 8  # minimum number of steps for one call
 
 
@@ -59,7 +60,10 @@ class Batch:
         )
         bars = model.bars
         law = (bars.far, bars.rest, bars.watched, bars.heat, block.parameters, block.area, block.history)
-        self._bars = BarArrays(bars.ends, block.sweep, *law, block.law.slack_row, self._reach(), bars.can_break)
+        counted = block.counted - block.start
+        self._bars = BarArrays(
+            bars.ends, block.sweep, *law, block.law.slack_row, counted, self._reach(), bars.can_break
+        )
         supports, inertia, contact = model.supports, model.inertia, model.contact
         nothing = np.empty((0, 3))
         external = stepper.state.external if model.external.active else nothing
@@ -77,6 +81,7 @@ class Batch:
         impact = (stepper.closed, contact.restitution, ledger.impacts.slack)
         self._walls = WallArrays(*walls, PROJECTED * model.length, *work, *impact)
         self._probes = ProbeArrays(*recorder.probed())
+        self._messages = model.mesh.messages()
         self.sums = np.zeros((MOST, recorder.width))
 
     def _reach(self) -> int:
@@ -87,14 +92,17 @@ class Batch:
 
     @staticmethod
     def serves(stepper: Stepper, ledger: Ledger) -> bool:
-        """Return whether the fused loop applies to the steps of this run or stage."""
+        """Return whether the fused loop applies to this rank's part of the steps of a run or stage."""
         from petsc4py import PETSc
 
         model = stepper.model
+        alone = model.comm.size == 1
         return (
             # -log_view measures the methods of single steps
             not PETSc.Log.isActive()
-            and model.comm.size == 1
+            # all ranks would have to stop where a bar of one breaks
+            and (alone or not model.bars.can_break)
+            and model.mesh.messages() is not None
             and isinstance(ledger, LeapfrogLedger)
             and model.steady
             and all(energy.value is None for energy in ENERGIES)
@@ -103,13 +111,13 @@ class Batch:
     def make(self, due: np.ndarray) -> tuple[int, np.ndarray]:
         """Make up to ``len(due)`` steps; return their number and the walls touched in each (steps, walls) bool.
 
-        ``due`` (count,) bool: whether a row of the history is due after each step. Fewer steps are made if a bar
-        breaks. The same holds if a bar fails, a node is infeasible or the energy is not finite; the stepper then has
-        a fault.
+        ``due`` (count,) bool: whether a row of the history is due after each step. On one rank fewer steps are made if
+        a bar breaks. The same holds if a bar fails, a node is infeasible or the energy is not finite; the stepper then
+        has a fault. With several ranks all make all steps, but this rank's state remains that of a failure.
         """
         stepper, ledger, state = self.stepper, self.ledger, self.stepper.state
         log, scheme = self.model.contact.log, stepper.scheme
-        begin = state.step
+        begin, known = state.step, stepper.fault
         walls = len(self.model.contact.walls)
         support, contact = (
             np.zeros_like(state.v) if array is stepper.zero else array for array in (state.support, state.contact)
@@ -120,7 +128,7 @@ class Batch:
         pushed = ledger.impulses.state
         impulses = ImpulseArrays(pushed.memory["half_velocity"], pushed.a, pushed.v)
         ledger.sums[_BROKEN] = stepper.ruptures.count
-        done, changed, failed, turned, infeasible, offsets, kinetic, u, touched, log.last, met = self._fused_loop(
+        done, lost, changed, failed, turned, infeasible, offsets, kinetic, u, touched, log.last, met = self._fused_loop(
             len(due),
             stepper.h,
             state.x,
@@ -130,6 +138,7 @@ class Batch:
             self._nodes,
             self._walls,
             self._probes,
+            self._messages,
             arrays,
             log.last,
             ledger.impacts.met,
@@ -139,6 +148,8 @@ class Batch:
             due,
             self.sums,
         )
+        if lost:
+            raise MPI.Exception(lost)
         state.support = support if self.model.supports.any else stepper.zero
         state.contact = contact if len(touched[3]) else stepper.zero
         stepper.energy = StrainEnergy(tuple(energies.tolist()), failed)
@@ -154,7 +165,11 @@ class Batch:
         elif infeasible >= 0:
             text = self.model.contact.infeasible_message(touched[3][infeasible], offsets[infeasible])
             stepper.fault = SimulationFailure(f"{stepper.when(stepper.balance)}: {text}")
-        state.step += 1
+        if known is not None:  # of earlier steps; the ranks have not synchronised since
+            stepper.fault = known
+            self.sums[: len(due), _ALARM] = 1.0
+        done = done if self.model.comm.size == 1 else len(due)
+        state.step, state.time = begin + done, (begin + done) * stepper.h
         ledger.impacts.met = met
         ledger.resume(kinetic)
         share = self.sums[:done, HEAD.width + 1 : HEAD.width + 1 + WALL.width * walls]
@@ -206,15 +221,16 @@ class Batches:
             self._changes, self._batch = stepper.support_changes, None
             return True
         if self._batch is None:
-            self._refused = not Batch.serves(stepper, history.ledger)
+            serves = Batch.serves(stepper, history.ledger)
+            self._refused = not analysis.model.comm.allreduce(serves, op=MPI.LAND)
             if self._refused:
                 return True
             self._batch = Batch(stepper, history.ledger, history.recorder)
         numbers = range(stepper.number + 1, stepper.number + count + 1)
         due = np.array([history.due(number) for number in numbers])
         made, touched = self._batch.make(due)
-        failed = stepper.fault is not None
         contact, comm = analysis.model.contact, analysis.model.comm
+        failed = stepper.fault is not None and comm.size == 1
         for k in range(made - failed):
             sums = self._batch.sums[k]
             state.step, state.time = begin + k + 1, (begin + k + 1) * stepper.h
@@ -222,8 +238,8 @@ class Batches:
                 contact.log.note(touched[k], stepper.h, comm)
                 contact.log.changes += int(sums[HEAD.width])
                 sums[HEAD.width] = contact.log.changes
-            if due[k]:
-                history.take(history.recorder.row_of(sums))
+            if due[k] and not history.take_sums(sums):
+                return False
         if failed:
             state.step, state.time = begin + made, (begin + made) * stepper.h
         return not failed

@@ -95,19 +95,18 @@ def fill_walls(row, at, force, moment, v, contacts, releases) -> int:
 
 
 @kernel
-def fill_probes(row, at, nodes, starts, x, v, a, contact, support) -> None:
-    """Write positions, velocities, accelerations and reactions of probed nodes, from index ``at`` of a row.
+def fill_probes(row, at, nodes, places, counts, x, v, a, contact, support) -> None:
+    """Write positions, velocities, accelerations and reactions of this rank's probed nodes, from index ``at`` of a row.
 
-    ``nodes`` (m,) of all probes, which start at ``starts`` (probes + 1,); ``support`` (0, 3) if there are no supports.
+    ``nodes`` (m,); ``places`` (m,) of the positions among the sums of all probes; ``counts`` (m,) numbers of nodes of
+    the probes on all ranks; ``support`` (0, 3) if there are no supports.
     """
     supported = len(support) > 0
-    for p in range(len(starts) - 1):
-        first, size = starts[p], starts[p + 1] - starts[p]
-        for j in range(size):
-            i = nodes[first + j]
-            for c in range(3):
-                row[at + 3 * j + c] = x[i, c]
-                row[at + 3 * (size + j) + c] = v[i, c]
-                row[at + 3 * (2 * size + j) + c] = a[i, c]
-                row[at + 3 * (3 * size + j) + c] = contact[i, c] + (support[i, c] if supported else 0.0)
-        at += 12 * size
+    for j in range(len(nodes)):
+        i = nodes[j]
+        first, size = at + places[j], 3 * counts[j]
+        for c in range(3):
+            row[first + c] = x[i, c]
+            row[first + size + c] = v[i, c]
+            row[first + 2 * size + c] = a[i, c]
+            row[first + 3 * size + c] = contact[i, c] + (support[i, c] if supported else 0.0)

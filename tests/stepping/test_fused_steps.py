@@ -60,6 +60,20 @@ def test_fused_stepses_are_the_single_steps(name, tmp_path):
         np.testing.assert_array_equal(first.field("velocity", k), second.field("velocity", k))
 
 
+@pytest.mark.parallel
+@pytest.mark.parametrize("name", CASES)
+def test_ranks_make_fused_steps_too(name, shared_tmp_path):
+    changes = CASES[name] | {"mesh": LATTICE["mesh"] | {"cells": [2, 4, 3]}}
+    one, count = made(case(changes, end=4e-5), shared_tmp_path / "one", False)
+    many, fewer = made(case(changes, end=4e-5), shared_tmp_path / "many", True)
+    assert count == 200 and fewer < 100
+    first, second = open_result(shared_tmp_path / "one"), open_result(shared_tmp_path / "many")
+    for column in first.history:
+        np.testing.assert_array_equal(first.history[column], second.history[column], err_msg=column)
+    for what in ("x", "v", "a", "f", "contact", "support"):
+        np.testing.assert_array_equal(getattr(one.state, what), getattr(many.state, what), err_msg=what)
+
+
 @pytest.mark.parametrize("other", ["chung_lee", "newmark"])
 def test_other_integrators_take_single_steps(other, tmp_path):
     _, count = made(case({}, integrator=other, end=2e-6), tmp_path / "out", True)
@@ -84,13 +98,14 @@ def test_a_stopped_run_of_batches_goes_on_to_the_same_end(tmp_path):
         np.testing.assert_array_equal(first.history[column], second.history[column], err_msg=column)
 
 
-def test_a_failure_is_that_of_single_steps(tmp_path):
+@pytest.mark.parallel
+def test_a_failure_is_that_of_single_steps(shared_tmp_path):
     crushed = {"initial": {"velocity": [0.0, 0.0, -2e4]}, "wall": [FLOOR]}
     texts, steps = [], []
     for together in (False, True):
         with pytest.raises(SimulationFailure) as failure:
-            made(case(crushed), tmp_path / str(together), together)
+            made(case(crushed), shared_tmp_path / str(together), together)
         texts.append(str(failure.value))
-        steps.append(open_result(tmp_path / str(together)).history["step"])
+        steps.append(open_result(shared_tmp_path / str(together)).history["step"])
     assert "bar" in texts[0] and texts[0] == texts[1]
     np.testing.assert_array_equal(steps[0], steps[1])

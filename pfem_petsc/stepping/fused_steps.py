@@ -213,8 +213,7 @@ class Batches:
         stepper, state, end = analysis.stepper, analysis.state, analysis.last_step
         begin = state.step
         count = min(left, end - begin, MOST + 1, stepper.removals.steps_left()) - 1
-        # if walls stop nodes immediately, damping in the first step uses velocities other than those of the state
-        if self._refused or count < _FEWEST or end < self._min_steps or begin == 0:
+        if self._refused or count < _FEWEST or end < self._min_steps or not history.ledger.begun:
             return True
         if self._changes != stepper.support_changes:
             # the forces of the last step act at supports that are gone; the arrays of the loop alternate

@@ -3,6 +3,8 @@ functions."""
 
 from __future__ import annotations
 
+from typing import Any
+
 from llvmlite import ir
 from numba.core import types
 from numba.extending import intrinsic
@@ -14,7 +16,7 @@ __all__ = ["trade_positions"]
 _INT, _SHORT, _BYTES = ir.IntType(64), ir.IntType(32), ir.IntType(8).as_pointer()
 
 
-def _call(context, builder, signature, values):  # noqa: ANN001, ANN202 - Numba's types
+def _call(context: Any, builder: Any, signature: Any, values: Any) -> Any:
     """Generate a call of the function at an address with the number of requests and pointers to arrays."""
     address, count, *arrays = values
     pointers = [

@@ -17,6 +17,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from mpi4py import MPI
 
 from ..output.sums import HEAD
 from .balance_loops import DAMPING, EXTERNAL, INERTIAL, book_balance, book_row, new_sums
@@ -37,9 +38,10 @@ _NOTHING = np.empty((0, 3))
 
 
 def make_ledger(stepper: Stepper) -> Ledger:
-    """Return the ledger for the steps of a run or stage. Construction follows the start of the stepper."""
+    """Return the ledger for the steps of a run or stage, after the start of the stepper. Collective."""
     leapfrog = stepper.scheme.loops is not None and stepper.steady and stepper.treatment is None
-    return (LeapfrogLedger if leapfrog and stepper.model.steady else Ledger)(stepper)
+    same = stepper.model.comm.allreduce(leapfrog and stepper.model.steady, op=MPI.LAND)
+    return (LeapfrogLedger if same else Ledger)(stepper)
 
 
 class LeapfrogLedger(Ledger):
@@ -53,6 +55,7 @@ class LeapfrogLedger(Ledger):
 
     def __init__(self, stepper: Stepper) -> None:
         self.powers = np.zeros(len(WORKS))
+        self.begun = False
         super().__init__(stepper)
         self._ends = np.zeros(len(WORKS))
         self._lanes, self._room = new_sums(), new_lanes()
@@ -60,7 +63,7 @@ class LeapfrogLedger(Ledger):
     def update(self) -> None:
         """Add the last step."""
         stepper = self.stepper
-        if stepper.state.step == 0:  # the start may have stopped nodes
+        if not self.begun:  # the start may have stopped nodes
             super().update()
             self._sum_row(self._before)
             self._begin()
@@ -103,6 +106,7 @@ class LeapfrogLedger(Ledger):
         self.powers[:] = -ends
         self.powers[EXTERNAL] += sums[_EXTERNAL]
         self.powers[DAMPING] += sums[_DAMPING]
+        self.begun = True
         self.powers[INERTIAL] = sums[_NUMERICAL] + ends[INERTIAL] + self.stepper.energy.total + sums[_IMPACT]
 
     def follow_removal(self) -> None:
@@ -112,9 +116,11 @@ class LeapfrogLedger(Ledger):
 
     def kept(self) -> dict[str, Any]:
         """Return this rank's share for a checkpoint: numbers that can be summed over ranks."""
-        return super().kept() | {"powers": self.powers.tolist()}
+        return super().kept() | ({"powers": self.powers.tolist()} if self.begun else {})
 
     def load_state(self, kept: dict[str, Any]) -> None:
         """Restore this rank's share from a checkpoint, after the state."""
         super().load_state(kept)
-        self.powers[:] = kept["powers"]
+        self.begun = "powers" in kept
+        if self.begun:
+            self.powers[:] = kept["powers"]

@@ -52,7 +52,11 @@ class Ledger:
         and totals of this rank's nodes at the present state
     impulses : Impulses
     impacts : Impacts
+    begun : whether the works of the steps before are continued; false until the first step, and after a restart from a
+        checkpoint of another ledger, where a ledger needs steps of its own
     """
+
+    begun = True
 
     def __init__(self, stepper: Stepper) -> None:
         self.stepper = stepper

@@ -28,11 +28,14 @@ def provoke(stepper):
     state = stepper.state
 {body}
 
+provoked = []
+
 def watched(step):
     def wrapper(self):
-        if self.state.step == {at}:
+        if self.state.step >= {at} and not provoked:  # some steps before may be fused
+            provoked.append(True)
             if rank == 0:
-                print("provoked", flush=True)
+                print("provoked after step", self.state.step, flush=True)
             provoke(self)
         step(self)
     return wrapper
@@ -108,12 +111,12 @@ def test_positions_that_are_no_numbers(on_ranks, tmp_path, every):
     words = (f"output.history_every={every}", "output.fields_every=0")
     done = fail(on_ranks, tmp_path, body, *ROD, *words)
     assert_told(done, "diverged", "bar ", "nodes ", "reduce time.step", "step ")
-    said = done.stderr.partition("step ")[2]
-    assert 57 <= int(said.partition(",")[0]) <= 57 + 101
+    said, last = done.stderr.partition("step ")[2], int(done.stdout.partition("after step")[2].split()[0])
+    assert last <= int(said.partition(",")[0]) <= last + 101
     with open_result(tmp_path / "out") as result:
         assert len(result.times) == 1
         assert np.isfinite(result.positions(-1)).all()
-        assert result.history["step"][-1] == (57 if every == 1 else 0)
+        assert result.history["step"][-1] == (last if every == 1 else 0)
 
 
 def test_velocities_that_are_no_numbers_in_an_implicit_step(on_ranks, tmp_path):

@@ -96,9 +96,7 @@ class Truss:
             return self.__dict__
         return {key: self.__dict__[key] for key in ("n_nodes", "n_bars", "digest", "warnings")}
 
-    def _take(
-        self, points: Any, bars: Any, node_groups: Any, bar_groups: Any, bar_fields: Any, source: str
-    ) -> None:
+    def _take(self, points: Any, bars: Any, node_groups: Any, bar_groups: Any, bar_fields: Any, source: str) -> None:
         from mpi4py import MPI
 
         from .checks import check_mesh

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 __all__ = ["write_mesh"]
 
+
 def write_mesh(
     path: Path | str,
     points: ArrayLike,

@@ -36,16 +36,16 @@ def suffixes() -> dict[str, str]:
     return {suffix: name for name in choices(__name__) for suffix in lookup(__name__, name, "").SUFFIXES}
 
 
-def _reader_name(path: Path) -> str:
-    """Return the name of the module that reads a file."""
+def _reader_name(path: Path, key: str = "mesh.file: ") -> str:
+    """Return the name of the module that reads a file; messages begin with the key that names it."""
     from ...errors import InputError
 
-    _check_file(path)
+    _check_file(path, key)
     known = suffixes()
     reader = known.get(path.suffix.lower())
     if reader is None:
         hint = _CONVERT.get(path.suffix.lower(), "").format(name=path.name, stem=path.stem)
-        raise InputError(f"mesh.file: no reader for {path.name!r}; known suffixes: {', '.join(known)}{hint}")
+        raise InputError(f"{key}no reader for {path.name!r}; known suffixes: {', '.join(known)}{hint}")
     return reader
 
 
@@ -92,7 +92,7 @@ def read_whole(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     from ...registry import lookup
 
     path = Path(path)
-    whole = lookup(__name__, _reader_name(path), "").read(path, fields)
+    whole = lookup(__name__, _reader_name(path, ""), "").read(path, fields)
     known = list(whole.bar_fields) if whole.known_fields is None else whole.known_fields
     missing = missing_field(path, dict.fromkeys(fields or (), "bar_fields"), known)
     if missing is not None:
@@ -113,16 +113,16 @@ def missing_field(path: Path | str, fields: Mapping[str, str], known: Iterable[s
     return None
 
 
-def _check_file(path: Path) -> None:
+def _check_file(path: Path, key: str) -> None:
     from ...errors import InputError
 
     try:
         with open(path, "rb"):
             pass
     except FileNotFoundError:
-        raise InputError(f"mesh.file: there is no file {path}{_near(path)}") from None
+        raise InputError(f"{key}there is no file {path}{_near(path)}") from None
     except OSError as error:
-        raise InputError(f"mesh.file: cannot open {path}: {error.strerror}") from None
+        raise InputError(f"{key}cannot open {path}: {error.strerror}") from None
 
 
 def _near(path: Path) -> str:

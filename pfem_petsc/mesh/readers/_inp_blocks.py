@@ -178,7 +178,7 @@ def _parts(path: Path, above: tuple[Path, ...]) -> Iterator[Block | Piece]:
     if content[: starts[0] if starts else None].strip():
         yield Piece(path, 1, content[: starts[0] if starts else None])
     line += content.count(b"\n", 0, starts[0]) if starts else 0
-    for start, stop in zip(starts, [*starts[1:], len(content)], strict=True):
+    for start, stop in zip(starts, [*starts[1:], len(content)]):
         at, line = line, line + content.count(b"\n", start, stop)
         text, end = _logical_line(content, start)
         data = content[end:stop]

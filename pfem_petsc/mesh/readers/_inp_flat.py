@@ -36,7 +36,7 @@ class Flat:
         if model.left_out:
             self.warnings.append(f"{path}: left out elements of the types {', '.join(sorted(model.left_out))}")
         self._model = model
-        self._lost = 0
+        self._lost: dict[int, int] = {}
         self._groups: dict[str, dict[str, np.ndarray]] = {}
         self._placed: dict[str, _Placed] = {}
         points, bars = [np.empty((0, 3))], [np.empty((0, 2), np.int64)]
@@ -96,29 +96,40 @@ class Flat:
         for upper, (name, parts) in common.items():
             if upper not in taken:
                 found[name] = np.unique(np.concatenate(parts))
-        if self._lost:
+        lost, self._lost = sum(self._lost.values()), {}
+        if lost:
             what = {"NSET": "node", "ELSET": "element"}[kind]
-            self.warnings.append(f"{self.path}: {self._lost} members of {what} sets are not there, and are left out")
-            self._lost = 0
+            self.warnings.append(f"{self.path}: {lost} members of {what} sets are not there, and are left out")
         self._groups[kind] = {name.replace("/", "_"): members for name, members in found.items()}
         return self._groups[kind]
 
     def sections(self) -> Iterator[tuple[Block, str, np.ndarray]]:
-        """Return each section with the name of a bar group, and its bars."""
+        """Return each section with the name of a bar group, and its bars.
+
+        That of a part is one for all instances if the set of its name has these bars, else one for each instance.
+        """
         groups = self.groups("ELSET")
-        upper = {name.upper(): name for name in groups}
-        for key, placed in [*self._placed.items(), ("*ASSEMBLY", _nothing(self._model.assembly))]:
-            if key == "*ASSEMBLY" and key in self._placed and placed is not self._placed[key]:
-                continue
-            for block, name in placed.scope.sections:
-                table = _sets(placed.scope, "ELSET").get(name.upper())
+        names = {name.upper(): name for name in groups}
+        found: dict[int, tuple[Block, str, list[tuple[str, np.ndarray]]]] = {}
+        for key, scope in [*((key, placed.scope) for key, placed in self._placed.items()), *self._bare_assembly()]:
+            for block, name in scope.sections:
+                table = _sets(scope, "ELSET").get(name.upper())
                 if table is None:
                     raise InputError(f"{block.where}: there is no element set {name}")
+                full = f"{scope.name}.{name}".upper().replace("/", "_")
                 members = self._members("ELSET", key, table)
-                full = f"{placed.scope.name}.{name}".upper().replace("/", "_")
-                short = upper.get(name.upper().replace("/", "_"))
-                alone = short is not None and np.array_equal(groups[short], members)
-                yield block, short if alone or full not in upper else upper[full], members
+                found.setdefault(id(block), (block, name, []))[2].append((full, members))
+        for block, name, parts in found.values():
+            short = names.get(name.upper().replace("/", "_"))
+            together = np.unique(np.concatenate([members for _, members in parts]))
+            if short is not None and np.array_equal(groups[short], together):
+                yield block, short, together
+            else:
+                yield from ((block, names.get(full, short or name), members) for full, members in parts)
+
+    def _bare_assembly(self) -> list[tuple[str, Scope]]:
+        """Return the assembly if it has no nodes and elements of its own: it may have sections of sets of instances."""
+        return [] if "*ASSEMBLY" in self._placed else [("*ASSEMBLY", self._model.assembly)]
 
     def _members(self, kind: str, key: str, table: SetTable, above: tuple[str, ...] = ()) -> np.ndarray:
         """Return the members of a set in the mesh, ascending."""
@@ -141,7 +152,7 @@ class Flat:
         place = np.minimum(np.searchsorted(known, labels), max(len(known) - 1, 0))
         there = known[place] == labels if len(known) else np.zeros(len(labels), bool)
         if not entry.generated and (kind == "NSET" or not self._model.left_out):
-            self._lost += int((~there).sum())
+            self._lost[id(entry)] = int((~there).sum())
         members = at[place[there]] if len(known) else at
         if kind == "NSET":
             members = self._number[members]

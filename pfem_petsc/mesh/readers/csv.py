@@ -70,7 +70,9 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
         [nodes.numbers(axis) if nodes.column(axis, axis != "z") else np.zeros(nodes.n) for axis in "xyz"], axis=1
     )
     labels = nodes.texts("node") if nodes.column("node", False) else [str(i) for i in range(nodes.n)]
-    number = {label: i for i, label in enumerate(labels)}
+    number: dict[str, int] = {}
+    for i, label in enumerate(labels):
+        number.setdefault(label, i)
     if len(number) < nodes.n:
         twice = next(i for i, label in enumerate(labels) if number[label] != i)
         raise InputError(f"{nodes.where(twice)}: node {labels[twice]!r} is listed more than once")

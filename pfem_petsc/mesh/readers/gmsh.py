@@ -73,6 +73,8 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     bar_tags = np.concatenate([np.empty(0, np.int64), *lines])
     if any(ORDERED in text for text in parts.get("Comments", [])):
         bar_tags = _in_order(mesh, bar_tags)
+    if layout.version == "2.2":
+        bar_tags = _once(mesh, bar_tags)
     for payload in parts.get("ElementData", []):
         _element_data(path, payload, layout, bar_tags, mesh)
     return mesh
@@ -86,6 +88,26 @@ def _in_order(mesh: WholeMesh, tags: np.ndarray) -> np.ndarray:
     mesh.bars = mesh.bars[order]
     mesh.bar_groups = {name: np.sort(place[members]) for name, members in mesh.bar_groups.items()}
     return tags[order]
+
+
+def _once(mesh: WholeMesh, tags: np.ndarray) -> np.ndarray:
+    """Join the copies of a bar in version 2.2, where it is listed once for each of its groups; return the tags."""
+    _, first, place = np.unique(mesh.bars, axis=0, return_index=True, return_inverse=True)
+    first = first[place.ravel()]
+    grouped = np.zeros(len(mesh.bars), bool)
+    for members in mesh.bar_groups.values():
+        grouped[members] = True
+    # two lines of the same group are no copies
+    own = {name: np.unique(first[members], return_counts=True) for name, members in mesh.bar_groups.items()}
+    twice = np.unique(np.concatenate([np.empty(0, np.int64), *(bars[count > 1] for bars, count in own.values())]))
+    copy = (first != np.arange(len(first))) & grouped & grouped[first] & ~np.isin(first, twice)
+    if not copy.any():
+        return tags
+    number = np.cumsum(~copy) - 1
+    number = np.where(copy, number[first], number)
+    mesh.bars = mesh.bars[~copy]
+    mesh.bar_groups = {name: np.unique(number[members]) for name, members in mesh.bar_groups.items()}
+    return tags[~copy]
 
 
 def _element_data(path: Path, payload: bytes, layout: Format, bar_tags: np.ndarray, mesh: WholeMesh) -> None:

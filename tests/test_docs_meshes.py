@@ -1,4 +1,4 @@
-"""The commands and the Python of docs/meshes.md run, in their order, and the table of formats is that of the program."""
+"""The commands and the Python of docs/meshes.md run in their order, and its formats are those of the program."""
 
 from __future__ import annotations
 

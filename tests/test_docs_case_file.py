@@ -83,7 +83,7 @@ def test_every_key_of_walls_is_named():
 def test_example_is_read(tmp_path):
     case = Case.from_toml(re.search(r"^```toml\n(.*?)^```$", TEXT, flags=re.MULTILINE | re.DOTALL)[1], tmp_path)
     assert [load.force for load in case.load] == [(0.0, 0.0, -5e4)]
-    mesh = read(DOCS.parent / "meshes" / case.mesh.file.name, MPI.COMM_SELF)
+    mesh = read(DOCS.parent / "meshes" / case.mesh.file.name)
     assert {"left", "right"} <= set(mesh.node_groups)
     assert {"chords"} <= set(mesh.bar_groups)
     assert case.temperature[0].bars == case.section["chord"].bars == "chords"

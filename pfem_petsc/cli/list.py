@@ -1,4 +1,4 @@
-"""List the built-in cases, integrators, mesh generators, walls, constraints and treatments of impact."""
+"""List the built-in cases, integrators, mesh generators and formats, walls, constraints and treatments of impact."""
 
 from __future__ import annotations
 
@@ -21,6 +21,8 @@ example:
 KINDS = {
     "integrators": "pfem_petsc.integrators",
     "mesh generators": "pfem_petsc.mesh.generators",
+    "mesh formats that are read": "pfem_petsc.mesh.readers",
+    "mesh formats that are written": "pfem_petsc.mesh.writers",
     "material laws": "pfem_petsc.mechanics.materials",
     "walls": "pfem_petsc.contact.walls",
     "constraints": "pfem_petsc.contact.constraints",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 from mpi4py import MPI
 
@@ -75,7 +77,7 @@ def _check_ends(slab: MeshSlab, comm: MPI.Comm) -> None:
     _refuse(slab, comm, lines, len(bad), "bars have an end that does not exist", remedy)
     bad = np.flatnonzero(slab.bars[:, 0] == slab.bars[:, 1])
     lines = [_bar(slab, i) for i in bad[:_SHOWN]]
-    _refuse(slab, comm, lines, len(bad), "bars start and end at the same node", "remove them")
+    _refuse(slab, comm, lines, len(bad), "bars start and end at the same node", "remove them" + _way(slab))
 
 
 def _check_bare_nodes(slab: MeshSlab, comm: MPI.Comm, used: np.ndarray) -> None:
@@ -83,7 +85,7 @@ def _check_bare_nodes(slab: MeshSlab, comm: MPI.Comm, used: np.ndarray) -> None:
     bare[used] = False
     bad = np.flatnonzero(bare)
     lines = [f"node {slab.first_node + i}" for i in bad[:_SHOWN]]
-    remedy = "remove them: a node without bars has neither mass nor stiffness"
+    remedy = "remove them: a node without bars has neither mass nor stiffness" + _way(slab)
     if slab.source.endswith(".msh"):
         remedy += (
             " (Gmsh saves each point of a physical group: these are points that no line in a group ends at; points at "
@@ -99,7 +101,7 @@ def _check_lengths(slab: MeshSlab, comm: MPI.Comm, points: np.ndarray, ends: np.
         length = np.sqrt(np.einsum("ij,ij->i", length, length))
     bad = np.flatnonzero(~((length > 0.0) & (length < np.inf)))
     lines = [f"{_bar(slab, i)}, length {length[i]:g}" for i in bad[:_SHOWN]]
-    remedy = "merge the nodes at its ends, or correct their positions"
+    remedy = "merge the nodes at its ends, or correct their positions" + _way(slab)
     _refuse(slab, comm, lines, len(bad), "bars have a length that is zero or overflows double precision", remedy)
     mean = comm.allreduce(float(length.sum())) / slab.n_bars
     short = np.flatnonzero(length < SHORT * mean)
@@ -124,7 +126,13 @@ def _check_duplicates(slab: MeshSlab, comm: MPI.Comm) -> None:
     for one, other, ends in pairs[:_SHOWN]:
         lines.append(f"bars {one} and {other} (nodes {ends // slab.n_nodes} and {ends % slab.n_nodes})")
     what = "bars join the same two nodes as another bar"
-    _refuse(slab, comm, lines, len(again), what, "keep one of each, with the sum of the areas")
+    _refuse(slab, comm, lines, len(again), what, "keep one of each, with the sum of the areas" + _way(slab))
+
+
+def _way(slab: MeshSlab) -> str:
+    """Return the command that mends a mesh file; nothing for meshes from elsewhere."""
+    file = Path(slab.source)
+    return f"; python -m pfem_petsc mesh clean {file} {file.stem}_clean.h5" if file.is_file() else ""
 
 
 def _bar(slab: MeshSlab, i: int) -> str:

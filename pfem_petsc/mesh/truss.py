@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from .slab import MeshSlab
+    from .whole import WholeMesh
 
 __all__ = ["INLINE", "Truss"]
 
@@ -42,6 +43,7 @@ class Truss:
     node_groups, bar_groups : numbers of the members, or a boolean mask, for each name
     bar_fields : (bars,) numbers for each name, such as areas [m2] for ``area_field`` of sections
     comm : whose rank 0 gives the arrays; default: all ranks give the same
+    source : name of the truss in messages
 
     Attributes
     ----------
@@ -49,8 +51,10 @@ class Truss:
     points, bars, node_groups, bar_groups, bar_fields : as given, read-only; None where another rank has them
     digest : str
         Identifies the content.
+    tables : dict
+        Tables ``material`` and ``section`` of a case, as far as the file had them that the truss was read from.
     warnings : list of str
-        About bars that are far shorter than the others.
+        About bars that are far shorter than the others, and what was left out of a file.
 
     Raises
     ------
@@ -74,8 +78,10 @@ class Truss:
         bar_groups: Mapping[str, ArrayLike] | None = None,
         bar_fields: Mapping[str, ArrayLike] | None = None,
         comm: MPI.Comm | None = None,
+        source: str = "Truss",
     ) -> None:
-        given = points, bars, node_groups or {}, bar_groups or {}, bar_fields or {}
+        given = points, bars, node_groups or {}, bar_groups or {}, bar_fields or {}, source
+        self.tables: dict[str, dict[str, Any]] = {}
         if comm is None:
             self._take(*given)
         else:
@@ -90,12 +96,12 @@ class Truss:
             return self.__dict__
         return {key: self.__dict__[key] for key in ("n_nodes", "n_bars", "digest", "warnings")}
 
-    def _take(self, points: Any, bars: Any, node_groups: Any, bar_groups: Any, bar_fields: Any) -> None:
+    def _take(self, points: Any, bars: Any, node_groups: Any, bar_groups: Any, bar_fields: Any, source: str) -> None:
         from mpi4py import MPI
 
         from .checks import check_mesh
 
-        slab = slab_from_arrays("Truss", points, bars, node_groups, bar_groups, bar_fields)
+        slab = slab_from_arrays(source, points, bars, node_groups, bar_groups, bar_fields)
         self.warnings = check_mesh(slab, MPI.COMM_SELF)
         self.points, self.bars = _kept(slab.points), _kept(slab.bars)
         self.node_groups = {name: _kept(members) for name, members in slab.node_groups.items()}
@@ -105,36 +111,65 @@ class Truss:
         self.digest = _digest(slab)
 
     @classmethod
-    def read(cls, path: Path | str, bar_fields: Iterable[str] = ()) -> Truss:
-        """Read a mesh file (``.msh``, ``.vtu``, ``.vtkhdf``, ``.h5``) with its groups and the named bar fields.
+    def read(cls, path: Path | str, bar_fields: Iterable[str] | None = None, *, clean: float | None = None) -> Truss:
+        """Read a mesh file with its groups and bar fields; ``docs/meshes.md`` lists the formats.
+
+        Parameters
+        ----------
+        path : name of the file, whose suffix chooses the reader
+        bar_fields : names of the bar fields to be read; default: all
+        clean : distance [m] up to which nodes are merged before double bars, bars without length and nodes without bars
+            are removed (0: nodes at the same place); default: a file with such is refused
 
         Raises
         ------
         InputError
             As for the mesh file of a case.
         """
-        from mpi4py import MPI
+        from .readers import read_whole
 
-        from .readers import read_slab
+        mesh = read_whole(Path(path), None if bar_fields is None else list(bar_fields))
+        if clean is not None:
+            from .tools import cleaned
 
-        slab = read_slab(Path(path), MPI.COMM_SELF, dict.fromkeys(bar_fields, "bar_fields"))
-        return cls(
-            slab.points,
-            slab.bars,
-            node_groups=slab.node_groups,
-            bar_groups=slab.bar_groups,
-            bar_fields=slab.bar_fields,
-        )
+            mesh, _ = cleaned(mesh, clean)
+        return cls.from_mesh(mesh)
 
-    def write(self, path: Path | str) -> Path:
-        """Write the truss to an HDF5 file for ``mesh.file``; see :func:`~pfem_petsc.mesh.writing.write_mesh`."""
-        from mpi4py import MPI
+    @classmethod
+    def from_mesh(cls, mesh: WholeMesh) -> Truss:
+        """Return the truss of a mesh that a reader has returned; its tables and warnings are kept."""
+        groups: dict[str, Any] = {"node_groups": mesh.node_groups, "bar_groups": mesh.bar_groups}
+        truss = cls(mesh.points, mesh.bars, **groups, bar_fields=mesh.bar_fields, source=mesh.source)
+        truss.tables = mesh.tables
+        truss.warnings = mesh.warnings + truss.warnings
+        return truss
 
-        from .writing import write_mesh
+    def to_mesh(self) -> WholeMesh:
+        """Return the truss as a mesh that a writer takes."""
+        from .whole import WholeMesh
 
         self._require("written")
-        groups: dict[str, Any] = {"node_groups": self.node_groups, "bar_groups": self.bar_groups}
-        return write_mesh(path, self.points, self.bars, **groups, bar_fields=self.bar_fields, comm=MPI.COMM_SELF)
+        groups = [
+            {name: rows.copy() for name, rows in table.items()}
+            for table in (self.node_groups, self.bar_groups, self.bar_fields)
+        ]
+        return WholeMesh(self.points.copy(), self.bars.copy(), *groups, tables=dict(self.tables))
+
+    def write(self, path: Path | str) -> Path:
+        """Write the truss to a file, whose suffix chooses the format; ``docs/meshes.md`` lists them.
+
+        Returns
+        -------
+        The absolute path.
+
+        Raises
+        ------
+        InputError
+            If there is no writer for the suffix, or the file cannot be written.
+        """
+        from .writers import write_whole
+
+        return write_whole(path, self.to_mesh())
 
     @cached_property
     def lengths(self) -> np.ndarray:
@@ -156,7 +191,7 @@ class Truss:
         return {"points": self.points.tolist(), "bars": self.bars.tolist(), **lists}
 
     def grid(self) -> pyvista.UnstructuredGrid:
-        """Return a pyvista grid of lines with the bar fields; groups are ``group/NAME``, 1 for members."""
+        """Return a pyvista grid of lines with the bar fields; groups are ``group:NAME``, 1 for members."""
         import pyvista
 
         self._require("drawn")
@@ -171,7 +206,7 @@ class Truss:
             for name, members in groups.items():
                 mask = np.zeros(n, np.uint8)
                 mask[members] = 1
-                data[f"group/{name}"] = mask
+                data[f"group:{name}"] = mask
         return grid
 
     def _require(self, what: str) -> None:

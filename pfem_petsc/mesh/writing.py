@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..errors import InputError
 from ..parallel.agreement import on_root
 from .arrays import slab_from_arrays
 
@@ -16,8 +14,6 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
 __all__ = ["write_mesh"]
-
-_SUFFIX = ".h5"
 
 
 def write_mesh(
@@ -30,11 +26,11 @@ def write_mesh(
     bar_fields: Mapping[str, ArrayLike] | None = None,
     comm: MPI.Comm | None = None,
 ) -> Path:
-    """Write nodes and bars to an HDF5 file for ``mesh.file``; an earlier file of this name is replaced. Collective.
+    """Write nodes and bars to a file for ``mesh.file``; an earlier file of this name is replaced. Collective.
 
     Parameters
     ----------
-    path : name of the file; ends in ``.h5``
+    path : name of the file; its suffix chooses the format (``docs/meshes.md``), ``.h5`` has everything exactly
     points : (nodes, 3) positions [m]
     bars : (bars, 2) integers, the nodes at the ends of each bar, numbered from 0
     node_groups, bar_groups : numbers of the members, or a boolean mask, for each name
@@ -72,20 +68,11 @@ def _write(
     from mpi4py import MPI
 
     from .checks import check_mesh
-    from .readers.hdf5 import write_hdf5
+    from .whole import WholeMesh
+    from .writers import write_whole, writer_name
 
-    if path.suffix != _SUFFIX:
-        raise InputError(f"{path}: the name of a mesh file that is written from arrays ends in {_SUFFIX}")
+    writer_name(path)
     slab = slab_from_arrays(str(path), points, bars, node_groups, bar_groups, bar_fields)
     check_mesh(slab, MPI.COMM_SELF)
-    new = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            write_hdf5(new, slab, MPI.COMM_SELF)
-            os.replace(new, path)
-        finally:
-            new.unlink(missing_ok=True)
-    except (OSError, RuntimeError) as error:
-        raise InputError(f"{path}: cannot be written: {getattr(error, 'strerror', None) or error}") from error
-    return path
+    mesh = WholeMesh(slab.points, slab.bars, slab.node_groups, slab.bar_groups, slab.bar_fields)
+    return write_whole(path, mesh)

@@ -32,11 +32,11 @@ MOST_BARS = 50_000
 _SIZE = (640, 360)
 
 
-def png(figure: Figure) -> bytes:
-    """Return a figure of matplotlib as PNG."""
+def png(figure: Figure, dpi: float = 100) -> bytes:
+    """Return a figure of matplotlib as PNG, with so many pixels per inch."""
     made = io.BytesIO()
     with boxes_allowed():
-        figure.savefig(made, format="png", dpi=100)
+        figure.savefig(made, format="png", dpi=dpi)
     return made.getvalue()
 
 

@@ -33,6 +33,7 @@ def test_they_are_listed(examples, capsys):
         ("viscoplastic", "Viscoplastic bar with kinematic hardening"),
         ("polygon", "A regular polygon"),
         ("tether", "A bound on the distance of two nodes"),
+        ("obj", "Wavefront OBJ files"),
         ("secant", "Held nodes have the mean normal velocity"),
         ("polygon_spin", "A polygon that spins inside a funnel"),
     ):
@@ -190,3 +191,21 @@ def test_treatment_stops_the_chatter_of_the_trapezoidal_rule(examples, comm, sha
 def test_treatment_states_what_it_goes_with(examples, comm, tmp_path):
     with pytest.raises(InputError, match='friction needs contact.treatment = "scheme" or "stick"'):
         Simulation(Case.load("polygon_spin", ["wall.0.friction=0.2"]), comm, output=tmp_path / "out", quiet=True)
+
+
+def test_reader_of_a_mesh_format(examples, tmp_path):
+    from pfem_petsc.mesh.readers import read_whole
+
+    text = "# a square\nv 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\no frame\nl 1 2 3 4 1\no brace\nl -4/1 -2/1\nf 1 2 3\n"
+    (tmp_path / "square.obj").write_text(text)
+    mesh = read_whole(tmp_path / "square.obj")
+    assert mesh.bars.tolist() == [[0, 1], [1, 2], [2, 3], [3, 0], [0, 2]]
+    assert {name: members.tolist() for name, members in mesh.bar_groups.items()} == {
+        "frame": [0, 1, 2, 3],
+        "brace": [4],
+    }
+    assert main(["mesh", "convert", str(tmp_path / "square.obj"), str(tmp_path / "square.msh")]) == 0
+    for wrong, line in (("v 0 0", 2), ("v 0 0 z", 2)):
+        (tmp_path / "square.obj").write_text(text.replace("v 0 0 0", wrong))
+        with pytest.raises(InputError, match=f"square.obj: line {line}: "):
+            read_whole(tmp_path / "square.obj")

@@ -113,7 +113,7 @@ def test_arrays_are_kept_and_read_only():
     assert repr(truss) == "<Truss of 4 nodes and 6 bars, groups feet, top, legs>"
     assert pickle.loads(pickle.dumps(truss)) == truss != Truss(POINTS * 2, BARS, **GROUPS)
     grid = tripod().grid()
-    assert (grid.n_points, grid.n_cells, grid["group/legs"].sum()) == (4, 6, 3)
+    assert (grid.n_points, grid.n_cells, grid["group:legs"].sum()) == (4, 6, 3)
 
 
 def test_written_and_read(tmp_path):

@@ -51,7 +51,7 @@ def test_arrays_become_a_case(comm, shared_tmp_path):
 @pytest.mark.parametrize(
     ("name", "points", "bars", "groups", "text"),
     [
-        ("m.msh", POINTS, BARS, {}, r"m\.msh: .* ends in \.h5"),
+        ("m.stl", POINTS, BARS, {}, r"m\.stl: no writer for \.stl; known suffixes: .*\.h5"),
         ("m.h5", POINTS[:, :2], BARS, {}, r"points has shape \(3, 2\) and type float64; expected \(points, 3\)"),
         ("m.h5", [[0, 0, 0], [1, 0]], BARS, {}, r"points has shape"),
         ("m.h5", POINTS + 1j, BARS, {}, r"points has .* complex128"),

@@ -13,9 +13,9 @@ from ...case.base import StrictModel
 from ...errors import InputError
 from ...parallel.agreement import agreed
 from ..readers import missing_field
-from ..readers.scatter import WholeMesh, scattered
 from ..slab import MeshSlab, check_size, slab_of_whole, slab_range
 from ..truss import Truss
+from ..whole import WholeMesh, scattered
 
 __all__ = ["Parameters", "generate_on"]
 

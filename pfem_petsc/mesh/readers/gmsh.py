@@ -1,25 +1,29 @@
 """Gmsh .msh files, versions 2.2 and 4.1, ASCII and binary: lines are bars, physical groups are groups.
 
 Two-node lines (element type 1) are the bars, in file order; points (type 15) with a physical group define node groups;
-surfaces and volumes are ignored with a warning. Nodes are numbered from 0 in file order.
+surfaces and volumes are ignored with a warning. Nodes are numbered from 0 in file order. Data of elements
+($ElementData) with one component and a value for every line are bar fields.
 """
 
 from __future__ import annotations
 
 import codecs
-from collections.abc import Mapping
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
-from mpi4py import MPI
 
 from ...errors import InputError
-from ..slab import MeshSlab
-from . import missing_field
-from .gmsh_sections import Format, Numbers, sections
-from .scatter import WholeMesh, read_and_scatter
+from ..whole import WholeMesh
+from ._gmsh_lines import element_data, in_order, once
+from ._gmsh_sections import Format, Numbers, sections
 
-__all__ = ["read"]
+__all__ = ["ORDERED", "SUFFIXES", "read"]
+
+SUFFIXES = (".msh",)
+
+ORDERED = b"bars in the order of their tags"
+"""In $Comments of a file whose elements are sorted by groups: the bars are numbered by their tags."""
 
 _POINT, _LINE = 15, 1
 
@@ -29,32 +33,25 @@ _NODES |= {17: 20, 18: 15, 19: 13, 20: 9, 21: 10, 22: 12, 23: 15, 24: 15, 25: 21
 _NODES |= {31: 56, 92: 64, 93: 125}
 _CURVED = (8, 26, 27, 28)
 
-Elements = list[tuple[int, np.ndarray, np.ndarray]]
-"""Runs of elements: type, (n, nodes of an element) tags of nodes, (n, physical groups) tags, 0 for none."""
+Elements = list[tuple[int, np.ndarray, np.ndarray, np.ndarray]]
+"""Runs of elements: type, (n,) tags, (n, nodes of an element) tags of nodes, (n, physical groups) tags, 0 for none."""
 
 
-def read(path: Path, comm: MPI.Comm, fields: Mapping[str, str] | None = None) -> MeshSlab:
-    """Return this rank's slab of the mesh in a Gmsh file, which rank 0 reads; cell fields are refused. Collective.
+def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
+    """Return the mesh in a Gmsh file, with all data of elements.
 
     Raises
     ------
     InputError
-        On all ranks, naming the section, for any content that is not a mesh of bars.
+        Naming the section, for any content that is not a mesh of bars.
     """
-    missing = missing_field(path, fields or {}, ())
-    if missing is not None:
-        raise InputError(f"{missing}; files .h5, .vtu and .vtkhdf can have fields")
-    return read_and_scatter(_read, path, comm)
-
-
-def _read(path: Path) -> WholeMesh:
     # editors on Windows insert a byte order mark
     content = path.read_bytes().removeprefix(codecs.BOM_UTF8)
     if not content.lstrip().startswith(b"$MeshFormat"):
         raise InputError(f"{path}: does not start with $MeshFormat: not a Gmsh mesh of version 2.2 or 4.1")
     parts = sections(path, content)
     del content
-    layout = Format(path, parts["MeshFormat"])
+    layout = Format(path, parts["MeshFormat"][0])
     if "PartitionedEntities" in parts:
         raise InputError(f"{path}: section $PartitionedEntities: save the mesh without partitions")
     for name in ("Nodes", "Elements"):
@@ -62,9 +59,9 @@ def _read(path: Path) -> WholeMesh:
             raise InputError(f"{path}: has no section ${name}")
 
     def numbers(name: str) -> Numbers:
-        return Numbers(f"{path}: section ${name}", parts.pop(name), layout, layout.version == "2.2")
+        return Numbers(f"{path}: section ${name}", parts.pop(name)[0], layout, layout.version == "2.2")
 
-    names = _physical_names(path, parts.get("PhysicalNames", b"0"))
+    names = _physical_names(path, parts.get("PhysicalNames", [b"0"])[0])
     if layout.version == "2.2":
         tags, points = _nodes_2(numbers("Nodes"))
         elements = _elements_2(path, numbers("Elements"), layout.binary)
@@ -72,7 +69,16 @@ def _read(path: Path) -> WholeMesh:
         tags, points = _nodes_4(path, numbers("Nodes"))
         groups = _entities_4(numbers("Entities")) if "Entities" in parts else {}
         elements = _elements_4(path, numbers("Elements"), groups)
-    return _assemble(path, tags, points, elements, names)
+    mesh = _assemble(path, tags, points, elements, names)
+    lines = [own for kind, own, _, _ in elements if kind == _LINE]
+    bar_tags = np.concatenate([np.empty(0, np.int64), *lines])
+    if any(ORDERED in text for text in parts.get("Comments", [])):
+        bar_tags = in_order(mesh, bar_tags)
+    if layout.version == "2.2":
+        bar_tags = once(mesh, bar_tags)
+    for payload in parts.get("ElementData", []):
+        element_data(path, payload, layout, bar_tags, mesh)
+    return mesh
 
 
 def _physical_names(path: Path, payload: bytes) -> dict[tuple[int, int], str]:
@@ -149,7 +155,7 @@ def _elements_2(path: Path, numbers: Numbers, binary: bool) -> Elements:
         if not 0 <= n_tags < 1000:
             raise InputError(f"{path}: section $Elements: {n_tags} tags of element {done} of {declared}")
         if binary:
-            rows = numbers.ints(n * (1 + n_tags + nodes)).reshape(n, 1 + n_tags + nodes)[:, 1:]
+            rows = numbers.ints(n * (1 + n_tags + nodes)).reshape(n, 1 + n_tags + nodes)
         else:
             # Find the run of consecutive elements of the same type, searching ever farther.
             width = 3 + n_tags + nodes
@@ -158,11 +164,11 @@ def _elements_2(path: Path, numbers: Numbers, binary: bool) -> Elements:
             alike = (ahead[:, 1] == kind) & (ahead[:, 2] == n_tags)
             n = len(alike) if alike.all() else int(alike.argmin())
             run = 2 * max(n, 1)
-            rows = numbers.ints(max(n, 1) * width).reshape(-1, width)[:, 3:]
+            rows = numbers.ints(max(n, 1) * width).reshape(-1, width)[:, [0, *range(3, width)]]
         if not 0 < len(rows) <= declared - done:
             raise InputError(f"{path}: section $Elements declares {declared} elements, its blocks hold others")
         done += len(rows)
-        elements.append((kind, rows[:, n_tags:], rows[:, : min(n_tags, 1)]))
+        elements.append((kind, rows[:, 0], rows[:, 1 + n_tags :], rows[:, 1 : 1 + min(n_tags, 1)]))
     numbers.end()
     return elements
 
@@ -176,9 +182,9 @@ def _elements_4(path: Path, numbers: Numbers, groups: dict[tuple[int, int], np.n
         nodes = _nodes_of(path, kind)
         rows = numbers.sizes(n * (1 + nodes)).reshape(n, 1 + nodes)
         physical = groups.get((dimension, entity), np.empty(0, np.int64))
-        elements.append((kind, rows[:, 1:], np.broadcast_to(physical, (n, len(physical)))))
+        elements.append((kind, rows[:, 0], rows[:, 1:], np.broadcast_to(physical, (n, len(physical)))))
     numbers.end()
-    held = sum(len(nodes) for _, nodes, _ in elements)
+    held = sum(len(tags) for _, tags, _, _ in elements)
     if held != declared:
         raise InputError(f"{path}: section $Elements declares {declared} elements, its blocks hold {held}")
     return elements
@@ -214,7 +220,7 @@ def _assemble(
     node_parts: dict[int, list[np.ndarray]] = {}
     bar_parts: dict[int, list[np.ndarray]] = {}
     n_bars = 0
-    for kind, nodes, physical in elements:
+    for kind, _, nodes, physical in elements:
         if kind == _LINE:
             bars.append(numbered(nodes))
             _collect(bar_parts, np.arange(n_bars, n_bars + len(nodes)), physical)
@@ -225,8 +231,11 @@ def _assemble(
     for dimension, parts, groups in ((0, node_parts, mesh.node_groups), (1, bar_parts, mesh.bar_groups)):
         for tag in sorted(parts):
             name = names.get((dimension, tag), f"group_{tag}")
-            groups[name] = np.concatenate([*parts[tag], groups.get(name, np.empty(0, np.int64))])
-    others = sum(len(nodes) for kind, nodes, _ in elements if kind not in (_LINE, _POINT))
+            groups[name] = np.unique(np.concatenate([*parts[tag], groups.get(name, np.empty(0, np.int64))]))
+        for (of, _), name in names.items():
+            if of == dimension:
+                groups.setdefault(name, np.empty(0, np.int64))
+    others = sum(len(nodes) for kind, _, nodes, _ in elements if kind not in (_LINE, _POINT))
     if others:
         mesh.warnings.append(f"{path}: left out {others} elements that are neither lines nor points")
     return mesh

@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -17,9 +17,12 @@ from mpi4py import MPI
 from ...errors import InputError
 from ...parallel.agreement import agreed, on_root
 from ..slab import MeshSlab, check_size, slab_range
+from ..whole import WholeMesh
 from . import missing_field
 
-__all__ = ["read", "write_hdf5"]
+__all__ = ["SUFFIXES", "read", "read_on", "write_hdf5"]
+
+SUFFIXES = (".h5",)
 
 # Number of group members read or written at a time.
 _PIECE = 1 << 20
@@ -28,7 +31,23 @@ _PIECE = 1 << 20
 _COMPRESSION = 1100
 
 
-def read(path: Path, comm: MPI.Comm, fields: Mapping[str, str] | None = None) -> MeshSlab:
+def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
+    """Return the mesh in an HDF5 file, with the named cell fields; None: with all.
+
+    Raises
+    ------
+    InputError
+        As :func:`read_on`.
+    """
+    if fields is None:
+        sizes = _describe(path)
+        with _opened(path) as file:
+            fields = _fields(file, sizes[1])
+    slab = read_on(path, MPI.COMM_SELF, dict.fromkeys(fields, "bar_fields"))
+    return WholeMesh(slab.points, slab.bars, slab.node_groups, slab.bar_groups, slab.bar_fields)
+
+
+def read_on(path: Path, comm: MPI.Comm, fields: Mapping[str, str] | None = None) -> MeshSlab:
     """Return this rank's slab of the mesh in an HDF5 file, with the named cell fields. Collective; no rank reads more
     than its part at a time.
 

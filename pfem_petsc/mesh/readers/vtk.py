@@ -2,7 +2,9 @@
 
 A cell array of integers named ``group`` or ``section`` assigns every bar with value i to the bar group ``group_i`` or
 ``section_i``; a field array of strings named ``group_names`` or ``section_names`` replaces these names by its i-th
-entry. Point arrays of the same names define node groups (a negative value: no group).
+entry. Point arrays of the same names define node groups (a negative value: no group). An array named ``group:NAME`` is
+the group NAME of those with a value other than 0; these may overlap. Other cell arrays with one component are bar
+fields.
 """
 
 from __future__ import annotations
@@ -12,40 +14,36 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping
-from functools import partial
+from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
-from mpi4py import MPI
 
 from ...errors import InputError
-from ..slab import MeshSlab
-from . import missing_field, vtk_extract
-from .scatter import WholeMesh, read_and_scatter
+from ..whole import WholeMesh
+from . import _vtk_extract
 
-__all__ = ["read"]
+__all__ = ["SUFFIXES", "read"]
+
+SUFFIXES = (".vtu", ".vtkhdf")
 
 
-def read(path: Path, comm: MPI.Comm, fields: Mapping[str, str] | None = None) -> MeshSlab:
-    """Return this rank's slab of the mesh in a VTK file, which rank 0 reads, with the named cell fields. Collective.
+def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
+    """Return the mesh in a VTK file, with the named cell fields; None: all.
 
     Raises
     ------
     InputError
-        On all ranks, for any content that is not an unstructured grid of lines.
+        For any content that is not an unstructured grid of lines.
     """
-    return read_and_scatter(partial(_read, fields=fields or {}), path, comm)
-
-
-def _read(path: Path, fields: Mapping[str, str]) -> WholeMesh:
     with tempfile.TemporaryDirectory() as folder:
         result = Path(folder, "mesh.npz")
         # -P removes the program's folder from the path, where this module would shadow the package vtk.
-        command = [sys.executable, "-P", vtk_extract.__file__, str(path.resolve()), str(result), *fields]
+        command = [sys.executable, "-P", _vtk_extract.__file__, str(path.resolve()), str(result)]
+        command += [_vtk_extract.ALL] if fields is None else list(fields)
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join(p for p in sys.path if p)}
         done = subprocess.run(command, env=environment, capture_output=True, text=True, errors="replace", check=False)
-        if done.returncode == vtk_extract.REFUSED:
+        if done.returncode == _vtk_extract.REFUSED:
             raise InputError(f"{path}: {done.stdout.strip()}")
         if done.returncode < 0:
             raise InputError(
@@ -63,7 +61,5 @@ def _read(path: Path, fields: Mapping[str, str]) -> WholeMesh:
                     mesh.warnings.append(f"{path}: left out {arrays[key]} cells that are no lines")
                 if slash:
                     getattr(mesh, kind)[name] = arrays[key]
-            missing = missing_field(path, fields, arrays["cell_fields"].tolist())
-            if missing is not None:
-                raise InputError(missing)
+            mesh.known_fields = arrays["cell_fields"].tolist()
     return mesh

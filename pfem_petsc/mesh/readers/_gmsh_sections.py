@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 
 import numpy as np
 
 from ...errors import InputError
+from ._text import numbers_of
 
 __all__ = ["Format", "Numbers", "sections"]
 
@@ -32,7 +32,8 @@ class Format:
         where = f"{path}: section $MeshFormat"
         if len(fields) != 3 or fields[1] not in (b"0", b"1") or fields[2] not in (b"4", b"8"):
             raise InputError(f"{where}: {_shown(first)!r} is not 'version file-type data-size', such as '4.1 0 8'")
-        self.version = {b"2.2": "2.2", b"4.1": "4.1"}.get(fields[0], "")
+        # versions 2 to 2.2 differ in nothing that is read here
+        self.version = {**dict.fromkeys((b"2", b"2.0", b"2.1", b"2.2"), "2.2"), b"4.1": "4.1"}.get(fields[0], "")
         if not self.version:
             raise InputError(
                 f"{where}: version {_shown(fields[0])} is not read; save the mesh as version 4.1 or 2.2 "
@@ -148,9 +149,9 @@ class Numbers:
         return values.astype(np.int64)
 
 
-def sections(path: Path, content: bytes) -> dict[str, bytes]:
-    """Return the payloads of the sections of a file by name; of several with the same name the first."""
-    found: dict[str, bytes] = {}
+def sections(path: Path, content: bytes) -> dict[str, list[bytes]]:
+    """Return the payloads of the sections of a file by name."""
+    found: dict[str, list[bytes]] = {}
     at = 0
     while True:
         at = content.find(b"$", at)
@@ -163,7 +164,7 @@ def sections(path: Path, content: bytes) -> dict[str, bytes]:
         end = content.find(b"$End" + name, newline)
         if end < 0:
             raise InputError(f"{path}: section ${name.decode()} has no end; the file is truncated")
-        found.setdefault(name.decode(), content[newline + 1 : end])
+        found.setdefault(name.decode(), []).append(content[newline + 1 : end])
         at = end + 4 + len(name)
     return found
 
@@ -171,11 +172,8 @@ def sections(path: Path, content: bytes) -> dict[str, bytes]:
 def _parse(where: str, text: bytes) -> np.ndarray:
     """Return all numbers of a text as float64, exact for tags up to 2^53."""
     try:
-        with warnings.catch_warnings():
-            # Text other than numbers ends the parsing, with a warning in older NumPy and an error in newer versions.
-            warnings.simplefilter("error")
-            return np.fromstring(text, dtype=np.float64, sep=" ") if text.strip() else np.empty(0)
-    except (DeprecationWarning, ValueError):
+        return numbers_of(text)
+    except ValueError:
         for number, line in enumerate(text.split(b"\n"), 1):
             for word in line.split():
                 try:

@@ -1,24 +1,25 @@
-"""Distributes a mesh that one rank has read to all ranks as slabs."""
+"""A mesh that one rank has whole: what readers return and writers take, and its distribution to all ranks as slabs."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from mpi4py import MPI
 
-from ...errors import InputError
-from ...parallel.agreement import agreed
-from ..slab import MeshSlab, check_size, slab_range
+from ..errors import InputError
+from ..parallel.agreement import agreed
+from .slab import MeshSlab, check_size, slab_range
 
 __all__ = ["WholeMesh", "read_and_scatter", "scattered"]
 
 
 @dataclass
 class WholeMesh:
-    """A mesh read from a file by one rank; numbers from 0."""
+    """A mesh that one rank has; numbers from 0."""
 
     points: np.ndarray
     """(n_nodes, 3) float64 [m]."""
@@ -27,8 +28,14 @@ class WholeMesh:
     node_groups: dict[str, np.ndarray] = field(default_factory=dict)
     bar_groups: dict[str, np.ndarray] = field(default_factory=dict)
     bar_fields: dict[str, np.ndarray] = field(default_factory=dict)
-    """(n_bars,) float64."""
+    """(n_bars,) float64; the field ``area`` has the areas of cross-sections [m2]."""
+    tables: dict[str, dict[str, Any]] = field(default_factory=dict)
+    """What a file has besides the mesh, as the tables ``material`` and ``section`` of a case: keys by name."""
     warnings: list[str] = field(default_factory=list)
+    known_fields: list[str] | None = None
+    """Names of all fields of a file; None: those in ``bar_fields``."""
+    source: str = "mesh"
+    """The file, for messages."""
 
 
 def read_and_scatter(read: Callable[[Path], WholeMesh], path: Path, comm: MPI.Comm) -> MeshSlab:

@@ -1,4 +1,4 @@
-"""Extracts a mesh of lines from a VTK file; run as a program, ``vtk_extract.py FILE RESULT.npz [FIELD ...]``.
+"""Extracts a mesh of lines from a VTK file; run as a program, ``_vtk_extract.py FILE RESULT.npz [FIELD ...]``.
 
 It is a separate process because VTK aborts the process on some damaged files. Imports neither MPI nor this package. For
 a file without a mesh of bars the status is 3 and the reason is printed on stdout.
@@ -17,6 +17,9 @@ REFUSED = 3
 
 _VTK_LINE = 3
 _ARRAYS = ("group", "section")
+_MASK = "group:"
+ALL = "*"
+"""In the place of names of fields: all of them."""
 
 
 def main(path: str, result: str, *fields: str) -> int:
@@ -88,8 +91,10 @@ def _arrays(grid: Any, fields: tuple[str, ...]) -> dict[str, np.ndarray]:
     cells = grid.GetCellData()
     known = [cells.GetArray(i) for i in range(cells.GetNumberOfArrays())]
     known = {a.GetName(): a for a in known if a is not None and a.GetName() and a.GetNumberOfComponents() == 1}
+    known = {name: a for name, a in known.items() if not name.startswith(_MASK)}
     arrays["cell_fields"] = np.array(list(known), dtype=str)
-    for name in set(fields) & set(known):
+    every = [name for name in known if name not in _ARRAYS and "/" not in name]
+    for name in every if fields == (ALL,) else set(fields) & set(known):
         arrays[f"bar_fields/{name}"] = vtk_to_numpy(known[name]).astype(np.float64)[lines]
     return arrays
 
@@ -99,6 +104,12 @@ def _groups(data: Any, fields: Any, kept: np.ndarray | None) -> dict[str, np.nda
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
     groups = {}
+    for i in range(data.GetNumberOfArrays()):
+        array = data.GetArray(i)
+        name = array.GetName() or "" if array is not None else ""
+        if name.startswith(_MASK) and len(name) > len(_MASK) and array.GetNumberOfComponents() == 1:
+            values = vtk_to_numpy(array)
+            groups[name.removeprefix(_MASK)] = np.flatnonzero(values if kept is None else values[kept])
     for array_name in _ARRAYS:
         array = data.GetArray(array_name)
         if array is None:

@@ -1,0 +1,264 @@
+"""Generate, convert, inspect, draw, refine, merge and clean mesh files."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..errors import InputError, printable
+from .parser import PROGRAM, add_debug
+
+if TYPE_CHECKING:
+    from ..mesh.whole import WholeMesh
+
+RANKS = "one"
+
+EXAMPLE = f"""\
+examples:
+  {PROGRAM} mesh generate lattice block.inp --set kind=octet cells=[4,4,4] pitch=0.01 --area 1e-6
+  {PROGRAM} mesh convert tower.inp tower.vtu --scale 0.001 --case tower.toml
+  {PROGRAM} mesh info meshes/ring.msh
+  {PROGRAM} mesh picture meshes/mast.vtu -o mast.png
+  {PROGRAM} mesh refine cable.msh fine.msh --parts 8
+  {PROGRAM} mesh merge deck.h5 towers.inp -o bridge.h5 --tolerance 1e-4
+  {PROGRAM} mesh clean scanned.stl truss.3mf --tolerance 1e-5 --area 1e-6
+
+The suffix chooses the format: docs/meshes.md."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Subcommands of the verb."""
+    subparsers = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
+
+    def add(name: str, text: str, *files: str) -> argparse.ArgumentParser:
+        sub = subparsers.add_parser(name, help=text, description=text, prog=f"{PROGRAM} mesh {name}")
+        add_debug(sub)
+        for file in files:
+            sub.add_argument(file.lower(), metavar=file, type=Path)
+        return sub
+
+    generate = add("generate", "Write the mesh of a generator or a case.")
+    generate.add_argument("what", metavar="GENERATOR|CASE", help="name of a generator (see list), or a case")
+    generate.add_argument("output", metavar="OUTPUT", type=Path)
+    generate.add_argument(
+        "--set",
+        dest="overrides",
+        metavar="KEY=VALUE",
+        nargs="+",
+        action="extend",
+        default=[],
+        help="keys of the generator, kind=octet pitch=0.01, or of the case, mesh.pitch=0.01",
+    )
+    convert = add("convert", "Write a mesh file in another format.", "INPUT", "OUTPUT")
+    refine = add("refine", "Divide each bar into several.", "INPUT", "OUTPUT")
+    refine.add_argument("--parts", metavar="N", type=int, default=2, help="bars in the place of one; default: 2")
+    merge = add("merge", "Put several files together, and join nodes at the same place.")
+    merge.add_argument("inputs", metavar="INPUT", type=Path, nargs="+")
+    merge.add_argument("-o", "--output", metavar="OUTPUT", type=Path, required=True)
+    clean = add(
+        "clean", "Merge nodes, remove double bars, bars without length, and nodes without bars.", "INPUT", "OUTPUT"
+    )
+    clean.add_argument("--sum-areas", action="store_true", help="add up the areas of bars between the same nodes")
+    info = add("info", "Show counts, sizes, groups, and what is wrong with mesh files.")
+    info.add_argument("inputs", metavar="FILE", type=Path, nargs="+")
+    picture = add("picture", "Draw a mesh file.", "INPUT")
+    picture.add_argument("-o", "--output", metavar="PNG", type=Path, help="default: INPUT with the suffix .png")
+    picture.add_argument("--size", metavar="WxH", type=_size, default=(1280, 720), help="pixels; default: 1280x720")
+    picture.add_argument("--view", default="auto", help="xy, xz, yz, iso or auto; default: %(default)s")
+    for sub in (merge, clean, info):
+        sub.add_argument(
+            "--tolerance",
+            metavar="METRES",
+            type=_distance,
+            help="distance up to which nodes are at the same place; default: 1e-6 of the mean length of the bars",
+        )
+    for sub in (convert, refine, merge, clean, info, picture):
+        sub.add_argument(
+            "--scale",
+            metavar="METRES",
+            type=float,
+            default=1.0,
+            help="metres in the unit of the file: 0.001 for millimetres, with MPa and t/mm3",
+        )
+    for sub in (generate, convert, refine, merge, clean):
+        sub.add_argument("--area", metavar="M2", type=_distance, help="area of all bars, over that of the file")
+        sub.add_argument("--case", metavar="TOML", type=Path, help="write a case file for OUTPUT as well")
+
+
+def _size(text: str) -> tuple[int, int]:
+    width, _, height = text.partition("x")
+    if not (width.isdigit() and height.isdigit() and 50 <= int(width) <= 20000 and 50 <= int(height) <= 20000):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a size in pixels, like 1280x720")
+    return int(width), int(height)
+
+
+def _distance(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0.0 <= value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a positive number")
+    return value
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Do what the subcommand says, and return the exit status."""
+    actions: dict[str, Callable[[argparse.Namespace], None]] = {
+        "generate": _generate,
+        "convert": _convert,
+        "refine": _refine,
+        "merge": _merge,
+        "clean": _clean,
+        "info": _info,
+        "picture": _picture,
+    }
+    actions[arguments.action](arguments)
+    return 0
+
+
+def _read(path: Path, scale: float) -> WholeMesh:
+    """Read a file, and print what its reader has to say."""
+    from ..mesh.readers import read_whole
+    from ..mesh.tools import scaled
+
+    mesh = read_whole(path)
+    for text in mesh.warnings:
+        print(printable(f"warning: {text}"))
+    mesh.warnings = []
+    return mesh if scale == 1.0 else scaled(mesh, scale)
+
+
+def _write(arguments: argparse.Namespace, mesh: WholeMesh) -> None:
+    """Write the mesh, and a case file if there is to be one; print what they are."""
+    import numpy as np
+
+    from ..mesh.skeleton import skeleton
+    from ..mesh.writers import write_whole
+
+    if arguments.area is not None:
+        mesh.bar_fields["area"] = np.full(len(mesh.bars), arguments.area)
+        for keys in mesh.tables.get("section", {}).values():
+            keys.update(area=arguments.area)
+            keys.pop("area_field", None)
+    if arguments.case is not None and arguments.case.exists():
+        raise InputError(f"--case {arguments.case}: there is such a file; remove it, or give another name")
+    path = write_whole(arguments.output, mesh)
+    print(printable(f"{arguments.output}: {len(mesh.points):,} nodes, {len(mesh.bars):,} bars"))
+    if arguments.case is not None:
+        try:
+            arguments.case.write_text(skeleton(mesh, path, arguments.case), encoding="utf-8")
+        except OSError as error:
+            raise InputError(f"--case {arguments.case}: cannot be written: {error.strerror}") from error
+        print(printable(f"{arguments.case}: a case for it; see what it says at its top"))
+
+
+def _generate(arguments: argparse.Namespace) -> None:
+    """Generate the mesh of a case, or of a generator, with the areas and materials of the case."""
+    from ..mesh.writers import writer_name
+
+    writer_name(arguments.output)  # before a long computation
+    _write(arguments, _made(arguments.what, arguments.overrides))
+
+
+def _made(what: str, overrides: list[str]) -> WholeMesh:
+    from mpi4py import MPI
+
+    from ..case.schema import Case
+    from ..mechanics.sections import section_of_bars
+    from ..mesh import load_slab
+    from ..mesh.whole import WholeMesh
+    from ..registry import choices
+
+    plain = what in choices("pfem_petsc.mesh.generators")
+    if plain:
+        tables: dict[str, Any] = {
+            "mesh": {"generator": what},
+            "material": {"m": {"young_modulus": 1.0, "density": 1.0}},
+            "section": {"s": {"area": 1.0, "material": "m"}},
+            "time": {"integrator": "central_differences", "step": "auto", "end": 1.0},
+        }
+        prefixed = [text if text.startswith("mesh.") else f"mesh.{text}" for text in overrides]
+        case = Case.from_dict(tables, source=f"mesh generate {what}", overrides=prefixed)
+    else:
+        case = Case.load(what, overrides)
+    keys = case.mesh.parameters
+    names = dict(getattr(keys, "bar_fields", None) or getattr(getattr(keys, "truss", None), "bar_fields", None) or {})
+    if case.mesh.file is not None:
+        from ..mesh.readers import read_whole
+
+        names = read_whole(case.mesh.file).bar_fields
+    slab = load_slab(case.mesh, MPI.COMM_SELF, dict.fromkeys(names, "mesh.bar_fields"))
+    mesh = WholeMesh(slab.points, slab.bars.astype("int64"), slab.node_groups, slab.bar_groups, dict(slab.bar_fields))
+    if not plain:
+        import numpy as np
+
+        index = section_of_bars(case, slab)
+        area = np.empty(len(mesh.bars))
+        for k, section in enumerate(case.section.values()):
+            own = index == k
+            area[own] = section.area if section.area_field is None else slab.bar_fields[section.area_field][own]
+        mesh.bar_fields["area"] = area
+        given = case.to_dict()
+        mesh.tables = {name: given[name] for name in ("material", "section") if name in given}
+    return mesh
+
+
+def _convert(arguments: argparse.Namespace) -> None:
+    _write(arguments, _read(arguments.input, arguments.scale))
+
+
+def _refine(arguments: argparse.Namespace) -> None:
+    from ..mesh.tools import refined
+
+    _write(arguments, refined(_read(arguments.input, arguments.scale), arguments.parts))
+
+
+def _merge(arguments: argparse.Namespace) -> None:
+    from ..mesh.tools import merged
+
+    mesh, done = merged([_read(path, arguments.scale) for path in arguments.inputs], arguments.tolerance)
+    _tell(done)
+    _write(arguments, mesh)
+
+
+def _clean(arguments: argparse.Namespace) -> None:
+    from ..mesh.tools import cleaned
+
+    mesh, done = cleaned(_read(arguments.input, arguments.scale), arguments.tolerance, arguments.sum_areas)
+    _tell(done or ["nothing to clean"])
+    _write(arguments, mesh)
+
+
+def _tell(lines: list[str]) -> None:
+    for line in lines:
+        print(printable(line))
+
+
+def _info(arguments: argparse.Namespace) -> None:
+    from ..mesh.summary import summary
+
+    for path in arguments.inputs:
+        mesh = _read(path, arguments.scale)
+        lines = summary(mesh, arguments.tolerance)
+        width = max(len(label) for label, _ in lines)
+        print(printable(str(path)))
+        _tell([f"  {label:{width}}  {text}" for label, text in lines])
+
+
+def _picture(arguments: argparse.Namespace) -> None:
+    from ..post.mesh_picture import draw
+
+    output = arguments.output or arguments.input.with_suffix(".png")
+    mesh = _read(arguments.input, arguments.scale)
+    if output.suffix.lower() != ".png":
+        raise InputError(f"{output}: a picture is written as .png")
+    data = draw(mesh, arguments.size, arguments.view)
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+        output.write_bytes(data)
+    except OSError as error:
+        raise InputError(f"{output}: cannot be written: {error.strerror}") from error
+    print(printable(str(output)))

@@ -1,0 +1,231 @@
+"""The model of an Abaqus input file as one mesh: instances placed, labels replaced by numbers from 0."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from ...errors import InputError
+from ._inp_blocks import Block
+from ._inp_model import Entry, Model, Scope, SetTable
+
+__all__ = ["Flat"]
+
+
+@dataclass
+class _Placed:
+    """A scope with its nodes and bars in the mesh; ``nodes`` and ``bars`` are its labels, ascending, and ``*_at`` where
+    these are."""
+
+    scope: Scope
+    nodes: np.ndarray
+    nodes_at: np.ndarray
+    bars: np.ndarray
+    bars_at: np.ndarray
+
+
+class Flat:
+    """Nodes and bars of all instances in their order, without nodes where no bar ends."""
+
+    def __init__(self, path: Path, model: Model) -> None:
+        self.path = path
+        self.warnings = [f"{path}: {n} elements {note}" for note, n in model.notes.items()]
+        if model.left_out:
+            self.warnings.append(f"{path}: left out elements of the types {', '.join(sorted(model.left_out))}")
+        self._model = model
+        self._lost: dict[int, int] = {}
+        self._groups: dict[str, dict[str, np.ndarray]] = {}
+        self._placed: dict[str, _Placed] = {}
+        points, bars = [np.empty((0, 3))], [np.empty((0, 2), np.int64)]
+        labels = [np.empty(0, np.int64)]
+        n_nodes = n_bars = 0
+        for key, scope, place in self._scopes():
+            placed, own_points, own_bars = _numbered(path, scope, place, n_nodes, n_bars)
+            self._placed[key] = placed
+            points.append(own_points)
+            bars.append(own_bars)
+            labels.append(placed.nodes[np.argsort(placed.nodes_at)])
+            n_nodes, n_bars = n_nodes + len(own_points), n_bars + len(own_bars)
+        self.points, self.bars = np.concatenate(points), np.concatenate(bars)
+        self._drop_bare_nodes(np.concatenate(labels))
+
+    def _scopes(self) -> Iterator[tuple[str, Scope, np.ndarray]]:
+        still = np.vstack([np.eye(3), np.zeros(3)])
+        model = self._model
+        yield "", model.root, still
+        for own, part, place, block in model.instances:
+            if part.upper() not in model.parts:
+                raise InputError(f"{block.where}: there is no part {part}")
+            if own.name.upper() in self._placed:
+                raise InputError(f"{block.where}: there are two instances of the name {own.name}")
+            yield own.name.upper(), _joined(model.parts[part.upper()], own), place
+        if model.assembly.labels or model.assembly.elements:
+            yield "*ASSEMBLY", model.assembly, still
+
+    def _drop_bare_nodes(self, labels: np.ndarray) -> None:
+        used = np.zeros(len(self.points), bool)
+        used[self.bars] = True
+        self.labels_left_out = labels[~used].tolist()
+        self._number = np.where(used, np.cumsum(used) - 1, -1)
+        self.points, self.bars = self.points[used], self._number[self.bars]
+
+    def groups(self, kind: str) -> dict[str, np.ndarray]:
+        """Return the node sets (``NSET``) or element sets (``ELSET``) as groups.
+
+        A set of a part has its own name where no other set has it, and INSTANCE.NAME otherwise; with several instances
+        NAME is the set of all of them.
+        """
+        if kind in self._groups:
+            return self._groups[kind]
+        found: dict[str, np.ndarray] = {}
+        common: dict[str, tuple[str, list[np.ndarray]]] = {}
+        for table in _sets(self._model.assembly, kind).values():
+            found[table.name] = self._members(kind, "*ASSEMBLY", table)
+        taken = {name.upper() for name in found}
+        for key, placed in self._placed.items():
+            if key == "*ASSEMBLY":
+                continue
+            for upper, table in _sets(placed.scope, kind).items():
+                members = self._members(kind, key, table)
+                common.setdefault(upper, (table.name, []))[1].append(members)
+                if key and (upper in taken or len(self._model.instances) > 1):
+                    found[f"{placed.scope.name}.{table.name}"] = members
+        for upper, (name, parts) in common.items():
+            if upper not in taken:
+                found[name] = np.unique(np.concatenate(parts))
+        lost, self._lost = sum(self._lost.values()), {}
+        if lost:
+            what = {"NSET": "node", "ELSET": "element"}[kind]
+            self.warnings.append(f"{self.path}: {lost} members of {what} sets are not there, and are left out")
+        self._groups[kind] = {name.replace("/", "_"): members for name, members in found.items()}
+        return self._groups[kind]
+
+    def sections(self) -> Iterator[tuple[Block, str, np.ndarray]]:
+        """Return each section with the name of a bar group, and its bars.
+
+        That of a part is one for all instances if the set of its name has these bars, else one for each instance.
+        """
+        groups = self.groups("ELSET")
+        names = {name.upper(): name for name in groups}
+        found: dict[int, tuple[Block, str, list[tuple[str, np.ndarray]]]] = {}
+        for key, scope in [*((key, placed.scope) for key, placed in self._placed.items()), *self._bare_assembly()]:
+            for block, name in scope.sections:
+                table = _sets(scope, "ELSET").get(name.upper())
+                if table is None:
+                    raise InputError(f"{block.where}: there is no element set {name}")
+                full = f"{scope.name}.{name}".upper().replace("/", "_")
+                members = self._members("ELSET", key, table)
+                found.setdefault(id(block), (block, name, []))[2].append((full, members))
+        for block, name, parts in found.values():
+            short = names.get(name.upper().replace("/", "_"))
+            together = np.unique(np.concatenate([members for _, members in parts]))
+            if short is not None and np.array_equal(groups[short], together):
+                yield block, short, together
+            else:
+                yield from ((block, names.get(full, short or name), members) for full, members in parts)
+
+    def _bare_assembly(self) -> list[tuple[str, Scope]]:
+        """Return the assembly if it has no nodes and elements of its own: it may have sections of sets of instances."""
+        return [] if "*ASSEMBLY" in self._placed else [("*ASSEMBLY", self._model.assembly)]
+
+    def _members(self, kind: str, key: str, table: SetTable, above: tuple[str, ...] = ()) -> np.ndarray:
+        """Return the members of a set in the mesh, ascending."""
+        parts = [np.empty(0, np.int64)]
+        for entry in table.entries:
+            here = entry.instance.upper() or key
+            if isinstance(entry.what, str):
+                parts.append(self._named(kind, here, entry, (*above, f"{key}.{table.name.upper()}")))
+            elif entry.what.size:
+                parts.append(self._labelled(kind, here, entry.what, entry))
+        return np.unique(np.concatenate(parts))
+
+    def _labelled(self, kind: str, key: str, labels: np.ndarray, entry: Entry) -> np.ndarray:
+        placed = self._placed.get(key)
+        if placed is None and key != "*ASSEMBLY":
+            raise InputError(f"{entry.block.where}: there is no instance {key}")
+        if placed is None:
+            placed = _nothing(self._model.assembly)
+        known, at = (placed.nodes, placed.nodes_at) if kind == "NSET" else (placed.bars, placed.bars_at)
+        place = np.minimum(np.searchsorted(known, labels), max(len(known) - 1, 0))
+        there = known[place] == labels if len(known) else np.zeros(len(labels), bool)
+        if not entry.generated and (kind == "NSET" or not self._model.left_out):
+            self._lost[id(entry)] = int((~there).sum())
+        members = at[place[there]] if len(known) else at
+        if kind == "NSET":
+            members = self._number[members]
+            members = members[members >= 0]
+        return members
+
+    def _named(self, kind: str, key: str, entry: Entry, above: tuple[str, ...]) -> np.ndarray:
+        """Members of a set that is named in another one, as NAME or INSTANCE.NAME, or of INSTANCE.LABEL."""
+        name = str(entry.what)
+        instance, dot, rest = name.partition(".")
+        if dot and instance.upper() in self._placed:
+            key, name = instance.upper(), rest
+            if name.isdigit():
+                return self._labelled(kind, key, np.array([int(name)]), entry)
+        scope = self._model.assembly if key == "*ASSEMBLY" else self._placed[key].scope if key in self._placed else None
+        table = None if scope is None else _sets(scope, kind).get(name.upper())
+        if table is None:
+            what = {"NSET": "node", "ELSET": "element"}[kind]
+            raise InputError(f"{entry.block.where}: {name!r} is neither a number nor a {what} set")
+        if f"{key}.{name.upper()}" in above:
+            raise InputError(f"{entry.block.where}: set {name} includes itself")
+        return self._members(kind, key, table, above)
+
+
+def _sets(scope: Scope, kind: str) -> dict[str, SetTable]:
+    return scope.nsets if kind == "NSET" else scope.elsets
+
+
+def _nothing(scope: Scope) -> _Placed:
+    none = np.empty(0, np.int64)
+    return _Placed(scope, none, none, none, none)
+
+
+def _joined(part: Scope, own: Scope) -> Scope:
+    """The content of a part with that of an instance."""
+    return replace(
+        own,
+        labels=part.labels + own.labels,
+        points=part.points + own.points,
+        elements=part.elements + own.elements,
+        nsets={**part.nsets, **own.nsets},
+        elsets={**part.elsets, **own.elsets},
+        sections=part.sections + own.sections,
+    )
+
+
+def _numbered(
+    path: Path, scope: Scope, place: np.ndarray, first_node: int, first_bar: int
+) -> tuple[_Placed, np.ndarray, np.ndarray]:
+    """Return a scope in the mesh, its points (n, 3), and its bars (n, 2)."""
+    labels = np.concatenate([np.empty(0, np.int64), *scope.labels])
+    points = np.concatenate([np.empty((0, 3)), *scope.points])
+    nodes, first, at = np.unique(labels, return_index=True, return_inverse=True)
+    if len(nodes) < len(labels):
+        moved = np.flatnonzero((points != points[first[at.ravel()]]).any(axis=1))
+        if len(moved):
+            raise InputError(f"{path}: *NODE: node {labels[moved[0]]} is listed more than once, at different places")
+        keep = np.sort(first)
+        labels, points = labels[keep], points[keep]
+    order = np.argsort(labels, kind="stable")
+    own_bars = np.concatenate([np.empty(0, np.int64), *(own for _, own, _ in scope.elements)])
+    ends = [np.empty((0, 2), np.int64)]
+    for block, own, wanted in scope.elements:
+        found = np.minimum(np.searchsorted(nodes, wanted), max(len(nodes) - 1, 0))
+        missing = np.argwhere(nodes[found] != wanted) if len(nodes) else np.argwhere(wanted >= 0)
+        if len(missing):
+            element, side = missing[0]
+            raise InputError(f"{block.where}: node {wanted[element, side]} of element {own[element]} is not defined")
+        ends.append(order[found])
+    sequence = np.argsort(own_bars, kind="stable")
+    twice = np.flatnonzero(np.diff(own_bars[sequence]) == 0)
+    if len(twice):
+        raise InputError(f"{path}: *ELEMENT: element {own_bars[sequence[twice[0]]]} is listed more than once")
+    placed = _Placed(scope, nodes, order + first_node, own_bars[sequence], sequence + first_bar)
+    moved_points = points if np.array_equal(place, np.eye(4, 3)) else points @ place[:3] + place[3]
+    return placed, moved_points, np.concatenate(ends) + first_node

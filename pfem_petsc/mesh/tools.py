@@ -1,0 +1,252 @@
+"""Operations on whole meshes: clean, merge, refine, scale. Each returns a new mesh, for one rank."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import InputError
+from .whole import WholeMesh
+
+__all__ = ["cleaned", "coincident", "components", "copies", "lengths", "merged", "refined", "scaled", "tolerance_of"]
+
+MERGED = 1e-6
+"""Default of the distance up to which nodes are merged, over the mean length of the bars."""
+
+_POWERS = {
+    "young_modulus": -2,
+    "yield_stress": -2,
+    "isotropic_hardening": -2,
+    "kinematic_hardening": -2,
+    "density": -4,
+    "damping": -4,
+}
+"""Powers of a unit of length in those of material keys, with newtons and seconds: MPa are N/mm2, t/mm3 are N s2/mm4."""
+
+
+def lengths(mesh: WholeMesh) -> np.ndarray:
+    """Return the lengths (bars,) of the bars [m]."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.linalg.norm(mesh.points[mesh.bars[:, 1]] - mesh.points[mesh.bars[:, 0]], axis=1)
+
+
+def tolerance_of(mesh: WholeMesh) -> float:
+    """Return the default distance [m] up to which nodes are merged."""
+    own = lengths(mesh)
+    own = own[np.isfinite(own)]
+    return MERGED * float(own.mean()) if len(own) else 0.0
+
+
+def components(n: int, pairs: np.ndarray) -> np.ndarray:
+    """Return for each of n items the lowest number (n,) of those that pairs (m, 2) connect it with."""
+    root = np.arange(n)
+    while True:
+        ends = root[pairs]
+        ends = ends[ends[:, 0] != ends[:, 1]]
+        if len(ends) == 0:
+            return root
+        np.minimum.at(root, ends.max(axis=1), ends.min(axis=1))
+        while not np.array_equal(root, root[root]):
+            root = root[root]
+
+
+def coincident(points: np.ndarray, tolerance: float) -> np.ndarray:
+    """Return for each node the lowest number (nodes,) of those at its place.
+
+    Parameters
+    ----------
+    points : (nodes, 3) [m]
+    tolerance : distance [m] up to which two nodes are at the same place, also over a third one; 0: equal coordinates
+    """
+    if not np.isfinite(points).all():
+        bad = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
+        raise InputError(f"node {bad} has coordinates that are not finite: correct them first")
+    if tolerance <= 0.0:
+        _, first, place = np.unique(points + 0.0, axis=0, return_index=True, return_inverse=True)
+        return first[place.ravel()]
+    found = [np.empty((0, 2), np.int64)]
+    low = points.min(axis=0) if len(points) else np.zeros(3)
+    # two nodes that are near share a cell of twice the tolerance in one of eight grids
+    for shift in product((0.0, 0.5), repeat=3):
+        cells = np.floor((points - low) / (2.0 * tolerance) + shift).astype(np.int64).astype(np.uint64)
+        key = cells[:, 0] * np.uint64(0x9E3779B97F4A7C15)
+        key ^= cells[:, 1] * np.uint64(0xC2B2AE3D27D4EB4F) + (key >> np.uint64(29))
+        key ^= cells[:, 2] * np.uint64(0x165667B19E3779F9) + (key >> np.uint64(31))
+        order = np.argsort(key, kind="stable")
+        key = key[order]
+        for ahead in range(1, len(points)):
+            here = np.flatnonzero(key[ahead:] == key[:-ahead])
+            if len(here) == 0:
+                break
+            pairs = np.stack([order[here], order[here + ahead]], axis=1)
+            apart = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1)
+            found.append(pairs[apart <= tolerance])
+    return components(len(points), np.concatenate(found))
+
+
+def copies(bars: np.ndarray) -> np.ndarray:
+    """Return for each bar the lowest number (bars,) of those between the same two nodes."""
+    _, first, place = np.unique(np.sort(bars, axis=1), axis=0, return_index=True, return_inverse=True)
+    return first[place.ravel()]
+
+
+def cleaned(mesh: WholeMesh, tolerance: float | None = None, sum_areas: bool = False) -> tuple[WholeMesh, list[str]]:
+    """Merge nodes, and remove double bars, bars without length, and nodes without bars.
+
+    Parameters
+    ----------
+    tolerance : distance [m] up to which nodes are merged; default: 1e-6 of the mean length of the bars
+    sum_areas : whether the bar that stays of several between the same nodes has the sum of their areas
+
+    Returns
+    -------
+    The mesh, and what was done, as lines. Groups have the bars and nodes that stay for those that were removed.
+    """
+    distance = tolerance_of(mesh) if tolerance is None else tolerance
+    done = []
+    node = coincident(mesh.points, distance)
+    merged_away = int((node != np.arange(len(node))).sum())
+    if merged_away:
+        done.append(f"{merged_away} nodes merged with others within {distance:g} m")
+    bars = node[mesh.bars]
+    real = bars[:, 0] != bars[:, 1]
+    if not real.all():
+        done.append(f"{int((~real).sum())} bars without length removed")
+    first = np.full(len(bars), -1)
+    first[real] = np.flatnonzero(real)[copies(bars[real])] if real.any() else -1
+    kept = np.flatnonzero(first == np.arange(len(bars)))
+    double = int(real.sum()) - len(kept)
+    fields = {name: values[kept] for name, values in mesh.bar_fields.items()}
+    if double:
+        done.append(f"{double} bars between the same nodes as another one removed")
+        if sum_areas and "area" in fields:
+            fields["area"] = np.bincount(first[real], mesh.bar_fields["area"][real], len(bars))[kept]
+            done[-1] += ", their areas added to its area"
+    used = np.zeros(len(node), bool)
+    used[bars[kept]] = True
+    bare = len(node) - merged_away - int(used.sum())
+    if bare:
+        done.append(f"{bare} nodes without bars removed")
+    new_node = np.where(used, np.cumsum(used) - 1, -1)[node]
+    new_bar = np.full(len(bars), -1)
+    new_bar[kept] = np.arange(len(kept))
+    new_bar = np.where(first >= 0, new_bar[first], -1)
+    return WholeMesh(
+        mesh.points[used],
+        new_node[bars[kept]],
+        _renumbered(mesh.node_groups, new_node),
+        _renumbered(mesh.bar_groups, new_bar),
+        fields,
+        mesh.tables,
+        mesh.warnings,
+        source=mesh.source,
+    ), done
+
+
+def _renumbered(groups: dict[str, np.ndarray], new: np.ndarray) -> dict[str, np.ndarray]:
+    found = {name: np.unique(new[members]) for name, members in groups.items()}
+    return {name: members[members >= 0] for name, members in found.items()}
+
+
+def merged(meshes: Sequence[WholeMesh], tolerance: float | None = None) -> tuple[WholeMesh, list[str]]:
+    """Put meshes together, join nodes at the same place, and remove what :func:`cleaned` removes.
+
+    Groups of the same name become one. The bars and nodes of each file are groups with the name of the file, where no
+    other group has it. Bar fields that not all meshes have are left out, which the lines tell that are returned.
+    """
+    nodes = np.cumsum([0, *(len(mesh.points) for mesh in meshes)])
+    bars = np.cumsum([0, *(len(mesh.bars) for mesh in meshes)])
+    together = WholeMesh(
+        np.concatenate([mesh.points for mesh in meshes]),
+        np.concatenate([mesh.bars + first for mesh, first in zip(meshes, nodes)]),
+    )
+    done = []
+    for kind, firsts in (("node_groups", nodes), ("bar_groups", bars)):
+        groups: dict[str, np.ndarray] = {}
+        named = {name for mesh in meshes for name in getattr(mesh, kind)}
+        for mesh, first, end in zip(meshes, firsts, firsts[1:]):
+            own = {name: members + first for name, members in getattr(mesh, kind).items()}
+            own |= {name: np.arange(first, end) for name in {Path(mesh.source).stem} - named}
+            for name, members in own.items():
+                groups[name] = np.concatenate([groups.get(name, np.empty(0, np.int64)), members])
+        setattr(together, kind, groups)
+    every = {name for mesh in meshes for name in mesh.bar_fields}
+    for name in sorted(every):
+        if all(name in mesh.bar_fields for mesh in meshes):
+            together.bar_fields[name] = np.concatenate([mesh.bar_fields[name] for mesh in meshes])
+        else:
+            done.append(f"field {name} left out: not all files have it")
+    for mesh in meshes:
+        together.warnings += mesh.warnings
+        for table, rows in mesh.tables.items():
+            into: dict[str, Any] = together.tables.setdefault(table, {})
+            differing = [name for name, keys in rows.items() if into.setdefault(name, keys) != keys]
+            told = "differs from that of a file before, which is kept"
+            done += [f"{table} {name} of {mesh.source} {told}" for name in differing]
+    result, removed = cleaned(together, tolerance)
+    return result, done + removed
+
+
+def refined(mesh: WholeMesh, n: int) -> WholeMesh:
+    """Divide each bar into n of the same length.
+
+    Bar k becomes the bars from n k to n k + n - 1, with its groups and fields; new nodes are numbered after the others.
+    """
+    if n < 1:
+        raise InputError(f"refine: {n} parts of a bar; expected a whole number from 1 on")
+    old, count = len(mesh.points), len(mesh.bars)
+    start, end = mesh.points[mesh.bars[:, 0]], mesh.points[mesh.bars[:, 1]]
+    share = (np.arange(1, n) / n)[None, :, None]
+    inner = (start[:, None] * (1.0 - share) + end[:, None] * share).reshape(-1, 3)
+    between = old + np.arange(count * (n - 1)).reshape(count, n - 1)
+    chain = np.concatenate([mesh.bars[:, :1], between, mesh.bars[:, 1:]], axis=1)
+    bars = np.stack([chain[:, :-1], chain[:, 1:]], axis=2).reshape(-1, 2)
+    groups = {
+        name: (np.asarray(members)[:, None] * n + np.arange(n)).ravel() for name, members in mesh.bar_groups.items()
+    }
+    return WholeMesh(
+        np.concatenate([mesh.points, inner]),
+        bars,
+        dict(mesh.node_groups),
+        groups,
+        {name: np.repeat(values, n) for name, values in mesh.bar_fields.items()},
+        mesh.tables,
+        mesh.warnings,
+        source=mesh.source,
+    )
+
+
+def scaled(mesh: WholeMesh, scale: float) -> WholeMesh:
+    """Convert a mesh from another unit of length, with newtons and seconds.
+
+    Coordinates are multiplied by ``scale`` [m per unit], the field ``area`` and areas of sections by its square,
+    stresses of materials by its power -2, densities by its power -4 (tonnes per cubic millimetre with 0.001).
+    """
+    if not 0.0 < scale < np.inf:
+        raise InputError(f"scale: {scale!r} is not a positive number of metres in a unit of the file")
+    fields = {name: values * scale**2 if name == "area" else values for name, values in mesh.bar_fields.items()}
+    tables: dict[str, dict[str, Any]] = {}
+    for table, rows in mesh.tables.items():
+        tables[table] = {name: _scaled_keys(keys, scale) for name, keys in rows.items()}
+    return WholeMesh(
+        mesh.points * scale,
+        mesh.bars,
+        mesh.node_groups,
+        mesh.bar_groups,
+        fields,
+        tables,
+        mesh.warnings,
+        source=mesh.source,
+    )
+
+
+def _scaled_keys(keys: dict[str, Any], scale: float) -> dict[str, Any]:
+    powers = {**_POWERS, "area": 2, "thickness": 1}
+    found = {key: value * scale ** powers[key] if key in powers else value for key, value in keys.items()}
+    if "curve" in found:
+        found["curve"] = [[strain, stress * scale**-2] for strain, stress in found["curve"]]
+    return found

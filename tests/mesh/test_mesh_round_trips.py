@@ -1,0 +1,379 @@
+"""A truss that is written in any format and read back is the same truss; so are files of other programs."""
+
+import zipfile
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from helpers.gathered import whole
+
+from pfem_petsc import Truss, write_mesh
+from pfem_petsc.errors import InputError
+from pfem_petsc.mesh import load_slab
+from pfem_petsc.mesh.readers import read_whole
+from pfem_petsc.mesh.readers import suffixes as read_suffixes
+from pfem_petsc.mesh.writers import suffixes as written_suffixes
+
+NAMES = ["t.h5", "t.vtu", "t.vtkhdf", "t.msh", "t.inp", "t.3mf", "t_bars.csv"]
+EXACT = ("t.h5", "t.vtu", "t.vtkhdf", "t.msh", "t_bars.csv")
+"""Have all bar fields; the others the areas."""
+
+
+def irregular():
+    """Coordinates with all digits, groups that overlap, with other letters, and bars in no order."""
+    random = np.random.default_rng(5)
+    points = random.normal(size=(12, 3))
+    points[0] = [1.0 / 3.0, -1e-17, 1e5]
+    bars = np.array([(i, j) for i in range(12) for j in range(i + 1, min(i + 4, 12))])
+    random.shuffle(bars)
+    n = len(bars)
+    return Truss(
+        points,
+        bars,
+        node_groups={"feet": [0, 1, 2], "top": [2, 7, 11], "all nodes": np.arange(12)},
+        bar_groups={"legs": [3, 4, 5], "Träger": [5, 9, n - 1], "third": np.arange(0, n, 3)},
+        bar_fields={"area": random.choice([1e-4, 2e-4, 1.0 / 3e4], n), "load": random.normal(size=n)},
+    )
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_same_truss(tmp_path, name):
+    truss = irregular()
+    again = Truss.read(truss.write(tmp_path / name))
+    np.testing.assert_array_equal(again.points, truss.points)
+    np.testing.assert_array_equal(again.bars, truss.bars)
+    for groups, own in ((again.node_groups, truss.node_groups), (again.bar_groups, truss.bar_groups)):
+        assert {key: members.tolist() for key, members in groups.items()} == {
+            key: members.tolist() for key, members in own.items()
+        }
+    assert set(again.bar_fields) == (set(truss.bar_fields) if name in EXACT else {"area"})
+    for field, values in again.bar_fields.items():
+        np.testing.assert_allclose(values, truss.bar_fields[field], rtol=0 if name in EXACT else 4e-16)
+    assert again.warnings == []
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("name", NAMES)
+def test_a_case_reads_what_was_written(comm, shared_tmp_path, name):
+    truss = irregular()
+    path = write_mesh(
+        shared_tmp_path / name,
+        truss.points,
+        truss.bars,
+        node_groups=truss.node_groups,
+        bar_groups=truss.bar_groups,
+        bar_fields=truss.bar_fields,
+        comm=comm,
+    )
+    slab = load_slab(SimpleNamespace(generator=None, file=path), comm, {"area": "section.s.area_field"})
+    mesh = whole(slab, comm)
+    np.testing.assert_array_equal(mesh.points, truss.points)
+    np.testing.assert_array_equal(mesh.bars, truss.bars)
+    areas = np.concatenate(comm.allgather(slab.bar_fields["area"]))
+    np.testing.assert_allclose(areas, truss.bar_fields["area"], rtol=4e-16)
+    with pytest.raises(InputError, match=r"section.s.area_field = 'aera': .* has no cell field of this name"):
+        load_slab(SimpleNamespace(generator=None, file=path), comm, {"aera": "section.s.area_field"})
+
+
+def test_sections_and_materials_of_abaqus_come_back(tmp_path):
+    truss = irregular()
+    truss.tables = {
+        "material": {
+            "STEEL": {"young_modulus": 2.1e11, "density": 7850.0, "yield_stress": 2e8, "kinematic_hardening": 1e9},
+            "rope": {"young_modulus": 1e11, "density": 1000.0, "thermal_expansion": 1e-5, "damping": 500.0},
+            "curve": {"law": "multilinear", "young_modulus": 1e9, "density": 1.0, "curve": [[1e-3, 1e6], [0.5, 2e6]]},
+        },
+        "section": {
+            "rest": {"area_field": "area", "material": "STEEL"},
+            "legs": {"bars": "legs", "area_field": "area", "material": "rope"},
+        },
+    }
+    text = truss.write(tmp_path / "t.inp").read_text()
+    assert text.count("MATERIAL=rope") == len(set(truss.bar_fields["area"][[3, 4, 5]]))
+    again = read_whole(tmp_path / "t.inp")
+    assert list(again.tables["material"]) == ["STEEL", "rope", "curve"]
+    for name, keys in again.tables["material"].items():
+        own = truss.tables["material"][name]
+        assert set(keys) == set(own)
+        for key, value in keys.items():
+            assert value == own[key] if key == "law" else np.allclose(value, own[key], rtol=1e-14)
+    np.testing.assert_array_equal(again.bar_fields["area"], truss.bar_fields["area"])
+    of = {m: again.bar_groups[s["bars"]].tolist() for s in again.tables["section"].values() if (m := s["material"])}
+    assert {3, 4, 5} & set(of["STEEL"]) == set()
+
+
+def test_every_format_that_is_written_is_read():
+    assert set(written_suffixes()) <= set(read_suffixes())
+    assert {".inp", ".msh", ".vtu", ".vtkhdf", ".3mf", ".csv", ".h5", ".stl"} == set(read_suffixes())
+
+
+def test_gmsh_and_vtk_as_meshio_reads_them(tmp_path):
+    meshio = pytest.importorskip("meshio")
+    truss = irregular()
+    truss = Truss(truss.points, truss.bars)  # it refuses files in which only some elements are in groups
+    for name in ("t.msh", "t.vtu"):
+        mesh = meshio.read(truss.write(tmp_path / name))
+        np.testing.assert_array_equal(mesh.points, truss.points)
+        lines = [block.data for block in mesh.cells if block.type == "line"]
+        found = {tuple(sorted(bar)) for bar in np.concatenate(lines).tolist()}
+        assert found == {tuple(sorted(bar)) for bar in truss.bars.tolist()}
+
+
+def test_vtkhdf_as_pyvista_reads_it(tmp_path):
+    import pyvista
+
+    truss = irregular()
+    grid = pyvista.read(truss.write(tmp_path / "t.vtkhdf"))
+    np.testing.assert_array_equal(grid.points, truss.points)
+    np.testing.assert_array_equal(grid.cells_dict[3], truss.bars)
+    np.testing.assert_array_equal(grid.cell_data["area"], truss.bar_fields["area"])
+    assert np.flatnonzero(grid.point_data["group:feet"]).tolist() == [0, 1, 2]
+    truss.grid().save(tmp_path / "grid.vtu")
+    assert Truss.read(tmp_path / "grid.vtu") == truss
+
+
+def gmsh_elements(physical):
+    """Lines with number, type, tags, nodes: one of two groups, listed twice, as Gmsh does in version 2.2."""
+    lines = [f"{k} 1 2 {group} {curve} {a} {b}" for k, (group, curve, a, b) in enumerate(physical, 1)]
+    return (
+        '$MeshFormat\n2.2 0 8\n$EndMeshFormat\n$PhysicalNames\n2\n1 1 "one"\n1 2 "two"\n$EndPhysicalNames\n'
+        "$Nodes\n3\n1 0 0 0\n2 1 0 0\n3 0 1 0\n$EndNodes\n"
+        f"$Elements\n{len(lines)}\n" + "\n".join(lines) + "\n$EndElements\n"
+        '$ElementData\n1\n"area"\n1\n0.0\n3\n0\n1\n'
+        + f"{len(lines)}\n"
+        + "".join(f"{k} {k}e-4\n" for k in range(len(lines), 0, -1))
+        + "$EndElementData\n"
+        '$ElementData\n1\n"part"\n1\n0.0\n3\n0\n1\n1\n1 5.0\n$EndElementData\n'
+    )
+
+
+def test_bars_of_several_groups_in_gmsh_2(tmp_path):
+    path = tmp_path / "two.msh"
+    path.write_text(gmsh_elements([(1, 7, 1, 2), (2, 7, 1, 2), (1, 8, 2, 3), (2, 9, 3, 1)]))
+    mesh = read_whole(path)
+    assert mesh.bars.tolist() == [[0, 1], [1, 2], [2, 0]]
+    assert {name: members.tolist() for name, members in mesh.bar_groups.items()} == {"one": [0, 1], "two": [0, 2]}
+    assert mesh.bar_fields["area"].tolist() == [1e-4, 3e-4, 4e-4]
+    (warning,) = mesh.warnings
+    assert "section $ElementData 'part' is left out: it has not a value for each line" in warning
+    # of the same group they are two bars at the same place, which a case refuses
+    path.write_text(gmsh_elements([(1, 7, 1, 2), (1, 7, 1, 2), (1, 8, 2, 3), (2, 9, 3, 1)]))
+    assert len(read_whole(path).bars) == 4
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "text"),
+    [
+        ('1\n"area"', 'x\n"area"', r"section \$ElementData: 'x' is not the number of its tags"),
+        ("3\n0\n1\n4", "3\n0\nmany\n4", r"section \$ElementData 'area': expected three whole numbers"),
+        ("3\n0\n1\n4", "3\n0\n1\n400", r"\$ElementData 'area': its counts declare 800 numbers where 8"),
+    ],
+)
+def test_gmsh_data_with_one_thing_wrong(tmp_path, old, new, text):
+    path = tmp_path / "wrong.msh"
+    content = gmsh_elements([(1, 7, 1, 2), (2, 7, 1, 2), (1, 8, 2, 3), (2, 9, 3, 1)])
+    assert old in content
+    path.write_text(content.replace(old, new, 1))
+    with pytest.raises(InputError, match=text):
+        read_whole(path)
+
+
+STL = """solid tetra
+ facet normal 0 0 0
+  outer loop
+   vertex 0 0 0
+   vertex 1.0E+00 0 0
+   VERTEX 0 1 -0.0
+  endloop
+ endfacet
+ facet normal 0 0 0
+  outer loop
+   vertex 0 0 0
+   vertex 0 1 0
+   vertex 0 0 1
+  endloop
+ endfacet
+endsolid tetra
+"""
+
+
+def test_stl_edges(tmp_path):
+    (tmp_path / "t.stl").write_text(STL)
+    mesh = read_whole(tmp_path / "t.stl")
+    lengths = np.sort(np.linalg.norm(mesh.points[mesh.bars[:, 0]] - mesh.points[mesh.bars[:, 1]], axis=1))
+    assert len(mesh.points) == 4
+    np.testing.assert_allclose(lengths, [1.0, 1.0, 1.0, 2**0.5, 2**0.5])
+    corners = np.array([[[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 0, 0]] * 3], "<f4")
+    facets = b"".join(bytes(12) + facet.tobytes() + bytes(2) for facet in corners)
+    (tmp_path / "b.stl").write_bytes(b"solid of another program".ljust(80) + b"\3\0\0\0" + facets)
+    binary = read_whole(tmp_path / "b.stl")
+    np.testing.assert_array_equal(binary.bars, mesh.bars)
+    assert binary.warnings == [f"{tmp_path}/b.stl: left out 1 triangles with two corners at the same place"]
+
+
+@pytest.mark.parametrize(
+    ("content", "text"),
+    [
+        (STL.replace("vertex 0 0 1", "vertex 0 0"), "line 13: 'vertex 0 0' has not three numbers"),
+        (STL.replace("vertex 0 0 1", "vertex 0 0 one"), "line 13: 'vertex 0 0 one' has not three numbers"),
+        (STL.replace("vertex 0 0 1\n", "\n"), "5 lines 'vertex x y z', not three for each triangle"),
+        (STL.replace("0 1 -0.0", "0 nan 0"), "triangle 0 .* has coordinates that are not finite"),
+        ("x" * 83, "is not STL"),
+        (b"x" * 80 + b"\2\0\0\0" + bytes(50), "the 2 triangles that it declares take 184 bytes, and it has 134"),
+        (b"x" * 80 + bytes(4), "has no triangles"),
+    ],
+)
+def test_stl_with_one_thing_wrong(tmp_path, content, text):
+    path = tmp_path / "w.stl"
+    path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    with pytest.raises(InputError, match=text) as caught:
+        read_whole(path)
+    assert str(path) in str(caught.value)
+
+
+MODEL = """<?xml version="1.0" encoding="utf-8"?>
+<model unit="millimeter" xmlns="http://schemas.microsoft.com/3dmanufacturing/core/2015/02"
+ xmlns:bl="http://schemas.microsoft.com/3dmanufacturing/beamlattice/2017/02" requiredextensions="bl">
+ <metadata name="Title">made elsewhere</metadata>
+ <resources>
+  <object id="4" type="model"><mesh><vertices>
+    <vertex x="0" y="0" z="0"/><vertex x="10" y="0" z="0"/><vertex x="0" y="10" z="0"/><vertex x="9" y="9" z="9"/>
+   </vertices><triangles><triangle v1="0" v2="1" v3="2"/></triangles>
+   <bl:beamlattice radius="1" minlength="0.001" cap="hemisphere"><bl:beams>
+    <bl:beam v1="0" v2="1"/><bl:beam v1="1" v2="2" r1="0.5"/><bl:beam v1="2" v2="0" r1="1" r2="2" cap1="butt"/>
+   </bl:beams><bl:beamsets><bl:beamset name="thin" identifier="a"><bl:ref index="1"/></bl:beamset></bl:beamsets>
+   </bl:beamlattice></mesh></object>
+  <object id="5" type="model" name="pair"><components>
+    <component objectid="4"/><component objectid="4" transform="0 1 0 -1 0 0 0 0 1 100 0 0"/></components></object>
+ </resources>
+ <build><item objectid="5" transform="2 0 0 0 2 0 0 0 2 0 0 5"/></build>
+</model>"""
+
+
+def three_mf(path, model=MODEL, name="3D/part.model"):
+    """A package whose relationships name the model."""
+    kind = "http://schemas.microsoft.com/3dmanufacturing/2013/01/3dmodel"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr(
+            "_rels/.rels", f'<Relationships><Relationship Target="/{name}" Id="r" Type="{kind}"/></Relationships>'
+        )
+        archive.writestr(name, model)
+    return path
+
+
+def test_3mf_of_another_program(tmp_path):
+    """Millimetres, radii of the lattice and of beams, components and transforms."""
+    mesh = read_whole(three_mf(tmp_path / "p.3mf"))
+    expected = np.array([[0, 0, 5], [20, 0, 5], [0, 20, 5], [200, 0, 5], [200, 20, 5], [180, 0, 5]]) * 1e-3
+    np.testing.assert_allclose(mesh.points, expected, atol=1e-16)
+    assert mesh.bars.tolist() == [[0, 1], [1, 2], [2, 0], [3, 4], [4, 5], [5, 3]]
+    # cones between radii of 2 and 4 mm: the mean square of the radius is 28/3 mm2
+    np.testing.assert_allclose(mesh.bar_fields["area"], np.pi * 1e-6 * np.array([4, 1, 28 / 3] * 2), rtol=1e-12)
+    assert mesh.bar_groups["thin"].tolist() == [1, 4]
+    cones, left = mesh.warnings
+    assert "2 beams whose radii differ" in cones and "left out 1 triangles and 2 vertices" in left
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "text"),
+    [
+        ('unit="millimeter"', 'unit="yard"', r"line 2: unit 'yard'; known: micron"),
+        ('v1="1" v2="2"', 'v2="2"', r"line 10: the attribute 'v1' is missing"),
+        ('v1="1" v2="2"', 'v1="1" v2="8"', r"object 4: beams: vertex 8 is not there; they are numbered from 0 to 3"),
+        ('x="10"', 'x="ten"', r"object 4: a vertex: 'ten 0 0' are not numbers"),
+        ('r1="0.5"', 'r1="-1"', r"object 4: beam 1 has no radius .* that is positive"),
+        ('<bl:ref index="1"/>', '<bl:ref index="3"/>', r"beamset thin: beam 3 is not there"),
+        ('objectid="5"', 'objectid="9"', r"there is no object 9"),
+        ('<component objectid="4"/>', '<component objectid="5"/>', r"object 5 is a component of itself"),
+        ("2 0 0 0 2 0 0 0 2 0 0 5", "2 0 0", r"line 16: transform has 3 numbers; expected 12"),
+        ("</resources>", "", r"mismatched tag: line 17"),
+        ("<model", '<!DOCTYPE model [<!ENTITY a "b">]><model', r"a document type, which 3MF does not allow"),
+        ('objectid="5" t', 'objectid="5" p:path="/3D/o.model" xmlns:p="u" t', r"in another part of the file"),
+    ],
+)
+def test_3mf_with_one_thing_wrong(tmp_path, old, new, text):
+    assert old in MODEL
+    path = three_mf(tmp_path / "w.3mf", MODEL.replace(old, new, 1))
+    with pytest.raises(InputError, match=text) as caught:
+        read_whole(path)
+    assert str(path) in str(caught.value)
+
+
+def test_3mf_without_lattice_and_damaged(tmp_path):
+    path = three_mf(tmp_path / "s.3mf", MODEL.partition("<bl:beamlattice")[0] + "</mesh></object></resources>"
+                    '<build><item objectid="4"/></build></model>')  # fmt: skip
+    with pytest.raises(InputError, match="has no beam lattice; a surface of triangles is read from STL"):
+        read_whole(path)
+    content = three_mf(tmp_path / "d.3mf").read_bytes()
+    for damaged in (content[:200], b"", b"PK" + bytes(100)):
+        (tmp_path / "d.3mf").write_bytes(damaged)
+        with pytest.raises(InputError, match="d.3mf: is not 3MF, or damaged"):
+            read_whole(tmp_path / "d.3mf")
+    with pytest.raises(InputError, match="3MF needs a radius of each bar"):
+        Truss([[0, 0, 0], [1, 0, 0]], [[0, 1]]).write(tmp_path / "n.3mf")
+
+
+def test_tables_as_spreadsheets_save_them(tmp_path):
+    """Semicolons and decimal commas, units, texts as names of nodes, comments, a byte order mark."""
+    (tmp_path / "Nodes tower.csv").write_bytes(
+        "\ufeff# from a spreadsheet\r\nNode;X [m];Y [m];Groups\r\nA;0,0;0;feet\r\n".encode()
+        + b'B;1,5;0;"feet; right"\r\n\r\nC;0;2;\r\n'
+    )
+    (tmp_path / "Bars tower.csv").write_bytes(
+        b"Member;Node 1;Node 2;Area [m2];Note\r\n1;A;B;1,5e-4;short\r\n2;B;C;2e-4;long\r\n"
+    )
+    with pytest.raises(InputError, match="there is no such file, the other table"):
+        read_whole(tmp_path / "Bars tower.csv")
+    (tmp_path / "Nodes tower.csv").rename(tmp_path / "nodes tower.csv")
+    (tmp_path / "Bars tower.csv").rename(tmp_path / "bars tower.csv")
+    mesh = read_whole(tmp_path / "bars tower.csv")
+    assert mesh.points.tolist() == [[0, 0, 0], [1.5, 0, 0], [0, 2, 0]]
+    assert mesh.bars.tolist() == [[0, 1], [1, 2]]
+    assert mesh.bar_fields["area"].tolist() == [1.5e-4, 2e-4]
+    assert {name: members.tolist() for name, members in mesh.node_groups.items()} == {"feet": [0, 1], "right": [1]}
+    assert mesh.warnings == [f"{tmp_path}/bars tower.csv: left out column 'note', which has other texts than numbers"]
+
+
+@pytest.mark.parametrize(
+    ("nodes", "bars", "text"),
+    [
+        ("x,y,z\n0,0,0\n1,0,zero\n", "a,b\n0,1\n", "nodes.csv: line 3: column 'z': 'zero' is not a number"),
+        ("x,z\n0,0\n", "a,b\n0,1\n", "nodes.csv: line 1: there is no column 'y'; it has 'x', 'z'"),
+        ("x,y\n0,0\n1,1\n", "a,b\n0,2\n", "bars.csv: line 2: there is no node '2' in t_nodes.csv"),
+        ("x,y\n0,0\n1\n", "a,b\n0,1\n", "nodes.csv: line 3: 1 entries; expected 2"),
+        ("node,x,y\n7,0,0\n7,1,0\n", "a,b\n7,7\n", "nodes.csv: line 3: node '7' is listed more than once"),
+        ("", "a,b\n0,1\n", "nodes.csv: is empty"),
+        ('x,y\n"0,0\n1,1\n', "a,b\n0,1\n", "nodes.csv"),
+        (b"\xff\xfe\x00", "a,b\n0,1\n", "nodes.csv: cannot be read"),
+    ],
+)
+def test_tables_with_one_thing_wrong(tmp_path, nodes, bars, text):
+    (tmp_path / "t_nodes.csv").write_bytes(nodes if isinstance(nodes, bytes) else nodes.encode())
+    (tmp_path / "t_bars.csv").write_text(bars)
+    with pytest.raises(InputError, match=text):
+        read_whole(tmp_path / "t_nodes.csv")
+
+
+def test_a_table_without_a_pair(tmp_path):
+    (tmp_path / "t.csv").write_text("x,y\n")
+    with pytest.raises(InputError, match="is a pair of files, t_nodes.csv and t_bars.csv: name one of them"):
+        read_whole(tmp_path / "t.csv")
+
+
+@pytest.mark.parametrize("suffix", ["inp", "stl", "3mf"])
+@pytest.mark.parametrize("content", [b"", b"\0" * 1000, b"$", b"*", b"<VTKFile", b"PK\3\4" + b"\xff" * 500])
+def test_garbage_is_refused(tmp_path, capfd, suffix, content):
+    path = tmp_path / f"garbage.{suffix}"
+    path.write_bytes(content)
+    with pytest.raises(InputError) as caught:
+        Truss.read(path)
+    assert str(path) in str(caught.value)
+    assert capfd.readouterr().err == ""
+
+
+def test_what_cannot_be_written_leaves_the_earlier_file(tmp_path):
+    path = Truss([[0, 0, 0], [1, 0, 0]], [[0, 1]], bar_fields={"area": [1.0]}).write(tmp_path / "a.3mf")
+    before = path.read_bytes()
+    with pytest.raises(InputError, match="3MF needs a radius"):
+        Truss([[0, 0, 0], [1, 0, 0]], [[0, 1]]).write(path)
+    assert path.read_bytes() == before and [file.name for file in tmp_path.iterdir()] == ["a.3mf"]

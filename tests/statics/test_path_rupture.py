@@ -1,4 +1,4 @@
-"""Paths beyond breaks of bars: closed forms of what is left, energies, restarts; by displacement, arc length, and load."""
+"""Paths beyond breaks of bars: closed forms of what is left, energies, restarts."""
 
 import numpy as np
 import pytest

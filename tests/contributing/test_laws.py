@@ -142,7 +142,7 @@ SCHEMES += ("newmark", "houbolt", "wilson", "generalized_alpha", "energy_momentu
 
 @pytest.mark.slow
 def test_law_in_every_scheme(examples, comm, tmp_path):
-    """The motion of a chain that yields is the same in all of them within their own errors, and each has its balance."""
+    """The motion of a chain that yields is the same in all of them within their errors, and balances close."""
     keys, moved = ["mesh.elements=4", "output.fields_every=0"], {}
     for integrator in SCHEMES:
         table = one_bar(integrator, 1e-4, 400).to_dict()

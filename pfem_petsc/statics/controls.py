@@ -35,6 +35,9 @@ class Control(Protocol):
     def advance(self, tangent: np.ndarray, size: float) -> float:
         """Return the length along the tangent at the last point that reaches a measure. Collective."""
 
+    def still(self, tangent: np.ndarray) -> np.ndarray:
+        """Return the gradient (owned, 3) [1/m] of the displacement that is held where bars have broken."""
+
 
 class ByArc:
     """Points at a distance from the last one in a metric: the chord of the arc."""
@@ -60,6 +63,10 @@ class ByArc:
     def advance(self, tangent: np.ndarray, size: float) -> float:
         """See :class:`Control`."""
         return size
+
+    def still(self, tangent: np.ndarray) -> np.ndarray:
+        """See :class:`Control`: that along the path."""
+        return self._metric.weight * tangent
 
 
 class ByComponent:
@@ -93,3 +100,7 @@ class ByComponent:
         if not along > _LEAST:
             raise NotConverged("the displacement along static.direction does not increase any more along the path")
         return size / along
+
+    def still(self, tangent: np.ndarray) -> np.ndarray:
+        """See :class:`Control`."""
+        return self._direction.weights / self.scale

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from ..stepping.model import Model
 
-__all__ = ["Along", "Arc", "Component", "Constraint", "Direction", "LoadFactor", "Metric", "Terms", "dot"]
+__all__ = ["Along", "Arc", "Component", "Constraint", "Direction", "LoadFactor", "Metric", "Still", "Terms", "dot"]
 
 
 def dot(comm: MPI.Comm, a: np.ndarray, b: np.ndarray) -> float:
@@ -143,3 +143,14 @@ class Along:
         """See :class:`Constraint`."""
         gradient = self.metric.weight * self.mode
         return Terms(dot(self.metric.comm, gradient, u) - self.size, gradient, 0.0)
+
+
+class Still:
+    """The point at an unchanged displacement: gradient.u = 0 with a gradient (owned, 3) [1/m]."""
+
+    def __init__(self, comm: MPI.Comm, gradient: np.ndarray, size: float) -> None:
+        self.comm, self.gradient, self.size = comm, gradient, size
+
+    def terms(self, u: np.ndarray, change: float) -> Terms:
+        """See :class:`Constraint`."""
+        return Terms(dot(self.comm, self.gradient, u), self.gradient, 0.0)

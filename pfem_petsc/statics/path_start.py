@@ -27,10 +27,10 @@ def check_path(model: Model, keys: PathKeys) -> None:
         On all ranks.
     """
     case = model.case
-    if model.bars.can_break or case.remove:
+    if case.remove:
         raise InputError(
-            f'{case.source}: static.method = "{case.static.method}" follows smooth paths, which end where bars '
-            'break or are removed; remove rupture and [[remove]], or take static.method = "newton"'
+            f'{case.source}: static.method = "{case.static.method}" passes a load factor several times or never, so '
+            'that [[remove]] has no time there; remove bars and supports with static.method = "newton"'
         )
     if model.can_touch:
         raise InputError(

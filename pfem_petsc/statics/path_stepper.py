@@ -16,6 +16,7 @@ from .critical import EVENTS, Event, find_critical
 from .free_motions import free_motions
 from .path_constraints import Along, Direction, Metric
 from .path_limits import end_at_limit
+from .path_rupture import settle_broken
 from .path_scheme import PathEquilibrium
 from .path_start import check_path, first_point
 from .points import Point, PointSolver
@@ -79,8 +80,8 @@ class PathStepper(StaticStepper):
             self.direction = Direction(model, keys.node_set, keys.direction)
         self.by_component = component
         self.control: Control = ByComponent(self.direction) if component else ByArc(self.metric)
-        self.system = BorderedSystem(model, self.hessian, choice, self.lagged, self.scheme, keys.step)
-        self.points = PointSolver(model, self.state, self.system, self.metric, keys.critical_points)
+        self._choice = choice
+        self._make_system()
         self.arc, self.slope, self.negatives = keys.step, 0.0, -1
         self.weight = 0.0  # of the metric; zero before the first point
         self.ended, self.outcome = 0, ""
@@ -92,6 +93,18 @@ class PathStepper(StaticStepper):
         if self.points.stability is not None and self.points.stability.refusal is not None:
             refusal = self.points.stability.refusal
             self.scheme.notice = f"bifurcations are not looked for, only limit points: {refusal}"
+
+    def _make_system(self) -> None:
+        """Create what solves for points, for the supports as they are. Collective."""
+        self.system = BorderedSystem(self.model, self.hessian, self._choice, self.lagged, self.scheme, self.keys.step)
+        self.points = PointSolver(self.model, self.state, self.system, self.metric, self.keys.critical_points)
+
+    def supports_changed(self) -> None:
+        """See :class:`~pfem_petsc.stepping.stepper.Stepper`. Collective."""
+        self.system.destroy()
+        self.points.destroy()
+        super().supports_changed()
+        self._make_system()
 
     @property
     def clock(self) -> float:
@@ -159,9 +172,9 @@ class PathStepper(StaticStepper):
                     raise self._no_path(failure) from failure
                 size *= 0.5
                 self.message(f"{failure}; halving the length of the step, to {size:.4g}")
-        self._accept(point, size)
-        self.turning, self._turn = self._turn, 0
-        self.events, self.outcome = events, reached
+        broke, parted = self._accept(point, size)
+        self.turning, self._turn = 0 if broke else self._turn, 0
+        self.events, self.outcome = events, reached or parted
         self.bifurcations += sum(event.kind == "bifurcation" for event in events)
         low, high = _FACTORS
         factor = np.clip(np.sqrt(self.keys.iterations / max(point.newton, 1)), low, high)
@@ -194,7 +207,7 @@ class PathStepper(StaticStepper):
         if moved:
             self._accept(point, self.keys.step)
         else:
-            self._keep(point)
+            self.keep(point)
         return moved
 
     def _next(self, size: float) -> tuple[Point, list[Event], str]:
@@ -271,17 +284,24 @@ class PathStepper(StaticStepper):
         if reason is not None:
             raise NotConverged(f"{self.points.place}: {reason}; {self.remedy}")
 
-    def _accept(self, point: Point, size: float) -> None:
-        """Advance the state to a point. Collective."""
-        self._point, self.part = point, size
-        self.smallest = size
-        self.scheme.reached = point.load_factor
+    def _accept(self, point: Point, size: float) -> tuple[bool, str]:
+        """Advance the state to a point; return whether bars broke there, and why the path ends if none carries the
+        load. Collective."""
+        self.part = self.smallest = size
+        self.commit(point)
+        self.keep(point)
+        broke, parted = settle_broken(self)
+        self.state.step += 1
+        return broke, parted
+
+    def commit(self, point: Point) -> None:
+        """Make the step to a point. Collective."""
+        self._point, self.scheme.reached = point, point.load_factor
         self._make_part(point.load_factor)
         self.system.linear = 0
-        self.state.step += 1
-        self._keep(point)
 
-    def _keep(self, point: Point) -> None:
+    def keep(self, point: Point) -> None:
+        """Store the tangent at a point and the signs of its eigenvalues."""
         self.state.memory["tangent"] = point.tangent
         self.slope, self.negatives = float(point.slope), int(point.negatives)
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from document_laws import text_of, undocumented
 from helpers.contributed import run
+from PIL import Image
 
 from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.cli.main import main
@@ -133,6 +134,43 @@ def test_law_restarts_to_the_last_bit(integrator, examples, comm, shared_tmp_pat
     for name in ("stress", *VARIABLES):
         assert first.field(name, -1).tobytes() == second.field(name, -1).tobytes(), name
         assert np.abs(first.field(name, -1)).max() > 0.0, name
+
+
+SCHEMES = ("chung_lee", "hulbert_chung", "souza_moura", "central_differences")
+SCHEMES += ("newmark", "houbolt", "wilson", "generalized_alpha", "energy_momentum")
+
+
+@pytest.mark.slow
+def test_law_in_every_scheme(examples, comm, tmp_path):
+    """The motion of a chain that yields is the same in all of them within their errors, and balances close."""
+    keys, moved = ["mesh.elements=4", "output.fields_every=0"], {}
+    for integrator in SCHEMES:
+        table = one_bar(integrator, 1e-4, 400).to_dict()
+        run(Case.from_dict(table, overrides=keys), comm, tmp_path / integrator)
+        history = open_result(tmp_path / integrator).history
+        assert np.abs(history["energy_imbalance"]).max() < 1e-10 * history["kinetic_energy"][0], integrator
+        assert history["plastic_heat"][-1] > 0.1 * history["kinetic_energy"][0], integrator
+        moved[integrator] = np.asarray(history["probe/tip/position"])[:, 0, 0] - 1.0
+    exact = moved["central_differences"]
+    for integrator, path in moved.items():
+        error = np.abs(path - exact).max() / np.abs(exact).max()
+        assert error < 1e-3, (integrator, error)
+
+
+@pytest.mark.slow
+def test_law_in_pictures(examples, tmp_path):
+    """A picture coloured by an internal variable of the law, and the reader's list of fields."""
+    from pfem_petsc.post.render import render
+
+    with Simulation(one_bar("central_differences", 2e-3, 40), output=tmp_path / "bar", quiet=True) as simulation:
+        simulation.run()
+    result = open_result(tmp_path / "bar")
+    assert set(VARIABLES) <= set(result.cell_fields)
+    written = render(tmp_path / "bar", field="back_stress", size=(480, 270), video="none", note=print)
+    frames = [np.asarray(Image.open(path).convert("RGB")).astype(int) for path in written if path.suffix == ".png"]
+    assert len(frames) >= 2
+    coloured = [(np.ptp(frame, axis=2) > 60).sum() for frame in frames]
+    assert min(coloured) > 50 and np.abs(frames[1] - frames[-1]).max() > 60  # its colour changes as it yields
 
 
 def test_law_without_mean_stress_is_refused_by_the_energy_momentum_scheme(examples, monkeypatch, tmp_path, capsys):

@@ -357,14 +357,6 @@ def test_a_mechanism_left_by_rupture_ends_a_static_run_with_the_reason(comm, tmp
     assert "node 1 along (1, 0, 0), with node 2" in str(failure.value)
 
 
-def test_paths_refuse_rupture(comm, tmp_path):
-    case = chain(
-        tmp_path, comm, 2, [0], {"strain": 1e-5}, None, static={"method": "arc_length", "step": 0.5, "max_points": 3}
-    )
-    with pytest.raises(InputError, match="follows smooth paths"):
-        Simulation(case, comm, output=tmp_path / "out", quiet=True)
-
-
 def test_bars_that_can_break_are_prestressed(comm, tmp_path):
     """The rest length is that of the material as it is at first; the row breaks where the limit is below the stress."""
     for limit, broken in ((2e6, 0), (0.5e6, 1)):

@@ -1,0 +1,151 @@
+"""Tangents of all laws and strain measures against complex step: those that the compiled loops use, from their code."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from helpers.complex_step import SIZE, Complex, derivative, inner, patch, real
+from helpers.laws import KEYS, SOFTENING, cycles, make
+
+from pfem_petsc.case.tables import Section
+from pfem_petsc.mechanics import rupture
+from pfem_petsc.mechanics.conserving import make_conserving_kernels
+from pfem_petsc.mechanics.sections import bar_shapes
+from pfem_petsc.mechanics.strain import MEASURES
+from pfem_petsc.mechanics.tangent_kernels import make_tangent_kernels
+
+REST, AREA = 0.3, 2e-4
+STRUT = {"yield_stress": 200e6}
+MORE = {
+    "elastic": {},
+    "elastoplastic": {"yield_stress": 250e6, "isotropic_hardening": 1e9, "kinematic_hardening": 2e9},
+    "cable": {"yield_stress": 200e6, "isotropic_hardening": 5e9},
+    "damage": {"young_modulus": 30e9, "tensile_strength": 3e6, "fracture_energy": 100.0},
+    "compaction": {
+        "yield_stress": 100e6, "kinematic_hardening": 1e9, "compaction_strain": 0.004, "compaction_modulus": 50e9
+    },
+    "strut": STRUT,
+}  # fmt: skip
+RADII = {"slender": 3e-3, "middle": 0.3 / 45.0, "stocky": 1.5e-2}  # slenderness 200, 90 (snaps), 40
+BARS = {
+    **{name: (name, KEYS.get(name, MORE.get(name)), 1.0) for name in (*MORE, *KEYS) if name != "strut"},
+    **{f"{name} strut": ("strut", STRUT, radius) for name, radius in RADII.items()},
+    "crooked strut": ("strut", STRUT | {"imperfection": 2e-3}, RADII["slender"]),
+    "damped damage": ("damage", MORE["damage"] | {"stiffness_damping": 1e-4}, 1.0),
+    "damped strut": ("strut", STRUT | {"stiffness_damping": 1e-4}, RADII["slender"]),
+    "damped perzyna": ("perzyna", {"stiffness_damping": 1e-4}, 1.0),
+    **{
+        f"softened {name}": (name, MORE.get(name, {}) | {"softening": SOFTENING}, 1.0)
+        for name in ("elastic", "elastoplastic", "voce", "ludwik", "multilinear", "cowper_symonds")
+    },
+}
+WARMTH = 130.0  # K
+
+
+def prepared(kind):
+    """Law of a bar, the numbers that it reads, and Young's modulus."""
+    name, keys, radius = BARS[kind]
+    material, law = make(name, **keys)
+    section = Section(area=AREA if radius == 1.0 else math.pi * radius**2, material="m", shape="round")
+    shapes = bar_shapes(section, np.array([REST]), np.array([section.area]))
+    numbers = material.numbers()
+    return law, (*numbers, *(float(v[0]) for v in material.pack_bars(shapes))), material.young_modulus
+
+
+def path(kind):
+    """Lengths and steps: loading and unloading in cycles at rates over five decades; a bar at rest, with reversals."""
+    strains, steps = cycles(4)
+    if "damage" in kind:
+        strains = 0.3 * strains  # parted at 2.2e-4, in the second half
+        strains = np.concatenate([0.03 * strains, strains])
+        steps = np.concatenate([steps, steps])
+    return REST * (1.0 + strains), steps
+
+
+@pytest.fixture
+def complex_functions(monkeypatch):
+    patch(monkeypatch)
+
+
+@pytest.mark.parametrize("measure", MEASURES)
+@pytest.mark.parametrize("kind", BARS)
+def test_stiffness_is_the_derivative_of_the_axial_force(complex_functions, kind, measure):
+    law, p, young = prepared(kind)
+    stiffness = inner(make_tangent_kernels(law, MEASURES[measure])["tangents"], "stiffness")
+    strain_of, scale = MEASURES[measure], young * AREA / REST
+    q, before, tangents = (0.0,) * len(law.internal), 0.0, []
+    for length, h in zip(*path(kind), strict=True):
+        length, h = float(length), float(h)
+        step = h if law.rate else 0.0
+        axial, _, _ = stiffness(length, 0.0, 0.0, REST, 1e-4, WARMTH, p, AREA, step, before, q)
+        varied = stiffness(Complex(length, SIZE), 0.0, 0.0, REST, 1e-4, WARMTH, p, AREA, step, before, q)
+        force = varied[1] / varied[2]
+        assert axial == pytest.approx(derivative(force), rel=1e-12, abs=1e-12 * scale), (length, h, q)
+        strain = strain_of(length / REST)[0] - 1e-4
+        rate = (strain - before) / h if law.rate else 0.0
+        stress, _, q, _ = law.response(strain, rate, step, WARMTH, p, q)
+        assert real(force) == pytest.approx(AREA * stress * strain_of(length / REST)[1], rel=1e-14, abs=1e-14 * scale)
+        before = strain
+        tangents.append(axial / scale)
+    if kind != "elastic":
+        assert min(tangents) < 0.9 < 1.1 * max(tangents)
+
+
+@pytest.mark.parametrize("measure", MEASURES)
+@pytest.mark.parametrize("kind", [kind for kind in BARS if "softened" not in kind or "elastic" in kind.split()])
+def test_stiffness_of_the_conserving_force(complex_functions, kind, measure):
+    law, p, young = prepared(kind)
+    pair = inner(make_conserving_kernels(law, MEASURES[measure]).tangents, "pair")
+    strain_of, scale = MEASURES[measure], young * AREA / REST
+    q, before, kept = (0.0,) * len(law.internal), REST, 0.0
+    for length, h in zip(*path(kind), strict=True):
+        length, h = float(length), float(h)
+        step = h if law.rate else 0.0
+        rest = (before, 0.0, 0.0), (0.0, 0.0, REST, REST, 0.0, 0.0, WARMTH, WARMTH, p, AREA, step, kept, q)
+        _, slope, _ = pair(*rest[0], length, *rest[1])
+        varied, _, _ = pair(*rest[0], Complex(length, SIZE), *rest[1])
+        # the mean stress is a quotient by the change of strain
+        noise = 1e-12 + 1e-14 * REST / max(abs(length - before), 1e-3 * REST)
+        assert slope * REST == pytest.approx(derivative(varied) * REST, rel=noise, abs=noise * scale), (length, h, q)
+        strains = [strain_of(x / REST)[0] for x in (before, length)]
+        rate = (strains[1] - strains[0]) / h if law.rate else 0.0
+        kept, _, q, _ = law.response(strains[1], rate, step, WARMTH, p, q)
+        before = length
+
+
+def tuple_functions(monkeypatch):
+    """Python twins of the functions of tuples that exist in compiled code only."""
+    twins = {
+        "blend": lambda there, one, other: one if there else other,
+        "sum_with": lambda one, factor, other: tuple(a + factor * b for a, b in zip(one, other, strict=True)),
+        "sum_where": lambda mask: lambda values: sum(v for v, m in zip(values, mask, strict=True) if m),
+        "keep_where": lambda mask: lambda values: tuple(v if m else 0.0 for v, m in zip(values, mask, strict=True)),
+    }
+    for name, twin in twins.items():
+        monkeypatch.setattr(rupture, name, twin)
+
+
+@pytest.mark.parametrize("kind", ["elastic", "voce", "perzyna", "damage", "slender strut", "damped damage"])
+def test_stiffness_of_bars_that_break(complex_functions, monkeypatch, kind):
+    """Bars of which a share is left, that lose a part of it in the step, and broken ones."""
+    tuple_functions(monkeypatch)
+    law, p, young = prepared(kind)
+    law = rupture.breakable.__wrapped__(law)
+    limits = (math.inf, 0.003 if "damage" not in kind else 1e-4, *(math.inf,) * 4, 0.25)  # in four steps
+    stiffness = inner(make_tangent_kernels(law, MEASURES["logarithmic"])["tangents"], "stiffness")
+    q, before, scale, shares = (0.0,) * len(law.internal), 0.0, young * AREA / REST, []
+    for length, h in zip(*path(kind), strict=True):
+        length, h = float(length), float(h)
+        step = h if law.rate else 0.0
+        given = (0.0, 0.0, REST, 0.0, 0.0, (*limits, *p), AREA, step, before, q)
+        axial, _, _ = stiffness(length, *given)
+        _, over, inverse = stiffness(Complex(length, SIZE), *given)
+        force = over / inverse if q[law.rupture] < 1.0 else 0.0
+        assert axial == pytest.approx(derivative(force), rel=1e-12, abs=1e-12 * scale), (length, h, q)
+        shares.append(q[law.rupture])
+        strain = math.log(length / REST)
+        _, _, q, _ = law.response(strain, (strain - before) / h if law.rate else 0.0, step, 0.0, given[5], q)
+        before = strain
+    assert set(shares) == {0.0, 0.25, 0.5, 0.75, 1.0}

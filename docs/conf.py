@@ -23,8 +23,8 @@ include_patterns = ["docs/**", "README.md", "CONTRIBUTING.md", "CHANGELOG.md"]
 exclude_patterns = [".*", "build", "results", "docs/_*", "docs/images", "docs/reference/README.md"]
 
 extensions = [
-    *("myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"),
-    *("mathml", "checkout_links", "case_keys"),
+    *("myst_parser", "sphinx.ext.autodoc"),
+    *("mathml", "checkout_links", "docstrings", "case_keys"),
 ]
 html_math_renderer = "mathml"
 myst_enable_extensions = ["dollarmath", "colon_fence"]
@@ -38,12 +38,10 @@ html_css_files = ["site.css"]
 html_copy_source = False
 html_show_sphinx = False
 
-autodoc_typehints = "none"  # the texts of parameters say what they are; signatures have the types
+autodoc_typehints_format = "short"
+python_maximum_signature_line_length = 90
+python_use_unqualified_type_names = True
 autodoc_member_order = "bysource"
-autodoc_default_options = {"members": True, "show-inheritance": True}
-napoleon_google_docstring = False
-napoleon_use_ivar = True
-napoleon_use_rtype = False
-napoleon_preprocess_types = False
+autodoc_default_options = {"members": True}
 # What types of other libraries and texts such as "(nodes, 3) [m]" look like to a cross-reference.
 nitpick_ignore_regex = [("py:.*", ".*")]

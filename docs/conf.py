@@ -1,7 +1,7 @@
 """Configuration of the site: ``scripts/docs.sh`` builds it from the Markdown pages of the checkout.
 
-The source folder is the root of the checkout, so that links between ``docs``, README.md and CONTRIBUTING.md are the same
-here and where the files are read as they are. Nothing of the result asks the network for anything.
+The source folder is the root of the checkout, so that links between ``docs``, README.md and CONTRIBUTING.md are the
+same here and where the files are read as they are. Nothing of the result asks the network for anything.
 """
 
 from __future__ import annotations

@@ -51,7 +51,10 @@ TABLES: dict[str, tuple[type[StrictModel] | Family, ...]] = {
     "[[temperature]]": (tables.Temperature,),
     "[[wall]]": (WallKeys, Family(WALLS, "type", WallKeys)),
     "[[contact_pair]]": (tables.ContactPair,),
-    "[[constraint]]": (ConstraintKeys, Family(CONSTRAINTS, "kind", None),),
+    "[[constraint]]": (
+        ConstraintKeys,
+        Family(CONSTRAINTS, "kind", None),
+    ),
     "[[remove]]": (tables.Remove,),
     "[contact]": (settings.ContactSettings,),
     "[time]": (settings.TimeKeys, Family(INTEGRATORS, "integrator", None)),
@@ -71,11 +74,11 @@ NOTES = {
     "[wind]": "`velocity` is a vector, or rows over time.",
     "[[wall]]": "`name`: default `wall1`, `wall2` and so on.",
     "[[constraint]]": "Kinds are modules of `pfem_petsc.contact.constraints`; none is built in.",
-    "[[stage]]": "A stage has a `name` (default `stage1`, `stage2` and so on), `[stage.time]` or `[stage.static]`, and the "
-    "tables that change: " + ", ".join(f"`{name}`" for name in stages.TABLES) + ". Of `[output]` it takes:",
+    "[[stage]]": "A stage has a `name` (default `stage1`, `stage2` and so on), `[stage.time]` or `[stage.static]`, and "
+    "the tables that change: " + ", ".join(f"`{name}`" for name in stages.TABLES) + ". Of `[output]` it takes:",
     "Columns of files": "What a key `..._file` takes instead of the name of a file: a table with these keys.",
 }
-UNIT = re.compile(r"\s*\[((?:-|1/\w+|deg(?:rees)?|%|min|(?:[NJ]|Pa|kg|m|s|K|rad)[\w/() ^-]*?)(?:, (?:-|[NJ\w/()^ -]+?))*)\]")
+UNIT = re.compile(r"\s*\[((?:-|1/\w+|degrees|min|(?:[NJ]|Pa|kg|m|s|K|rad)[\w/() ^-]*?)(?:, (?:-|[NJ\w/()^ -]+?))*)\]")
 HEAD = "| key | type | unit | default | meaning |\n|---|---|---|---|---|\n"
 
 
@@ -84,8 +87,8 @@ def page() -> str:
     text = (
         "# All keys of a case file\n\n"
         "Generated from the models that validate case files; [the keys of a case file](../case_file.md) explains them, "
-        "with examples. A key without default and not marked *required* may be left out. Whole numbers are accepted for "
-        "numbers; rows are lists of lists.\n\n"
+        "with examples. A key without default and not marked *required* may be left out. Whole numbers are accepted "
+        "for numbers; rows are lists of lists.\n\n"
         "The top level of a case file has `title` and the tables " + ", ".join(f"`{key}`" for key in KEYS[1:]) + ".\n"
     )
     for heading, models in TABLES.items():
@@ -105,7 +108,7 @@ def _family(family: Family) -> str:
         without = family.common.model_fields if family.common is not None else ()
         about = (module.__doc__ or "").strip().partition("\n\n")[0].replace("\n", " ").partition(". ")[0].rstrip(".:")
         own = [key for key in module.Parameters.model_fields if key not in without]
-        text += f"\n### `{family.key} = \"{name}\"`\n\n{_plain(about)}.\n"
+        text += f'\n### `{family.key} = "{name}"`\n\n{_plain(about)}.\n'
         text += "\n" + _table(module.Parameters, without) if own else "\nNo keys of its own.\n"
     return text
 

@@ -1,7 +1,7 @@
 """Writes docs/gallery.md from docs/gallery.toml: every built-in case with a picture, its cost and a checked number.
 
-    python scripts/gallery.py                  # the page alone
-    python scripts/gallery.py --run [CASE ...] # runs the cases on one rank, measures and draws them, and writes the page
+python scripts/gallery.py                  # the page alone
+python scripts/gallery.py --run [CASE ...] # runs the cases on one rank, measures and draws them; and the page
 """
 
 from __future__ import annotations
@@ -113,14 +113,15 @@ def _record(name: str, cost: dict[str, Any]) -> None:
     text = DATA.read_text()
     section = re.search(rf"^\[{name}\]\n(?:(?!\[).*\n)*?(?=\n|\Z)", text, flags=re.MULTILINE)
     kept = re.sub(r"^(bars|steps|seconds) = .*\n", "", section[0], flags=re.MULTILINE)
-    lines = "".join(f"{key} = {value:.3g}\n" if key == "seconds" else f"{key} = {value}\n" for key, value in cost.items())
+    shown = {key: f"{value:.3g}" if key == "seconds" else value for key, value in cost.items()}
+    lines = "".join(f"{key} = {value}\n" for key, value in shown.items())
     DATA.write_text(text[: section.start()] + kept + lines + text[section.end() :])
 
 
 def main() -> None:
     """Run what is asked for and write the page."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--run", nargs="*", metavar="CASE", help="run, measure and draw these cases; without names: all")
+    parser.add_argument("--run", nargs="*", metavar="CASE", help="run, measure, draw these cases; without names: all")
     arguments = parser.parse_args()
     if arguments.run is not None:
         for name in arguments.run or entries():

@@ -97,8 +97,9 @@ def test_formulas_are_drawn_by_the_browser(site):
 
 def models() -> Iterator[type[StrictModel]]:
     """Every model with keys of a case file that there is, however it is found."""
+    folders = r"\.(case|contact\.(walls|constraints)|integrators|materials|generators|lattices|methods)\."
     for module in pkgutil.walk_packages(pfem_petsc.__path__, "pfem_petsc."):
-        if re.search(r"\.(case|contact\.(walls|constraints)|integrators|materials|generators|lattices|methods)\.", module.name):
+        if re.search(folders, module.name):
             importlib.import_module(module.name)
     waiting = [StrictModel]
     while waiting:

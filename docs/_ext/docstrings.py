@@ -1,4 +1,4 @@
-"""Sections of docstrings (Parameters, Returns, Raises and so on) as lists, with the names and texts as they are written."""
+"""Sections of docstrings (Parameters, Returns, Raises and so on) as lists, with names and texts as they are written."""
 
 from __future__ import annotations
 

@@ -21,6 +21,7 @@ from PIL import Image
 from pfem_petsc import open_result
 from pfem_petsc.case.builtin import built_in_path, read_text
 from pfem_petsc.case.schema import Case
+from pfem_petsc.output.units import prefix_for
 
 __all__ = ["DATA", "PAGE", "PICTURES", "entries", "page"]
 
@@ -56,14 +57,13 @@ def page() -> str:
 
 def _section(name: str, entry: dict[str, Any]) -> str:
     title = Case.load(name).title
-    unit = f" {entry['unit']}" if "unit" in entry else ""
     cost = "a moment" if entry["seconds"] < 0.1 else f"{entry['seconds']:.2g} s"
     steps = f", {entry['steps']:,} steps" if entry["steps"] else ", modes of the initial state"
     rows = [
         ("", ""),
         ("---", "---"),
         ("size and cost", f"{entry['bars']:,} bars{steps}, {cost}"),
-        ("number", f"{entry['quantity']}: {entry['value']:.6g}{unit} ± {entry['tolerance']:.2g}"),
+        ("number", f"{entry['quantity']}: {_number(entry)}"),
         ("reference", entry["reference"]),
         ("the test", f"`{name}`" + (f", with `{entry['smaller']}`" if "smaller" in entry else "")),
         ("case file", f"[{name}.toml](../pfem_petsc/cases/{name}.toml)"),
@@ -73,6 +73,13 @@ def _section(name: str, entry: dict[str, Any]) -> str:
     about = " ".join(line.lstrip("# ") for line in comments).partition("python -m")[0].partition("mpirun")[0]
     about = re.split(r"(?<=[.:])\s", about.strip())[0].rstrip(".:")
     return f"\n## `{name}`\n\n![{title}](images/gallery/{name}.png)\n\n{about}.\n\n{table}\n"
+
+
+def _number(entry: dict[str, Any]) -> str:
+    factor, unit = prefix_for(entry["value"], entry.get("unit", ""))
+    if unit in ("", "°"):
+        return f"{entry['value']:.6g}{unit} ± {entry['tolerance']:.2g}{unit}"
+    return f"{factor * entry['value']:.7g} {unit} ± {factor * entry['tolerance']:.2g} {unit}"
 
 
 def run(name: str, folder: Path) -> dict[str, Any]:

@@ -6,6 +6,7 @@ import importlib
 import os
 import pkgutil
 import re
+import shlex
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -44,9 +45,12 @@ class Page(HTMLParser):
 @pytest.fixture(scope="module")
 def site(tmp_path_factory) -> dict[Path, Page]:
     folder = tmp_path_factory.mktemp("site")
-    command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-n", "-q", "-b", "html"]
+    script = (ROOT / "scripts" / "docs.sh").read_text()
+    options = re.search(r'^"\$python" (-m sphinx .*)$', script, flags=re.MULTILINE)[1]
+    assert {"-W", "-n"} <= set(options.split())  # warnings are errors, and so are references to nothing
+    command = shlex.split(options.replace("$folder", str(folder / "html")))
     done = subprocess.run(
-        [*command, "-d", str(folder / ".doctrees"), "-c", "docs", ".", str(folder / "html")],
+        [sys.executable, *command],
         cwd=ROOT,
         env={**os.environ, "OMP_NUM_THREADS": "1"},
         capture_output=True,
@@ -87,6 +91,17 @@ def test_links_of_the_site_lead_somewhere(site):
             assert file.exists(), (path.name, target)
             if parts.fragment and file in site:
                 assert unquote(parts.fragment) in site[file].anchors, (path.name, target)
+
+
+@pytest.mark.slow
+def test_every_public_name_is_in_the_reference(site):
+    anchors = next(page for path, page in site.items() if path.name == "api.html").anchors
+    assert {f"pfem_petsc.{name}" for name in pfem_petsc.__all__ if not name.startswith("_")} <= anchors
+    assert {
+        "pfem_petsc.Simulation.residual",
+        "pfem_petsc.Case.update",
+        "pfem_petsc.output.result.Result.grid",
+    } <= anchors
 
 
 @pytest.mark.slow

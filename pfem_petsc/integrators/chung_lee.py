@@ -24,6 +24,7 @@ class Parameters(StrictModel):
     """Parameters of the method of Chung and Lee."""
 
     beta: Annotated[float, Field(ge=1.0, le=28.0 / 27.0)] = 28.0 / 27.0
+    """factor beta of the acceleration; 1: no damping, 28/27: most damping of high frequencies"""
 
 
 class Scheme(ExplicitGeneralisedAlpha):

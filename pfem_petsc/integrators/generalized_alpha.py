@@ -26,6 +26,7 @@ class Parameters(StrictModel):
     """Parameters of the implicit generalised-alpha method."""
 
     rho_inf: Annotated[float, Field(ge=0.0, le=1.0)] = 0.8
+    """spectral radius at infinite frequency; 1: no damping"""
 
 
 class Scheme(Base):

@@ -24,6 +24,7 @@ class Parameters(StrictModel):
     """Parameters of the explicit generalised-alpha method."""
 
     rho_b: Annotated[float, Field(ge=0.0, le=1.0)] = 0.8
+    """spectral radius rho_b at the bifurcation frequency; smaller values damp high frequencies more"""
 
 
 # the loops run over arrays (3 n,), so that they are vectorised

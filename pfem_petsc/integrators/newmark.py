@@ -22,7 +22,9 @@ class Parameters(StrictModel):
     """Parameters of the Newmark family."""
 
     beta: PositiveFloat = 1.0
+    """parameter beta; 1/4 with gamma = 1/2: trapezoidal rule"""
     gamma: NonNegativeFloat = 1.5
+    """parameter gamma; above 1/2: of first order, with damping"""
 
 
 class Scheme(Base):

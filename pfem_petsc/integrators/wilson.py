@@ -31,6 +31,7 @@ class Parameters(StrictModel):
     """Parameters of Wilson's method."""
 
     theta: Annotated[float, Field(ge=1.0)] = 1.4
+    """factor theta on the step, at whose end the balance holds; 2 with contact"""
 
 
 class Scheme(Base):

@@ -1,0 +1,141 @@
+"""Writes docs/gallery.md from docs/gallery.toml: every built-in case with a picture, its cost and a checked number.
+
+python scripts/gallery.py                  # the page alone
+python scripts/gallery.py --run [CASE ...] # runs the cases on one rank, measures and draws them; and the page
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import subprocess
+import sys
+import tempfile
+import time
+import tomllib
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+
+from pfem_petsc import open_result
+from pfem_petsc.case.builtin import built_in_path, read_text
+from pfem_petsc.case.schema import Case
+from pfem_petsc.output.units import prefix_for
+
+__all__ = ["DATA", "PAGE", "PICTURES", "entries", "page"]
+
+ROOT = Path(__file__).resolve().parent.parent
+DATA = ROOT / "docs" / "gallery.toml"
+PAGE = ROOT / "docs" / "gallery.md"
+PICTURES = ROOT / "docs" / "images" / "gallery"
+SIZE = "960x540"
+
+HEAD = """# Gallery
+
+The built-in cases. Each runs as shown, and a test runs it (some shortened) and compares the number
+([tests/cases/test_built_in_cases.py](../tests/cases/test_built_in_cases.py)). Times are those of one core of a virtual
+machine, without the start of Python and the compilation of loops at the first run ever. `scripts/gallery.py` runs the
+cases, draws the pictures and writes this page from [gallery.toml](gallery.toml).
+
+```
+python -m pfem_petsc CASE
+python -m pfem_petsc render results/CASE
+```
+"""
+
+
+def entries() -> dict[str, dict[str, Any]]:
+    """Return the entries by case."""
+    return tomllib.loads(DATA.read_text())
+
+
+def page() -> str:
+    """Return the page."""
+    return HEAD + "".join(_section(name, entry) for name, entry in entries().items())
+
+
+def _section(name: str, entry: dict[str, Any]) -> str:
+    title = Case.load(name).title
+    cost = "a moment" if entry["seconds"] < 0.1 else f"{entry['seconds']:.2g} s"
+    steps = f", {entry['steps']:,} steps" if entry["steps"] else ", modes of the initial state"
+    rows = [
+        ("", ""),
+        ("---", "---"),
+        ("size and cost", f"{entry['bars']:,} bars{steps}, {cost}"),
+        ("number", f"{entry['quantity']}: {_number(entry)}"),
+        ("reference", entry["reference"]),
+        ("the test", f"`{name}`" + (f", with `{entry['smaller']}`" if "smaller" in entry else "")),
+        ("case file", f"[{name}.toml](../pfem_petsc/cases/{name}.toml)"),
+    ]
+    table = "\n".join(f"| {left} | {right} |" for left, right in rows).replace("| --- | --- |", "|---|---|")
+    comments = re.match(r"(?:#.*\n)+", read_text(built_in_path(name)))[0].splitlines()
+    about = " ".join(line.lstrip("# ") for line in comments).partition("python -m")[0].partition("mpirun")[0]
+    about = re.split(r"(?<=[.:])\s", about.strip())[0].rstrip(".:")
+    return f"\n## `{name}`\n\n![{title}](images/gallery/{name}.png)\n\n{about}.\n\n{table}\n"
+
+
+def _number(entry: dict[str, Any]) -> str:
+    factor, unit = prefix_for(entry["value"], entry.get("unit", ""))
+    if unit in ("", "°"):
+        return f"{entry['value']:.6g}{unit} ± {entry['tolerance']:.2g}{unit}"
+    return f"{factor * entry['value']:.7g} {unit} ± {factor * entry['tolerance']:.2g} {unit}"
+
+
+def run(name: str, folder: Path) -> dict[str, Any]:
+    """Run a case twice, so that nothing is compiled in the second, draw it, and return what it cost."""
+    entry = entries()[name]
+    times = []
+    for again in ("first", "second"):
+        _program(name, "-o", folder / again)
+        log = (folder / again / "log.txt").read_text()
+        found = re.findall(r"done: .* in ([\d.]+) (s|min)\b", log)
+        times.append(float(found[-1][0]) * (60.0 if found[-1][1] == "min" else 1.0) if found else 0.0)
+    start = time.perf_counter()
+    result = open_result(folder / "second")
+    _draw(name, entry, folder, len(result.times))
+    print(f"{name}: {times[1]:.3g} s, drawn in {time.perf_counter() - start:.1f} s", flush=True)
+    return {"bars": len(result.bars), "steps": int(result.history["step"][-1]), "seconds": times[1]}
+
+
+def _draw(name: str, entry: dict[str, Any], folder: Path, count: int) -> None:
+    options = ["--size", SIZE, "--video", "none", "--no-poster", *entry["render"]]
+    if "modes" in entry:
+        options += ["--modes", str(entry["modes"]), "--frames", "4"]
+    else:
+        options += ["--frames", f"0,{entry['frame'] % count}"]
+    _program("render", folder / "second", "-o", folder / "pictures", *options)
+    frames = sorted((folder / "pictures").rglob("*.png"))
+    picture = Image.open(frames[1 if "modes" in entry else -1]).convert("RGB")
+    PICTURES.mkdir(parents=True, exist_ok=True)
+    picture.quantize(128, dither=Image.Dither.NONE).save(PICTURES / f"{name}.png", optimize=True)
+
+
+def _program(*arguments: Any) -> None:
+    subprocess.run([sys.executable, "-m", "pfem_petsc", *map(str, arguments)], check=True, stdout=subprocess.DEVNULL)
+
+
+def _record(name: str, cost: dict[str, Any]) -> None:
+    """Put the cost into the entry of a case."""
+    text = DATA.read_text()
+    section = re.search(rf"^\[{name}\]\n(?:(?!\[).*\n)*?(?=\n|\Z)", text, flags=re.MULTILINE)
+    kept = re.sub(r"^(bars|steps|seconds) = .*\n", "", section[0], flags=re.MULTILINE)
+    shown = {key: f"{value:.3g}" if key == "seconds" else value for key, value in cost.items()}
+    lines = "".join(f"{key} = {value}\n" for key, value in shown.items())
+    DATA.write_text(text[: section.start()] + kept + lines + text[section.end() :])
+
+
+def main() -> None:
+    """Run what is asked for and write the page."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--run", nargs="*", metavar="CASE", help="run, measure, draw these cases; without names: all")
+    arguments = parser.parse_args()
+    if arguments.run is not None:
+        for name in arguments.run or entries():
+            with tempfile.TemporaryDirectory() as folder:
+                _record(name, run(name, Path(folder)))
+    PAGE.write_text(page())
+
+
+if __name__ == "__main__":
+    main()

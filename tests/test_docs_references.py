@@ -1,0 +1,71 @@
+"""Tests, messages and pages that the documentation names exist."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+ANY = "\0"
+"""Stands for what a message fills in."""
+
+
+def defined(tree: ast.Module) -> set[str]:
+    """Names of the tests of a file, those of a class as ``Class::test``."""
+    found = set()
+    for node in tree.body:
+        if isinstance(node, ast.FunctionDef | ast.ClassDef):
+            found.add(node.name)
+        if isinstance(node, ast.ClassDef):
+            found |= {f"{node.name}::{each.name}" for each in node.body if isinstance(each, ast.FunctionDef)}
+    return found
+
+
+@pytest.mark.parametrize("page", sorted([*DOCS.glob("*.md"), ROOT / "README.md"]), ids=lambda page: page.stem)
+def test_tests_named_exist(page):
+    for file, _, name in re.findall(r"\b(tests/[\w/]+\.py)(::([\w:]+))?", page.read_text()):
+        path = ROOT / file
+        assert path.exists(), file
+        if name:
+            assert name in defined(ast.parse(path.read_text())), f"{file}::{name}"
+
+
+def test_every_folder_of_tests_of_physics_is_verified():
+    named = set(re.findall(r"tests/(\w+)/", (DOCS / "verification.md").read_text()))
+    assert {"physics", "statics", "modes", "contact", "integrators", "mechanics", "restart", "random_cases"} <= named
+
+
+def texts(path: Path) -> Iterator[str]:
+    """Texts of a module, with ANY for what is filled in; docstrings too, which do no harm."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.JoinedStr):
+            yield "".join(each.value if isinstance(each, ast.Constant) else ANY for each in node.values)
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+            yield node.value
+
+
+def quoted() -> list[str]:
+    """The messages of docs/troubleshooting.md: code in the first column."""
+    return re.findall(r"^\| `([^`]+)` \|", (DOCS / "troubleshooting.md").read_text(), flags=re.MULTILINE)
+
+
+@pytest.fixture(scope="module")
+def messages() -> str:
+    return "\n".join(" ".join(text.split()) for path in (ROOT / "pfem_petsc").rglob("*.py") for text in texts(path))
+
+
+def test_there_are_messages():
+    assert len(quoted()) > 50 and len(set(quoted())) == len(quoted())
+
+
+@pytest.mark.parametrize("message", quoted())
+def test_message_is_one_of_the_program(message, messages):
+    """Its parts, between dots, follow one another in one text of the code."""
+    parts = [re.escape(part.strip()) for part in message.replace("\\|", "|").split("...") if part.strip()]
+    assert re.search(r"[^\n]*?".join(parts), messages), message
+    assert len(message) > 10

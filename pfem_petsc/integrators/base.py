@@ -12,7 +12,6 @@ accelerations are second differences of positions over h^2 and would lose signif
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -96,9 +95,8 @@ class Scheme(ABC):
     solves_end : the position solved for is x_{n+1}
     discrete_gradient : the internal force of its balances is that of the step (``Balance.discrete_gradient``)
     force_acts_once : a contact force affects only its own step if its acceleration is removed
-    loops : of leapfrog schemes, ``inlined`` functions that move nodes by velocities at half steps, advance these, and
-        compute the velocities of the balance, for the fused loop (``stepping/fused_loop.py``); None for other schemes,
-        whose steps are made one by one
+    leapfrog : whether its steps are those of :mod:`~pfem_petsc.integrators.leapfrog`, with velocities at half steps in
+        the memory ``half_velocity``, so that the fused loop (``stepping/fused_loop.py``) applies
     symmetric : whether the Hessian is symmetric
     remembers : names of the scheme's nodal arrays in the state's memory, which are linear in the motion
     dissipates : whether the scheme dissipates energy at high frequencies
@@ -115,7 +113,7 @@ class Scheme(ABC):
     solves_end = True
     discrete_gradient = False
     force_acts_once = False
-    loops: tuple[Callable, Callable, Callable] | None = None
+    leapfrog = False
     symmetric = True
     remembers: tuple[str, ...] = ()
     dissipates = True

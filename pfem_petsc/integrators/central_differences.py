@@ -11,45 +11,19 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..mechanics.compiled import inlined, kernel
 from .base import Balance, ExplicitScheme, NoParameters, State
+from .leapfrog import centre, drift, kick
 
 __all__ = ["Parameters", "Scheme"]
 
 Parameters = NoParameters
-
-# the loops run over arrays (3 n,), so that they are vectorised
-
-
-@inlined
-def move(x, h, half, moved):
-    """Compute ``moved`` = x + h half."""
-    for i in range(len(half)):
-        moved[i] = x[i] + h * half[i]
-
-
-@inlined
-def push(u, alpha, h, half):
-    """Advance the velocities ``half`` by a step with the acceleration of the balance, alpha u."""
-    for i in range(len(u)):
-        half[i] += h * (alpha * u[i])
-
-
-@inlined
-def centre(u, eta, half, v):
-    """Compute velocities of the balance from the increments and the velocities half a step later."""
-    for i in range(len(u)):
-        v[i] = half[i] - eta * u[i]
-
-
-drift, kick, settle = kernel(move), kernel(push), kernel(centre)
 
 
 class Scheme(ExplicitScheme):
     """Central differences (explicit)."""
 
     solves_next_position = True
-    loops = (move, push, centre)
+    leapfrog = True
     remembers = ("half_velocity",)
     dissipates = False
 
@@ -84,4 +58,4 @@ class Scheme(ExplicitScheme):
         state.a, state.v = balance.alpha * u, np.empty_like(u)
         half, increments = state.memory["half_velocity"].reshape(-1), u.reshape(-1)
         kick(increments, balance.alpha, h, half)
-        settle(increments, balance.eta, half, state.v.reshape(-1))
+        centre(increments, balance.eta, half, state.v.reshape(-1))

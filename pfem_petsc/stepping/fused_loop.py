@@ -18,6 +18,7 @@ import numpy as np
 from ..contact.flat import press_planes
 from ..contact.impact_loops import join_nodes, plane_gaps, stop_nodes, unpressed
 from ..contact.log import compare_contacts
+from ..integrators.leapfrog import advance, advance_loaded, centre, drift, kick
 from ..mechanics.bar_geometry import first_inverted
 from ..mechanics.compiled import inlined, kernel
 from ..mechanics.rows import CHUNK
@@ -39,10 +40,10 @@ from .balance_loops import (
     start_of_step,
     sum_balance,
 )
-from .book_loops import WORKS, new_lanes
+from .book_loops import WORKS, new_lanes, spread
 from .ghost_loops import trade_positions
 from .impulses import WALLS, fill_impulses
-from .node_loops import accelerations, explicit_increments, hold_still, react
+from .node_loops import accelerations, explicit_increments, hold, hold_still, react
 from .sum_loops import add_totals, fill_bars, fill_probes, fill_walls, fill_works
 
 __all__ = ["make_fused_loop"]
@@ -59,15 +60,11 @@ def make_fused_loop(
     sum_energies: Callable,
     clear_energies: Callable,
     work_rows: int,
-    drift: Callable,
-    kick: Callable,
-    centre: Callable,
 ) -> Callable:
-    """Return the fused loop for a law and strain measure, and a scheme.
+    """Return the fused loop for a law and strain measure.
 
     ``forces`` is the bar loop over a part of a sweep, with the functions for its energies and the number of its working
-    arrays, see :func:`~pfem_petsc.mechanics.kernels.make_kernels`; ``drift``, ``kick`` and ``centre`` are the loops of
-    the scheme.
+    arrays, see :func:`~pfem_petsc.mechanics.kernels.make_kernels`.
 
     Its arguments are the maximum number of steps; the step [s]; positions, positions of the previous step, which are
     computed for the last step alone, and velocities at half steps (n, 3); arrays of bars, nodes, walls, probes,
@@ -124,10 +121,12 @@ def make_fused_loop(
         nothing = np.empty((0, 3))
         supported, loaded = len(nodes.support_nodes) > 0, len(nodes.external) > 0
         damped = len(nodes.damping) > 0
-        # increments are kept where forces alone do not determine them; else those of a block are enough
+        # increments are kept where forces alone do not determine them
         kept = n_walls > 0 or damped
-        # positions in the absence of forces, which walls need of all nodes
-        predictor = np.empty((n if n_walls > 0 else 0, 3))
+        predictor = np.empty((n if kept else 0, 3))
+        inverse, inverses = np.empty(3 * NODE_BLOCK), np.empty(0 if kept else n)
+        for i in range(len(inverses)):
+            inverses[i] = 1.0 / (alpha * nodes.mass[i])
         u = np.empty((n, 3))
         stiffness = np.empty(n)
         load, held = np.empty(len(nodes.support_nodes)), np.empty(len(nodes.support_nodes))
@@ -221,8 +220,7 @@ def make_fused_loop(
                     first = NODE_BLOCK * block
                     last = min(first + NODE_BLOCK, n)
                     begin, end = nodes.support_starts[block], nodes.support_starts[block + 1]
-                    part_u = u[first:last] if kept else u[: last - first]
-                    part_stiffness = stiffness[first:last] if kept else stiffness[: last - first]
+                    part_u, part_stiffness = u[first:last], stiffness[first:last]
                     ahead = half[first:last].reshape(-1)
                     if stage == 0:
                         while moved < min(block + 1 + bars.reach, n_blocks):
@@ -248,6 +246,42 @@ def make_fused_loop(
                             failed = at if failed < 0 else failed
                             shortened = shortened or short
                             changed += broke
+                        if not kept:
+                            here = speeds[: 3 * (last - first)]
+                            factors = inverse[: 3 * (last - first)]
+                            spread(inverses[first:last], factors)
+                            hold_still(
+                                begin,
+                                end,
+                                first,
+                                nodes.support_nodes,
+                                nodes.support_components,
+                                nodes.support_positions,
+                                nodes.mass,
+                                nodes.external,
+                                f,
+                                x,
+                                half,
+                                h,
+                                alpha,
+                                factors,
+                                held,
+                                support,
+                            )
+                            pulls = f[first:last].reshape(-1)
+                            if loaded:
+                                load_here = nodes.external[first:last].reshape(-1)
+                                advance_loaded(pulls, load_here, factors, alpha, eta, h, ahead, here, lanes[INTERNAL])
+                                add_loads(load_here, here, lanes)
+                            else:
+                                advance(pulls, factors, alpha, eta, h, ahead, lanes[INTERNAL])
+                            for k in range(begin, end):
+                                i, c = nodes.support_nodes[k], nodes.support_components[k]
+                                half[i, c] += h * (alpha * held[k])
+                            add_sparse_forces(
+                                begin, end, nodes.support_nodes, nodes.support_components, support, lanes[REACTIONS]
+                            )
+                            continue
                         explicit_increments(
                             nodes.external[first:last] if loaded else nothing,
                             f[first:last],
@@ -260,23 +294,21 @@ def make_fused_loop(
                             part_stiffness,
                             part_u,
                         )
-                        hold_still(
+                        where = predictor[first:last]
+                        drift(x[first:last].reshape(-1), h, ahead, where.reshape(-1))
+                        hold(
                             begin,
                             end,
                             first,
                             nodes.support_nodes,
                             nodes.support_components,
                             nodes.support_positions,
-                            x,
-                            half,
-                            h,
+                            where,
                             part_stiffness,
                             part_u,
                             load,
-                            held,
                         )
                         if n_walls > 0:
-                            drift(x[first:last].reshape(-1), h, ahead, predictor[first:last].reshape(-1))
                             continue
                     react(
                         begin,

@@ -56,7 +56,6 @@ class Batch:
             block.kernels.sum_energies,
             block.kernels.clear_energies,
             block.kernels.work_rows,
-            *stepper.scheme.loops,
         )
         bars = model.bars
         law = (bars.far, bars.rest, bars.watched, bars.heat, block.parameters, block.area, block.history)

@@ -39,7 +39,7 @@ _NOTHING = np.empty((0, 3))
 
 def make_ledger(stepper: Stepper) -> Ledger:
     """Return the ledger for the steps of a run or stage, after the start of the stepper. Collective."""
-    leapfrog = stepper.scheme.loops is not None and stepper.steady and stepper.treatment is None
+    leapfrog = stepper.scheme.leapfrog and stepper.steady and stepper.treatment is None
     same = stepper.model.comm.allreduce(leapfrog and stepper.model.steady, op=MPI.LAND)
     return (LeapfrogLedger if same else Ledger)(stepper)
 

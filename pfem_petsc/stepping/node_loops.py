@@ -64,15 +64,23 @@ def hold(begin, end, origin, nodes, components, positions, predictor, stiffness,
 
 
 @kernel
-def hold_still(begin, end, origin, nodes, components, positions, x, half, h, stiffness, u, load, held):
-    """Like :func:`hold` for a scheme that predicts ``x`` + ``h half``, arrays (n, 3) of all nodes; the increments are
-    written to ``held`` (k,) too."""
+def hold_still(
+    begin, end, origin, nodes, components, positions, mass, external, f, x, half, h, alpha, inverse, held, support
+):
+    """:func:`hold` and :func:`react` for a leapfrog scheme without damping and contact, before its other components.
+
+    Writes the increments of the prescribed components [begin, end) to ``held`` (k,) and their reactions to ``support``
+    (owned, 3) [N], and sets their inverse stiffness to zero in ``inverse`` (3 m,), of the nodes from ``origin`` on.
+    """
+    loaded = len(external) > 0
     for k in range(begin, end):
-        node, c = nodes[k], components[k]
-        i = node - origin
-        load[k] = stiffness[i] * u[i, c]
-        held[k] = positions[k] - (x[node, c] + h * half[node, c])
-        u[i, c] = held[k]
+        i, c = nodes[k], components[k]
+        stiffness = alpha * mass[i]
+        force = external[i, c] - f[i, c] if loaded else -f[i, c]
+        free = stiffness * (force * (1.0 / stiffness))
+        held[k] = positions[k] - (x[i, c] + h * half[i, c])
+        support[i, c] = stiffness * held[k] - free
+        inverse[3 * (i - origin) + c] = 0.0
 
 
 @kernel

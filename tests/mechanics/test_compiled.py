@@ -13,7 +13,6 @@ import pytest
 
 from pfem_petsc import Case, Simulation
 from pfem_petsc.case.materials import LAWS
-from pfem_petsc.integrators.central_differences import Scheme
 from pfem_petsc.mechanics import strips
 from pfem_petsc.mechanics.compiled import Compilation, _variant, code_digest
 from pfem_petsc.mechanics.kernels import make_kernels
@@ -145,14 +144,13 @@ def test_every_process_finds_the_machine_code_of_another():
 def test_every_process_finds_the_fused_loop_of_another():
     """Keys of loops that are made of other loops are the same in all processes: a start must not compile them anew."""
     program = (
-        "from pfem_petsc.integrators.central_differences import Scheme\n"
         "from pfem_petsc.mechanics.kernels import make_kernels\n"
         "from pfem_petsc.mechanics.materials.elastic import LAW\n"
         "from pfem_petsc.mechanics.strain import engineering\n"
         "from pfem_petsc.stepping.fused_loop import make_fused_loop\n"
         "kernels = make_kernels(LAW, engineering)\n"
         "parts = kernels.sweep_part, kernels.sum_energies, kernels.clear_energies, kernels.work_rows\n"
-        "loop = make_fused_loop(*parts, *Scheme.loops)\n"
+        "loop = make_fused_loop(*parts)\n"
         "print(loop._cache._index_key((), loop.targetctx.codegen()), loop._cache._cache_file._source_stamp)"
     )
     keys = set()
@@ -173,7 +171,7 @@ def test_loops_of_all_laws_have_names_of_their_own():
                 kernels = make_kernels(variant, measure)
                 names.append(_variant(kernels.forces.py_func))
                 fused = make_fused_loop(
-                    kernels.sweep_part, kernels.sum_energies, kernels.clear_energies, kernels.work_rows, *Scheme.loops
+                    kernels.sweep_part, kernels.sum_energies, kernels.clear_energies, kernels.work_rows
                 )
                 longest = fused._cache._cache_file._data_path("x")
                 assert len(Path(longest).name) < 220
@@ -241,7 +239,7 @@ def test_functions_of_one_name_have_the_same_code():
             kernels = make_kernels(law, measure)
             parts = kernels.sweep_part, kernels.sum_energies, kernels.clear_energies, kernels.work_rows
             loops = [value for value in vars(kernels).values() if not isinstance(value, int)]
-            for loop in (*loops, make_fused_loop(*parts, *Scheme.loops)):
+            for loop in (*loops, make_fused_loop(*parts)):
                 closures(loop, found)
     digests = {}
     for function in found:

@@ -11,7 +11,7 @@ from pfem_petsc.errors import EarlyStop, SimulationFailure
 LATTICE = {
     "mesh": {"generator": "lattice", "kind": "cubic", "cells": [2, 2, 2], "pitch": 0.01},
     "node_set": {"foot": {"group": "bottom"}, "corner": {"nearest": [0.02, 0.02, 0.02]}},
-    "material": {"it": {"young_modulus": 110e9, "density": 4500.0, "damping": 2e4}},
+    "material": {"it": {"young_modulus": 110e9, "density": 4500.0}},
     "section": {"it": {"area": 1e-6, "material": "it"}},
     "initial": {"velocity": [3.0, 1.0, -20.0]},
     "time": {"integrator": "central_differences", "step": 2e-7, "end": 1.2e-4},
@@ -21,12 +21,17 @@ PLASTIC = {"yield_stress": 100e6, "isotropic_hardening": 1e9, "kinematic_hardeni
 FLOOR = {"name": "floor", "type": "plane", "point": [0, 0, -1e-5], "normal": [0.0, 0.1, 1.0]}
 SIDE = {"name": "side", "type": "plane", "point": [0.0201, 0, 0], "normal": [-1.0, 0.0, 0.0], "node_set": "foot"}
 
+DAMPED = {"it": LATTICE["material"]["it"] | {"damping": 2e4}}
+
 CASES = {
-    "yielding": {"material": {"it": LATTICE["material"]["it"] | PLASTIC}, "wall": [FLOOR]},
+    "yielding": {"material": {"it": DAMPED["it"] | PLASTIC}, "wall": [FLOOR]},
     "flying": {},
+    "damped": {"material": DAMPED, "support": [{"node_set": "foot", "fix": "z"}]},
+    "held by feet": {"support": [{"node_set": "foot", "fix": "xyz"}]},
     "walls": {"wall": [FLOOR, SIDE]},
     "held": {"support": [{"node_set": "foot", "fix": "xz"}], "gravity": {"acceleration": [0.0, 0.0, -1e4]}},
     "held and loaded": {
+        "material": DAMPED,
         "support": [{"node_set": "foot", "fix": "z"}],
         "load": [{"node_set": "corner", "force": [10.0, 0.0, 0.0]}],
         "wall": [SIDE | {"node_set": "foot"}],

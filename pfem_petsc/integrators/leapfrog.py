@@ -1,0 +1,66 @@
+"""Compiled loops of leapfrog schemes, with velocities at half steps: x1 = x0 + h half, half1 = half0 + h a, v = half1 -
+h a/2. The solution of the balance is u with a = alpha u and h a/2 = eta u.
+
+The loops run over arrays (3 n,), so that they are vectorised.
+"""
+
+from __future__ import annotations
+
+from ..mechanics.compiled import kernel
+
+__all__ = ["advance", "advance_loaded", "centre", "drift", "kick"]
+
+
+@kernel
+def drift(x, h, half, moved):
+    """Compute ``moved`` = x + h half."""
+    for i in range(len(half)):
+        moved[i] = x[i] + h * half[i]
+
+
+@kernel
+def kick(u, alpha, h, half):
+    """Advance the velocities ``half`` by a step with the acceleration of the balance, alpha u."""
+    for i in range(len(u)):
+        half[i] += h * (alpha * u[i])
+
+
+@kernel
+def centre(u, eta, half, v):
+    """Compute velocities ``v`` of the balance from the increments and the velocities half a step later."""
+    for i in range(len(u)):
+        v[i] = half[i] - eta * u[i]
+
+
+@kernel
+def advance(f, inverse, alpha, eta, h, half, sums):
+    """Solve balances u = -f ``inverse``, advance ``half``, and add f . v to ``sums``, one for each number of a part of
+    this length: :func:`kick` and :func:`centre` in one pass."""
+    wide = len(sums)
+    for first in range(0, len(half), wide):
+        last = min(first + wide, len(half))
+        force, factor, ahead = f[first:last], inverse[first:last], half[first:last]
+        for j in range(len(force)):
+            u = -force[j] * factor[j]
+            ahead[j] += h * (alpha * u)
+            sums[j] += force[j] * (ahead[j] - eta * u)
+
+
+@kernel
+def advance_loaded(f, external, inverse, alpha, eta, h, half, v, sums):
+    """As :func:`advance` with external forces, u = (``external`` - f) ``inverse``; writes ``v``."""
+    wide = len(sums)
+    for first in range(0, len(half), wide):
+        last = min(first + wide, len(half))
+        force, load, factor, ahead, speed = (
+            f[first:last],
+            external[first:last],
+            inverse[first:last],
+            half[first:last],
+            v[first:last],
+        )
+        for j in range(len(force)):
+            u = (load[j] - force[j]) * factor[j]
+            ahead[j] += h * (alpha * u)
+            speed[j] = ahead[j] - eta * u
+            sums[j] += force[j] * speed[j]

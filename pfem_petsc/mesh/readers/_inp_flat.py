@@ -149,9 +149,12 @@ class Flat:
         if placed is None:
             placed = _nothing(self._model.assembly)
         known, at = (placed.nodes, placed.nodes_at) if kind == "NSET" else (placed.bars, placed.bars_at)
+        if entry.generated:
+            first, last, step = labels.tolist()
+            labels = known[(known >= first) & (known <= last) & ((known - first) % step == 0)]
         place = np.minimum(np.searchsorted(known, labels), max(len(known) - 1, 0))
         there = known[place] == labels if len(known) else np.zeros(len(labels), bool)
-        if not entry.generated and (kind == "NSET" or not self._model.left_out):
+        if kind == "NSET" or not self._model.left_out:
             self._lost[id(entry)] = int((~there).sum())
         members = at[place[there]] if len(known) else at
         if kind == "NSET":
@@ -165,8 +168,8 @@ class Flat:
         instance, dot, rest = name.partition(".")
         if dot and instance.upper() in self._placed:
             key, name = instance.upper(), rest
-            if name.isdigit():
-                return self._labelled(kind, key, np.array([int(name)]), entry)
+            if name.isdecimal() and len(name) < 16:
+                return self._labelled(kind, key, np.array([int(name)]), replace(entry, generated=False))
         scope = self._model.assembly if key == "*ASSEMBLY" else self._placed[key].scope if key in self._placed else None
         table = None if scope is None else _sets(scope, kind).get(name.upper())
         if table is None:

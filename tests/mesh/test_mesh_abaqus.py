@@ -241,7 +241,7 @@ def test_sections_of_beams(tmp_path, text):
         ("2, 10, 7", "1, 10, 7", r"\*ELEMENT: element 1 is listed more than once"),
         ("TYPE=t3d2,\n   ELSET=Base", "ELSET=Base", r"line 11: \*ELEMENT: the parameter TYPE= is missing"),
         ("NSET=Top", "NAME=Top", r"line 21: \*NSET: the parameter NSET= is missing"),
-        ("top, FEET", "top, FEED", r"line 25: \*NSET: 'FEED' is neither a number nor a node set"),
+        ("top, FEET", "top, FEED", r"line 25: \*NSET: 'FEED' is neither a number nor an existing node set"),
         ("top, FEET", "every one", r"line 25: \*NSET: set every one includes itself"),
         ("1, 11, 5", "11, 1, 5", r"line 29: \*ELSET: 11, 1, 5 are not first, last and step"),
         ("1, 11, 5", "1, 11, 5, 7", r"line 30: \*ELSET: .* has 4 values; expected 2 to 3"),
@@ -264,6 +264,15 @@ def test_one_thing_wrong(tmp_path, old, new, text):
 def test_members_that_are_not_there_are_told(tmp_path):
     mesh = read_whole(written(tmp_path, FLAT.replace("*NSET, NSET=Top\n21,", "*NSET, NSET=Top\n21, 22, 23")))
     assert mesh.warnings[0].endswith("2 members of node sets are not there, and are left out")
+
+
+def test_nodes_of_element_sets_and_constraints(tmp_path):
+    more = "*NSET, NSET=of legs, ELSET=LEGS\n*TIE, NAME=t\na, b\n*MPC\n*TIE, NAME=u\nc, d\n*MATERIAL"
+    mesh = read_whole(written(tmp_path, FLAT.replace("*MATERIAL", more)))
+    assert mesh.node_groups["of legs"].tolist() == [0, 1, 2, 3]
+    assert mesh.warnings[-1].startswith(f"{tmp_path}/a.inp: left out *TIE, *MPC; nodes that they connect")
+    with pytest.raises(InputError, match="'LEX' is neither a number nor an existing element set"):
+        read_whole(written(tmp_path, FLAT.replace("*MATERIAL", more.replace("LEGS", "LEX"))))
 
 
 def test_plastic_curves_that_no_law_has_are_told(tmp_path):

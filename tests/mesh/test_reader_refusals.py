@@ -260,7 +260,7 @@ def test_changed_files_of_other_programs_are_read_or_refused(tmp_path, name):
 
 
 @pytest.mark.parallel
-@pytest.mark.parametrize("name", ["a.inp", "a.stl", "a.3mf", "a_nodes.csv", "a.msh"])
+@pytest.mark.parametrize("name", ["a.inp", "a.stl", "a.3mf", "a.msh"])
 def test_all_ranks_refuse(comm, shared_tmp_path, name):
     if comm.rank == 0:
         (shared_tmp_path / name).write_text("*NODE\n1, zero\n" if name == "a.inp" else "x,y\n")

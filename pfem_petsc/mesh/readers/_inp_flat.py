@@ -136,7 +136,10 @@ class Flat:
         parts = [np.empty(0, np.int64)]
         for entry in table.entries:
             here = entry.instance.upper() or key
-            if isinstance(entry.what, str):
+            if entry.of_elements:
+                bars = self._named("ELSET", here, entry, ())
+                parts.append(np.unique(self.bars[bars]))
+            elif isinstance(entry.what, str):
                 parts.append(self._named(kind, here, entry, (*above, f"{key}.{table.name.upper()}")))
             elif entry.what.size:
                 parts.append(self._labelled(kind, here, entry.what, entry))
@@ -174,7 +177,7 @@ class Flat:
         table = None if scope is None else _sets(scope, kind).get(name.upper())
         if table is None:
             what = {"NSET": "node", "ELSET": "element"}[kind]
-            raise InputError(f"{entry.block.where}: {name!r} is neither a number nor a {what} set")
+            raise InputError(f"{entry.block.where}: {name!r} is neither a number nor an existing {what} set")
         if f"{key}.{name.upper()}" in above:
             raise InputError(f"{entry.block.where}: set {name} includes itself")
         return self._members(kind, key, table, above)

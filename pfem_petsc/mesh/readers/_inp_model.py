@@ -40,6 +40,8 @@ class Entry:
     """Labels (n,), or the name of a set."""
     generated: bool = False
     """Whether ``what`` is first, last and step of labels, of which not all need exist."""
+    of_elements: bool = False
+    """Whether ``what`` is an element set, whose nodes they are."""
 
 
 @dataclass
@@ -118,6 +120,9 @@ class Model:
         sets = scope.nsets if kind == "NSET" else scope.elsets
         name, instance = block.required(kind), block.get("INSTANCE")
         scope.add_to(sets, name, Entry(block, instance, np.empty(0, np.int64)))
+        if kind == "NSET" and block.get("ELSET"):
+            scope.add_to(sets, name, Entry(block, instance, block.get("ELSET"), of_elements=True))
+            return
         if "GENERATE" in block.parameters:
             for first, last, step in _labels(_filled(block), block, "member").reshape(-1, 3).tolist():
                 if step < 1 or last < first:

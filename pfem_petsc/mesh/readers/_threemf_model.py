@@ -19,6 +19,8 @@ UNITS = {"micron": 1e-6, "millimeter": 1e-3, "centimeter": 1e-2, "inch": 0.0254,
 CORE = "http://schemas.microsoft.com/3dmanufacturing/core/2015/02"
 LATTICE = "http://schemas.microsoft.com/3dmanufacturing/beamlattice/2017/02"
 
+_KNOWN = "http://schemas.microsoft.com/3dmanufacturing/beamlattice/"
+
 GROUP = "node_group."
 """Beginning of the local names of metadata with a node group: name and numbers from 0, separated by a line break."""
 
@@ -66,6 +68,8 @@ class ModelFile:
     ----------
     scale : float
         Metres in the unit of the file.
+    not_read : list of str
+        Namespaces of extensions that the file requires, and that are not read.
     triangles : int
         Number of triangles.
     node_groups : dict
@@ -79,6 +83,8 @@ class ModelFile:
         self._current = Lattice("")
         self._text: list[str] | None = None
         self._texts: list[str] = []
+        self._namespaces: dict[str, str] = {}
+        self.not_read: list[str] = []
         self.scale = 1e-3
         self.triangles = 0
         self.node_groups: dict[str, np.ndarray] = {}
@@ -96,6 +102,7 @@ class ModelFile:
         parser.StartElementHandler = self._start
         parser.EndElementHandler = self._end
         parser.CharacterDataHandler = self._characters
+        parser.StartNamespaceDeclHandler = self._declared
         parser.StartDoctypeDeclHandler = self._refuse_doctype
         self._line = lambda: parser.CurrentLineNumber
         try:
@@ -113,6 +120,9 @@ class ModelFile:
 
     def _refuse_doctype(self, *_: Any) -> None:
         raise InputError(f"{self._where}: line {self._line()}: a document type, which 3MF does not allow")
+
+    def _declared(self, prefix: str | None, uri: str) -> None:
+        self._namespaces[prefix or ""] = uri
 
     def _start(self, tag: str, attributes: dict[str, str]) -> None:
         name = tag.rpartition(" ")[2]
@@ -145,6 +155,10 @@ class ModelFile:
         if unit not in UNITS:
             raise InputError(f"{self._where}: line {self._line()}: unit {unit!r}; known: {', '.join(UNITS)}")
         self.scale = UNITS[unit]
+        for prefix in attributes.get("requiredextensions", "").split():
+            uri = self._namespaces.get(prefix, prefix)
+            if not uri.startswith(_KNOWN):
+                self.not_read.append(uri)
 
     def _start_metadata(self, attributes: dict[str, str]) -> None:
         if attributes.get("name", "").partition(":")[2].startswith(GROUP):

@@ -28,6 +28,7 @@ SUFFIXES = (".inp",)
 _REFUSED = ("NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "SYSTEM", "PARAMETER", "SUBSTRUCTURE GENERATE")
 MADE = "_section_"
 """Beginning of the names of element sets that the writer makes for areas."""
+_CONSTRAINTS = ("TIE", "EQUATION", "MPC", "COUPLING", "RIGID BODY", "EMBEDDED ELEMENT", "MULTIPLE POINT CONSTRAINT")
 _SECTIONS = ("SOLID SECTION", "BEAM SECTION", "BEAM GENERAL SECTION")
 
 
@@ -40,10 +41,13 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
         Naming file and line, for any content that is not a mesh of bars.
     """
     model, materials = Model(), Materials()
-    _collect(path, model, materials)
+    constraints = _collect(path, model, materials)
     flat = Flat(path, model)
     mesh = WholeMesh(flat.points, flat.bars, flat.groups("NSET"), dict(flat.groups("ELSET")))
     mesh.warnings = flat.warnings + materials.warnings
+    if constraints:
+        told = "nodes that they connect are joined by `mesh clean` if they are at the same place"
+        mesh.warnings.append(f"{path}: left out {', '.join(constraints)}; {told}")
     found = materials.tables()
     mesh.tables = {"material": found} if found else {}
     _add_sections(mesh, flat, materials)
@@ -56,8 +60,9 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     return mesh
 
 
-def _collect(path: Path, model: Model, materials: Materials) -> None:
-    """Read all keywords up to the first ``*STEP``."""
+def _collect(path: Path, model: Model, materials: Materials) -> list[str]:
+    """Read all keywords up to the first ``*STEP``; return those of constraints, which are left out."""
+    constraints: dict[str, None] = {}
     scope = model.root
     outer = scope
     for block in blocks(path):
@@ -85,6 +90,9 @@ def _collect(path: Path, model: Model, materials: Materials) -> None:
             materials.begin(block)
         elif keyword in MATERIAL_KEYWORDS and not (keyword == "DAMPING" and not block.parameters):
             materials.add(block)
+        elif keyword in _CONSTRAINTS:
+            constraints[f"*{keyword}"] = None
+    return list(constraints)
 
 
 def _entered(block: Block, model: Model) -> Scope:

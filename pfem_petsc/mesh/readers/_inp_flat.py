@@ -103,6 +103,14 @@ class Flat:
         self._groups[kind] = {name.replace("/", "_"): members for name, members in found.items()}
         return self._groups[kind]
 
+    def members_of(self, kind: str, block: Block, target: str) -> np.ndarray:
+        """Return the members (n,) of a set, or that of a label, which a keyword outside of parts names."""
+        key = "*ASSEMBLY" if self._model.instances else ""
+        entry = Entry(block, "", target.strip('"'))
+        if target.isdecimal() and len(target) < 16:
+            return self._labelled(kind, key, np.array([int(target)]), entry)
+        return self._named(kind, key, entry, ())
+
     def sections(self) -> Iterator[tuple[Block, str, np.ndarray]]:
         """Return each section with the name of a bar group, and its bars.
 

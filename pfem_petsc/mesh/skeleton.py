@@ -9,16 +9,17 @@ from typing import Any
 import numpy as np
 
 from ..case.toml import table_text
-from .whole import WholeMesh
+from .whole import WholeMesh, case_tables
 
 __all__ = ["skeleton", "tables_of"]
 
 _STEEL = {"young_modulus": 210e9, "density": 7850.0}
 _AREA = 1e-4
+_CONDITIONS = ("support", "load", "gravity")
 
 
 def tables_of(mesh: WholeMesh) -> tuple[dict[str, Any], list[str]]:
-    """Return the tables ``node_set``, ``material`` and ``section`` of a case, and the keys that the mesh did not tell.
+    """Return the tables of a case, and the keys of sections and materials that the mesh did not tell.
 
     Keys that it did not tell have the values of steel and an area of 1 cm2.
     """
@@ -51,7 +52,8 @@ def tables_of(mesh: WholeMesh) -> tuple[dict[str, Any], list[str]]:
             if len(materials) > 1:
                 made.append(f"section.{name}.material")
     node_sets = {name: {"group": name} for name, members in mesh.node_groups.items() if len(members)}
-    return {"node_set": node_sets, "material": materials, "section": sections}, made
+    conditions = {name: table for name, table in case_tables(mesh.tables).items() if name in _CONDITIONS}
+    return {"node_set": node_sets, "material": materials, "section": sections, **conditions}, made
 
 
 def skeleton(mesh: WholeMesh, file: Path, case: Path) -> str:
@@ -60,15 +62,19 @@ def skeleton(mesh: WholeMesh, file: Path, case: Path) -> str:
     relative = os.path.relpath(file.absolute(), case.absolute().parent)
     lines = [f"# A case for {file.name}. Replace what is not known from it:\n"]
     lines += [f"#   {key}\n" for key in made]
-    lines += ["#   supports, loads, what moves, and the analysis\n\n"]
+    known = [name for name in _CONDITIONS if name in tables]
+    told = "the analysis, which is an explicit one of a millisecond" if known else "supports, loads, and the analysis"
+    lines += [f"#   {told}\n\n"]
     data = {
         "title": file.stem,
         "mesh": {"file": relative},
         **{name: table for name, table in tables.items() if table},
-        "gravity": {"acceleration": [0.0, 0.0, -9.81]},
+        **({} if known else {"gravity": {"acceleration": [0.0, 0.0, -9.81]}}),
         "time": {"integrator": "central_differences", "step": "auto", "end": 1e-3},
     }
     text = table_text(data)
+    if "support" in tables:
+        return "".join(lines) + text
     groups = list(tables["node_set"])
     held = groups[0] if groups else "NAME"
     example = f'\n# [[support]]\n# node_set = "{held}"\n# fix = "xyz"\n'

@@ -249,4 +249,6 @@ def _scaled_keys(keys: dict[str, Any], scale: float) -> dict[str, Any]:
     found = {key: value * scale ** powers[key] if key in powers else value for key, value in keys.items()}
     if "curve" in found:
         found["curve"] = [[strain, stress * scale**-2] for strain, stress in found["curve"]]
+    if "acceleration" in found:
+        found["acceleration"] = [component * scale for component in found["acceleration"]]
     return found

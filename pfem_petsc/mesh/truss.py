@@ -52,7 +52,8 @@ class Truss:
     digest : str
         Identifies the content.
     tables : dict
-        Tables ``material`` and ``section`` of a case, as far as the file had them that the truss was read from.
+        Tables of a case (``material``, ``section``, ``node_set``, ``support``, ``load``, ``gravity``), as far as the
+        file had them that the truss was read from.
     warnings : list of str
         About bars that are far shorter than the others, and what was left out of a file.
 
@@ -138,9 +139,11 @@ class Truss:
     @classmethod
     def from_mesh(cls, mesh: WholeMesh) -> Truss:
         """Return the truss of a mesh that a reader has returned; its tables and warnings are kept."""
+        from .whole import case_tables
+
         groups: dict[str, Any] = {"node_groups": mesh.node_groups, "bar_groups": mesh.bar_groups}
         truss = cls(mesh.points, mesh.bars, **groups, bar_fields=mesh.bar_fields, source=mesh.source)
-        truss.tables = mesh.tables
+        truss.tables = case_tables(mesh.tables)
         truss.warnings = mesh.warnings + truss.warnings
         return truss
 
@@ -153,7 +156,8 @@ class Truss:
             {name: rows.copy() for name, rows in table.items()}
             for table in (self.node_groups, self.bar_groups, self.bar_fields)
         ]
-        return WholeMesh(self.points.copy(), self.bars.copy(), *groups, tables=dict(self.tables))
+        tables = {name: dict(self.tables[name]) for name in ("material", "section") if name in self.tables}
+        return WholeMesh(self.points.copy(), self.bars.copy(), *groups, tables=tables)
 
     def write(self, path: Path | str) -> Path:
         """Write the truss to a file, whose suffix chooses the format; ``docs/meshes.md`` lists them.

@@ -14,7 +14,7 @@ from ..errors import InputError
 from ..parallel.agreement import agreed
 from .slab import MeshSlab, check_size, slab_range
 
-__all__ = ["WholeMesh", "read_and_scatter", "scattered"]
+__all__ = ["WholeMesh", "case_tables", "read_and_scatter", "scattered"]
 
 
 @dataclass
@@ -30,12 +30,25 @@ class WholeMesh:
     bar_fields: dict[str, np.ndarray] = field(default_factory=dict)
     """(n_bars,) float64; the field ``area`` has the areas of cross-sections [m2]."""
     tables: dict[str, dict[str, Any]] = field(default_factory=dict)
-    """What a file has besides the mesh, as the tables ``material`` and ``section`` of a case: keys by name."""
+    """What a file has besides the mesh: ``material``, ``section``, ``support`` and ``load`` (by node group), and
+    ``gravity``, each with the keys of a case by name."""
     warnings: list[str] = field(default_factory=list)
     known_fields: list[str] | None = None
     """Names of all fields of a file; None: those in ``bar_fields``."""
     source: str = "mesh"
     """The file, for messages."""
+
+
+def case_tables(tables: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """Return tables of a mesh in the form that a case takes: lists of supports and loads, and their node sets."""
+    found: dict[str, Any] = {name: table for name, table in tables.items() if name in ("material", "section")}
+    for name in ("support", "load"):
+        if tables.get(name):
+            found[name] = list(tables[name].values())
+            found.setdefault("node_set", {}).update({own: {"group": own} for own in tables[name]})
+    for table in tables.get("gravity", {}).values():
+        found["gravity"] = table
+    return found
 
 
 def read_and_scatter(read: Callable[[Path], WholeMesh], path: Path, comm: MPI.Comm) -> MeshSlab:

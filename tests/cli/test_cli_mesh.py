@@ -37,8 +37,9 @@ def test_a_file_in_millimetres_becomes_a_case_that_runs(mesh, tmp_path):
     assert case.material["Steel"].young_modulus == pytest.approx(2.1e11)
     assert case.section["Legs"].area == pytest.approx(314.159265e-6) and case.section["Braces"].bars == "Braces"
     assert set(case.node_set) == {"Feet", "Head"}
-    support = [{"node_set": "Feet", "fix": "xyz"}]
-    with Simulation(case.copy({"support": support, "time.end": 1e-4}), output=tmp_path / "out", quiet=True) as run:
+    assert [(entry.node_set, entry.fix) for entry in case.support] == [("Feet", "xyz")]
+    assert case.load[0].force == (250.0, 0.0, -1000.0) and case.gravity.acceleration == pytest.approx((0, 0, -9.81))
+    with Simulation(case.copy({"time.end": 1e-4}), output=tmp_path / "out", quiet=True) as run:
         run.run()
         mass = run.model.total_mass
     truss = Truss.read("tower.vtu")
@@ -125,7 +126,10 @@ def test_a_case_for_a_mesh_that_tells_nothing(mesh):
         (["picture", MESHES / "ring.msh", "--size", "9x9"], "'9x9' is not a size in pixels"),
         (["picture", MESHES / "ring.msh", "--view", "top"], "view = 'top' is not known"),
         (["generate", "rod", "a.h5"], "mesh generate rod: mesh.length: this key is missing"),
-        (["generate", "rod", "a.h5", "--set", "pitch=1"], "mesh.pitch (given by --set): unknown key"),
+        (
+            ["generate", "rod", "a.h5", "--set", "pitch=1"],
+            "mesh.pitch (given by --set): a key of lattice, not of generator rod",
+        ),
         (["generate", "rood", "a.h5"], "rood"),
         (["generate", "rod", "a.xyz", "--set", "length=1", "elements=2"], "no writer for .xyz"),
     ],

@@ -10,10 +10,11 @@ import signal
 from pathlib import Path
 
 import pfem_petsc
+from pfem_petsc import Truss
 from pfem_petsc.case.builtin import built_in_cases
 from pfem_petsc.cli.main import main
 
-from .samples import GMSH, write_hdf5, write_vtk
+from .samples import BARS, GMSH, LEGS, POINTS, TOP, write_hdf5, write_vtk
 
 # A refusal must name, besides the file, a key or line of a case, or a section, line, dataset, node or bar of a mesh.
 OF_A_CASE = re.compile(
@@ -150,6 +151,15 @@ def sound_meshes(folder: Path) -> list[Path]:
     for name, write in (("mesh.h5", write_hdf5), ("mesh.vtu", write_vtk), ("mesh.vtkhdf", write_vtk)):
         write(folder / name)
         found.append(folder / name)
+    truss = Truss(POINTS, BARS, node_groups={"top": TOP}, bar_groups={"legs": LEGS}, bar_fields={"area": [1e-4] * 6})
+    found += [truss.write(folder / name) for name in ("mesh.inp", "mesh.3mf", "mesh_nodes.csv")]
+    found.append(found[-1].with_name("mesh_bars.csv"))
+    found.append(folder / "parts.inp")
+    tower = Path(pfem_petsc.__file__).parents[1] / "meshes" / "tower.inp"
+    found[-1].write_text(tower.read_text().replace("1000.\n          0.", "1001.\n          0."))
+    corners = "\n".join(f"vertex {x} {y} {z}" for x, y, z in POINTS[[0, 1, 2, 0, 1, 3]])
+    found.append(folder / "mesh.stl")
+    found[-1].write_text(f"solid\nfacet normal 0 0 1\nouter loop\n{corners}\nendloop\nendfacet\nendsolid\n")
     return found
 
 
@@ -202,6 +212,8 @@ def try_one(seed: int, folder: Path, texts: list[str], meshes: list[Path]) -> tu
         kind, said = verdict(path, OF_A_CASE)
         return ("bad", f"names neither key nor line: {said}") if kind == "file alone" else (kind, said)
     sound = chance.choice(meshes)
+    for pair in sound.parent.glob("*.csv"):
+        (folder / pair.name).write_bytes(pair.read_bytes())
     (folder / sound.name).write_bytes(mutated_bytes(sound.read_bytes(), chance))
     path.write_text(CASE_OF_A_MESH.format(name=sound.name))
     return verdict(path, OF_A_MESH)

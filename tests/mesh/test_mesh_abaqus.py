@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pfem_petsc import Truss
+from pfem_petsc import Case, Truss
 from pfem_petsc.errors import InputError
 from pfem_petsc.mesh.readers import read_whole
 
@@ -83,6 +83,7 @@ def test_written_by_hand(tmp_path, ends):
         "Top": [2, 3],
         "Feet": [0, 1, 2],
         "every one": [0, 1, 2, 3],
+        "node_21": [3],  # of *CLOAD
     }
     assert members(mesh.bar_groups) == {"Base": [0, 1, 2], "LEGS": [3, 4, 5], "some": [0, 3]}
     assert mesh.bar_fields["area"].tolist() == [1e-4] * 3 + [2e-4] * 3
@@ -241,7 +242,7 @@ def test_sections_of_beams(tmp_path, text):
         ("2, 10, 7", "1, 10, 7", r"\*ELEMENT: element 1 is listed more than once"),
         ("TYPE=t3d2,\n   ELSET=Base", "ELSET=Base", r"line 11: \*ELEMENT: the parameter TYPE= is missing"),
         ("NSET=Top", "NAME=Top", r"line 21: \*NSET: the parameter NSET= is missing"),
-        ("top, FEET", "top, FEED", r"line 25: \*NSET: 'FEED' is neither a number nor a node set"),
+        ("top, FEET", "top, FEED", r"line 25: \*NSET: 'FEED' is neither a number nor an existing node set"),
         ("top, FEET", "every one", r"line 25: \*NSET: set every one includes itself"),
         ("1, 11, 5", "11, 1, 5", r"line 29: \*ELSET: 11, 1, 5 are not first, last and step"),
         ("1, 11, 5", "1, 11, 5, 7", r"line 30: \*ELSET: .* has 4 values; expected 2 to 3"),
@@ -264,6 +265,83 @@ def test_one_thing_wrong(tmp_path, old, new, text):
 def test_members_that_are_not_there_are_told(tmp_path):
     mesh = read_whole(written(tmp_path, FLAT.replace("*NSET, NSET=Top\n21,", "*NSET, NSET=Top\n21, 22, 23")))
     assert mesh.warnings[0].endswith("2 members of node sets are not there, and are left out")
+
+
+def test_supports_and_loads(tmp_path):
+    """Of sets, labels and instances; degrees of freedom in ranges; what a case cannot have is told."""
+    step = """*BOUNDARY
+feet, 1, 2
+Feet, 3
+7, ENCASTRE
+10, YSYMM
+21, 4, 6
+*STEP
+*BOUNDARY
+Top, 1, 3, 0.5
+*CLOAD
+21, 3, -1.D1
+Top, 1, 2.
+21, 3, -5.
+Top, 4, 1.
+*DLOAD
+ALLE, GRAV, 9.81, 0., 0., -1.
+, GRAV, 1., 2., 0., 0.
+LEGS, GRAV, 1., 1., 0., 0.
+LEGS, P1, 1.
+*NODE
+99, 0, 0, 0
+*END STEP
+*STEP
+*CLOAD
+21, 1, 77.
+"""
+    text = FLAT.partition("*STEP")[0].replace("*MATERIAL", "*ELSET, ELSET=ALLE\nBase, LEGS\n*MATERIAL") + step
+    mesh = read_whole(written(tmp_path, text))
+    assert len(mesh.points) == 4
+    assert mesh.tables["support"] == {
+        "Feet": {"node_set": "Feet", "fix": "xyz"},
+        "node_7": {"node_set": "node_7", "fix": "xyz"},
+        "node_10": {"node_set": "node_10", "fix": "y"},
+    }
+    assert mesh.tables["load"] == {
+        "node_21": {"node_set": "node_21", "force": [0.0, 0.0, -15.0]},
+        "Top": {"node_set": "Top", "force": [2.0, 0.0, 0.0]},
+    }
+    assert mesh.tables["gravity"]["gravity"]["acceleration"] == pytest.approx([2.0, 0.0, -9.81])
+    assert mesh.node_groups["node_10"].tolist() == [1] and mesh.node_groups["node_21"].tolist() == [3]
+    told = [text.partition("a.inp: ")[2] for text in mesh.warnings[1:]]
+    assert told == [
+        "line 54: *BOUNDARY: 'Top, 1, 3, 0.5' is left out: prescribed displacements are those of the case",
+        "line 59: *CLOAD: 'Top, 4, 1.' is left out: only forces along x, y and z are read",
+        "line 63: *DLOAD: 'LEGS, GRAV, 1., 1., 0., 0.' is left out: the gravity of a case acts on all bars",
+        "line 64: *DLOAD: 'LEGS, P1, 1.' is left out: only GRAV is read of distributed loads",
+    ]
+    case = Case(Truss.read(tmp_path / "a.inp").tables, mesh=Truss.read(tmp_path / "a.inp"), static={"step": 1.0})
+    assert [support.fix for support in case.support] == ["xyz", "xyz", "y"]
+    assert case.node_set["node_21"].group == "node_21"
+
+
+def test_conditions_of_an_assembly(tmp_path):
+    mesh = read_whole(MESHES / "tower.inp")
+    assert mesh.tables["support"] == {"Feet": {"node_set": "Feet", "fix": "xyz"}}
+    assert mesh.tables["load"] == {"Head": {"node_set": "Head", "force": [250.0, 0.0, -1000.0]}}
+    text = (MESHES / "tower.inp").read_text().replace("Feet, PINNED", "Storey-2.13, 2, 3\nStorey-1.11, XASYMM")
+    mesh = read_whole(written(tmp_path, text))
+    assert (
+        mesh.tables["support"]["node_Storey-2.13"]["fix"] == "yz" == mesh.tables["support"]["node_Storey-1.11"]["fix"]
+    )
+    assert mesh.node_groups["node_Storey-2.13"].tolist() == [14] and mesh.warnings == []
+    with pytest.raises(InputError, match="line 79: .*BOUNDARY: 'Foot' is neither a number nor an existing node set"):
+        read_whole(written(tmp_path, (MESHES / "tower.inp").read_text().replace("Feet, PIN", "Foot, PIN")))
+
+
+def test_nodes_of_element_sets_and_constraints(tmp_path):
+    more = "*NSET, NSET=of legs, ELSET=LEGS\n*TIE, NAME=t\na, b\n*MPC\n*TIE, NAME=u\nc, d\n*MATERIAL"
+    mesh = read_whole(written(tmp_path, FLAT.replace("*MATERIAL", more)))
+    assert mesh.node_groups["of legs"].tolist() == [0, 1, 2, 3]
+    assert mesh.warnings[-1].startswith(f"{tmp_path}/a.inp: left out *TIE, *MPC; nodes that they connect")
+    with pytest.raises(InputError, match="'LEX' is neither a number nor an existing element set"):
+        read_whole(written(tmp_path, FLAT.replace("*MATERIAL", more.replace("LEGS", "LEX"))))
 
 
 def test_plastic_curves_that_no_law_has_are_told(tmp_path):

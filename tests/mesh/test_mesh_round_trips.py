@@ -1,5 +1,6 @@
 """A truss that is written in any format and read back is the same truss; so are files of other programs."""
 
+import re
 import zipfile
 from types import SimpleNamespace
 
@@ -117,6 +118,20 @@ def test_gmsh_and_vtk_as_meshio_reads_them(tmp_path):
         lines = [block.data for block in mesh.cells if block.type == "line"]
         found = {tuple(sorted(bar)) for bar in np.concatenate(lines).tolist()}
         assert found == {tuple(sorted(bar)) for bar in truss.bars.tolist()}
+
+
+def test_abaqus_as_meshio_reads_it(tmp_path):
+    meshio = pytest.importorskip("meshio")
+    truss = irregular()
+    mesh = meshio.read(truss.write(tmp_path / "t.inp"))
+    np.testing.assert_array_equal(mesh.points, truss.points)
+    np.testing.assert_array_equal(mesh.cells_dict["line"], truss.bars)
+    assert mesh.point_sets["top"].tolist() == [2, 7, 11]
+    assert [members.tolist() for members in mesh.cell_sets["legs"]] == [[3, 4, 5]]
+    with open(tmp_path / "t.inp") as file:
+        areas = re.findall(r"^\*SOLID SECTION, ELSET=(\S+)\n(\S+),$", file.read(), flags=re.MULTILINE)
+    for name, area in areas:
+        assert (truss.bar_fields["area"][mesh.cell_sets[name][0]] == float(area)).all()
 
 
 def test_vtkhdf_as_pyvista_reads_it(tmp_path):
@@ -263,6 +278,9 @@ def three_mf(path, model=MODEL, name="3D/part.model"):
 
 def test_3mf_of_another_program(tmp_path):
     """Millimetres, radii of the lattice and of beams, components and transforms."""
+    required = MODEL.replace('requiredextensions="bl"', 'xmlns:v="urn:volumes" requiredextensions="bl v"')
+    *_, told = [w for w in read_whole(three_mf(tmp_path / "p.3mf", required)).warnings if "extension" in w]
+    assert told.endswith("requires the extension urn:volumes, which is not read")
     mesh = read_whole(three_mf(tmp_path / "p.3mf"))
     expected = np.array([[0, 0, 5], [20, 0, 5], [0, 20, 5], [200, 0, 5], [200, 20, 5], [180, 0, 5]]) * 1e-3
     np.testing.assert_allclose(mesh.points, expected, atol=1e-16)
@@ -280,12 +298,13 @@ def test_3mf_of_another_program(tmp_path):
         ('unit="millimeter"', 'unit="yard"', r"line 2: unit 'yard'; known: micron"),
         ('v1="1" v2="2"', 'v2="2"', r"line 10: the attribute 'v1' is missing"),
         ('v1="1" v2="2"', 'v1="1" v2="8"', r"object 4: beams: vertex 8 is not there; they are numbered from 0 to 3"),
-        ('x="10"', 'x="ten"', r"object 4: a vertex: 'ten 0 0' are not numbers"),
+        ('x="10"', 'x="ten"', r"object 4: a vertex: 'ten 0 0' are not 3 numbers"),
+        ('v1="1" v2="2"', 'v1="" v2="2"', r"object 4: a beam: ' 2 0.5 0.5' are not 4 numbers"),
         ('r1="0.5"', 'r1="-1"', r"object 4: beam 1 has no radius .* that is positive"),
         ('<bl:ref index="1"/>', '<bl:ref index="3"/>', r"beamset thin: beam 3 is not there"),
         ('objectid="5"', 'objectid="9"', r"there is no object 9"),
         ('<component objectid="4"/>', '<component objectid="5"/>', r"object 5 is a component of itself"),
-        ("2 0 0 0 2 0 0 0 2 0 0 5", "2 0 0", r"line 16: transform has 3 numbers; expected 12"),
+        ("2 0 0 0 2 0 0 0 2 0 0 5", "2 0 0", r"line 16: transform: '2 0 0' are not 12 numbers"),
         ("</resources>", "", r"mismatched tag: line 17"),
         ("<model", '<!DOCTYPE model [<!ENTITY a "b">]><model', r"a document type, which 3MF does not allow"),
         ('objectid="5" t', 'objectid="5" p:path="/3D/o.model" xmlns:p="u" t', r"in another part of the file"),

@@ -1,7 +1,10 @@
 """Any mesh file is read, or refused with a message that names the file."""
 
+import random
+
 import numpy as np
 import pytest
+from helpers.mutations import mutated_bytes, sound_meshes
 from helpers.samples import BARS, GMSH, POINTS, write_hdf5, write_vtk
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
@@ -239,3 +242,29 @@ def test_read_only_the_own_slab_of_hdf5(tmp_path):
     np.testing.assert_array_equal(slab.points, POINTS[2:3])
     np.testing.assert_array_equal(slab.bars, BARS[2:4])
     assert slab.bar_groups["legs"].tolist() == [3]
+
+
+@pytest.mark.parametrize("name", ["mesh.inp", "parts.inp", "mesh.3mf", "mesh_bars.csv", "mesh_nodes.csv", "mesh.stl"])
+def test_changed_files_of_other_programs_are_read_or_refused(tmp_path, name):
+    sound_meshes(tmp_path)
+    content = (tmp_path / name).read_bytes()
+    for seed in range(150):
+        (tmp_path / name).write_bytes(mutated_bytes(content, random.Random(seed)))
+        try:
+            slab = read_slab(tmp_path / name, ALONE)
+            check_mesh(slab, ALONE)
+        except InputError as error:
+            assert str(tmp_path) in str(error)
+        else:
+            assert len(slab.points) == slab.n_nodes > 0
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("name", ["a.inp", "a.stl", "a.3mf", "a.msh"])
+def test_all_ranks_refuse(comm, shared_tmp_path, name):
+    if comm.rank == 0:
+        (shared_tmp_path / name).write_text("*NODE\n1, zero\n" if name == "a.inp" else "x,y\n")
+    comm.Barrier()
+    with pytest.raises(InputError, match=rf"{name}: ") as caught:
+        read_slab(shared_tmp_path / name, comm)
+    assert len(set(comm.allgather(str(caught.value)))) == 1

@@ -98,6 +98,27 @@ def test_vtk_with_other_cells_between_the_lines(comm, shared_tmp_path):
     check_sample(whole(slab, comm), ("group_2",), ("section_1",))
 
 
+def test_vtk_with_lines_of_several_points(comm, shared_tmp_path):
+    """A line of n points is n - 1 bars, each with the group and the numbers of the line."""
+
+    def write(path):
+        import pyvista
+
+        cells = [5, 0, 1, 2, 0, 3, 2, 3, 1, 2, 2, 3]
+        grid = pyvista.UnstructuredGrid(cells, np.array([4, 3, 3], np.uint8), POINTS)
+        grid.cell_data["section"] = np.array([0, 1, 1], np.int32)
+        grid.cell_data["area"] = np.array([1.0, 2.0, 3.0])
+        grid.save(path)
+
+    path = written(comm, shared_tmp_path, "lines.vtu", write)
+    slab = load_slab(SimpleNamespace(generator=None, file=path), comm, {"area": "area_field"})
+    mesh = whole(slab, comm)
+    check_sample(mesh, (), ())
+    assert sorted(mesh.bar_groups["section_0"].tolist()) == [0, 1, 2, 3]
+    areas = np.concatenate(comm.allgather(slab.bar_fields["area"]))
+    assert areas.tolist() == [1.0, 1.0, 1.0, 1.0, 2.0, 3.0] and slab.warnings == []
+
+
 def test_hdf5_of_another_writer(comm, shared_tmp_path):
     check_sample(whole(read(written(comm, shared_tmp_path, "truss.h5", write_hdf5), comm), comm))
 
@@ -157,13 +178,13 @@ def test_the_other_meshes_in_the_repository_are_braced_trusses(comm, name, nodes
         ("ring.vtu", "there is no file .*ring.vtu, did you mean 'ring.msh'"),
         ("house.vtu", "there is no file .*house.vtu; that folder has ring.msh"),
         ("sub/ring.msh", "there is no file .*sub/ring.msh: there is no folder .*sub"),
-        ("ring.stl", "no reader for 'ring.stl'; known.*.msh"),
+        ("ring.dxf", "no reader for 'ring.dxf'; known.*.msh"),
         ("ring.geo", "no reader for 'ring.geo'; .*; this is a geometry: mesh it by `gmsh -1 ring.geo -o ring.msh`"),
         ("ring.vtk", "no reader for 'ring.vtk'; .*; convert it by `meshio convert ring.vtk ring.vtu`"),
     ],
 )
 def test_files_that_are_not_there_or_not_known(comm, shared_tmp_path, name, text):
-    for there in ("ring.msh", "ring.stl", "ring.geo", "ring.vtk"):
+    for there in ("ring.msh", "ring.dxf", "ring.geo", "ring.vtk"):
         written(comm, shared_tmp_path, there, b"solid")
     with pytest.raises(InputError, match=text):
         read_slab(shared_tmp_path / name, comm)

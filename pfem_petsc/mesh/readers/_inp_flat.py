@@ -103,6 +103,14 @@ class Flat:
         self._groups[kind] = {name.replace("/", "_"): members for name, members in found.items()}
         return self._groups[kind]
 
+    def members_of(self, kind: str, block: Block, target: str) -> np.ndarray:
+        """Return the members (n,) of a set, or that of a label, which a keyword outside of parts names."""
+        key = "*ASSEMBLY" if self._model.instances else ""
+        entry = Entry(block, "", target.strip('"'))
+        if target.isdecimal() and len(target) < 16:
+            return self._labelled(kind, key, np.array([int(target)]), entry)
+        return self._named(kind, key, entry, ())
+
     def sections(self) -> Iterator[tuple[Block, str, np.ndarray]]:
         """Return each section with the name of a bar group, and its bars.
 
@@ -136,7 +144,10 @@ class Flat:
         parts = [np.empty(0, np.int64)]
         for entry in table.entries:
             here = entry.instance.upper() or key
-            if isinstance(entry.what, str):
+            if entry.of_elements:
+                bars = self._named("ELSET", here, entry, ())
+                parts.append(np.unique(self.bars[bars]))
+            elif isinstance(entry.what, str):
                 parts.append(self._named(kind, here, entry, (*above, f"{key}.{table.name.upper()}")))
             elif entry.what.size:
                 parts.append(self._labelled(kind, here, entry.what, entry))
@@ -149,9 +160,12 @@ class Flat:
         if placed is None:
             placed = _nothing(self._model.assembly)
         known, at = (placed.nodes, placed.nodes_at) if kind == "NSET" else (placed.bars, placed.bars_at)
+        if entry.generated:
+            first, last, step = labels.tolist()
+            labels = known[(known >= first) & (known <= last) & ((known - first) % step == 0)]
         place = np.minimum(np.searchsorted(known, labels), max(len(known) - 1, 0))
         there = known[place] == labels if len(known) else np.zeros(len(labels), bool)
-        if not entry.generated and (kind == "NSET" or not self._model.left_out):
+        if kind == "NSET" or not self._model.left_out:
             self._lost[id(entry)] = int((~there).sum())
         members = at[place[there]] if len(known) else at
         if kind == "NSET":
@@ -165,13 +179,13 @@ class Flat:
         instance, dot, rest = name.partition(".")
         if dot and instance.upper() in self._placed:
             key, name = instance.upper(), rest
-            if name.isdigit():
-                return self._labelled(kind, key, np.array([int(name)]), entry)
+            if name.isdecimal() and len(name) < 16:
+                return self._labelled(kind, key, np.array([int(name)]), replace(entry, generated=False))
         scope = self._model.assembly if key == "*ASSEMBLY" else self._placed[key].scope if key in self._placed else None
         table = None if scope is None else _sets(scope, kind).get(name.upper())
         if table is None:
             what = {"NSET": "node", "ELSET": "element"}[kind]
-            raise InputError(f"{entry.block.where}: {name!r} is neither a number nor a {what} set")
+            raise InputError(f"{entry.block.where}: {name!r} is neither a number nor an existing {what} set")
         if f"{key}.{name.upper()}" in above:
             raise InputError(f"{entry.block.where}: set {name} includes itself")
         return self._members(kind, key, table, above)

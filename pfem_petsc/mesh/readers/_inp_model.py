@@ -39,7 +39,9 @@ class Entry:
     what: np.ndarray | str
     """Labels (n,), or the name of a set."""
     generated: bool = False
-    """Whether not all labels need exist."""
+    """Whether ``what`` is first, last and step of labels, of which not all need exist."""
+    of_elements: bool = False
+    """Whether ``what`` is an element set, whose nodes they are."""
 
 
 @dataclass
@@ -106,7 +108,7 @@ class Model:
         least = 2 + ends[1]
         rows = block.rows(least + 2, least)[:, :least]
         labels = _labels(rows[:, 0], block, "element")
-        nodes = _labels(rows[:, 1:].ravel(), block, "node").reshape(len(rows), -1)
+        nodes = _labels(rows[:, 1:].ravel(), block, "node").reshape(len(rows), least - 1)
         scope.elements.append((block, labels, nodes[:, list(ends)]))
         if note:
             self.notes[f"{kind}: {note}"] = self.notes.get(f"{kind}: {note}", 0) + len(rows)
@@ -118,11 +120,14 @@ class Model:
         sets = scope.nsets if kind == "NSET" else scope.elsets
         name, instance = block.required(kind), block.get("INSTANCE")
         scope.add_to(sets, name, Entry(block, instance, np.empty(0, np.int64)))
+        if kind == "NSET" and block.get("ELSET"):
+            scope.add_to(sets, name, Entry(block, instance, block.get("ELSET"), of_elements=True))
+            return
         if "GENERATE" in block.parameters:
             for first, last, step in _labels(_filled(block), block, "member").reshape(-1, 3).tolist():
-                if step < 1 or last < first or (last - first) // step > 10**9:
+                if step < 1 or last < first:
                     raise InputError(f"{block.where}: {first}, {last}, {step} are not first, last and step")
-                labels = np.arange(first, last + 1, step, dtype=np.int64)
+                labels = np.array([first, last, step])
                 scope.add_to(sets, name, Entry(block, instance, labels, generated=True))
             return
         numbers = block.numbers()
@@ -130,10 +135,10 @@ class Model:
             scope.add_to(sets, name, Entry(block, instance, _labels(numbers, block, "member")))
             return
         for _, _, words in block.words():
-            whole = [int(word) for word in words if word.isdigit()]
-            scope.add_to(sets, name, Entry(block, instance, np.array(whole, np.int64)))
+            whole = np.array([float(word) for word in words if word.isdecimal()])
+            scope.add_to(sets, name, Entry(block, instance, _labels(whole, block, "member")))
             for word in words:
-                if word and not word.isdigit():
+                if word and not word.isdecimal():
                     scope.add_to(sets, name, Entry(block, instance, word.strip('"')))
 
 

@@ -19,6 +19,8 @@ UNITS = {"micron": 1e-6, "millimeter": 1e-3, "centimeter": 1e-2, "inch": 0.0254,
 CORE = "http://schemas.microsoft.com/3dmanufacturing/core/2015/02"
 LATTICE = "http://schemas.microsoft.com/3dmanufacturing/beamlattice/2017/02"
 
+_KNOWN = "http://schemas.microsoft.com/3dmanufacturing/beamlattice/"
+
 GROUP = "node_group."
 """Beginning of the local names of metadata with a node group: name and numbers from 0, separated by a line break."""
 
@@ -38,10 +40,10 @@ class Lattice:
 
     def finish(self, where: str) -> None:
         """Convert texts to arrays: ``points`` (n, 3), ``ends`` (n, 2), ``radii`` (n, 2), ``sets`` by name."""
-        self.points = _numbers(self.vertices, f"{where}: a vertex").reshape(-1, 3)
+        self.points = _numbers(self.vertices, f"{where}: a vertex", 3).reshape(-1, 3)
         radius = self.radius or "nan"
         texts = [(a, b, one or radius, two or one or radius) for a, b, one, two in self.beams]
-        table = _numbers([" ".join(row) for row in texts], f"{where}: a beam").reshape(-1, 4)
+        table = _numbers([" ".join(row) for row in texts], f"{where}: a beam", 4).reshape(-1, 4)
         self.ends, self.radii = _whole(table[:, :2], len(self.points), f"{where}: beams: vertex"), table[:, 2:]
         if not (self.radii >= 0.0).all():
             bad = int(np.flatnonzero(~(self.radii >= 0.0).all(axis=1))[0])
@@ -66,6 +68,8 @@ class ModelFile:
     ----------
     scale : float
         Metres in the unit of the file.
+    not_read : list of str
+        Namespaces of extensions that the file requires, and that are not read.
     triangles : int
         Number of triangles.
     node_groups : dict
@@ -79,6 +83,8 @@ class ModelFile:
         self._current = Lattice("")
         self._text: list[str] | None = None
         self._texts: list[str] = []
+        self._namespaces: dict[str, str] = {}
+        self.not_read: list[str] = []
         self.scale = 1e-3
         self.triangles = 0
         self.node_groups: dict[str, np.ndarray] = {}
@@ -96,6 +102,7 @@ class ModelFile:
         parser.StartElementHandler = self._start
         parser.EndElementHandler = self._end
         parser.CharacterDataHandler = self._characters
+        parser.StartNamespaceDeclHandler = self._declared
         parser.StartDoctypeDeclHandler = self._refuse_doctype
         self._line = lambda: parser.CurrentLineNumber
         try:
@@ -113,6 +120,9 @@ class ModelFile:
 
     def _refuse_doctype(self, *_: Any) -> None:
         raise InputError(f"{self._where}: line {self._line()}: a document type, which 3MF does not allow")
+
+    def _declared(self, prefix: str | None, uri: str) -> None:
+        self._namespaces[prefix or ""] = uri
 
     def _start(self, tag: str, attributes: dict[str, str]) -> None:
         name = tag.rpartition(" ")[2]
@@ -145,6 +155,10 @@ class ModelFile:
         if unit not in UNITS:
             raise InputError(f"{self._where}: line {self._line()}: unit {unit!r}; known: {', '.join(UNITS)}")
         self.scale = UNITS[unit]
+        for prefix in attributes.get("requiredextensions", "").split():
+            uri = self._namespaces.get(prefix, prefix)
+            if not uri.startswith(_KNOWN):
+                self.not_read.append(uri)
 
     def _start_metadata(self, attributes: dict[str, str]) -> None:
         if attributes.get("name", "").partition(":")[2].startswith(GROUP):
@@ -180,9 +194,7 @@ class ModelFile:
         text = attributes.get("transform")
         if text is None:
             return np.eye(4, 3)
-        values = _numbers([text], f"{self._where}: line {self._line()}: transform")
-        if len(values) != 12:
-            raise InputError(f"{self._where}: line {self._line()}: transform has {len(values)} numbers; expected 12")
+        values = _numbers([text], f"{self._where}: line {self._line()}: transform", 12)
         return values.reshape(4, 3)
 
     def placed(self) -> Iterator[tuple[str, Lattice, np.ndarray]]:
@@ -203,20 +215,25 @@ class ModelFile:
             yield from self._within(other, np.vstack([inner[:3] @ place[:3], move]), depth + 1)
 
 
-def _numbers(texts: list[str], what: str) -> np.ndarray:
+def _numbers(texts: list[str], what: str, width: int = 0) -> np.ndarray:
+    """Return the numbers of texts, each with ``width`` of them; 0: any number."""
     try:
         values = numbers_of(" ".join(texts).encode())
     except ValueError:
-        wrong = next((text for text in texts if not _are_numbers(text)), "")
-        raise InputError(f"{what}: {wrong[:60]!r} are not numbers") from None
+        values = np.empty(0)
+        width = width or -1
+    if (width and len(values) != width * len(texts)) or width < 0:
+        wrong = next((text for text in texts if not _are_numbers(text, width)), "")
+        raise InputError(f"{what}: {wrong[:60]!r} are not {'' if width < 0 else f'{width} '}numbers")
     return values
 
 
-def _are_numbers(text: str) -> bool:
+def _are_numbers(text: str, width: int) -> bool:
     try:
-        return len([float(word) for word in text.split()]) > 0
+        found = len([float(word) for word in text.split()])
     except ValueError:
         return False
+    return found > 0 if width < 0 else found == width
 
 
 def _whole(values: np.ndarray, n: int, what: str) -> np.ndarray:

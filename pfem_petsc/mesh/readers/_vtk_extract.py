@@ -15,7 +15,7 @@ import numpy as np
 
 REFUSED = 3
 
-_VTK_LINE = 3
+_VTK_LINE, _VTK_POLY_LINE = 3, 4
 _ARRAYS = ("group", "section")
 _MASK = "group:"
 ALL = "*"
@@ -72,24 +72,30 @@ def _arrays(grid: Any, fields: tuple[str, ...]) -> dict[str, np.ndarray]:
         raise ValueError(f"{n_nodes} points and {n_cells} cells: not a mesh of bars, or a damaged file")
     types = grid.GetDistinctCellTypesArray()
     found = sorted(types.GetValue(i) for i in range(types.GetNumberOfTuples()))
-    if _VTK_LINE not in found:
+    if not set(found) & {_VTK_LINE, _VTK_POLY_LINE}:
         raise ValueError(f"cells of types {found}; bars are lines (type {_VTK_LINE}), and there are none")
-    lines = np.flatnonzero(vtk_to_numpy(grid.GetCellTypesArray()) == _VTK_LINE)
+    kinds = vtk_to_numpy(grid.GetCellTypesArray())
+    cells = np.flatnonzero((kinds == _VTK_LINE) | (kinds == _VTK_POLY_LINE))
     ends = vtk_to_numpy(grid.GetCells().GetConnectivityArray())
-    offsets = vtk_to_numpy(grid.GetCells().GetOffsetsArray())
-    first = offsets[lines]
-    if np.any(offsets[lines + 1] - first != 2) or first.min() < 0 or first.max() > len(ends) - 2:
+    offsets = vtk_to_numpy(grid.GetCells().GetOffsetsArray()).astype(np.int64)
+    first, size = offsets[cells], offsets[cells + 1] - offsets[cells]
+    if np.any((size != 2) & (kinds[cells] == _VTK_LINE)) or np.any(size < 2):
         raise ValueError("lines that have not two ends; a bar has two")
+    if first.min() < 0 or (first + size).max() > len(ends):
+        raise ValueError("lines whose nodes are not there: a damaged file")
+    # a line of several points is as many bars less one: the cell of each bar, and where its ends are listed
+    lines = np.repeat(cells, size - 1)
+    place = np.arange(len(lines)) - np.repeat(np.cumsum(size - 1) - (size - 1), size - 1) + np.repeat(first, size - 1)
     arrays = {
         "points": vtk_to_numpy(grid.GetPoints().GetData()).astype(np.float64),
-        "bars": ends[first[:, None] + np.array([0, 1])].astype(np.int64),
-        "left_out": np.array(n_cells - len(lines)),
+        "bars": ends[place[:, None] + np.array([0, 1])].astype(np.int64),
+        "left_out": np.array(n_cells - len(cells)),
     }
     for kind, data, kept in (("node_groups", grid.GetPointData(), None), ("bar_groups", grid.GetCellData(), lines)):
         for name, members in _groups(data, grid.GetFieldData(), kept).items():
             arrays[f"{kind}/{name}"] = members
-    cells = grid.GetCellData()
-    known = [cells.GetArray(i) for i in range(cells.GetNumberOfArrays())]
+    data = grid.GetCellData()
+    known = [data.GetArray(i) for i in range(data.GetNumberOfArrays())]
     known = {a.GetName(): a for a in known if a is not None and a.GetName() and a.GetNumberOfComponents() == 1}
     known = {name: a for name, a in known.items() if not name.startswith(_MASK)}
     arrays["cell_fields"] = np.array(list(known), dtype=str)

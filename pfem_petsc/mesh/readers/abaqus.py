@@ -2,8 +2,8 @@
 
 T3D2 and T2D2 are bars; other trusses and beams are read as bars with a warning, other elements are left out with
 one. Node sets and element sets are groups. Sections give the bar field ``area``; sections and materials are tables of
-a case. Included files are read. Keywords that generate nodes and elements are refused; what follows ``*STEP`` is not
-read.
+a case, as are fixed nodes, nodal forces and gravity up to the end of the first step. Included files are read. Keywords
+that generate nodes and elements are refused.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import numpy as np
 from ...errors import InputError
 from ..whole import WholeMesh
 from ._inp_blocks import Block, blocks
+from ._inp_conditions import CONDITION_KEYWORDS, add_conditions
 from ._inp_flat import Flat
 from ._inp_model import Model, Scope
 from ._inp_tables import MATERIAL_KEYWORDS, Materials, section_of
@@ -28,6 +29,7 @@ SUFFIXES = (".inp",)
 _REFUSED = ("NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "SYSTEM", "PARAMETER", "SUBSTRUCTURE GENERATE")
 MADE = "_section_"
 """Beginning of the names of element sets that the writer makes for areas."""
+_CONSTRAINTS = ("TIE", "EQUATION", "MPC", "COUPLING", "RIGID BODY", "EMBEDDED ELEMENT", "MULTIPLE POINT CONSTRAINT")
 _SECTIONS = ("SOLID SECTION", "BEAM SECTION", "BEAM GENERAL SECTION")
 
 
@@ -40,13 +42,17 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
         Naming file and line, for any content that is not a mesh of bars.
     """
     model, materials = Model(), Materials()
-    _collect(path, model, materials)
+    constraints, conditions = _collect(path, model, materials)
     flat = Flat(path, model)
     mesh = WholeMesh(flat.points, flat.bars, flat.groups("NSET"), dict(flat.groups("ELSET")))
     mesh.warnings = flat.warnings + materials.warnings
+    if constraints:
+        told = "nodes that they connect are joined by `mesh clean` if they are at the same place"
+        mesh.warnings.append(f"{path}: left out {', '.join(constraints)}; {told}")
     found = materials.tables()
     mesh.tables = {"material": found} if found else {}
     _add_sections(mesh, flat, materials)
+    add_conditions(mesh, flat, conditions)
     if flat.labels_left_out:
         first = ", ".join(str(label) for label in flat.labels_left_out[:5])
         more = ", ..." if len(flat.labels_left_out) > 5 else ""
@@ -56,19 +62,32 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     return mesh
 
 
-def _collect(path: Path, model: Model, materials: Materials) -> None:
-    """Read all keywords up to the first ``*STEP``."""
+def _collect(path: Path, model: Model, materials: Materials) -> tuple[list[str], list[Block]]:
+    """Read all keywords up to the end of the first step, and of steps only conditions.
+
+    Returns
+    -------
+    The keywords of constraints, which are left out, and the conditions.
+    """
+    constraints: dict[str, None] = {}
+    conditions: list[Block] = []
+    in_step = False
     scope = model.root
     outer = scope
     for block in blocks(path):
         keyword = block.keyword
+        if keyword == "END STEP":
+            break
+        in_step = in_step or keyword == "STEP"
+        if keyword in CONDITION_KEYWORDS:
+            conditions.append(block)
+        if in_step:
+            continue
         if keyword in _REFUSED:
             raise InputError(
                 f"{block.where} is not read: write the nodes and elements one by one (Abaqus/CAE and most "
                 "preprocessors do)"
             )
-        if keyword == "STEP":
-            break
         if keyword in ("PART", "ASSEMBLY", "INSTANCE"):
             outer, scope = (scope if keyword == "INSTANCE" else model.root), _entered(block, model)
         elif keyword in ("END PART", "END ASSEMBLY", "END INSTANCE"):
@@ -85,6 +104,9 @@ def _collect(path: Path, model: Model, materials: Materials) -> None:
             materials.begin(block)
         elif keyword in MATERIAL_KEYWORDS and not (keyword == "DAMPING" and not block.parameters):
             materials.add(block)
+        elif keyword in _CONSTRAINTS:
+            constraints[f"*{keyword}"] = None
+    return list(constraints), conditions
 
 
 def _entered(block: Block, model: Model) -> Scope:

@@ -105,6 +105,8 @@ def _assembled(path: Path, model: ModelFile) -> WholeMesh:
     area = np.concatenate(areas)
     if (area > 0.0).all():
         mesh.bar_fields["area"] = area
+    for uri in model.not_read:
+        mesh.warnings.append(f"{path}: requires the extension {uri}, which is not read")
     if conical:
         mesh.warnings.append(f"{path}: {conical} beams whose radii differ have a constant area, with the same volume")
     if left or model.triangles:

@@ -34,6 +34,7 @@ suppress_warnings = ["myst.header"]
 html_theme = "furo"
 html_title = f"pfem_petsc {release}"
 html_static_path = ["_static"]
+html_extra_path = ["_extra"]  # index.html leads to docs/index.html
 html_css_files = ["site.css"]
 html_copy_source = False
 html_show_sphinx = False

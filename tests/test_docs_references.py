@@ -40,9 +40,9 @@ def test_every_folder_of_tests_of_physics_is_verified():
     assert {"physics", "statics", "modes", "contact", "integrators", "mechanics", "restart", "random_cases"} <= named
 
 
-def texts(path: Path) -> Iterator[str]:
-    """Texts of a module, with ANY for what is filled in; docstrings too, which do no harm."""
-    for node in ast.walk(ast.parse(path.read_text())):
+def literals(tree: ast.AST) -> Iterator[str]:
+    """Texts in a tree, with ANY for what is filled in; docstrings too, which do no harm."""
+    for node in ast.walk(tree):
         if isinstance(node, ast.JoinedStr):
             yield "".join(each.value if isinstance(each, ast.Constant) else ANY for each in node.values)
         elif isinstance(node, ast.Constant) and isinstance(node.value, str):
@@ -54,9 +54,38 @@ def quoted() -> list[str]:
     return re.findall(r"^\| `([^`]+)` \|", (DOCS / "troubleshooting.md").read_text(), flags=re.MULTILINE)
 
 
+def failures() -> Iterator[tuple[str, str]]:
+    """What the exceptions of exit status 3 say, where it is written at their place; modules and texts."""
+    for path in sorted((ROOT / "pfem_petsc").rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.args:
+                first = node.args[0]
+                written = isinstance(first, ast.JoinedStr | ast.Constant)
+                if node.func.id in ("SimulationFailure", "NotConverged") and written:
+                    text = next(iter(literals(first)))
+                    if re.search(r"[a-z]{3}", text):  # not only a place, and the failure that it wraps
+                        yield path.name, " ".join(text.split())
+
+
+def pattern(message: str) -> re.Pattern[str]:
+    """Parts of a quoted message, between dots, follow one another in one text of the code."""
+    parts = [re.escape(part.strip()) for part in message.replace("\\|", "|").split("...") if part.strip()]
+    return re.compile(r"[^\n]*?".join(parts))
+
+
+def test_every_failure_is_listed():
+    """A new message of a run that fails needs a row in docs/troubleshooting.md."""
+    patterns = [pattern(message) for message in quoted()]
+    told = list(failures())
+    assert len(told) > 50
+    missing = [(file, text) for file, text in told if not any(each.search(text) for each in patterns)]
+    assert not missing
+
+
 @pytest.fixture(scope="module")
 def messages() -> str:
-    return "\n".join(" ".join(text.split()) for path in (ROOT / "pfem_petsc").rglob("*.py") for text in texts(path))
+    trees = [ast.parse(path.read_text()) for path in (ROOT / "pfem_petsc").rglob("*.py")]
+    return "\n".join(" ".join(text.split()) for tree in trees for text in literals(tree))
 
 
 def test_there_are_messages():
@@ -65,7 +94,5 @@ def test_there_are_messages():
 
 @pytest.mark.parametrize("message", quoted())
 def test_message_is_one_of_the_program(message, messages):
-    """Its parts, between dots, follow one another in one text of the code."""
-    parts = [re.escape(part.strip()) for part in message.replace("\\|", "|").split("...") if part.strip()]
-    assert re.search(r"[^\n]*?".join(parts), messages), message
+    assert pattern(message).search(messages), message
     assert len(message) > 10

@@ -10,6 +10,9 @@ from pathlib import Path
 
 import pytest
 
+from pfem_petsc import open_result
+from pfem_petsc.cli.main import main
+
 PAGE = Path(__file__).parents[1] / "docs" / "tutorial.md"
 BLOCK = re.compile(r"^```(toml|python|bash)\n(.*?)^```$", flags=re.MULTILINE | re.DOTALL)
 STAND_INS = {
@@ -61,10 +64,26 @@ def test_numbers_of_the_page(told):
     elastic = re.search(r"elastic_energy .* ([\d.]+) mJ$", info, flags=re.MULTILINE)[1]
     assert float(start) == 125.0
     assert (float(end) + float(elastic)) / float(start) == pytest.approx(0.975, abs=1e-3)
+    assert energy_left(Path(told[""]) / "results" / "newmark") == pytest.approx(1.0 - 0.19, abs=5e-3)
     sway, rest = output(told, "python tower.py").splitlines()[:2]
     largest, last = map(float, re.findall(r"([\d.]+) mm", sway))
     equilibrium = float(re.search(r"([\d.]+) mm", rest)[1])
     assert 1.6 < largest / equilibrium < 2.0 and last == pytest.approx(equilibrium, rel=5e-3)
+
+
+def energy_left(folder: Path) -> float:
+    history = open_result(folder).history
+    energy = history["kinetic_energy"] + history["elastic_energy"]
+    return float(energy[-1] / energy[0])
+
+
+@pytest.mark.slow
+def test_mistakes_that_check_finds(told, capsys, monkeypatch):
+    monkeypatch.chdir(told[""])
+    assert main(["check", "rod.toml", "--set", "section.rod.area=100.0"]) == 0
+    assert "no bar has that; 1 mm2 is 1e-6 m2" in "".join(capsys.readouterr())
+    assert main(["check", "rod.toml", "--set", "wall.0.normal=[1.0, 0.0, 0.0]"]) == 2
+    assert "beyond the wall" in capsys.readouterr().err
 
 
 @pytest.mark.slow

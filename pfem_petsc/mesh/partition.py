@@ -10,9 +10,14 @@ from .exchange import Router
 from .ordering import BITS, hilbert_keys
 from .slab import MeshSlab, slab_of
 
-__all__ = ["PARTITIONERS", "bounding_cube", "partition"]
+__all__ = ["PARTITIONERS", "UNEVEN", "bounding_cube", "partition"]
 
 PARTITIONERS = ("auto", "ptscotch", "coordinates")
+
+UNEVEN = 1.1
+"""Ratio of the largest to the mean work of the ranks that the partitioner ``"auto"`` accepts."""
+
+_OF_NODE = 4  # work of a node in an explicit step, where that of a bar is 2
 
 # Candidate positions tested at once for each border between two ranks.
 _CANDIDATES = 256
@@ -26,9 +31,10 @@ def partition(slab: MeshSlab, comm: MPI.Comm, partitioner: str = "auto") -> tupl
     slab : MeshSlab
     comm : MPI.Comm
     partitioner : str
-        ``"ptscotch"`` cuts few bars (PETSc must have been built with it); ``"coordinates"`` divides a space-filling
-        curve into equal parts, independent of the slabs; ``"auto"`` uses the second for structured meshes and if PETSc
-        lacks PT-Scotch. Both are reproducible from run to run; ``"ptscotch"`` uses random numbers that continue from
+        ``"ptscotch"`` cuts few bars (PETSc must have been built with it), with equal numbers of nodes; ``"coordinates"``
+        divides a space-filling curve into parts of equal work, independent of the slabs; ``"auto"`` uses the second for
+        structured meshes, if PETSc lacks PT-Scotch, and if a rank would have over :data:`UNEVEN` times the mean work,
+        because nodes have very different numbers of bars. Both are reproducible from run to run; ``"ptscotch"`` uses random numbers that continue from
         call to call, so a second call in one process may differ.
 
     Returns
@@ -43,11 +49,11 @@ def partition(slab: MeshSlab, comm: MPI.Comm, partitioner: str = "auto") -> tupl
         return np.zeros(len(slab.points), np.int32), "none (one rank)"
     if partitioner == "ptscotch" or (partitioner == "auto" and not slab.structured):
         owners = _by_graph(slab, comm)
-        if owners is not None:
+        if owners is not None and (partitioner == "ptscotch" or _is_even(owners, slab, comm)):
             return owners, "ptscotch"
         if partitioner == "ptscotch":
             raise InputError("partitioner: this PETSc was built without PT-Scotch; use 'coordinates'")
-    return _by_coordinates(slab, comm), "coordinates"
+    return _by_coordinates(slab, _works(slab, comm), comm), "coordinates"
 
 
 def bounding_cube(points: np.ndarray, comm: MPI.Comm) -> tuple[np.ndarray, float]:
@@ -59,23 +65,37 @@ def bounding_cube(points: np.ndarray, comm: MPI.Comm) -> tuple[np.ndarray, float
     return box[0], float((-box[1] - box[0]).max())
 
 
-def _by_coordinates(slab: MeshSlab, comm: MPI.Comm) -> np.ndarray:
-    """Divide the Hilbert curve through the nodes such that ranks have equal numbers of nodes.
+def _works(slab: MeshSlab, comm: MPI.Comm) -> np.ndarray:
+    """Return the work of a step for each node of the slab (int64), in halves of that for a bar. Collective."""
+    ends = slab.bars.reshape(-1).astype(np.int64)
+    ends = Router(comm, slab_of(ends, slab.n_nodes, comm.size)).send(ends)
+    return _OF_NODE + np.bincount(ends - slab.first_node, minlength=len(slab.points))
 
-    The borders are found by counting keys below candidate positions, refined around each border, so the result depends
-    on the nodes and the number of ranks only.
+
+def _is_even(owners: np.ndarray, slab: MeshSlab, comm: MPI.Comm) -> bool:
+    """Return whether the ranks have about the same work. Collective."""
+    shares = np.bincount(owners, weights=_works(slab, comm), minlength=comm.size)
+    comm.Allreduce(MPI.IN_PLACE, shares)
+    return bool(shares.max() <= UNEVEN * shares.mean())
+
+
+def _by_coordinates(slab: MeshSlab, works: np.ndarray, comm: MPI.Comm) -> np.ndarray:
+    """Divide the Hilbert curve through the nodes such that ranks have equal ``works``, integers.
+
+    The borders are found by summing works below candidate positions, refined around each border, so the result depends
+    on the nodes, their works and the number of ranks only.
     """
     keys = hilbert_keys(slab.points, *bounding_cube(slab.points, comm))
-    in_order = np.sort(keys)
-    wanted = (slab.n_nodes * np.arange(1, comm.size)) // comm.size
-    # Invariant: fewer keys than required lie below `low`, at least as many below `high`.
+    order = np.argsort(keys)
+    in_order, sums = keys[order], np.concatenate([[0], np.cumsum(works[order])])
+    wanted = (comm.allreduce(int(sums[-1])) * np.arange(1, comm.size)) // comm.size
+    # Invariant: less work than required lies below `low`, at least as much below `high`.
     low = np.zeros(comm.size - 1, np.uint64)
     width = 1 << (3 * BITS)
     while width > 1:
         step = max(width // _CANDIDATES, 1)
         candidates = low[:, None] + np.uint64(step) * np.arange(1, _CANDIDATES + 1, dtype=np.uint64)
-        below = np.searchsorted(in_order, candidates.ravel(), side="left").reshape(candidates.shape)
-        below = below.astype(np.int64)
+        below = sums[np.searchsorted(in_order, candidates.ravel(), side="left")].reshape(candidates.shape)
         comm.Allreduce(MPI.IN_PLACE, below, op=MPI.SUM)
         low += np.uint64(step) * (below < wanted[:, None]).sum(axis=1).astype(np.uint64)
         width = step

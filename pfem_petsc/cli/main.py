@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 __all__ = ["main"]
 
-VERBS = ("run", "list", "check", "render", "plot", "info", "sweep", "bench")
+VERBS = ("run", "list", "check", "render", "plot", "report", "info", "sweep", "bench")
 """Modules of this package: ``EXAMPLE``, ``RANKS``, ``add_arguments(parser)`` and ``run(arguments[, comm])``."""
 
 EXAMPLES = f"""\

@@ -139,10 +139,12 @@ class Truss:
     @classmethod
     def from_mesh(cls, mesh: WholeMesh) -> Truss:
         """Return the truss of a mesh that a reader has returned; its tables and warnings are kept."""
-        from .whole import case_tables
+        from .whole import case_tables, without_slashes
 
-        groups: dict[str, Any] = {"node_groups": mesh.node_groups, "bar_groups": mesh.bar_groups}
-        truss = cls(mesh.points, mesh.bars, **groups, bar_fields=mesh.bar_fields, source=mesh.source)
+        named: dict[str, Any] = {
+            name: without_slashes(getattr(mesh, name)) for name in ("node_groups", "bar_groups", "bar_fields")
+        }
+        truss = cls(mesh.points, mesh.bars, **named, source=mesh.source)
         truss.tables = case_tables(mesh.tables)
         truss.warnings = mesh.warnings + truss.warnings
         return truss

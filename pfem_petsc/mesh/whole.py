@@ -14,7 +14,7 @@ from ..errors import InputError
 from ..parallel.agreement import agreed
 from .slab import MeshSlab, check_size, slab_range
 
-__all__ = ["WholeMesh", "case_tables", "read_and_scatter", "scattered"]
+__all__ = ["WholeMesh", "case_tables", "read_and_scatter", "scattered", "without_slashes"]
 
 
 @dataclass
@@ -48,6 +48,17 @@ def case_tables(tables: dict[str, dict[str, Any]]) -> dict[str, Any]:
             found.setdefault("node_set", {}).update({own: {"group": own} for own in tables[name]})
     for table in tables.get("gravity", {}).values():
         found["gravity"] = table
+    return found
+
+
+def without_slashes(named: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return groups or fields with names that HDF5 and trusses can have: an underscore for each slash."""
+    found: dict[str, np.ndarray] = {}
+    for name, values in named.items():
+        own = name.replace("/", "_")
+        while own in found or (own != name and own in named):
+            own += "_"
+        found[own] = values
     return found
 
 

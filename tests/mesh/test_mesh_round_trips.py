@@ -14,6 +14,7 @@ from pfem_petsc.mesh import load_slab
 from pfem_petsc.mesh.readers import read_whole
 from pfem_petsc.mesh.readers import suffixes as read_suffixes
 from pfem_petsc.mesh.writers import suffixes as written_suffixes
+from pfem_petsc.mesh.writers import write_whole
 
 NAMES = ["t.h5", "t.vtu", "t.vtkhdf", "t.msh", "t.inp", "t.3mf", "t_bars.csv"]
 EXACT = ("t.h5", "t.vtu", "t.vtkhdf", "t.msh", "t_bars.csv")
@@ -371,6 +372,18 @@ def test_tables_with_one_thing_wrong(tmp_path, nodes, bars, text):
     (tmp_path / "t_bars.csv").write_text(bars)
     with pytest.raises(InputError, match=text):
         read_whole(tmp_path / "t_nodes.csv")
+
+
+@pytest.mark.parametrize("name", ["a.h5", "a.vtkhdf"])
+def test_names_with_slashes(tmp_path, name):
+    """Gmsh has such names, HDF5 cannot."""
+    mesh = irregular().to_mesh()
+    mesh.bar_groups = {"a/b": np.array([1]), "a_b": np.array([2])}
+    write_whole(tmp_path / "s.msh", mesh)
+    write_whole(tmp_path / name, read_whole(tmp_path / "s.msh"))
+    for file in ("s.msh", name):
+        truss = Truss.read(tmp_path / file)
+        assert {key: members.tolist() for key, members in truss.bar_groups.items()} == {"a_b_": [1], "a_b": [2]}
 
 
 def test_a_table_without_a_pair(tmp_path):

@@ -1,4 +1,4 @@
-"""Abaqus input files (.inp): trusses, their sets, sections and materials, flat or in parts and instances.
+"""Abaqus input files (.inp): trusses with sets, sections, materials, supports and loads, flat or in parts.
 
 T3D2 and T2D2 are bars; other trusses and beams are read as bars with a warning, other elements are left out with
 one. Node sets and element sets are groups. Sections give the bar field ``area``; sections and materials are tables of

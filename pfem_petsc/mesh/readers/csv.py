@@ -1,4 +1,4 @@
-"""Pairs of tables in text files (.csv): one of nodes, one of bars, with names of columns in the first line.
+"""Pairs of text tables (NAME_nodes.csv, NAME_bars.csv) with names of columns in the first line.
 
 ``tower_nodes.csv`` goes with ``tower_bars.csv``; either names the mesh. Nodes have the columns ``x``, ``y``, ``z`` [m]
 (``z`` may be missing), bars ``first`` and ``second``. Where the nodes have a column ``node``, its entries, numbers or

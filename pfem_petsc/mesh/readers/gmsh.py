@@ -1,4 +1,4 @@
-"""Gmsh .msh files, versions 2.2 and 4.1, ASCII and binary: lines are bars, physical groups are groups.
+"""Gmsh .msh files, versions 2 to 2.2 and 4.1, ASCII and binary: lines are bars, physical groups are groups.
 
 Two-node lines (element type 1) are the bars, in file order; points (type 15) with a physical group define node groups;
 surfaces and volumes are ignored with a warning. Nodes are numbered from 0 in file order. Data of elements

@@ -1,4 +1,4 @@
-"""The mesh file format of this package: HDF5, read and written by all ranks, each its slab.
+"""The mesh file format of this package (.h5): HDF5, read and written by all ranks, each its slab.
 
 ``/points`` (n_nodes, 3) float [m], ``/bars`` (n_bars, 2) integers from 0, ``/node_groups/<name>`` and
 ``/bar_groups/<name>`` with the numbers of members, in any order; ``/bar_fields/<name>`` (n_bars,) float.

@@ -1,4 +1,4 @@
-"""3MF files with beam lattices (.3mf): beams are bars, beam sets are bar groups, radii give the field ``area``.
+"""3MF files with beam lattices (.3mf): beams are bars, beam sets are bar groups, radii give areas.
 
 Coordinates have the unit of the file and are converted to metres. All objects of the build are read, with their
 components and transforms; triangles are left out. A beam whose radii differ has the area of a round bar of the same

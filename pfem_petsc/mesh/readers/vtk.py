@@ -1,10 +1,10 @@
-"""VTK files (.vtu, .vtkhdf): lines are bars, integer cell arrays are groups; other cells are left out, with a warning.
+"""VTK files (.vtu, .vtkhdf): lines are bars, arrays of points and cells are groups and bar fields.
 
-A cell array of integers named ``group`` or ``section`` assigns every bar with value i to the bar group ``group_i`` or
-``section_i``; a field array of strings named ``group_names`` or ``section_names`` replaces these names by its i-th
-entry. Point arrays of the same names define node groups (a negative value: no group). An array named ``group:NAME`` is
-the group NAME of those with a value other than 0; these may overlap. Other cell arrays with one component are bar
-fields.
+Other cells are left out, with a warning; a line of several points is as many bars less one. A cell array of integers
+named ``group`` or ``section`` assigns every bar with value i to the bar group ``group_i`` or ``section_i``; a field
+array of strings named ``group_names`` or ``section_names`` replaces these names by its i-th entry. Point arrays of the
+same names define node groups (a negative value: no group). An array named ``group:NAME`` is the group NAME of those
+with a value other than 0; these may overlap. Other cell arrays with one component are bar fields.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Abaqus input files (.inp): T3D2 elements, sets, a section for each area, and materials as far as they are known.
+"""Abaqus input files (.inp): T3D2 elements, sets, a section for each area, and known materials.
 
 Labels are the numbers from 1.
 """

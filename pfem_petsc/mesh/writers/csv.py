@@ -1,4 +1,4 @@
-"""A pair of tables (.csv): ``NAME_nodes.csv`` and ``NAME_bars.csv``, with groups and bar fields as columns."""
+"""A pair of text tables (NAME_nodes.csv, NAME_bars.csv) with groups and bar fields as columns."""
 
 from __future__ import annotations
 

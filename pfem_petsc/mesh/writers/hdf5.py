@@ -8,7 +8,7 @@ from mpi4py import MPI
 
 from ..readers.hdf5 import write_hdf5
 from ..slab import MeshSlab
-from ..whole import WholeMesh
+from ..whole import WholeMesh, without_slashes
 
 __all__ = ["SUFFIXES", "write"]
 
@@ -24,8 +24,8 @@ def write(path: Path, mesh: WholeMesh) -> None:
         points=mesh.points,
         first_bar=0,
         bars=mesh.bars,
-        node_groups=mesh.node_groups,
-        bar_groups=mesh.bar_groups,
-        bar_fields=mesh.bar_fields,
+        node_groups=without_slashes(mesh.node_groups),
+        bar_groups=without_slashes(mesh.bar_groups),
+        bar_fields=without_slashes(mesh.bar_fields),
     )
     write_hdf5(path, slab, MPI.COMM_SELF)

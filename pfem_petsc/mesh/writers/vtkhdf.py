@@ -1,4 +1,4 @@
-"""VTK's HDF5 format (.vtkhdf): bars are lines, groups are arrays ``group:NAME`` with 1 for members."""
+"""VTK's HDF5 format (.vtkhdf): bars are lines, groups are arrays of ones and zeros."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..whole import WholeMesh
+from ..whole import WholeMesh, without_slashes
 from .vtu import masks
 
 __all__ = ["SUFFIXES", "write"]
@@ -34,7 +34,7 @@ def write(path: Path, mesh: WholeMesh) -> None:
         root["Types"] = np.full(n, _LINE, np.uint8)
         # in the order in which they are given
         cells, points = (root.create_group(name, track_order=True) for name in ("CellData", "PointData"))
-        for name, values in {**mesh.bar_fields, **masks(mesh.bar_groups, n)}.items():
+        for name, values in {**without_slashes(mesh.bar_fields), **masks(without_slashes(mesh.bar_groups), n)}.items():
             cells[name] = values
-        for name, values in masks(mesh.node_groups, len(mesh.points)).items():
+        for name, values in masks(without_slashes(mesh.node_groups), len(mesh.points)).items():
             points[name] = values

@@ -1,4 +1,4 @@
-"""VTK's unstructured grids (.vtu): bars are lines, groups are arrays ``group:NAME`` with 1 for members."""
+"""VTK's unstructured grids (.vtu): bars are lines, groups are arrays of ones and zeros."""
 
 from __future__ import annotations
 

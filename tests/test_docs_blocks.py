@@ -5,8 +5,10 @@ Blocks that are run: test_docs_python.py, test_docs_tutorial.py, test_readme.py,
 
 from __future__ import annotations
 
+import ast
 import re
 import shlex
+import subprocess
 import tomllib
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,7 +16,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from mpi4py import MPI
 
+from pfem_petsc import Simulation
 from pfem_petsc.case.builtin import built_in_cases
 from pfem_petsc.case.schema import Case
 from pfem_petsc.cli import main as cli
@@ -114,3 +118,38 @@ def write_rows(path: Path) -> None:
 @pytest.mark.parametrize("text", fragments())
 def test_tables_are_accepted(text, tmp_path):
     Case.from_dict(completed(tomllib.loads(text), tmp_path), folder=tmp_path)
+
+
+def shell_blocks() -> list[Any]:
+    found = [(page, text) for page in PAGES for text in (*blocks(page, "bash"), *blocks(page, ""))]
+    commands = [(page, text) for page, text in found if re.search(r"^(\S+=\S+ )?(bash|python|mpirun|source|#!)", text)]
+    return [pytest.param(text, id=f"{page.stem}-{k}") for k, (page, text) in enumerate(commands)]
+
+
+@pytest.mark.parametrize("text", shell_blocks())
+def test_shell_reads_the_block(text, tmp_path):
+    """Synopses apart, whose brackets and dots mean what may be left out; scripts that it names are there."""
+    if not re.search(r"\[-|\.\.\.", text):
+        (tmp_path / "block.sh").write_text(text)
+        done = subprocess.run(["bash", "-n", "block.sh"], cwd=tmp_path, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+    for script in re.findall(r"\bscripts/[\w/]+\.(?:py|sh)", text):
+        assert (ROOT / script).exists(), script
+
+
+@pytest.mark.slow
+def test_example_of_modes_runs(tmp_path, monkeypatch, capsys):
+    (text,) = blocks(ROOT / "docs" / "modes.md", "python")
+    monkeypatch.chdir(tmp_path)
+    with Simulation(Case.load("taut_cable"), MPI.COMM_SELF, quiet=True) as simulation:
+        simulation.run()
+    exec(compile(text, "modes.md", "exec"), {})
+    kind, first = re.match(r"(\w+) \[\s*([\d.]+)", capsys.readouterr().out).groups()
+    assert kind == "vibration" and float(first) == pytest.approx(74.890, abs=2e-3)
+
+
+def test_python_blocks_are_python():
+    """Those that need what is not installed too, as gmsh."""
+    for page in PAGES:
+        for text in blocks(page, "python"):
+            ast.parse(text)

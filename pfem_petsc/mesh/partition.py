@@ -31,11 +31,11 @@ def partition(slab: MeshSlab, comm: MPI.Comm, partitioner: str = "auto") -> tupl
     slab : MeshSlab
     comm : MPI.Comm
     partitioner : str
-        ``"ptscotch"`` cuts few bars (PETSc must have been built with it), with equal numbers of nodes; ``"coordinates"``
-        divides a space-filling curve into parts of equal work, independent of the slabs; ``"auto"`` uses the second for
-        structured meshes, if PETSc lacks PT-Scotch, and if a rank would have over :data:`UNEVEN` times the mean work,
-        because nodes have very different numbers of bars. Both are reproducible from run to run; ``"ptscotch"`` uses random numbers that continue from
-        call to call, so a second call in one process may differ.
+        ``"ptscotch"`` cuts few bars (PETSc must have been built with it), for equal numbers of nodes;
+        ``"coordinates"`` divides a space-filling curve into parts of equal work, independent of the slabs; ``"auto"``
+        uses the second for structured meshes, if PETSc lacks PT-Scotch, and if a rank would have over :data:`UNEVEN`
+        times the mean work, because nodes have very different numbers of bars. Both are reproducible from run to run;
+        ``"ptscotch"`` uses random numbers that continue from call to call, so a second call in one process may differ.
 
     Returns
     -------

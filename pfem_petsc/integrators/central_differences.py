@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from .base import Balance, ExplicitScheme, NoParameters, State
-from .leapfrog import centre, drift, kick
+from ._leapfrog import centre, drift, kick
 
 __all__ = ["Parameters", "Scheme"]
 

@@ -18,7 +18,7 @@ import numpy as np
 from ..contact.flat import press_planes
 from ..contact.impact_loops import join_nodes, plane_gaps, stop_nodes, unpressed
 from ..contact.log import compare_contacts
-from ..integrators.leapfrog import advance, advance_loaded, centre, drift, kick
+from ..integrators._leapfrog import advance, advance_loaded, centre, drift, kick
 from ..mechanics.bar_geometry import first_inverted
 from ..mechanics.compiled import inlined, kernel
 from ..mechanics.rows import CHUNK

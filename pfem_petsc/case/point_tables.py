@@ -7,6 +7,7 @@ from typing import Annotated, Any
 from pydantic import ValidationInfo, field_validator, model_validator
 
 from .base import NonNegativeFloat, StrictModel, is_finite_number, listed
+from .support_tables import Direction, check_frame
 
 __all__ = ["Dashpot", "NodalMass", "Spring"]
 
@@ -43,6 +44,8 @@ class Spring(_GroundOrNodes):
 
     stiffness: Any
     """stiffness [kx, ky, kz] of each node of the set along the axes, or k along the line between two nodes [N/m]"""
+    frame: Annotated[tuple[Direction, Direction], listed] | None = None
+    """x axis of the three values, and a vector on the side of their y axis; default: the axes of the model"""
 
     @field_validator("stiffness")
     @classmethod
@@ -56,6 +59,16 @@ class Spring(_GroundOrNodes):
         if min(value) < 0.0:
             raise ValueError("expected values >= 0")
         return tuple(map(float, value))
+
+    @model_validator(mode="after")
+    def _frame_of_three_values(self) -> Spring:
+        if self.frame is not None:
+            if self.between is not None:
+                raise ValueError(
+                    "frame gives the axes of springs to the ground; those between nodes are along the line"
+                )
+            check_frame(self.frame)
+        return self
 
 
 class Dashpot(_GroundOrNodes):

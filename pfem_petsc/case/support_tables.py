@@ -10,7 +10,7 @@ from pydantic import AfterValidator, field_validator, model_validator
 from .base import Name, StrictModel, Vector3, listed
 from .rows import FileName, Table4
 
-__all__ = ["Direction", "Support"]
+__all__ = ["Direction", "Support", "check_frame"]
 
 
 def _has_direction(value: tuple[float, float, float]) -> tuple[float, float, float]:
@@ -25,6 +25,13 @@ _PARALLEL = 1e-6  # sine of the angle between two vectors that give no frame
 
 Direction = Annotated[Vector3, AfterValidator(_has_direction)]
 """A vector of any length, which gives a direction."""
+
+
+def check_frame(frame: tuple[tuple[float, float, float], tuple[float, float, float]]) -> None:
+    """Refuse two vectors that give no frame."""
+    first, second = (np.array(row) / np.linalg.norm(row) for row in frame)
+    if np.linalg.norm(np.cross(first, second)) < _PARALLEL:
+        raise ValueError("the two vectors of frame are parallel; the second gives the side of y")
 
 
 def _moves_along(normal: tuple, rows: tuple, velocity: tuple | None) -> None:
@@ -86,9 +93,7 @@ class Support(StrictModel):
         if self.frame is not None:
             if self.fix is None:
                 raise ValueError("frame gives the axes of fix; expected the key fix")
-            first, second = (np.array(row) / np.linalg.norm(row) for row in self.frame)
-            if np.linalg.norm(np.cross(first, second)) < _PARALLEL:
-                raise ValueError("the two vectors of frame are parallel; the second gives the side of y")
+            check_frame(self.frame)
         if self.normal is not None:
             _moves_along(self.normal, self.motion or self.acceleration or (), self.velocity)
         if self.fix is None or self.frame is not None:

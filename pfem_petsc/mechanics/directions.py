@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from ..case.tables import Support
     from .motion import Motion
 
-__all__ = ["Directions", "Prescribed", "directions_of"]
+__all__ = ["Directions", "Prescribed", "axes_of", "directions_of"]
 
 _ROUNDING = 16.0 * np.finfo(float).eps  # relative to positions: of displacements along directions
 
@@ -144,7 +144,7 @@ def directions_of(support: Support) -> tuple[np.ndarray, list[int] | None]:
         rows = rows / np.abs(rows).max()
         rows /= np.linalg.norm(rows)
     elif support.frame is not None:
-        rows = _frame(*np.array(support.frame))[["xyz".index(letter) for letter in support.fix]]
+        rows = axes_of(*np.array(support.frame))[["xyz".index(letter) for letter in support.fix]]
     else:
         rows = np.eye(3)[["xyz".index(letter) for letter in support.fix]]
     axes = np.abs(rows).argmax(axis=1)
@@ -153,7 +153,7 @@ def directions_of(support: Support) -> tuple[np.ndarray, list[int] | None]:
     return rows, None
 
 
-def _frame(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+def axes_of(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Return the axes (3, 3) of a frame: x along ``first``, y in the plane of both, on the side of ``second``."""
     x = first / np.abs(first).max()
     x /= np.linalg.norm(x)

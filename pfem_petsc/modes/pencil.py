@@ -169,7 +169,7 @@ class StateMatrices:
         low = self._at_nodes(2.0 * np.minimum(np.minimum(axial, transverse), 0.0))
         high = self._at_nodes(2.0 * np.maximum(np.maximum(axial, transverse), 0.0))
         if self.model.bars.springs is not None:
-            high[self.model.bars.springs.nodes] += self.model.bars.springs.stiffness.max(axis=1)
+            high[self.model.bars.springs.nodes] += self.model.bars.springs.largest()
         if blocks is not None:
             nodes, added = blocks
             values = np.linalg.eigvalsh(added)

@@ -11,18 +11,29 @@ if TYPE_CHECKING:
     from ..stepping.model import Model
     from ..stepping.plan import Plan
 
-__all__ = ["ContactWatch", "NoContactWatch"]
+__all__ = ["CAUSES", "ContactWatch", "NoContactWatch"]
 
 _SHARE = 0.02  # of the initial and supplied energy; more than the oscillation of the schemes' own energies
 _ROWS = 4  # consecutive rows with a gain without contact; a short peak is not reported
+_AT_END = 2  # the same, where the run ends with them
+
+CAUSES = {
+    "plastic_dissipation": "bars yield",
+    "damage_dissipation": "bars are damaged",
+    "rupture_dissipation": "bars break",
+    "viscous_dissipation": "bars or dashpots are damped",
+    "damping_dissipation": "damping stops nodes",
+}
+"""What dissipates besides friction and impact, and how messages tell it."""
 
 
 class ContactWatch:
     """Compares the energy with the energy input, after contact of nodes and for implicit steps.
 
-    The stored energy plus the energy dissipated by plasticity and damping, minus the energy supplied, cannot exceed its
+    The stored energy plus the energy dissipated by bars and damping, minus the energy supplied, cannot exceed its
     initial value: friction, impact and integration only reduce it. In large steps, within which bars yield or damping
-    stops nodes, the work of the forces of the balance is less than the dissipation. The energy of an explicit scheme
+    stops nodes, the work of the forces of the balance is less than the dissipation, and where supports move, their work
+    within a step is not that of the reactions at its ends. The energy of an explicit scheme
     oscillates near its stability limit even without dissipation: by h^2/8 a.Ma with central differences, which is at
     most (h w/2)^2 of the elastic energy with the highest frequency w (h times the acceleration by a load is small). A
     gain up to this amount is accepted, and any gain if nothing dissipates. The rows are the same on all ranks, so all
@@ -45,6 +56,7 @@ class ContactWatch:
         contact, time = model.case.contact, model.case.time
         self.key = "time.safety" if time.step == "auto" else "time.step"
         self.what = f'{time.integrator} with contact.treatment = "{contact.treatment}" and time.mass = "{time.mass}"'
+        self.last, self.moves = plan.steps, model.supports.moves
         self.start: float | None = None
         self.scale = 0.0
         self.touched = False
@@ -54,7 +66,7 @@ class ContactWatch:
         if self.told:
             return
         given = sum(row[name] for name in SUPPLIED)
-        net = sum(row[name] for name in STORED) + row["plastic_dissipation"] + row["damping_dissipation"] - given
+        net = sum(row[name] for name in STORED) + sum(row[name] for name in CAUSES) - given
         if self.start is None:
             self.start = net
         self.scale = max(self.scale, self.rounding, abs(self.start), *(abs(row[name]) for name in SUPPLIED))
@@ -74,7 +86,7 @@ class ContactWatch:
                 "energy at impacts; take another contact.treatment or time.integrator, or a smaller time.step "
                 "(docs/contact.md, phases of an impact)"
             )
-        elif self.rows >= _ROWS:
+        elif self.rows >= (_AT_END if row["step"] >= self.last else _ROWS):
             self.told = True
             self.tell(
                 f"{at}: the total energy, dissipated energy included, has grown by {made}, without contact: the "
@@ -83,16 +95,16 @@ class ContactWatch:
 
     def _swing(self, row: dict[str, Any]) -> float:
         """What an explicit scheme's own energy may have gained for a while [J]: all of it where nothing dissipates."""
-        if not row["plastic_dissipation"] > 0.0 and not row["damping_dissipation"] > 0.0:
+        if not any(row[name] > 0.0 for name in CAUSES):
             return float("inf")
         return self.swing * (row["elastic_energy"] + row["spring_energy"])
 
-    @staticmethod
-    def _causes(row: dict[str, Any]) -> str:
-        """Return the sources of dissipation as part of a sentence."""
-        causes = {"plastic_dissipation": "bars yield", "damping_dissipation": "damping stops nodes"}
-        found = [text for name, text in causes.items() if row[name] > 0.0]
-        return f" ({' and '.join(found)})" if found else ""
+    def _causes(self, row: dict[str, Any]) -> str:
+        """Return what large steps get wrong as part of a sentence."""
+        found = [text for name, text in CAUSES.items() if row[name] > 0.0]
+        found += ["supports move"] if self.moves else []
+        *most, last = found or [""]
+        return f" ({', '.join(most)}{' and ' if most else ''}{last})" if found else ""
 
 
 class NoContactWatch:

@@ -294,7 +294,8 @@ class MatrixFreeHessian:
         _diagonal(self.mesh.bars, self.stored, blocks)
         springs = self.model.bars.springs
         if springs is not None:
-            blocks[springs.nodes[:, None], [0, 3, 5]] += problem.balance.weight * springs.stiffness
+            upper = springs.stiffness.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
+            blocks[springs.nodes] += problem.balance.weight * upper
         if self.model.inertia.redistribution is not None:
             moved = self.model.inertia.redistribution
             upper = moved.tensors.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]

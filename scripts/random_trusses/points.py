@@ -33,3 +33,5 @@ def draw_points(chance: random.Random, case: dict[str, Any], size: float) -> Non
     if stiffness and math.isfinite(stiffness) and chance.random() < 0.1:
         coefficient = 10 ** chance.uniform(-3, -0.5) * math.sqrt(stiffness * bar)
         case["dashpot"] = [{"node_set": chance.choice(sorted(case["node_set"])), "coefficient": coefficient}]
+    if "spring" in case and chance.random() < 0.5:
+        case["spring"][0]["frame"] = [[chance.uniform(-1.0, 1.0) for _ in range(3)] for _ in range(2)]

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import impact_phases as table
 import numpy as np
@@ -10,6 +11,8 @@ from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation
 from pfem_petsc.contact.impact_phases import SWING, Asked, scan_impacts
+from pfem_petsc.energies import LOST, STORED, SUPPLIED
+from pfem_petsc.recording.contact_watch import CAUSES, ContactWatch
 from pfem_petsc.registry import lookup
 from pfem_petsc.stepping.contact_check import BOUND, contact_gain, overshoots, warn_of_gain
 
@@ -280,3 +283,43 @@ def test_the_remedy_for_automatic_steps_is_their_safety(tmp_path, capfd):
     given["time"] |= {"step": "auto", "safety": 0.95}
     Simulation(Case.from_dict(given), MPI.COMM_SELF, output=tmp_path, quiet=True).run()
     assert "has grown by" in (told := capfd.readouterr().err) and "reduce time.safety" in told
+
+
+def watched(rows, explicit=False, moves=False):
+    """Warnings about rows of a history, given as changes of a run of 10 steps that stores 1 J."""
+    model = SimpleNamespace(
+        rounding=1e-12,
+        length=1.0,
+        supports=SimpleNamespace(moves=moves),
+        case=SimpleNamespace(
+            contact=SimpleNamespace(treatment="scheme"),
+            time=SimpleNamespace(step=0.1, integrator="wilson", mass="lumped"),
+        ),
+    )
+    scheme, frequency = SimpleNamespace(explicit=explicit), SimpleNamespace(upper=1.0)
+    told = []
+    watch = ContactWatch(model, told.append, SimpleNamespace(scheme=scheme, frequency=frequency, step=0.1, steps=10))
+    still = dict.fromkeys((*STORED, *LOST, *SUPPLIED), 0.0) | {"kinetic_energy": 1.0, "active_contacts": 0}
+    for step in range(11):
+        watch.check({**still, "step": step, "time": 0.1 * step, **rows(step)})
+    return told
+
+
+@pytest.mark.parametrize("name", CAUSES)
+def test_energy_that_is_booked_as_dissipated_and_never_was_there_is_told(name):
+    """Every way in which bars and damping dissipate counts, with implicit and with explicit steps."""
+    for explicit in (False, True):
+        (told,) = watched(lambda step: {name: 0.3 if step > 2 else 0.0}, explicit)
+        assert (
+            "step 6, t = 0.6 s" in told and "30 % of the energy that the run had or was given, without contact" in told
+        )
+        assert f"({CAUSES[name]})" in told and "reduce time.step" in told
+    assert watched(lambda step: {name: 0.3, "kinetic_energy": 0.7} if step > 2 else {}) == []
+
+
+def test_a_gain_with_which_a_run_ends_is_told():
+    """A peak that passes within three rows is none, and two rows at the end are."""
+    assert watched(lambda step: {"elastic_energy": 0.5 if 4 <= step < 7 else 0.0}) == []
+    (told,) = watched(lambda step: {"external_work": -0.5 if step >= 9 else 0.0}, moves=True)
+    assert "step 10" in told and "(supports move)" in told
+    assert watched(lambda step: {"elastic_energy": 0.5 if step >= 10 else 0.0}) == []

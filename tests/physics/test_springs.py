@@ -153,6 +153,72 @@ def test_critical_step(tmp_path):
     assert steps["chung_lee", 20.0] < 0.99 * steps["chung_lee", 0.0]
 
 
+FRAME = [[1.0, 2.0, -0.5], [0.3, -1.0, 1.0]]
+
+
+def axes():
+    """Rows: the axes of the frame, by Gram and Schmidt."""
+    x, y = np.array(FRAME)
+    x = x / np.linalg.norm(x)
+    y = y - (y @ x) * x
+    y /= np.linalg.norm(y)
+    return np.stack([x, y, np.cross(x, y)])
+
+
+@pytest.mark.parametrize("operator", ["assembled", "matrix_free"])
+@pytest.mark.parametrize("scheme", [*EXPLICIT, *IMPLICIT])
+def test_frame(scheme, operator, tmp_path):
+    """A bar that moves as a whole: along each axis of the frame u = v/w sin(w t), beside springs along the model's."""
+    if operator == "matrix_free" and scheme not in ("newmark", "generalized_alpha"):
+        pytest.skip("one scheme of a kind is enough")
+    v, both = axes().T @ [0.05, 0.1, -0.2], {"node_set": "all", "stiffness": (0.25 * K).tolist(), "frame": FRAME}
+    twice = [both, {**both, "stiffness": (0.2 * K).tolist()}, {"node_set": "all", "stiffness": [5.0, 5.0, 5.0]}]
+    solver = {"rtol": 1e-13} | ({"operator": operator, "linear": "cg"} if operator == "matrix_free" else {})
+    it = case(spring=twice, time=time_of(scheme, 1e-3, 0.4), initial={"velocity": v.tolist()}, solver=solver)
+    history = run(it, tmp_path / "out", MPI.COMM_SELF)
+    stiff = 0.9 * K + 10.0
+    omega, t = np.sqrt(stiff / BAR), history["time"][:, None]
+    moved = (history["centre_of_mass"] - history["centre_of_mass"][0]) @ axes().T
+    exact = np.array([0.05, 0.1, -0.2]) / omega * np.sin(omega * t)
+    assert np.abs(moved - exact).max() < (0.03 if scheme == "souza_moura" else 1e-3) * np.abs(exact).max()
+    scale = history["kinetic_energy"][0]
+    assert np.abs(history["energy_imbalance"]).max() < 1e-11 * scale
+    assert history["spring_energy"][-1] == pytest.approx(0.5 * (stiff * moved[-1] ** 2).sum(), rel=1e-3)
+    gained = history["momentum"] - history["momentum"][0]
+    np.testing.assert_allclose(gained, history["support_impulse"], atol=1e-10 * np.abs(BAR * v).max())
+    if scheme == "energy_momentum":
+        assert np.abs(history["numerical_dissipation"]).max() < 1e-12 * scale
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("operator", ["assembled", "matrix_free"])
+def test_frame_in_statics_modes_and_critical_steps(operator, comm, shared_tmp_path):
+    """A weight that moves its bar aside; modes and the explicit limit of stiffness along the bar and across."""
+    tensor = 0.5 * axes().T @ np.diag(K) @ axes()  # of each node
+    springs = [{"node_set": "all", "stiffness": (0.5 * K).tolist(), "frame": FRAME}]
+    it = case(
+        spring=springs,
+        gravity={"acceleration": [0.0, 0.0, -G]},
+        static={"method": "newton"},
+        modes={"count": 6},
+        solver={"linear": "cg" if operator == "matrix_free" else "mumps", "operator": operator, "rtol": 1e-12},
+    )
+    assert Simulation(it, comm, output=shared_tmp_path / "out", quiet=True).run() == 0
+    sag = np.linalg.solve(2.0 * tensor, [0.0, 0.0, -BAR * G])
+    axial = YOUNG * AREA / LENGTH * np.outer([1, 0, 0], [1, 0, 0])
+    full = np.block([[tensor + axial, -axial], [-axial, tensor + axial]])
+    squares = np.linalg.eigvalsh(full) / (0.5 * BAR)
+    if comm.rank == 0:
+        with open_result(shared_tmp_path / "out") as result:
+            moved = result.history["centre_of_mass"][-1] - result.history["centre_of_mass"][0]
+            np.testing.assert_allclose(moved, sag, rtol=1e-8)
+            np.testing.assert_allclose(result.history["support_force"][-1], [0.0, 0.0, BAR * G], atol=1e-8 * BAR * G)
+            np.testing.assert_allclose(result.modes.eigenvalue, squares, rtol=1e-7)
+    shaken = case(spring=springs, time={**time_of("central_differences", "auto", 0.1), "safety": 0.9})
+    with Simulation(shaken, comm, output=shared_tmp_path / "auto", quiet=True) as simulation:
+        assert simulation.plan.critical_step == pytest.approx(2.0 / np.sqrt(squares[-1]), rel=1e-5)
+
+
 @pytest.mark.parallel
 @pytest.mark.parametrize("scheme", ["central_differences", "energy_momentum"])
 def test_ranks_restart_and_stages(scheme, comm, shared_tmp_path):
@@ -161,6 +227,7 @@ def test_ranks_restart_and_stages(scheme, comm, shared_tmp_path):
     time = data.pop("time")
     data["mesh"] = {"generator": "rod", "length": LENGTH, "elements": 5}
     data["dashpot"] = [{"node_set": "all", "coefficient": 0.3}]
+    data["spring"][1]["frame"] = FRAME
     data["gravity"] = {"acceleration": [0.0, 3.0, -G]}
     data["stage"] = [{"name": "one", "time": time}, {"name": "two", "time": time}]
     data["initial"] = {"angular_velocity": [0.0, 0.0, 3.0]}
@@ -184,6 +251,11 @@ def test_refusals(tmp_path):
     some = {"time": time_of("newmark", 1e-3, 1e-3)}
     with pytest.raises(InputError, match=r"spring\[0\].stiffness = .*expected values >= 0"):
         case(**some, spring=[{"node_set": "end", "stiffness": [1.0, -1.0, 0.0]}])
+    with pytest.raises(InputError, match=r"spring\[0\].*the two vectors of frame are parallel"):
+        case(**some, spring=[{"node_set": "end", "stiffness": [1.0, 1.0, 0.0], "frame": [[1, 0, 0], [2, 0, 0]]}])
+    with pytest.raises(InputError, match=r"spring\[0\].*frame gives the axes of springs to the ground"):
+        between = {"between": ["start", "end"], "stiffness": 1.0, "frame": [[1, 0, 0], [0, 1, 0]]}
+        case(**some, spring=[between])
     with pytest.raises(InputError, match=r"dashpot\[0\].node_set"):
         case(**some, dashpot=[{"node_set": "ende", "coefficient": 1.0}])
     for method in ("arc_length", "relaxation"):

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from helpers.launch import environment
 
 from pfem_petsc import open_result
 from pfem_petsc.cli.main import main
@@ -34,7 +35,7 @@ def told(tmp_path_factory) -> dict[str, str]:
     for name, text in STAND_INS.items():
         (folder / "bin" / name).write_text(f"#!/bin/bash\n{text}\n")
         (folder / "bin" / name).chmod(0o755)
-    environment = {**os.environ, "PATH": f"{folder / 'bin'}:{os.environ['PATH']}", "OMP_NUM_THREADS": "1"}
+    settings = {**environment(), "PATH": f"{folder / 'bin'}:{os.environ['PATH']}", "OMP_NUM_THREADS": "1"}
     printed = {"": str(folder)}
     for language, text in BLOCK.findall(PAGE.read_text()):
         if language in ("toml", "python"):
@@ -43,7 +44,7 @@ def told(tmp_path_factory) -> dict[str, str]:
         script = folder / ("job.sh" if text.startswith("#!") else "commands.sh")
         script.write_text(text)
         command = ["bash", "-e", script.name]
-        done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=300)
+        done = subprocess.run(command, cwd=folder, env=settings, capture_output=True, text=True, timeout=300)
         assert done.returncode == 0, f"{text}\n{done.stdout[-2000:]}\n{done.stderr[-3000:]}"
         assert "Traceback" not in done.stderr and "warning" not in done.stderr, done.stderr
         printed[text] = done.stdout

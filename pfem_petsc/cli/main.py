@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 __all__ = ["main"]
 
-VERBS = ("run", "list", "check", "mesh", "render", "plot", "info", "sweep", "bench")
+VERBS = ("run", "list", "check", "mesh", "render", "plot", "report", "info", "sweep", "bench")
 """Modules of this package: ``EXAMPLE``, ``RANKS``, ``add_arguments(parser)`` and ``run(arguments[, comm])``."""
 
 EXAMPLES = f"""\

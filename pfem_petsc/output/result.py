@@ -276,6 +276,11 @@ class History(Mapping[str, np.ndarray]):
         self._result, self._columns, self._prefix = result, columns, prefix
         self._names = [name.removeprefix(prefix) for name in columns if name.startswith(prefix)]
 
+    @property
+    def axis(self) -> Axis:
+        """What the times of its rows are."""
+        return self._result.axis
+
     def __getitem__(self, name: str) -> Any:
         if name in self._names:
             return self._result.column(self._prefix + name, self.n_rows)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import csv
+import itertools
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -13,11 +15,30 @@ import numpy as np
 from ..errors import InputError
 from ..output.units import TIME, Axis, prefix_for
 
-__all__ = ["COLOURS", "STYLE", "Chart", "boxes_allowed", "literal", "thinned", "window_mean"]
+__all__ = [
+    "COLOURS",
+    "FORMATS",
+    "REFERENCE",
+    "STYLE",
+    "Chart",
+    "boxes_allowed",
+    "check_formats",
+    "literal",
+    "thinned",
+    "window_mean",
+]
 
-COLOURS = ("#2563b0", "#d9482b", "#2a9d5c", "#8a4fbf", "#e09f1f", "#3aa7c9", "#6b7280", "#b5307c")
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#6b7280", "#000000")
+"""For colour-blind eyes (Okabe and Ito 2008), without their yellow, which is too pale for lines on white."""
+
+FORMATS = ("png", "svg", "pdf", "csv")
+
+REFERENCE: dict[str, Any] = {"color": "#000000", "linewidth": 1.1, "linestyle": (0, (5, 2.5)), "zorder": 3}
+"""The style of closed forms."""
 
 STYLE: dict[str, Any] = {
+    "svg.fonttype": "none",
+    "svg.hashsalt": "pfem_petsc",
     "font.size": 10,
     "axes.titlesize": 11,
     "axes.titleweight": "bold",
@@ -96,8 +117,29 @@ def boxes_allowed() -> Iterator[None]:
         yield
 
 
+def check_formats(formats: Iterable[str]) -> tuple[str, ...]:
+    """Return the formats of pictures, each once.
+
+    Raises
+    ------
+    InputError
+        For an unknown format, or none.
+    """
+    if isinstance(formats, str):
+        formats = (formats,)
+    chosen = tuple(dict.fromkeys(name.lower().removeprefix(".") for name in formats))
+    for name in chosen:
+        if name not in FORMATS:
+            raise InputError(f"plot: format = {name!r} is not known; it is one of {', '.join(FORMATS)}")
+    if not chosen:
+        raise InputError(f"plot: no format named; it is one of {', '.join(FORMATS)}")
+    return chosen
+
+
 class Chart:
-    """Panels over a common time axis, one below the other or in columns.
+    """Panels over a common axis, mostly of time, one below the other or in columns.
+
+    What is drawn is kept in SI units, with all points, and can be written as a table.
 
     Parameters
     ----------
@@ -106,6 +148,7 @@ class Chart:
     rows, columns : of panels
     heights : relative heights of the rows
     axis : what the times are
+    sharex : whether all panels have the times as their axis
     """
 
     def __init__(
@@ -116,6 +159,7 @@ class Chart:
         columns: int = 1,
         heights: Sequence[float] | None = None,
         axis: Axis = TIME,
+        sharex: bool = True,
     ) -> None:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
@@ -124,12 +168,15 @@ class Chart:
         size = (8.6 if columns == 1 else 5.2 * columns, 0.9 + 2.5 * sum(relative))
         self.figure = Figure(figsize=size, layout="constrained")
         FigureCanvasAgg(self.figure)
-        self.axes = self.figure.subplots(rows, columns, sharex=True, squeeze=False, height_ratios=relative)
+        self.axes = self.figure.subplots(rows, columns, sharex=sharex, squeeze=False, height_ratios=relative)
         self.figure.suptitle(literal(title), x=0.01, ha="left", fontsize=13, fontweight="bold", color="#1f242c")
         self.time = np.asarray(time, dtype=float)
         self.factor, self.unit = prefix_for(float(np.abs(self.time).max()) if self.time.size else 0.0, axis.unit)
-        for axes in self.axes[-1]:
-            axes.set_xlabel(axis.label(self.unit))
+        self._over = axis.label(axis.unit)
+        self._columns: list[tuple[str, np.ndarray, str, np.ndarray]] = []
+        if sharex:
+            for axes in self.axes[-1]:
+                axes.set_xlabel(axis.label(self.unit))
 
     def curves(
         self,
@@ -140,14 +187,19 @@ class Chart:
         title: str = "",
         styles: Sequence[dict[str, Any]] | None = None,
         legend: bool = True,
+        keys: Sequence[str] | None = None,
     ) -> tuple[float, str]:
-        """Draw named curves (n,) of one unit into a panel; return the factor and unit of its axis."""
+        """Draw named curves (n,) of one unit into a panel; return the factor and unit of its axis.
+
+        ``keys`` are the names of the curves in tables; default: label and name.
+        """
         finite = [np.abs(values[np.isfinite(values)]).max(initial=0.0) for _, values in curves]
         factor, shown = prefix_for(float(max(finite, default=0.0)), unit)
         for number, (name, values) in enumerate(curves):
             time, thin = thinned(self.time, np.asarray(values, dtype=float) * factor)
             options = {"color": COLOURS[number % len(COLOURS)], **(styles[number] if styles else {})}
             axes.plot(time * self.factor, thin, label=literal(name), **options)
+            self.record(keys[number] if keys else " ".join(dict.fromkeys([title, name])).strip(), values, unit)
         axes.set_ylabel(f"{label} [{shown}]" if shown else label)
         axes.set_title(literal(title))
         if legend and len(curves) > 1:
@@ -159,26 +211,56 @@ class Chart:
         from matplotlib.ticker import MaxNLocator
 
         time, thin = thinned(self.time, np.asarray(values, dtype=float))
+        self.record(" ".join(label.split()), np.asarray(values))
         axes.plot(time * self.factor, thin, color=colour, linewidth=1.0, drawstyle="steps-post")
         axes.fill_between(time * self.factor, thin, step="post", color=colour, alpha=0.15, linewidth=0)
         axes.yaxis.set_major_locator(MaxNLocator(integer=True, nbins=5))
         axes.set_ylim(0, max(1.0, 1.08 * float(thin.max(initial=0.0))))
         axes.set_ylabel(label)
 
-    def save(self, file: Path) -> Path:
-        """Write the picture.
+    def record(self, name: str, values: np.ndarray, unit: str = "", over: tuple[str, np.ndarray] | None = None) -> None:
+        """Add a column (n,) to the table of the picture, over the times or over other named values (n,)."""
+        along, places = over or (self._over, self.time)
+        heading = f"{name} [{unit}]" if unit else name
+        if not any(heading == other and along == before for before, _, other, _ in self._columns):
+            self._columns.append((along, places, heading, np.asarray(values)))
+
+    def save(self, file: Path, formats: Iterable[str] = ("png",)) -> list[Path]:
+        """Write the picture, or its table, in formats of :data:`FORMATS`; return the files.
 
         Raises
         ------
         InputError
-            If it cannot be written.
+            If one cannot be written.
         """
-        try:
-            file.parent.mkdir(parents=True, exist_ok=True)
-            with boxes_allowed():
-                self.figure.savefig(file)
-        except OSError as error:
-            raise InputError(
-                f"{file}: the picture cannot be written ({error.strerror}); give another folder"
-            ) from error
-        return file
+        written = []
+        for suffix in formats:
+            path = file.with_name(f"{file.name.removesuffix('.png')}.{suffix}")
+            try:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                if suffix == "csv":
+                    self._write_table(path)
+                else:
+                    metadata = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(suffix)
+                    with boxes_allowed():
+                        self.figure.savefig(path, metadata=metadata)
+            except OSError as error:
+                raise InputError(
+                    f"{path}: the picture cannot be written ({error.strerror}); give another folder"
+                ) from error
+            written.append(path)
+        return written
+
+    def _write_table(self, path: Path) -> None:
+        """Write all curves at all points: columns over the same values have these once, before the first of them."""
+        columns: list[tuple[str, np.ndarray]] = []
+        shown: list[np.ndarray] = []
+        for along, places, name, values in self._columns:
+            if not any(places is other or np.array_equal(places, other) for other in shown):
+                columns.append((along, places))
+                shown.append(places)
+            columns.append((name, values))
+        with path.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow([name for name, _ in columns])
+            writer.writerows(itertools.zip_longest(*(values.tolist() for _, values in columns), fillvalue=""))

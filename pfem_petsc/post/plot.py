@@ -4,39 +4,56 @@ from __future__ import annotations
 
 import itertools
 import os
-import textwrap
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import nullcontext
+from collections.abc import Iterable, Sequence
+from contextlib import ExitStack, nullcontext
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..energies import LOST, STORED, SUPPLIED
 from ..errors import InputError
-from ..output.units import TIME, engineering, unit_of
-from ..registry import nearest
-from .chart import COLOURS, STYLE, Chart
-from .forces import draw_forces
+from ..output.units import TIME, unit_of
+from .chart import COLOURS, REFERENCE, STYLE, Chart, check_formats
+from .closed_forms import ClosedForm, closed_form
+from .curves import History, draw_curves, draw_spectra, make_chart, read, usual_curves, words
+from .energies import draw_energies
+from .filters import WINDOWS, Filter, make_filter
+from .forces import draw_force_displacement, draw_forces
 
 __all__ = ["plot"]
 
-History = Mapping[str, np.ndarray]
-
-_NOTE_WIDTH = 100  # characters of a line above the axes
-
 
 def plot(
-    result_path: Path | str | Any, output: Path | str | None = None, *, curves: Iterable[str] | None = None
+    result_path: Path | str | Any | Sequence[Any],
+    output: Path | str | None = None,
+    *,
+    curves: Iterable[str] | None = None,
+    formats: Iterable[str] = ("png",),
+    force_filter: str | None = None,
+    against: str | None = None,
+    spectrum: Iterable[str] | None = None,
+    window: str = "hann",
+    highest: float | None = None,
+    closed_forms: bool = True,
 ) -> list[Path]:
     """Draw the history: ``energies.png``, ``momentum.png``, ``probes.png``, ``walls.png``, ``solver.png`` and others.
 
     Parameters
     ----------
-    result_path : result file or its folder, or an open result
-    output : folder of the pictures; None: beside the result
+    result_path : result file or its folder, or an open result; several of them are drawn over each other, into
+        ``comparison.png`` without ``curves``
+    output : folder of the pictures; None: beside the (first) result
     curves : names of history columns, drawn into ``curves.png`` instead of the other pictures; an existing
         ``curves.png`` is kept, and the new one is ``curves_2.png`` and so on
+    formats : of :data:`~pfem_petsc.post.chart.FORMATS`; "csv" writes a table of each picture, with all rows in SI
+        units, and, without curves, ``history.csv``
+    force_filter : of the forces of walls and others, and of the curves with which it is given: see
+        :func:`~pfem_petsc.post.filters.make_filter`; None: the mean of the last 2 % of the run, for forces alone
+    against : column or component, like ``probe/tip/position.x``, over which the curves are drawn instead of time
+    spectrum : names of history columns whose amplitude spectra are drawn into ``spectra.png`` instead
+    window : of the spectra, one of :data:`~pfem_petsc.post.filters.WINDOWS`
+    highest : frequency [Hz] at which the spectra end; None: half the sampling rate
+    closed_forms : whether closed forms are drawn where the case has one
 
     Returns
     -------
@@ -46,30 +63,77 @@ def plot(
     Raises
     ------
     InputError
-        For a column that the history does not have (with the nearest name), an empty history, or a folder that cannot
-        be written.
+        For a column that the history does not have (with the nearest name), an empty history, an unknown format, filter
+        or window, options that exclude each other, or a folder that cannot be written.
     """
     import matplotlib
 
-    with _opened(result_path) as result, matplotlib.rc_context(STYLE):
-        folder = Path(output) if output is not None else Path(result.path).parent
-        history: History = result.history
-        if "time" not in history or len(history["time"]) == 0:
-            raise InputError(f"{result.path}: the history is empty: nothing to plot; set [output] history_every >= 1")
-        case = result.case
-        title = case.title or case.name
-        if curves is not None:
-            return [_named(history, list(curves), title, _free(folder / "curves.png"))]
-        drawn = [
-            _energies(history, title, folder / "energies.png"),
-            _momentum(history, title, folder / "momentum.png") if result.axis is TIME else None,
-            _probes(history, title, folder / "probes.png"),
-            draw_forces(history, "wall", case.every_wall, title, folder / "walls.png"),
-            draw_forces(history, "pair", (), title, folder / "pairs.png"),
-            draw_forces(history, "constraint", (), title, folder / "constraints.png"),
-            _solver(history, title, folder / "solver.png"),
-        ]
-    return [file for file in drawn if file is not None]
+    several = isinstance(result_path, Sequence) and not isinstance(result_path, str)
+    paths = list(result_path) if several else [result_path]
+    suffixes = check_formats(formats)
+    chosen = make_filter(force_filter) if force_filter is not None else None
+    names, sines = (None if found is None else list(found) for found in (curves, spectrum))
+    _check_options(paths, names, sines, against, window)
+    with ExitStack() as stack, matplotlib.rc_context(STYLE):
+        results = [stack.enter_context(_opened(path)) for path in paths]
+        folder = Path(output) if output is not None else Path(results[0].path).parent
+        for result in results:
+            if "time" not in result.history or len(result.history["time"]) == 0:
+                raise InputError(
+                    f"{result.path}: the history is empty: nothing to plot; set [output] history_every >= 1"
+                )
+            if chosen is not None and result.axis is not TIME:
+                raise InputError(
+                    f"{result.path}: filter = {force_filter!r} needs a run over time, not a static analysis"
+                )
+        if sines is not None:
+            chart = draw_spectra(results, sines, window, highest)
+            return chart.save(_free(folder / "spectra", suffixes), suffixes)
+        if names is not None:
+            chart = draw_curves(results, names, against, chosen, closed_forms)
+            return chart.save(_free(folder / "curves", suffixes), suffixes)
+        if len(results) > 1:
+            chart = draw_curves(results, usual_curves(results), None, chosen, closed_forms)
+            return chart.save(folder / "comparison", suffixes)
+        (result,) = results
+        return _usual(result, folder, suffixes, chosen, closed_forms)
+
+
+def _check_options(
+    paths: list[Any], names: list[str] | None, sines: list[str] | None, against: str | None, window: str
+) -> None:
+    if not paths:
+        raise InputError("plot: no result named")
+    if sines is not None and (names is not None or against is not None):
+        raise InputError("plot: spectrum is a picture of its own: give it without curves and against")
+    if against is not None and names is None:
+        raise InputError(f"plot: against = {against!r} needs curves, the columns to draw over it")
+    if window not in WINDOWS:
+        raise InputError(f"plot: window = {window!r} is not known; it is one of {', '.join(WINDOWS)}")
+
+
+def _usual(
+    result: Any, folder: Path, suffixes: tuple[str, ...], chosen: Filter | None, closed_forms: bool
+) -> list[Path]:
+    """The pictures of a single result."""
+    history: History = result.history
+    case = result.case
+    title = case.title or case.name
+    exact = closed_form(result) if closed_forms else None
+    drawn: dict[str, Chart | None] = {
+        "energies": draw_energies(history, title, exact),
+        "momentum": _momentum(history, title, exact) if result.axis is TIME else None,
+        "probes": _probes(history, title, exact),
+        "walls": draw_forces(history, "wall", case.every_wall, title, chosen, exact),
+        "pairs": draw_forces(history, "pair", (), title, chosen),
+        "constraints": draw_forces(history, "constraint", (), title, chosen),
+        "force_displacement": draw_force_displacement(result, title, chosen, exact),
+        "solver": _solver(history, title),
+    }
+    written = [path for name, chart in drawn.items() if chart for path in chart.save(folder / name, suffixes)]
+    if "csv" in suffixes and hasattr(result, "table"):
+        written.append(result.table().to_csv(folder / "history.csv"))
+    return written
 
 
 def _opened(result: Path | str | Any) -> Any:
@@ -80,62 +144,11 @@ def _opened(result: Path | str | Any) -> Any:
     return open_result(result)
 
 
-def _free(file: Path) -> Path:
-    """Return the file name, with the next free number if it exists."""
-    numbered = (file.with_name(f"{file.stem}_{k}{file.suffix}") for k in itertools.count(2))
-    return next(path for path in itertools.chain([file], numbered) if not path.exists())
-
-
-def _read(history: History, name: str) -> np.ndarray:
-    return np.asarray(history[name], dtype=float)
-
-
-def _chart(history: History, title: str, rows: int, columns: int = 1, heights: Sequence[float] | None = None) -> Chart:
-    axis = getattr(history, "axis", TIME)
-    return Chart(_read(history, "time"), title, rows, columns, heights, axis)
-
-
-def _words(name: str) -> str:
-    return name.replace("_", " ")
-
-
-def balance_error(history: History) -> np.ndarray | None:
-    """Return the imbalance of stored, lost and supplied energies since the first row, (n,) [J]; None without them."""
-    signs = {**dict.fromkeys((*STORED, *LOST), 1.0), **dict.fromkeys(SUPPLIED, -1.0)}
-    parts = [sign * _read(history, name) for name, sign in signs.items() if name in history]
-    if not parts:
-        return None
-    total = np.sum(parts, axis=0)
-    return total - total[0]
-
-
-def _energies(history: History, title: str, file: Path) -> Path | None:
-    error = balance_error(history)
-    if error is None:
-        return None
-    held = {name: _read(history, name) for name in (*STORED, *LOST, *SUPPLIED) if name in history}
-    largest = max(float(np.nanmax(np.abs(values))) for values in held.values())
-    moving = {name: values for name, values in held.items() if np.abs(values).max() > 1e-12 * largest}
-    still = [_words(name) for name in held if name not in moving]
-    chart = _chart(history, title, 2, heights=(1.7, 0.8))
-    upper, lower = chart.axes[:, 0]
-    total = sum(values for name, values in held.items() if name in (*STORED, *LOST))
-    curves = [(_words(name), values) for name, values in moving.items()]
-    styles: list[dict[str, Any]] = [{} for _ in curves]
-    curves.append(("stored and lost", total))
-    styles.append({"color": "#1f242c", "linewidth": 1.2, "linestyle": (0, (4, 2)), "zorder": 1.5})
-    chart.curves(upper, "energy", "J", curves, styles=styles)
-    if still:
-        text = textwrap.fill("zero throughout: " + ", ".join(still), _NOTE_WIDTH)
-        note = upper.annotate(text, (0, 1.02), xycoords="axes fraction", fontsize=8, color="#5b6472", va="bottom")
-        note.set_in_layout(False)  # a long line must not take the width of the axes; the title makes the height for it
-        upper.set_title("\n" * text.count("\n"), fontsize=9)
-    chart.curves(lower, "balance error", "J", [("balance error", error)], styles=[{"color": COLOURS[1]}])
-    worst = float(np.nanmax(np.abs(error)))
-    if largest > 0:
-        text = f"largest: {worst / largest:.1e} of {engineering(largest, 'J')}"
-        lower.annotate(text, (1.01, 0.5), xycoords="axes fraction", fontsize=9, color="#5b6472", va="center")
-    return chart.save(file)
+def _free(file: Path, suffixes: Sequence[str]) -> Path:
+    """Return the file name without suffix, with the next free number if it exists in one of the formats."""
+    numbered = (file.with_name(f"{file.name}_{k}") for k in itertools.count(2))
+    free = (p for p in itertools.chain([file], numbered) if not any(Path(f"{p}.{s}").exists() for s in suffixes))
+    return next(free)
 
 
 def _components(values: np.ndarray, scale: float = 0.0) -> list[tuple[str, np.ndarray]]:
@@ -155,31 +168,47 @@ def _colours_of(curves: Sequence[tuple[str, np.ndarray]]) -> list[dict[str, Any]
 
 
 def _vector(
-    chart: Chart, axes: Any, label: str, unit: str, values: np.ndarray, title: str = "", scale: float = 0.0
+    chart: Chart,
+    axes: Any,
+    label: str,
+    unit: str,
+    values: np.ndarray,
+    title: str = "",
+    scale: float = 0.0,
+    exact: np.ndarray | None = None,
+    key: str = "",
 ) -> None:
     curves = _components(values, scale)
-    chart.curves(axes, label, unit, curves, title, _colours_of(curves), legend=False)
-    axes.legend(loc="best", ncols=3, handlelength=1.2)
+    styles, keys = _colours_of(curves), [f"{key or label}.{name}" for name, _ in curves]
+    for name, _ in list(curves) if exact is not None else ():
+        first = len(styles) == len(keys) and not any(label == "closed form" for label, _ in curves)
+        curves.append(("closed form" if first else f"_{name}", exact[:, "xyz".index(name)]))
+        styles.append(REFERENCE)
+        keys.append(f"{key or label}.{name} closed form")
+    chart.curves(axes, label, unit, curves, title, styles, legend=False, keys=keys)
+    axes.legend(loc="best", ncols=4, handlelength=1.4)
 
 
-def _momentum(history: History, title: str, file: Path) -> Path | None:
+def _momentum(history: History, title: str, exact: ClosedForm | None) -> Chart | None:
     names = [name for name in ("momentum", "angular_momentum", "centre_of_mass") if name in history]
     if not names:
         return None
-    chart = _chart(history, title, len(names), heights=[0.9] * len(names))
+    chart = make_chart(history, title, len(names), heights=[0.9] * len(names))
     for axes, name in zip(chart.axes[:, 0], names, strict=True):
-        values, label, scale = _read(history, name), _words(name), 0.0
+        values, label, scale = read(history, name), words(name), 0.0
+        known = exact.columns.get(name) if exact is not None else None
         if name == "centre_of_mass":
+            known = None if known is None else known - values[0]
             values = values - values[0]
             label = "centre of mass,\nmoved by"
         elif name == "angular_momentum" and {"momentum", "centre_of_mass"} <= set(names):
-            arm = np.linalg.norm(_read(history, "centre_of_mass"), axis=1)
-            scale = float(np.nanmax(arm * np.linalg.norm(_read(history, "momentum"), axis=1)))
-        _vector(chart, axes, label, unit_of(name), values, scale=scale)
-    return chart.save(file)
+            arm = np.linalg.norm(read(history, "centre_of_mass"), axis=1)
+            scale = float(np.nanmax(arm * np.linalg.norm(read(history, "momentum"), axis=1)))
+        _vector(chart, axes, label, unit_of(name), values, scale=scale, exact=known, key=name)
+    return chart
 
 
-def _probes(history: History, title: str, file: Path) -> Path | None:
+def _probes(history: History, title: str, exact: ClosedForm | None) -> Chart | None:
     quantities = ("position", "velocity", "acceleration", "reaction")
     probes: dict[str, dict[str, np.ndarray]] = {}
     for name in history:
@@ -190,7 +219,7 @@ def _probes(history: History, title: str, file: Path) -> Path | None:
         return None
     # reactions have a column only if there are any; accelerations in impacts are mostly noise
     columns = [q for q in quantities if q != "acceleration" and any(_wanted(q, held) for held in probes.values())]
-    chart = _chart(history, title, len(probes), len(columns))
+    chart = make_chart(history, title, len(probes), len(columns))
     labels = {"position": "displacement"}
     for row, (probe, held) in zip(chart.axes, probes.items(), strict=True):
         for axes, quantity in zip(row, columns, strict=True):
@@ -198,7 +227,10 @@ def _probes(history: History, title: str, file: Path) -> Path | None:
                 axes.set_axis_off()
                 continue
             values = held[quantity]
+            column = f"probe/{probe}/{quantity}"
+            known = exact.columns.get(column) if exact is not None else None
             if quantity == "position":
+                known = None if known is None else known - values[:1]
                 values = values - values[:1]
             nodes = values.shape[1]
             # the reaction of a support is the sum over its nodes
@@ -206,10 +238,12 @@ def _probes(history: History, title: str, file: Path) -> Path | None:
             how = f"sum of {nodes} nodes" if total else f"mean and range of {nodes} nodes"
             name = f"{probe} ({how})" if nodes > 1 else probe
             shown = values.sum(axis=1) if total else values.mean(axis=1)
-            _vector(chart, axes, labels.get(quantity, quantity), unit_of(quantity), shown, name)
+            known = None if known is None else known.mean(axis=1)
+            key = f"probe/{probe}/{labels.get(quantity, quantity)}"
+            _vector(chart, axes, labels.get(quantity, quantity), unit_of(quantity), shown, name, exact=known, key=key)
             if nodes > 1 and not total:
                 _range(chart, axes, quantity, values)
-    return chart.save(file)
+    return chart
 
 
 def _wanted(quantity: str, held: dict[str, np.ndarray]) -> bool:
@@ -230,7 +264,7 @@ def _range(chart: Chart, axes: Any, quantity: str, values: np.ndarray) -> None:
         axes.fill_between(time, low, high, color=COLOURS[k], alpha=0.15, linewidth=0)
 
 
-def _solver(history: History, title: str, file: Path) -> Path | None:
+def _solver(history: History, title: str) -> Chart | None:
     labels = {
         "newton_iterations": "Newton\niterations",
         "linear_iterations": "linear\niterations",
@@ -242,34 +276,13 @@ def _solver(history: History, title: str, file: Path) -> Path | None:
     names = [name for name in names if (walls and name == "active_contacts") or np.any(history[name])]
     if not names or (names == ["active_contacts"] and _is_shown(history)):
         return None
-    chart = _chart(history, title, len(names), heights=[0.7] * len(names))
+    chart = make_chart(history, title, len(names), heights=[0.7] * len(names))
     for number, (axes, name) in enumerate(zip(chart.axes[:, 0], names, strict=True)):
         chart.counts(axes, labels[name], history[name], COLOURS[number])
-    return chart.save(file)
+    return chart
 
 
 def _is_shown(history: History) -> bool:
     """Whether the nodes in contact are those of a single wall: their number is in the picture of the walls."""
     walls = [name for name in history if name.startswith("wall/") and name.endswith("/contacts")]
     return len(walls) == 1 and np.array_equal(history[walls[0]], history["active_contacts"])
-
-
-def _named(history: History, names: list[str], title: str, file: Path) -> Path:
-    if not names:
-        raise InputError("plot: no curves named; columns: " + ", ".join(history))
-    for name in names:
-        if name not in list(history):
-            raise InputError(f"plot: the history holds no column '{name}'{nearest(name, list(history))}")
-    chart = _chart(history, title, len(names), heights=[0.9] * len(names))
-    for axes, name in zip(chart.axes[:, 0], names, strict=True):
-        values = _read(history, name)
-        label, unit = _words(name.rsplit("/", 1)[-1]), unit_of(name)
-        if values.ndim == 3:  # nodes of a probe
-            many, total = values.shape[1] > 1, name.endswith("/reaction")
-            values = values.sum(axis=1) if total else values.mean(axis=1)
-            label += (" (sum)" if total else " (mean)") if many else ""
-        if values.ndim == 2:
-            _vector(chart, axes, label, unit, values, name)
-        else:
-            chart.curves(axes, label, unit, [(name, values)], name)
-    return chart.save(file)

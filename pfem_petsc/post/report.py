@@ -1,0 +1,256 @@
+"""A report of a run as one HTML file without references to others."""
+
+from __future__ import annotations
+
+import base64
+import html
+import os
+import re
+import tempfile
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import nullcontext
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..energies import LOST, STORED, SUPPLIED
+from ..errors import InputError
+from ..output.history import EVENT
+from ..output.modes import NAMES
+from ..output.units import engineering
+from .energies import balance_error
+from .plot import plot
+
+__all__ = ["write_report"]
+
+NAME = "report.html"
+POSTER_FRAMES = 6
+
+_STYLE = """
+:root { color-scheme: light; }
+body { font: 16px/1.5 system-ui, "DejaVu Sans", sans-serif; color: #1f242c; background: #fff; margin: 0 auto;
+  max-width: 66rem; padding: 1rem 1.25rem 4rem; }
+h1 { font-size: 1.7rem; line-height: 1.2; margin: 1rem 0 .25rem; }
+h2 { font-size: 1.25rem; margin: 2.2rem 0 .6rem; border-bottom: 1px solid #d5d9df; padding-bottom: .2rem; }
+p.lead { color: #4a5260; margin-top: 0; }
+nav { display: flex; flex-wrap: wrap; gap: .2rem 1.1rem; } nav a { color: #0072B2; }
+table { border-collapse: collapse; margin: .4rem 0 1rem; display: block; overflow-x: auto; max-width: 100%; }
+th, td { text-align: left; padding: .2rem .9rem .2rem 0; vertical-align: top; border-bottom: 1px solid #eceef1; }
+th { font-weight: 600; } td.number { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
+figure { margin: 1rem 0; } img { max-width: 100%; height: auto; display: block; }
+figcaption { color: #4a5260; font-size: .9rem; }
+pre { background: #f5f6f8; padding: .8rem 1rem; overflow-x: auto; font-size: .85rem; line-height: 1.4; }
+.warning { border-left: 4px solid #D55E00; background: #fdf3ec; padding: .5rem .9rem; margin: .5rem 0;
+  white-space: pre-wrap; overflow-wrap: anywhere; }
+@media print { nav { display: none; } h2 { break-after: avoid; } figure { break-inside: avoid; } }
+"""
+
+
+def write_report(
+    result_path: Path | str | Any,
+    output: Path | str | None = None,
+    *,
+    pictures: bool = True,
+    force_filter: str | None = None,
+    field: str = "stress",
+) -> Path:
+    """Write case, summary, warnings, pictures, curves, energies, events, modes and cost of a run into one HTML file.
+
+    Pictures are inside the file, which opens without a network. An earlier report is replaced.
+
+    Parameters
+    ----------
+    result_path : result file or its folder, or an open result
+    output : the file; None: ``report.html`` beside the result
+    pictures : whether to draw the truss; where that is not possible, the report says why
+    force_filter : of the forces: see :func:`~pfem_petsc.post.filters.make_filter`
+    field : that colours the bars
+
+    Raises
+    ------
+    InputError
+        If the result cannot be read, its history is empty, or the file cannot be written.
+    """
+    from ..output.result import open_result
+
+    known = not isinstance(result_path, (str, os.PathLike))
+    with nullcontext(result_path) if known else open_result(result_path) as result:
+        file = Path(output) if output is not None else Path(result.path).parent / NAME
+        if file.is_dir():
+            raise InputError(f"{file}: is a folder; name a file for the report, {file / NAME}")
+        with tempfile.TemporaryDirectory() as folder:
+            curves = plot(result, folder, force_filter=force_filter)
+            drawn, reason = _draw(result, Path(folder) / "truss", field) if pictures else (None, "not asked for")
+            text = _document(result, curves, drawn, reason)
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{file}: the report cannot be written ({error.strerror}); give another file") from error
+    return file
+
+
+def _draw(result: Any, folder: Path, field: str) -> tuple[Path | None, str]:
+    """Draw six instants of the truss; return the picture, or why there is none."""
+    from .render import render
+
+    try:
+        written = render(result, folder, field=field, frames=POSTER_FRAMES, video="none", note=lambda _: None)
+    except InputError as error:
+        return None, str(error)
+    return next((path for path in written if path.name == "render.png"), written[0]), ""
+
+
+def _document(result: Any, curves: Sequence[Path], drawn: Path | None, reason: str) -> str:
+    case, log = result.case, _log(result)
+    title = case.title or case.name
+    truss = _figure(drawn, "Six instants, coloured by the field named beside the scale") if drawn else ""
+    if not drawn:
+        truss = f"<p>No pictures of the truss: {html.escape(reason)}</p>"
+    sections = {
+        "Summary": _table(_summary(result)),
+        "Warnings": "".join(f'<div class="warning">{html.escape(text)}</div>' for text in log["warnings"])
+        or "<p>None.</p>",
+        "Truss": truss,
+        "Curves": "".join(_figure(path, path.stem.replace("_", " ").capitalize()) for path in curves),
+        "Energies": _energies(result.history),
+        "Events": _events(result),
+        "Modes": _modes(result),
+        "Cost": _table(_cost(result, log)),
+        "Case": f"<p>All keys, with defaults:</p><pre>{html.escape(result.case_text.strip())}</pre>",
+        "Versions": _table({key: str(value) for key, value in result.attributes.items() if value not in ("", {}, [])}),
+    }
+    shown = {name: body for name, body in sections.items() if body}
+    links = "".join(f'<a href="#{name.lower()}">{name}</a>' for name in shown)
+    body = "".join(f'<h2 id="{name.lower()}">{name}</h2>{content}' for name, content in shown.items())
+    lead = f"{result.n_nodes:,} nodes, {result.n_bars:,} bars · {_span(result)}"
+    return (
+        '<!DOCTYPE html><html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{html.escape(title)}</title><style>{_STYLE}</style></head><body>"
+        f'<h1>{html.escape(title)}</h1><p class="lead">{html.escape(lead)}</p><nav>{links}</nav>{body}</body></html>\n'
+    )
+
+
+def _span(result: Any) -> str:
+    time = np.asarray(result.history["time"], dtype=float)
+    return result.axis.span(float(time[0]), float(time[-1]))
+
+
+def _summary(result: Any) -> dict[str, str]:
+    history, case = result.history, result.case
+    rows = {"result": str(result.path), "mesh": f"{result.n_nodes:,} nodes, {result.n_bars:,} bars"}
+    if len(result.times):
+        points = np.asarray(result.positions(0), dtype=float)
+        rows["extent"] = " × ".join(engineering(float(length), "m") for length in np.ptp(points, axis=0))
+    analysis = [_analysis(stage) for stage in case.stages]
+    rows["analysis"] = "; ".join(analysis)
+    rows["history"] = f"{len(history['time']):,} rows, {_span(result)}"
+    rows["snapshots"] = f"{len(result.times):,}"
+    for wall in case.every_wall:
+        force = np.linalg.norm(np.asarray(history[f"wall/{wall.name}/force"], dtype=float), axis=1)
+        peak = int(np.argmax(force))
+        text = f"largest force {engineering(float(force[peak]), 'N')} at {result.axis.place(history['time'][peak])}"
+        rows[f"wall '{wall.name}'"] = text if force[peak] > 0.0 else "not touched"
+    if "broken_bars" in history and np.asarray(history["broken_bars"])[-1]:
+        rows["broken bars"] = f"{int(np.asarray(history['broken_bars'])[-1]):,} of {result.n_bars:,}"
+    return rows
+
+
+def _analysis(stage: Any) -> str:
+    if stage.time is not None:
+        return f"{stage.time.integrator}, {stage.time.mass} mass, to {engineering(stage.time.end, 's')}"
+    return f"static, {stage.static.method}" if stage.static is not None else "modes of the initial state"
+
+
+def _energies(history: Mapping[str, np.ndarray]) -> str:
+    held = {name: np.asarray(history[name], dtype=float) for name in (*STORED, *LOST, *SUPPLIED) if name in history}
+    error = balance_error(history)
+    if error is None:
+        return ""
+    side = {**dict.fromkeys(STORED, "stored"), **dict.fromkeys(LOST, "lost"), **dict.fromkeys(SUPPLIED, "supplied")}
+    lines = []
+    for name, values in held.items():
+        if np.any(values):
+            numbers = (values[0], float(values.max()), values[-1])
+            lines.append([name.replace("_", " "), side[name], *(engineering(float(v), "J") for v in numbers)])
+    largest = max(float(np.abs(values).max()) for values in held.values())
+    worst = float(np.abs(error).max())
+    share = f" ({worst / largest:.1e} of the largest energy)" if largest > 0.0 else ""
+    text = f"<p>Largest imbalance of stored + lost − supplied: {engineering(worst, 'J')}{share}."
+    return f"{text} Terms that are zero are left out.</p>" + _grid(["energy", "", "start", "largest", "end"], lines)
+
+
+def _events(result: Any) -> str:
+    history = result.history
+    names = [name for name in history if name.startswith(f"{EVENT}/")]
+    if not names or not len(history[names[0]]):
+        return ""
+    columns = [history[name] for name in names]
+    lines = [[f"{value:.6g}" if isinstance(value, float) else str(value) for value in row] for row in zip(*columns)]
+    more = f"<p>{len(lines) - 50:,} more are in the result.</p>" if len(lines) > 50 else ""
+    return _grid([name.removeprefix(f"{EVENT}/") for name in names], lines[:50]) + more
+
+
+def _modes(result: Any) -> str:
+    if not getattr(result, "n_modes", 0):
+        return ""
+    name, unit = NAMES[result.modes.kind]
+    lines = [[str(k + 1), f"{value:.6g}"] for k, value in enumerate(result.modes.values)]
+    return _grid(["mode", name.replace("_", " ") + (f" [{unit}]" if unit else "")], lines)
+
+
+def _log(result: Any) -> dict[str, list[str]]:
+    """Return warnings, closing lines and memory from the log beside the result."""
+    try:
+        text = (Path(result.path).parent / "log.txt").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return {"warnings": [], "done": [], "memory": []}
+    entries = re.findall(r"^\S+ \S+ (\w+) +(.*(?:\n(?!\d{4}-\d\d-\d\d ).*)*)", text, flags=re.MULTILINE)
+    found: dict[str, list[str]] = {"warnings": [], "done": [], "memory": []}
+    for level, message in entries:
+        message = message.strip()
+        if level in ("WARNING", "ERROR") and message not in found["warnings"]:
+            found["warnings"].append(message)
+        elif message.startswith(("done:", "stopped")):
+            found["done"].append(message.removeprefix("done: "))
+        elif message.startswith("memory"):
+            found["memory"] = [message.removeprefix("memory").strip()]
+    return found
+
+
+def _cost(result: Any, log: Mapping[str, list[str]]) -> dict[str, str]:
+    rows = {"run" if k == 0 else f"continued ({k})": text for k, text in enumerate(log["done"])}
+    if not rows:
+        rows["run"] = "not finished, or its log is not beside the result"
+    if log["memory"]:
+        rows["memory"] = log["memory"][-1]
+    rows["ranks"] = str(result.attributes.get("ranks", "?"))
+    rows["result file"] = f"{Path(result.path).stat().st_size / 1e6:.3g} MB"
+    for column in ("newton_iterations", "linear_iterations"):
+        if column in result.history and np.any(result.history[column]):
+            rows[column.replace("_", " ")] = f"{int(np.sum(result.history[column])):,} in the rows of the history"
+    return rows
+
+
+def _table(rows: Mapping[str, str]) -> str:
+    lines = (f"<tr><th>{html.escape(k)}</th><td>{html.escape(v)}</td></tr>" for k, v in rows.items())
+    return f"<table>{''.join(lines)}</table>"
+
+
+def _grid(head: Iterable[str], lines: Iterable[Sequence[str]]) -> str:
+    heading = "".join(f"<th>{html.escape(text)}</th>" for text in head)
+    body = "".join(f"<tr>{''.join(_cell(text) for text in line)}</tr>" for line in lines)
+    return f"<table><thead><tr>{heading}</tr></thead><tbody>{body}</tbody></table>"
+
+
+def _cell(text: str) -> str:
+    kind = ' class="number"' if re.match(r"[-−]?\d", text) else ""
+    return f"<td{kind}>{html.escape(text)}</td>"
+
+
+def _figure(path: Path, caption: str) -> str:
+    data = base64.b64encode(path.read_bytes()).decode("ascii")
+    text = html.escape(caption)
+    return f'<figure><img alt="{text}" src="data:image/png;base64,{data}"><figcaption>{text}</figcaption></figure>'

@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from .base import Balance, ExplicitScheme, NoParameters, State
 from ._leapfrog import centre, drift, kick
+from .base import Balance, ExplicitScheme, NoParameters, State
 
 __all__ = ["Parameters", "Scheme"]
 

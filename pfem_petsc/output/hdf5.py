@@ -158,6 +158,8 @@ def create_growing(
     properties.set_chunk((rows_per_chunk, *(max(1, extent) for extent in row_shape)))
     # Parallel writes need chunks allocated when the dataset grows, also in a file created by one rank.
     properties.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
+    # Ranks would write zeros into new chunks, one chunk after the other; rows count only once they are written.
+    properties.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
     *parents, leaf = name.split("/")
     if parents:
         group = group.require_group("/".join(parents))

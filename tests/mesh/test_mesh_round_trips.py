@@ -306,6 +306,7 @@ def test_3mf_of_another_program(tmp_path):
         ('objectid="5"', 'objectid="9"', r"there is no object 9"),
         ('<component objectid="4"/>', '<component objectid="5"/>', r"object 5 is a component of itself"),
         ("2 0 0 0 2 0 0 0 2 0 0 5", "2 0 0", r"line 16: transform: '2 0 0' are not 12 numbers"),
+        ('encoding="utf-8"', 'encoding="x"', r"unknown encoding"),
         ("</resources>", "", r"mismatched tag: line 17"),
         ("<model", '<!DOCTYPE model [<!ENTITY a "b">]><model', r"a document type, which 3MF does not allow"),
         ('objectid="5" t', 'objectid="5" p:path="/3D/o.model" xmlns:p="u" t', r"in another part of the file"),

@@ -352,7 +352,7 @@ def test_tables_as_spreadsheets_save_them(tmp_path):
     assert mesh.bars.tolist() == [[0, 1], [1, 2]]
     assert mesh.bar_fields["area"].tolist() == [1.5e-4, 2e-4]
     assert {name: members.tolist() for name, members in mesh.node_groups.items()} == {"feet": [0, 1], "right": [1]}
-    assert mesh.warnings == [f"{tmp_path}/bars tower.csv: left out column 'note', which has other texts than numbers"]
+    assert mesh.warnings == [f"{tmp_path}/bars tower.csv: left out column 'Note', which has other texts than numbers"]
 
 
 @pytest.mark.parametrize(
@@ -373,6 +373,44 @@ def test_tables_with_one_thing_wrong(tmp_path, nodes, bars, text):
     (tmp_path / "t_bars.csv").write_text(bars)
     with pytest.raises(InputError, match=text):
         read_whole(tmp_path / "t_nodes.csv")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_odd_names(tmp_path, name):
+    """Of groups and numbers of bars; only what a format cannot have is replaced."""
+    odd = [
+        "a b",
+        "A b",
+        "x,y",
+        "<tag>&",
+        "#hash",
+        "a=b",
+        "*star",
+        "nan",
+        "Ü",
+        "_section_1",
+        "1",
+        'q"uote',
+        "semi;colon",
+    ]
+    own = irregular()
+    truss = Truss(
+        own.points,
+        own.bars,
+        node_groups={text: [k % 12] for k, text in enumerate(odd)},
+        bar_groups={text: [k, k + 1] for k, text in enumerate(odd)},
+        bar_fields={"area": np.arange(1.0, 31.0), "Load case": np.ones(30), "<w>": np.zeros(30)},
+    )
+    again = Truss.read(truss.write(tmp_path / name))
+    changed = {"t.msh": ('"', "'"), "t.inp": ('"', "'"), "t_bars.csv": (";", "_")}.get(name, ("", ""))
+    expected = [text.replace(*changed) if changed[0] else text for text in odd]
+    if name == "t.inp":
+        expected[1] = "A b_"  # capitals are small letters there
+    for groups, kept in ((again.node_groups, truss.node_groups), (again.bar_groups, truss.bar_groups)):
+        found = {text: members.tolist() for text, members in groups.items()}
+        assert found == {new: kept[text].tolist() for new, text in zip(expected, odd)}
+    assert set(again.bar_fields) == (set(truss.bar_fields) if name in EXACT else {"area"})
+    np.testing.assert_allclose(again.bar_fields["area"], truss.bar_fields["area"], rtol=4e-16)
 
 
 @pytest.mark.parametrize("name", ["a.h5", "a.vtkhdf"])

@@ -114,6 +114,11 @@ class Flat:
             return self._labelled(kind, key, np.array([int(target)]), entry)
         return self._named(kind, key, entry, ())
 
+    def is_internal(self, name: str) -> bool:
+        """Whether a set outside of parts is made by a program for itself."""
+        table = self._model.root.elsets.get(name.upper())
+        return table is not None and all("INTERNAL" in entry.block.parameters for entry in table.entries)
+
     def sections(self) -> Iterator[tuple[Block, str, np.ndarray]]:
         """Return each section with the name of a bar group, and its bars.
 

@@ -184,13 +184,14 @@ def test_other_elements(tmp_path):
 2, .5, 0, 0
 3, 1, 0, 0
 4, 1, 1, 0
+5, 1, .4, 0
 9, 9, 9, 9
 *ELEMENT, TYPE=T3D3, ELSET=E
 1, 1, 2, 3
 *ELEMENT, TYPE=C3D8R, ELSET=E
 5, 1, 2, 3, 4, 1, 2, 3, 4
 *ELEMENT, TYPE=B32, ELSET=E
-2, 3, 2, 4
+2, 3, 4, 5
 *ELSET, ELSET=F
 1, 5
 *SOLID SECTION, ELSET=E
@@ -204,8 +205,14 @@ def test_other_elements(tmp_path):
         "/a.inp: 1 elements T3D3: trusses with three nodes are read as bars between their ends",
         "/a.inp: 1 elements B32: beams with three nodes are read as bars between their ends, without bending stiffness",
         "/a.inp: left out elements of the types C3D8R",
-        "/a.inp: left out 2 nodes where no bar ends (labels 2, 9)",
+        "/a.inp: left out 3 nodes where no bar ends (labels 2, 5, 9)",
     ]
+
+
+def test_third_nodes_that_are_not_between(tmp_path):
+    text = "*NODE\n1, 0\n2, 0, 1\n3, 1\n*ELEMENT, TYPE=T3D3\n7, 1, 2, 3\n"
+    with pytest.raises(InputError, match=r"line 5: \*ELEMENT: no node of element 7 is between the other two"):
+        read_whole(written(tmp_path, text))
 
 
 SECTIONS = {

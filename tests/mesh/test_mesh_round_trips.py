@@ -306,6 +306,7 @@ def test_3mf_of_another_program(tmp_path):
         ('objectid="5"', 'objectid="9"', r"there is no object 9"),
         ('<component objectid="4"/>', '<component objectid="5"/>', r"object 5 is a component of itself"),
         ("2 0 0 0 2 0 0 0 2 0 0 5", "2 0 0", r"line 16: transform: '2 0 0' are not 12 numbers"),
+        ('encoding="utf-8"', 'encoding="x"', r"unknown encoding"),
         ("</resources>", "", r"mismatched tag: line 17"),
         ("<model", '<!DOCTYPE model [<!ENTITY a "b">]><model', r"a document type, which 3MF does not allow"),
         ('objectid="5" t', 'objectid="5" p:path="/3D/o.model" xmlns:p="u" t', r"in another part of the file"),
@@ -351,7 +352,7 @@ def test_tables_as_spreadsheets_save_them(tmp_path):
     assert mesh.bars.tolist() == [[0, 1], [1, 2]]
     assert mesh.bar_fields["area"].tolist() == [1.5e-4, 2e-4]
     assert {name: members.tolist() for name, members in mesh.node_groups.items()} == {"feet": [0, 1], "right": [1]}
-    assert mesh.warnings == [f"{tmp_path}/bars tower.csv: left out column 'note', which has other texts than numbers"]
+    assert mesh.warnings == [f"{tmp_path}/bars tower.csv: left out column 'Note', which has other texts than numbers"]
 
 
 @pytest.mark.parametrize(
@@ -372,6 +373,44 @@ def test_tables_with_one_thing_wrong(tmp_path, nodes, bars, text):
     (tmp_path / "t_bars.csv").write_text(bars)
     with pytest.raises(InputError, match=text):
         read_whole(tmp_path / "t_nodes.csv")
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_odd_names(tmp_path, name):
+    """Of groups and numbers of bars; only what a format cannot have is replaced."""
+    odd = [
+        "a b",
+        "A b",
+        "x,y",
+        "<tag>&",
+        "#hash",
+        "a=b",
+        "*star",
+        "nan",
+        "Ü",
+        "_section_1",
+        "1",
+        'q"uote',
+        "semi;colon",
+    ]
+    own = irregular()
+    truss = Truss(
+        own.points,
+        own.bars,
+        node_groups={text: [k % 12] for k, text in enumerate(odd)},
+        bar_groups={text: [k, k + 1] for k, text in enumerate(odd)},
+        bar_fields={"area": np.arange(1.0, 31.0), "Load case": np.ones(30), "<w>": np.zeros(30)},
+    )
+    again = Truss.read(truss.write(tmp_path / name))
+    changed = {"t.msh": ('"', "'"), "t.inp": ('"', "'"), "t_bars.csv": (";", "_")}.get(name, ("", ""))
+    expected = [text.replace(*changed) if changed[0] else text for text in odd]
+    if name == "t.inp":
+        expected[1] = "A b_"  # capitals are small letters there
+    for groups, kept in ((again.node_groups, truss.node_groups), (again.bar_groups, truss.bar_groups)):
+        found = {text: members.tolist() for text, members in groups.items()}
+        assert found == {new: kept[text].tolist() for new, text in zip(expected, odd)}
+    assert set(again.bar_fields) == (set(truss.bar_fields) if name in EXACT else {"area"})
+    np.testing.assert_allclose(again.bar_fields["area"], truss.bar_fields["area"], rtol=4e-16)
 
 
 @pytest.mark.parametrize("name", ["a.h5", "a.vtkhdf"])

@@ -14,6 +14,9 @@ from ._inp_model import Entry, Model, Scope, SetTable
 
 __all__ = ["Flat"]
 
+_BETWEEN = 0.3
+"""Largest distance of the third node of an element from the middle of its ends, over their distance."""
+
 
 @dataclass
 class _Placed:
@@ -110,6 +113,11 @@ class Flat:
         if target.isdecimal() and len(target) < 16:
             return self._labelled(kind, key, np.array([int(target)]), entry)
         return self._named(kind, key, entry, ())
+
+    def is_internal(self, name: str) -> bool:
+        """Whether a set outside of parts is made by a program for itself."""
+        table = self._model.root.elsets.get(name.upper())
+        return table is not None and all("INTERNAL" in entry.block.parameters for entry in table.entries)
 
     def sections(self) -> Iterator[tuple[Block, str, np.ndarray]]:
         """Return each section with the name of a bar group, and its bars.
@@ -235,7 +243,7 @@ def _numbered(
         if len(missing):
             element, side = missing[0]
             raise InputError(f"{block.where}: node {wanted[element, side]} of element {own[element]} is not defined")
-        ends.append(order[found])
+        ends.append(_ends(order[found], points, own, block))
     sequence = np.argsort(own_bars, kind="stable")
     twice = np.flatnonzero(np.diff(own_bars[sequence]) == 0)
     if len(twice):
@@ -243,3 +251,18 @@ def _numbered(
     placed = _Placed(scope, nodes, order + first_node, own_bars[sequence], sequence + first_bar)
     moved_points = points if np.array_equal(place, np.eye(4, 3)) else points @ place[:3] + place[3]
     return placed, moved_points, np.concatenate(ends) + first_node
+
+
+def _ends(nodes: np.ndarray, points: np.ndarray, labels: np.ndarray, block: Block) -> np.ndarray:
+    """Return the nodes at the ends (n, 2) of elements with nodes (n, 2 or 3); the third is that between the others."""
+    if nodes.shape[1] == 2:
+        return nodes
+    pairs = np.array([[1, 2], [0, 2], [0, 1]])  # without each of the three
+    a, b = points[nodes[:, pairs[:, 0]]], points[nodes[:, pairs[:, 1]]]
+    span = np.linalg.norm(b - a, axis=2)
+    off = np.linalg.norm(points[nodes] - 0.5 * (a + b), axis=2) / np.maximum(span, 1e-300)
+    middle = off.argmin(axis=1)
+    far = np.flatnonzero(~(off.min(axis=1) < _BETWEEN))
+    if len(far):
+        raise InputError(f"{block.where}: no node of element {labels[far[0]]} is between the other two")
+    return np.take_along_axis(nodes, pairs[middle], axis=1)

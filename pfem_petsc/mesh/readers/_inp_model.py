@@ -10,23 +10,23 @@ import numpy as np
 from ...errors import InputError
 from ._inp_blocks import Block
 
-__all__ = ["ENDS", "Entry", "Model", "Scope", "SetTable"]
+__all__ = ["BARS", "Entry", "Model", "Scope", "SetTable"]
 
-ENDS = (
-    (re.compile(r"T[23]D2[A-Z]*|TRUSS"), (0, 1), ""),
-    (re.compile(r"T[23]D3[A-Z]*"), (0, 2), "trusses with three nodes are read as bars between their ends"),
+BARS = (
+    (re.compile(r"T[23]D2[A-Z]*|TRUSS"), 2, ""),
+    (re.compile(r"T[23]D3[A-Z]*"), 3, "trusses with three nodes are read as bars between their ends"),
     (
         re.compile(r"(B[23][13]|PIPE[23]1)[A-Z]*|FRAME[23]D"),
-        (0, 1),
+        2,
         "beams are read as bars, without bending stiffness",
     ),
     (
         re.compile(r"(B[23]2|PIPE[23]2)[A-Z]*"),
-        (0, 2),
+        3,
         "beams with three nodes are read as bars between their ends, without bending stiffness",
     ),
 )
-"""Types of elements that are bars, places of the ends among their nodes, and what is to be said about them."""
+"""Types of elements that are bars, their numbers of nodes, and what is to be said about them."""
 
 
 @dataclass
@@ -60,7 +60,7 @@ class Scope:
     labels: list[np.ndarray] = field(default_factory=list)
     points: list[np.ndarray] = field(default_factory=list)
     elements: list[tuple[Block, np.ndarray, np.ndarray]] = field(default_factory=list)
-    """Where, labels (n,), labels of the nodes at both ends (n, 2)."""
+    """Where, labels (n,), labels of the nodes (n, 2 or 3)."""
     nsets: dict[str, SetTable] = field(default_factory=dict)
     elsets: dict[str, SetTable] = field(default_factory=dict)
     sections: list[tuple[Block, str]] = field(default_factory=list)
@@ -100,16 +100,16 @@ class Model:
     def add_elements(self, scope: Scope, block: Block) -> None:
         """Read ``*ELEMENT``."""
         kind = block.required("TYPE").upper()
-        known = next(((ends, note) for pattern, ends, note in ENDS if pattern.fullmatch(kind)), None)
+        known = next(((count, note) for pattern, count, note in BARS if pattern.fullmatch(kind)), None)
         if known is None:
             self.left_out[kind] = self.left_out.get(kind, 0) + 1
             return
-        ends, note = known
-        least = 2 + ends[1]
+        count, note = known
+        least = 1 + count
         rows = block.rows(least + 2, least)[:, :least]
         labels = _labels(rows[:, 0], block, "element")
-        nodes = _labels(rows[:, 1:].ravel(), block, "node").reshape(len(rows), least - 1)
-        scope.elements.append((block, labels, nodes[:, list(ends)]))
+        nodes = _labels(rows[:, 1:].ravel(), block, "node").reshape(len(rows), count)
+        scope.elements.append((block, labels, nodes))
         if note:
             self.notes[f"{kind}: {note}"] = self.notes.get(f"{kind}: {note}", 0) + len(rows)
         if block.get("ELSET"):

@@ -107,10 +107,10 @@ class ModelFile:
         self._line = lambda: parser.CurrentLineNumber
         try:
             parser.ParseFile(stream)
-        except expat.ExpatError as error:
-            raise InputError(f"{self._where}: {error}: the file is damaged: write it again") from None
         except KeyError as error:
             raise InputError(f"{self._where}: line {self._line()}: the attribute {error} is missing") from None
+        except (expat.ExpatError, LookupError, ValueError) as error:  # the last two for unknown encodings
+            raise InputError(f"{self._where}: {error}: the file is damaged: write it again") from None
         for number, lattice in self._objects.items():
             lattice.finish(f"{self._where}: object {number}")
         for text in self._texts:

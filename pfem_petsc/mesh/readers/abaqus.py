@@ -159,19 +159,21 @@ def _add_sections(mesh: WholeMesh, flat: Flat, materials: Materials) -> None:
         material = block.get("MATERIAL")
         sections[group] = {"bars": group, **found, **({"material": materials.name_of(material)} if material else {})}
     if sections:
-        mesh.tables["section"] = _without_made(mesh, sections, (areas > 0.0).all())
+        mesh.tables["section"] = _without_made(mesh, flat, sections, (areas > 0.0).all())
     if len(areas) and (areas > 0.0).all():
         mesh.bar_fields["area"] = areas
     elif sections and np.isnan(areas).any():
         mesh.warnings.append(f"{flat.path}: {int(np.isnan(areas).sum())} bars have no area: there is no field area")
 
 
-def _without_made(mesh: WholeMesh, sections: dict[str, dict[str, Any]], whole: bool) -> dict[str, dict[str, Any]]:
+def _without_made(
+    mesh: WholeMesh, flat: Flat, sections: dict[str, dict[str, Any]], whole: bool
+) -> dict[str, dict[str, Any]]:
     """Return one section with the areas of the field in the place of those whose sets the writer has made for areas.
 
     The sets are no groups then.
     """
-    made = [name for name in sections if name.startswith(MADE)]
+    made = [name for name in sections if name.startswith(MADE) and flat.is_internal(name)]
     materials = {sections[name].get("material") for name in made}
     if not made or not whole or len(materials) > 1:
         return sections

@@ -119,7 +119,8 @@ class _Table:
             raise InputError(f"{path}: {error}") from None
         if len(rows) != len(kept):
             raise InputError(f"{path}: a text in quotes goes over several lines")
-        self.names = [_plain(name) for name in rows[0]]
+        self.headings = [_without_unit(name) for name in rows[0]]
+        self.names = [name.lower().replace(" ", "_") for name in self.headings]
         self.n = len(rows) - 1
         width = len(self.names)
         for i, row in enumerate(rows[1:]):
@@ -159,12 +160,12 @@ class _Table:
 
     def maybe_numbers(self, name: str) -> np.ndarray | None:
         """Return the numbers of a column; None if it has other texts."""
-        return self._converted(self._columns[self.names.index(name)])
+        return self._converted(self._columns[self.headings.index(name)])
 
     def others(self) -> list[str]:
         """Return the names of columns of bars without a meaning of their own."""
         known = {self.column(what, False) for what in ("bar", "first", "second", "groups")}
-        return [name for i, name in enumerate(self.names) if name and i + 1 not in known]
+        return [name for i, name in enumerate(self.headings) if name and i + 1 not in known]
 
     def groups(self) -> dict[str, np.ndarray]:
         """Return the members of the groups of the column ``groups``."""
@@ -185,9 +186,10 @@ class _Table:
             return None
 
 
-def _plain(name: str) -> str:
-    """Return the name of a column in small letters, without a unit in brackets."""
-    return re.sub(r"\s*[\[(].*?[\])]\s*$", "", name.strip()).strip().lower().replace(" ", "_")
+def _without_unit(name: str) -> str:
+    """Return the name of a column without a unit in brackets; ``area`` is written in small letters."""
+    name = re.sub(r"\s*[\[(].*?[\])]\s*$", "", name.strip()).strip()
+    return "area" if name.lower() == "area" else name
 
 
 def _label(word: str) -> str:

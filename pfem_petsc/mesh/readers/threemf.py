@@ -59,7 +59,7 @@ def _model_name(path: Path, archive: zipfile.ZipFile) -> str:
         parser.StartElementHandler = start
         try:
             parser.Parse(archive.read("_rels/.rels"), True)
-        except expat.ExpatError as error:
+        except (expat.ExpatError, LookupError, ValueError) as error:
             raise InputError(f"{path}: _rels/.rels: {error}") from None
     for name in [*targets, "3D/3dmodel.model"]:
         if name in names:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -75,6 +76,8 @@ def _sections(mesh: WholeMesh, names: dict[str, str]) -> Iterator[str]:
     which = which.ravel()
     order = np.argsort(which, kind="stable")
     starts = np.searchsorted(which[order], np.arange(len(pairs) + 1))
+    taken = {text.strip('"').upper() for text in names.values()}
+    free = (text for k in count(1) if (text := f"{MADE}{k}").upper() not in taken)
     exact = {mesh.bar_groups[name].tobytes(): text for name, text in names.items()}
     for number, (area, m) in enumerate(pairs.tolist()):
         if not area > 0.0:
@@ -82,7 +85,7 @@ def _sections(mesh: WholeMesh, names: dict[str, str]) -> Iterator[str]:
         members = order[starts[number] : starts[number + 1]]
         text = exact.get(members.tobytes())
         if text is None:
-            text = f"{MADE}{number + 1}"
+            text = next(free)
             yield from _set(f"*ELSET, ELSET={text}, INTERNAL", members)
         of = f", MATERIAL={_quoted(materials[int(m)])}" if m >= 0 else ""
         yield from (f"*SOLID SECTION, ELSET={text}{of}", f"{area!r},")

@@ -26,7 +26,8 @@ def write(path: Path, mesh: WholeMesh) -> None:
 def _table(path: Path, number: str, columns: dict[str, np.ndarray], groups: dict[str, np.ndarray]) -> None:
     n = len(next(iter(columns.values())))
     texts = [""] * n
-    for name, members in groups.items():
+    for group, members in groups.items():
+        name = group.replace(";", "_")
         for i in members.tolist():
             texts[i] += f";{name}" if texts[i] else name
     lists = [range(n), *(values.tolist() for values in columns.values()), *([texts] if groups else [])]

@@ -5,6 +5,7 @@ Bars of the same groups are a curve, each node of a group is a point. The tags a
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
@@ -86,4 +87,4 @@ def _tags(tags: list[int]) -> str:
 
 
 def _quoted(name: str) -> str:
-    return " ".join(name.replace('"', "'").split())
+    return re.sub(r"\s", " ", name.replace('"', "'"))

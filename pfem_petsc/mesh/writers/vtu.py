@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from xml.sax.saxutils import escape
 
 import numpy as np
 
@@ -12,6 +13,8 @@ from ..whole import WholeMesh
 __all__ = ["SUFFIXES", "masks", "write"]
 
 SUFFIXES = (".vtu",)
+
+_ESCAPED = {'"': "&quot;", "\t": "&#9;", "\n": "&#10;", "\r": "&#13;"}
 
 
 def write(path: Path, mesh: WholeMesh) -> None:
@@ -33,7 +36,7 @@ def write(path: Path, mesh: WholeMesh) -> None:
     arrays += [(grid.GetCellData(), *mask) for mask in masks(mesh.bar_groups, len(mesh.bars)).items()]
     for data, name, values in arrays:
         array = numpy_to_vtk(np.ascontiguousarray(values), deep=True)
-        array.SetName(name)
+        array.SetName(escape(name, _ESCAPED))  # VTK writes names as they are
         data.AddArray(array)
     writer = vtkXMLUnstructuredGridWriter()
     writer.SetFileName(str(path))

@@ -50,7 +50,8 @@ from mpi4py import MPI
 import petsc4py; petsc4py.init()
 from petsc4py import PETSc
 import h5py, json
-found = [MPI.COMM_WORLD.size, PETSc.COMM_WORLD.size, bool(h5py.get_config().mpi), h5py.version.hdf5_version, h5py.__file__]
+found = [MPI.COMM_WORLD.size, PETSc.COMM_WORLD.size]
+found += [bool(h5py.get_config().mpi), h5py.version.hdf5_version, h5py.__file__]
 if MPI.COMM_WORLD.rank == 0: print("found " + json.dumps(found), flush=True)
 """
 

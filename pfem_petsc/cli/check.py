@@ -1,11 +1,11 @@
-"""Check a case: read it, build its mesh and model, and summarise the run."""
+"""Check a case: read it, build its mesh and model, and summarise the run. Or, by --env, check this machine."""
 
 from __future__ import annotations
 
 import argparse
 from typing import TYPE_CHECKING
 
-from ..errors import printable
+from ..errors import InputError, printable
 from .parser import PROGRAM, add_case
 from .run import load_case
 
@@ -15,19 +15,36 @@ if TYPE_CHECKING:
 RANKS = "all"
 
 EXAMPLE = f"""\
-example:
+examples:
   {PROGRAM} check my_case.toml --set time.step=1e-5
+  {PROGRAM} check --env
 
-exit status: 0 it can run, 2 invalid input"""
+exit status: 0 it can run, 2 invalid input, or something that runs need is missing here"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the verb."""
-    add_case(parser)
+    add_case(parser, optional=True)
+    parser.add_argument(
+        "--env",
+        action="store_true",
+        help="check this machine instead: versions, MPI, HDF5, PETSc, OpenGL, and what brings the missing",
+    )
 
 
-def run(arguments: argparse.Namespace, comm: MPI.Comm) -> int:
+def ranks(arguments: argparse.Namespace) -> str:
+    """Return which ranks the verb needs: the check of a machine must not start an MPI that may be broken."""
+    return "one, without MPI" if arguments.env else RANKS
+
+
+def run(arguments: argparse.Namespace, comm: MPI.Comm | None = None) -> int:
     """Build the simulation without a step, and print its summary. Collective."""
+    if arguments.env:
+        return _check_machine(arguments)
+    if arguments.case is None:
+        raise InputError(
+            f"the following arguments are required: CASE (give it before --set), or --env; see {PROGRAM} check --help"
+        )
     case = load_case(arguments, comm)
     from ..simulation import Simulation
 
@@ -45,4 +62,18 @@ def run(arguments: argparse.Namespace, comm: MPI.Comm) -> int:
         if simulation.plan.scheme.notice:
             print(f"note: {simulation.plan.scheme.notice}")
         print("This case can run.")
+    return 0
+
+
+def _check_machine(arguments: argparse.Namespace) -> int:
+    if arguments.case is not None or arguments.overrides:
+        raise InputError("check --env checks the machine and takes no case: give one of the two")
+    from .environment import inspect_environment, report
+
+    found = inspect_environment()
+    print("\n".join(printable(line) for line in report(found)))
+    missing = [each.name for each in found if each.state == "missing"]
+    if missing:
+        raise InputError(f"check --env: missing: {', '.join(missing)}; the list above has the commands that bring it")
+    print("All that runs need is here.")
     return 0

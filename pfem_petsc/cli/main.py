@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 __all__ = ["main"]
 
-VERBS = ("run", "list", "check", "mesh", "render", "plot", "report", "info", "sweep", "bench")
+VERBS = ("run", "list", "check", "mesh", "render", "plot", "report", "info", "sweep", "bench", "completion")
 """Modules of this package: ``EXAMPLE``, ``RANKS``, ``add_arguments(parser)`` and ``run(arguments[, comm])``."""
 
 EXAMPLES = f"""\
@@ -69,9 +69,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             give_back_early()
         return verb.run(arguments, *comm)
 
-    if verb.RANKS == "all":
+    ranks = verb.ranks(arguments) if hasattr(verb, "ranks") else verb.RANKS
+    if ranks == "all":
         return collectively(run_verb, debug)
-    return on_first_rank(run_verb, debug, uses_mpi=verb.RANKS == "one")
+    return on_first_rank(run_verb, debug, uses_mpi=ranks == "one")
 
 
 def _require_text(words: Sequence[str]) -> None:
@@ -84,7 +85,7 @@ def _require_text(words: Sequence[str]) -> None:
 
 
 def _parse(words: list[str]) -> tuple[argparse.Namespace, ModuleType]:
-    parser, verbs = _parser()
+    parser, verbs = make_parser()
     if not words:
         raise InputError(f"CASE or a verb is missing: {', '.join(VERBS)}; see {PROGRAM} --help")
     if words[0] not in (*VERBS, "-h", "--help", "--version"):
@@ -101,7 +102,7 @@ def _parse(words: list[str]) -> tuple[argparse.Namespace, ModuleType]:
     return arguments, verbs[arguments.verb]
 
 
-def _parser() -> tuple[Parser, dict[str, ModuleType]]:
+def make_parser() -> tuple[Parser, dict[str, ModuleType]]:
     from .. import __version__
 
     parser = Parser(

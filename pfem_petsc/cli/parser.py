@@ -30,9 +30,11 @@ class Parser(argparse.ArgumentParser):
         raise InputError(f"{message}{hint}; see {self.prog} --help")
 
 
-def add_case(parser: argparse.ArgumentParser) -> None:
+def add_case(parser: argparse.ArgumentParser, optional: bool = False) -> None:
     """Add CASE and --set."""
-    parser.add_argument("case", metavar="CASE", help="TOML file, or name of a built-in case (see list)")
+    parser.add_argument(
+        "case", metavar="CASE", nargs="?" if optional else None, help="TOML file, or name of a built-in case (see list)"
+    )
     parser.add_argument(
         "--set",
         dest="overrides",

@@ -1,0 +1,259 @@
+"""What this machine has of what the program needs: versions, features, and the commands that bring what is missing."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterable
+from importlib import metadata
+from typing import Any, NamedTuple
+
+__all__ = ["Finding", "inspect_environment", "remedies", "report"]
+
+LIMIT = 120.0  # seconds of a probe; the first import of some packages compiles them
+
+PACKAGES = {  # distribution: module, and what it is for
+    "numpy": ("numpy", "arrays"),
+    "numba": ("numba", "compiled loops"),
+    "pydantic": ("pydantic", "case files"),
+    "rich": ("rich", "progress"),
+    "matplotlib": ("matplotlib", "curves"),
+    "Pillow": ("PIL", "pictures"),
+    "vtk": ("vtkmodules", "pictures"),
+    "pyvista": ("pyvista", "grids"),
+    "imageio-ffmpeg": ("imageio_ffmpeg", "films"),
+}
+OPTIONAL = {
+    "meshio": ("meshio", "foreign mesh formats"),
+    "scipy": ("scipy", "modes where SLEPc is missing"),
+    "slepc4py": ("slepc4py", "modes of large models"),
+    "pandas": ("pandas", "tables as data frames"),
+}
+
+_PETSC = """
+import json
+import petsc4py; petsc4py.init()
+from petsc4py import PETSc
+import numpy
+packages = ("mumps", "hypre", "ptscotch", "superlu_dist", "parmetis")
+has = getattr(PETSc.Sys, "hasExternalPackage", lambda name: None)
+print(json.dumps({"version": ".".join(map(str, PETSc.Sys.getVersion())), "scalar": str(numpy.dtype(PETSc.ScalarType)),
+    "index": str(numpy.dtype(PETSc.IntType)), **{name: has(name) for name in packages}}))
+"""
+_MPI = "from mpi4py import MPI; print(MPI.Get_library_version().split(chr(0))[0].splitlines()[0].split(',')[0].strip())"
+_TOGETHER = """
+from mpi4py import MPI
+import petsc4py; petsc4py.init()
+from petsc4py import PETSc
+import h5py, json
+found = [MPI.COMM_WORLD.size, PETSc.COMM_WORLD.size]
+found += [bool(h5py.get_config().mpi), h5py.version.hdf5_version, h5py.__file__]
+if MPI.COMM_WORLD.rank == 0: print("found " + json.dumps(found), flush=True)
+"""
+
+
+class Finding(NamedTuple):
+    """One line of the report.
+
+    Attributes
+    ----------
+    name : what was looked for
+    state : ``ok``, ``missing``, or ``optional`` (missing, and not needed for runs)
+    text : version and features, or what fails without it
+    remedy : the command that brings it
+    """
+
+    name: str
+    state: str
+    text: str
+    remedy: str = ""
+
+
+def inspect_environment(run: Callable[[list[str]], tuple[int, str]] | None = None) -> list[Finding]:
+    """Return what is there and what is missing. Each probe is a process of its own, because broken libraries crash.
+
+    Parameters
+    ----------
+    run : returns status and output of a command; default: runs it
+    """
+    run = run or _run
+    bring = remedies()
+    version = ".".join(map(str, sys.version_info[:3]))
+    found = [Finding("python", "ok", version) if sys.version_info >= (3, 11) else _old(version, bring)]
+    minimum = _minimum_versions()
+    for name, (module, use) in PACKAGES.items():
+        found.append(_package(name, module, use, minimum.get(name.lower(), ""), "missing", bring, run))
+    found += _mpi_and_petsc(bring, run)
+    found.append(_launcher(bring, run))
+    found.append(_drawing(bring, run))
+    found += [_package(name, module, use, "", "optional", bring, run) for name, (module, use) in OPTIONAL.items()]
+    return found
+
+
+def report(found: Iterable[Finding]) -> list[str]:
+    """Return the lines of the report: what is there, then what is missing with the command that brings it."""
+    found = list(found)
+    width = max(len(each.name) for each in found)
+    lines = [f"  {each.state:8}  {each.name:{width}}  {each.text}" for each in found]
+    commands = dict.fromkeys(each.remedy for each in found if each.state != "ok" and each.remedy)
+    if commands:
+        lines += ["", "what is missing comes with:", *(f"  {command}" for command in commands)]
+    return lines
+
+
+def remedies() -> dict[str, str]:
+    """Return the commands that bring things here: of conda in its environments, of Debian where apt-get is."""
+    pip = f"{os.path.relpath(sys.executable) if sys.prefix != sys.base_prefix else 'python3'} -m pip install "
+    if os.environ.get("CONDA_PREFIX"):
+        conda = "conda install -c conda-forge "
+        return {
+            "pip": conda,
+            "python": conda + '"python>=3.11"',
+            "mpi4py": conda + "mpi4py openmpi",
+            "petsc4py": conda + "petsc4py petsc=*=real*",
+            "h5py": conda + '"h5py=*=mpi*"',
+            "slepc4py": conda + "slepc4py",
+            "drawing": conda + "mesalib",
+        }
+    if shutil.which("apt-get"):
+        apt = "apt-get install --no-install-recommends "
+        return {
+            "pip": pip,
+            "python": "a distribution with Python 3.11 or newer, or conda (docs/installing.md)",
+            "mpi4py": apt + "python3-mpi4py openmpi-bin",
+            "petsc4py": apt + "python3-petsc4py-real, or bash scripts/setup.sh",
+            "h5py": apt + "python3-h5py-mpi",
+            "slepc4py": apt + "python3-slepc4py-real",
+            "drawing": apt + "libosmesa6, or libegl1 libgl1-mesa-dri",
+        }
+    return {
+        "pip": pip,
+        "python": "Python 3.11 or newer, for example by conda (docs/installing.md)",
+        "mpi4py": pip + "mpi4py",
+        "petsc4py": "module load petsc, set PETSC_DIR, or bash scripts/setup.sh --build-petsc",
+        "h5py": "HDF5_MPI=ON CC=mpicc " + pip + "--no-binary=h5py h5py",
+        "slepc4py": pip + "slepc4py",
+        "drawing": "OSMesa or EGL of Mesa, for example by module load mesa",
+    }
+
+
+def _run(command: list[str]) -> tuple[int, str]:
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=LIMIT, check=False)
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return 1, str(error)
+    return done.returncode, done.stdout if done.returncode == 0 else done.stdout + done.stderr
+
+
+def _python(code: str) -> list[str]:
+    return [sys.executable, "-c", code]
+
+
+def _old(version: str, bring: dict[str, str]) -> Finding:
+    return Finding("python", "missing", f"{version} is too old: 3.11 or newer is needed", bring["python"])
+
+
+def _minimum_versions() -> dict[str, str]:
+    try:
+        required = metadata.requires("pfem_petsc") or []
+    except metadata.PackageNotFoundError:
+        return {}
+    pairs = (re.match(r"([\w.-]+)>=([\d.]+)$", text.split(";")[0].strip()) for text in required)
+    return {pair[1].lower(): pair[2] for pair in pairs if pair}
+
+
+def _older(version: str, minimum: str) -> bool:
+    parts = [[int(part) for part in re.findall(r"\d+", text)[:3]] for text in (version, minimum)]
+    return bool(minimum) and parts[0] < parts[1]
+
+
+def _package(
+    name: str,
+    module: str,
+    use: str,
+    minimum: str,
+    lacking: str,
+    bring: dict[str, str],
+    run: Callable[[list[str]], tuple[int, str]],
+) -> Finding:
+    code = f"import {module}; from importlib.metadata import version; print(version({name!r}))"
+    status, output = run(_python(code))
+    remedy = bring.get(name, bring["pip"] + (f'"{name}>={minimum}"' if minimum else name))
+    if status:
+        return Finding(name, lacking, f"cannot be imported: {_last(output)} ({use})", remedy)
+    version = output.strip()
+    if _older(version, minimum):
+        return Finding(name, lacking, f"{version} is too old: {minimum} or newer is needed ({use})", remedy)
+    return Finding(name, "ok", version)
+
+
+def _mpi_and_petsc(bring: dict[str, str], run: Callable[[list[str]], tuple[int, str]]) -> list[Finding]:
+    status, output = run(_python(_MPI))
+    found = [
+        Finding("mpi4py", "missing", f"cannot be imported: {_last(output)}", bring["mpi4py"])
+        if status
+        else Finding("mpi4py", "ok", output.strip())
+    ]
+    status, output = run(_python(_PETSC))
+    if status:
+        old = "numpy.dtype size changed" in output or "compiled using NumPy 1" in output
+        remedy = bring["pip"] + '"numpy<2"' if old else bring["petsc4py"]
+        return [*found, Finding("petsc4py", "missing", f"cannot be imported: {_last(output)}", remedy)]
+    about: dict[str, Any] = json.loads(output.strip().splitlines()[-1])
+    text = f"PETSc {about['version']}, {about['scalar']}, {about['index']} indices"
+    if about["scalar"] != "float64":
+        found.append(Finding("petsc4py", "missing", f"{text}: a real, double build is needed", bring["petsc4py"]))
+    elif _older(about["version"], "3.18"):
+        found.append(Finding("petsc4py", "missing", f"{text}: 3.18 or newer is needed", bring["petsc4py"]))
+    else:
+        found.append(Finding("petsc4py", "ok", text))
+    uses = {"mumps": "direct solver on ranks", "hypre": "-pc_type hypre", "ptscotch": "partitions of mesh files"}
+    for name, use in uses.items():
+        if about[name] is None:
+            found.append(Finding(f"petsc: {name}", "optional", f"not told by this petsc4py ({use})"))
+        elif about[name]:
+            found.append(Finding(f"petsc: {name}", "ok", use))
+        else:
+            found.append(Finding(f"petsc: {name}", "optional", f"not in this PETSc ({use})", bring["petsc4py"]))
+    return found
+
+
+def _launcher(bring: dict[str, str], run: Callable[[list[str]], tuple[int, str]]) -> Finding:
+    """Two ranks: one MPI for all, and a parallel h5py."""
+    name = "2 ranks"
+    launcher = shutil.which("mpirun") or shutil.which("mpiexec")
+    if launcher is None:
+        return Finding(name, "missing", "there is no mpirun in PATH: runs on one rank work", bring["mpi4py"])
+    status, output = run([launcher, "-n", "2", *_python(_TOGETHER)])
+    line = re.search(r"^found (.*)$", output, flags=re.MULTILINE)
+    if status or line is None:
+        return Finding(name, "missing", f"mpirun -n 2 fails: {_last(output)}", bring["mpi4py"])
+    mpi, petsc, parallel, hdf5, file = json.loads(line[1])
+    if not mpi == petsc == 2:
+        text = f"mpi4py sees {mpi} rank(s) and PETSc {petsc}: they, and mpirun, are of different MPIs"
+        return Finding(name, "missing", text, bring["petsc4py"])
+    if not parallel:
+        remedy = bring["h5py"]
+        if remedy.startswith("apt-get") and file.startswith(sys.prefix + os.sep) and sys.prefix != sys.base_prefix:
+            # a wheel in the environment hides the one of the distribution
+            remedy = bring["pip"].replace(" install ", " uninstall --yes ") + f"h5py && {remedy}"
+        return Finding(name, "missing", f"h5py (HDF5 {hdf5}) in {file} is not the parallel build", remedy)
+    return Finding(name, "ok", f"mpirun, mpi4py and PETSc agree; h5py is parallel (HDF5 {hdf5})")
+
+
+def _drawing(bring: dict[str, str], run: Callable[[list[str]], tuple[int, str]]) -> Finding:
+    code = "from pfem_petsc.post.headless import require_rendering as r; r(); import os; "
+    status, output = run(_python(code + "print(os.environ.get('VTK_DEFAULT_OPENGL_WINDOW', 'default'))"))
+    if status:
+        return Finding("OpenGL", "optional", "nothing draws without a display (render, report)", bring["drawing"])
+    return Finding("OpenGL", "ok", output.strip().splitlines()[-1].removeprefix("vtk"))
+
+
+def _last(output: str) -> str:
+    lines = [line.strip() for line in output.splitlines() if line.strip() and not line.startswith("-----")]
+    errors = [line for line in lines if re.match(r"\w*(Error|Exception)\b", line)]
+    return (errors or lines or ["no message"])[-1][:160]

@@ -1,0 +1,104 @@
+"""Recipes of the folder packaging: the Slurm script in a queue that is made up, lists of dependencies and data."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from pfem_petsc import open_result
+
+ROOT = Path(__file__).parents[2]
+PACKAGING = ROOT / "packaging"
+
+
+@pytest.fixture
+def queue(tmp_path):
+    """Submit the job: srun runs its command here, or ends with the status of FAKE; scontrol notes what it is told."""
+    tools = tmp_path / "tools"
+    tools.mkdir()
+    srun = (
+        '#!/bin/bash\nif [[ -n ${FAKE:-} ]]; then exit "$FAKE"; fi\n'
+        f'while [[ $1 == --* || $1 == python ]]; do shift; done\nexec "{sys.executable}" "$@"\n'
+    )
+    (tools / "srun").write_text(srun)
+    (tools / "scontrol").write_text(f'#!/bin/bash\necho "$@" >> {tmp_path}/scontrol\nexit "${{REFUSE:-0}}"\n')
+    for tool in tools.iterdir():
+        tool.chmod(0o755)
+
+    def submit(*words, **variables):
+        environment = {**os.environ, "PATH": f"{tools}:{os.environ['PATH']}", "SLURM_JOB_ID": "77", **variables}
+        environment["PYTHONPATH"] = str(ROOT)
+        done = subprocess.run(
+            ["bash", str(PACKAGING / "slurm_requeue.sh"), *words],
+            cwd=tmp_path,
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=120,
+        )
+        told = tmp_path / "scontrol"
+        return done, told.read_text().split("\n")[:-1] if told.exists() else []
+
+    return submit
+
+
+def test_a_job_that_is_stopped_is_queued_again_and_continues(queue, tmp_path):
+    job = ("rod_impact", "out", "--set", "time.end=0.5")
+    stopped, told = queue(*job, "--wall-time", "0.001")
+    assert stopped.returncode == 0 and told == ["requeue 77"], stopped.stderr
+    assert "stopped with a checkpoint in out: queued again" in stopped.stdout
+    assert open_result(tmp_path / "out").history["time"][-1] < 0.5
+    done, told = queue(*job, SLURM_RESTART_COUNT="1")
+    assert done.returncode == 0 and told == ["requeue 77"], done.stderr
+    assert "the run in out is done" in done.stdout
+    assert open_result(tmp_path / "out").history["time"][-1] == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize(
+    ("variables", "status", "queued", "text"),
+    [
+        ({"FAKE": "3"}, 3, 0, "failed with status 3: not queued again"),
+        ({"FAKE": "2"}, 2, 0, "failed with status 2"),
+        ({"FAKE": "143"}, 143, 0, "failed with status 143"),
+        ({"FAKE": "4", "SLURM_RESTART_COUNT": "100"}, 4, 0, "after 100 restarts: not queued again"),
+        ({"FAKE": "4", "REFUSE": "1"}, 4, 1, "submit it once more"),
+    ],
+)
+def test_other_ends_of_a_job(queue, variables, status, queued, text):
+    done, told = queue("rod_impact", "out", **variables)
+    assert done.returncode == status and len(told) == queued
+    assert text in done.stderr
+
+
+def test_a_job_without_a_case_is_refused(queue):
+    done, _ = queue("rod_impact")
+    assert done.returncode == 2 and "usage: sbatch" in done.stderr
+
+
+def test_conda_environment_has_every_dependency():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    wanted = {re.match(r"[\w-]+", text)[0].lower() for text in project["dependencies"]}
+    listed = re.findall(r"^  - ([\w-]+)", (PACKAGING / "environment.yml").read_text(), flags=re.MULTILINE)
+    names = {name.removesuffix("-base") for name in listed}
+    assert wanted <= names
+
+
+def test_data_files_are_in_the_wheel():
+    """Everything of the package that git has, and that is no module, matches a pattern of the package data."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]
+    for path in (ROOT / "pfem_petsc").rglob("*"):
+        if path.is_dir() or path.suffix in (".py", ".pyc", ".nbc", ".nbi"):
+            continue
+        package = ".".join(path.parent.relative_to(ROOT).parts)
+        assert any(path.match(pattern) for pattern in project.get(package, ())), path
+
+
+def test_scripts_are_valid_shell():
+    for script in PACKAGING.glob("*.sh"):
+        subprocess.run(["bash", "-n", str(script)], check=True)

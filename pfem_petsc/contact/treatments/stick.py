@@ -111,12 +111,28 @@ class Treatment(Restitution):
         change, push = jumps(v[at] - old_v, friction)
         mean = np.einsum("kwi,kwi->kw", way, relative + 0.5 * change[:, None, :])
         # what the force dragged too much was booked with the slip of the step
-        mean = np.where(push < 0.0, np.minimum(mean, size[at] / stepper.part), mean)
+        mean = np.where(push < 0.0, np.minimum(mean, self._booked_rate(nodes[at], way, size[at])), mean)
         taken = (friction * push * mean).sum(axis=1)
         v, a = v.copy(), a.copy()
         v[at] = old_v + change
         a[at] = old_a + jumps(a[at] - old_a, dragged)[0]
         return v, a, float((stepper.model.inertia.mass[nodes[at]] * taken).sum())
+
+    def _booked_rate(self, nodes: np.ndarray, way: np.ndarray, size: np.ndarray) -> np.ndarray:
+        """Return the rates of slip (k, walls) [m/s] with which the solve has booked the friction of nodes (k,).
+
+        A scheme that solves for a position beyond the end of the step has the slip to there: none of nodes that stick
+        there and slip at the end. ``way`` (k, walls, 3), ``size`` (k, walls): direction and length of the slip of the
+        step.
+        """
+        stepper = self.stepper
+        if stepper.scheme.solves_end:
+            return size / stepper.part
+        balance, motion = stepper.balance, stepper.model.contact.motion
+        span = balance.time - self._time
+        moved = (balance.predictor + stepper.solution.u)[nodes] - self._place[nodes]
+        slip = moved[:, None, :] - (motion.displacements(balance.time) - motion.displacements(self._time))
+        return np.maximum(np.einsum("kwi,kwi->kw", way, slip), 0.0) / span
 
     def _pairs_let_go(self) -> tuple[np.ndarray, np.ndarray]:
         """Return ends (m,) of pairs that opened in this step, and their velocities (m, 3); see :meth:`_let_go`.

@@ -3,21 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ..errors import InputError
 
-__all__ = ["VIEWS", "Camera", "aim"]
+__all__ = ["VIEWS", "Camera", "aim", "direction", "fit"]
 
-VIEWS = ("auto", "xy", "xz", "yz", "iso")
+VIEWS = ("auto", "xy", "xz", "yz", "iso", "front", "back", "left", "right", "top", "bottom")
 
 _FLAT = {  # direction from the structure to the eye, and the upward direction
     "xy": ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0)),
     "xz": ((0.0, -1.0, 0.0), (0.0, 0.0, 1.0)),
     "yz": ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
+    "front": ((0.0, -1.0, 0.0), (0.0, 0.0, 1.0)),
+    "back": ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+    "left": ((-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
+    "right": ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
+    "top": ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0)),
+    "bottom": ((0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),
 }
 _OPENING = 25.0  # degrees, vertical
 
@@ -43,22 +48,43 @@ class Camera:
     half_height: float
     parallel: bool
 
-    def apply(self, camera: Any) -> None:
-        """Set a VTK camera."""
-        camera.SetFocalPoint(*self.centre)
-        camera.SetPosition(*(self.centre + self.distance * self.towards))
-        camera.SetViewUp(*self.up)
-        camera.SetParallelProjection(self.parallel)
-        camera.SetParallelScale(self.half_height)
-        camera.SetViewAngle(_OPENING)
-        camera.SetClippingRange(0.02 * self.distance, 4.0 * self.distance)
+    def project(self, points: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, ...]:
+        """Project points (n, 3) [m] into a picture of ``size`` pixels.
+
+        Returns
+        -------
+        Columns and rows (n,) [pixels], how near the points are (n,), which is linear in the picture and larger where
+        nearer, and pixels per metre there (n,), 0 behind the eye.
+        """
+        away = points - self.centre
+        across, along, deep = away @ self.right, away @ self.up, away @ self.towards
+        if self.parallel:
+            scale = np.full(len(points), size[1] / (2.0 * self.half_height))
+            near = deep * scale
+        else:
+            distance = self.distance - deep
+            seen = distance > 0.02 * self.distance
+            near = np.where(seen, 1.0 / np.where(seen, distance, 1.0), 0.0)
+            scale = self._focal(size) * near
+        return 0.5 * size[0] + across * scale, 0.5 * size[1] - along * scale, near, scale
+
+    def zoomed(self, factor: float) -> Camera:
+        """Return the camera that shows what is in the middle larger by a factor."""
+        return replace(self, half_height=self.half_height / factor, distance=self.distance / factor)
+
+    def lift(self, size: tuple[int, int]) -> np.ndarray:
+        """Return (2,): what is nearer by a pixel has a nearness larger by ``lift[0] + lift[1]*near``."""
+        return np.array([1.0, 0.0]) if self.parallel else np.array([0.0, 1.0 / self._focal(size)])
+
+    def _focal(self, size: tuple[int, int]) -> float:
+        return 0.5 * size[1] * self.distance / self.half_height
 
 
 def aim(
     points: np.ndarray,
     bounds: np.ndarray,
     normals: Sequence[np.ndarray],
-    view: str,
+    view: str | Sequence[float],
     aspect: float,
     upward: Sequence[float] = (0.0, 0.0, 1.0),
     margin: float = 1.05,
@@ -70,7 +96,7 @@ def aim(
     points : (n, 3) [m], points that must be visible (corners suffice)
     bounds : (2, 3) [m], bounds of the structure's motion, from which ``"auto"`` determines whether it is flat
     normals : allowed sides of the walls; the oblique view looks at walls from there
-    view : one of :data:`VIEWS`
+    view : one of :data:`VIEWS`, or the direction (3,) from the structure to the eye
     aspect : width over height of the picture
     upward : upward direction of the oblique view
     margin : factor on the visible extent
@@ -80,27 +106,69 @@ def aim(
     InputError
         For an unknown view.
     """
+    return fit(points, *direction(view, bounds, normals, upward), aspect, margin)
+
+
+def direction(
+    view: str | Sequence[float], bounds: np.ndarray, normals: Sequence[np.ndarray], upward: Sequence[float]
+) -> tuple[np.ndarray, np.ndarray, bool]:
+    """Return the direction to the eye (3,), the upward direction (3,), and whether there is no perspective.
+
+    Raises
+    ------
+    InputError
+        For an unknown view.
+    """
+    up = np.asarray(upward, dtype=float)
+    if not isinstance(view, str):
+        towards = np.asarray(view, dtype=float)
+        size = float(np.linalg.norm(towards)) if towards.shape == (3,) else 0.0
+        if not (size > 0.0 and np.isfinite(size)):
+            raise InputError(f"render: view = {view!r} is no direction; give three numbers that are not all zero")
+        towards = towards / size
+        if np.linalg.norm(np.cross(up, towards)) < 1e-3:
+            up = np.eye(3)[(int(np.argmax(np.abs(up))) + 2) % 3]
+        return towards, up, False
     if view not in VIEWS:
-        raise InputError(f"render: view = {view!r} is not known; it is one of {', '.join(VIEWS)}")
+        raise InputError(f"render: view = {view!r} is not known; it is one of {', '.join(VIEWS)}, or a direction x,y,z")
     if view == "auto":
         view = _flat_view(bounds)
     if view in _FLAT:
         towards, up = (np.array(vector) for vector in _FLAT[view])
-    else:
-        towards, up = _oblique(normals, np.asarray(upward, dtype=float))
+        return towards, up, True
+    return *_oblique(normals, up), False
+
+
+def fit(
+    points: np.ndarray,
+    towards: np.ndarray,
+    up: np.ndarray,
+    parallel: bool,
+    aspect: float,
+    margin: float = 1.05,
+    centre: np.ndarray | None = None,
+) -> Camera:
+    """Return the camera in a direction that has all points (n, 3) [m] in view.
+
+    Parameters
+    ----------
+    centre : (3,) [m], what is in the middle of the picture; None: the middle of the points
+    """
     right = np.cross(up, towards)
-    right /= np.linalg.norm(right)
+    right = right / np.linalg.norm(right)
     up = np.cross(towards, right)
-    across, along, deep = points @ right, points @ up, points @ towards
-    middle = [0.5 * (values.min() + values.max()) for values in (across, along, deep)]
-    centre = middle[0] * right + middle[1] * up + middle[2] * towards
-    half = 0.5 * max(np.ptp(along), np.ptp(across) / aspect) * margin or 1.0
-    if view in _FLAT:
+    ways = (right, up, towards)
+    spans = [points @ way for way in ways]
+    middle = [0.5 * (values.min() + values.max()) for values in spans] if centre is None else [centre @ w for w in ways]
+    centre = sum(value * way for value, way in zip(middle, ways, strict=True))
+    across, along, deep = (values - value for values, value in zip(spans, middle, strict=True))
+    half = max(float(np.abs(along).max()), float(np.abs(across).max()) / aspect) * margin or 1.0
+    if parallel:
         return Camera(towards, up, right, centre, 10.0 * (half * max(1.0, aspect) + np.ptp(deep)), half, True)
     # with perspective each point requires its own distance, larger for nearer points
     slope = np.tan(np.radians(_OPENING) / 2)
-    needed = np.maximum(np.abs(along - middle[1]), np.abs(across - middle[0]) / aspect) * margin / slope
-    distance = float((needed + deep - middle[2]).max()) or 1.0
+    needed = np.maximum(np.abs(along), np.abs(across) / aspect) * margin / slope
+    distance = float((needed + deep).max()) or 1.0
     return Camera(towards, up, right, centre, distance, distance * slope, False)
 
 

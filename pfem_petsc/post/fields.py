@@ -92,6 +92,10 @@ class ColourScale:
     cmap : a matplotlib colour map or its name; None: chosen by the sign of the lower limit
     unit : unit of the values
 
+    Attributes
+    ----------
+    table : (256, 3) uint8
+
     Raises
     ------
     InputError
@@ -114,9 +118,13 @@ class ColourScale:
             cmap = matplotlib.colormaps[cmap]
         self.low, self.high, self.cmap = float(low), float(high), cmap
         self.factor, self.unit = prefix_for(max(abs(low), abs(high)), unit)
-        self._table = (255 * cmap(np.linspace(0.0, 1.0, 256))[:, :3] + 0.5).astype(np.uint8)
+        self.table = (255 * cmap(np.linspace(0.0, 1.0, 256))[:, :3] + 0.5).astype(np.uint8)
 
     def colours(self, values: np.ndarray) -> np.ndarray:
         """Return colours (n, 3) uint8 of values (n,), clipped at the limits; NaN has the lowest colour."""
+        return self.table[self.places(values)]
+
+    def places(self, values: np.ndarray) -> np.ndarray:
+        """Return rows (n,) uint8 of the table for values (n,)."""
         place = np.nan_to_num((values - self.low) * (255.0 / (self.high - self.low)), nan=0.0, posinf=255, neginf=0)
-        return self._table[np.clip(place, 0, 255).astype(np.uint8)]
+        return np.clip(place, 0, 255).astype(np.uint8)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,7 +14,7 @@ from .fields import ColourScale
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-    from matplotlib.patches import FancyArrowPatch
+    from PIL import Image
 
 __all__ = ["Page"]
 
@@ -32,6 +33,9 @@ class Page:
     scale : its colours
     camera : for the length scale and the axes
     drawn_height : vertical extent of the camera's view in pixels; None: the region's height
+    still : whether the camera does not zoom: only then there is a length scale
+    transparent : whether the background is
+    legend : texts and colours of what is marked, below the picture
     """
 
     def __init__(
@@ -42,6 +46,10 @@ class Page:
         scale: ColourScale,
         camera: Camera,
         drawn_height: int | None = None,
+        *,
+        still: bool = True,
+        transparent: bool = False,
+        legend: Sequence[tuple[str, tuple[int, int, int]]] = (),
     ) -> None:
         from matplotlib import font_manager
         from PIL import ImageFont
@@ -53,6 +61,7 @@ class Page:
         path = font_manager.findfont("DejaVu Sans")
         self._font = ImageFont.truetype(path, max(9, round(20 * self._unit)))
         self._drawn_height = drawn_height or self.region[3]
+        self._still, self._transparent, self._legend, self._camera = still, transparent, legend, camera
         with boxes_allowed():
             self._background = self._draw(title, field, scale, camera)
 
@@ -68,32 +77,58 @@ class Page:
         """Return the height of the strip above a tile, in pixels."""
         return round(34 * min(size[0] / 1280, size[1] / 720))
 
-    def compose(self, drawing: np.ndarray, time: str) -> np.ndarray:
-        """Return the page (height, width, 3) uint8 with a drawing of the region's size, and a text for the time."""
+    def compose(
+        self,
+        drawing: np.ndarray,
+        time: str,
+        camera: Camera | None = None,
+        inset: tuple[np.ndarray, tuple[int, int]] | None = None,
+    ) -> np.ndarray:
+        """Return the page (height, width, 3 or 4) uint8 with a drawing of the region's size, and a text for the time.
+
+        Parameters
+        ----------
+        camera : for the axes; None: the page's
+        inset : a picture (h, w, 4) with its left upper corner within the drawing
+        """
         left, top, width, height = self.region
         page = self._background.copy()
         page[top : top + height, left : left + width] = drawing
-        return self._written(page, [(left + width, round(22 * self._unit), time)], "ra")
+        if inset is not None:
+            picture, (x, y) = inset
+            _lay_over(page[top + y : top + y + picture.shape[0], left + x : left + x + picture.shape[1]], picture)
+        return self._written(page, [(left + width, round(22 * self._unit), time)], "ra", camera)
 
-    def compose_tiles(self, drawings: list[np.ndarray], times: list[str], columns: int) -> np.ndarray:
-        """Return the page with several drawings of one size, row by row, each below a strip with its time."""
+    def compose_tiles(
+        self, drawings: list[np.ndarray], times: list[str], columns: int, camera: Camera | None = None, time: str = ""
+    ) -> np.ndarray:
+        """Return the page with several drawings of one size, row by row, each below a strip with its text."""
         left, top, _, _ = self.region
         page = self._background.copy()
         texts = []
-        for number, (drawing, time) in enumerate(zip(drawings, times, strict=True)):
+        for number, (drawing, text) in enumerate(zip(drawings, times, strict=True)):
             height, width = drawing.shape[:2]
             x, y = left + (number % columns) * width, top + (number // columns) * (height + self.strip) + self.strip
             page[y : y + height, x : x + width] = drawing
-            texts.append((x, y - round(0.8 * self.strip), time))
-        return self._written(page, texts, "la")
+            texts.append((x, y - round(0.8 * self.strip), text))
+        page = self._written(page, texts, "la", camera)
+        return self._written(page, [(left + self.region[2], round(22 * self._unit), time)], "ra") if time else page
 
-    def _written(self, page: np.ndarray, texts: list[tuple[int, int, str]], anchor: str) -> np.ndarray:
+    def _written(
+        self, page: np.ndarray, texts: list[tuple[int, int, str]], anchor: str, camera: Camera | None = None
+    ) -> np.ndarray:
         from PIL import Image, ImageDraw
 
         image = Image.fromarray(page)
         pen = ImageDraw.Draw(image)
         for x, y, text in texts:
             pen.text((x, y), text, font=self._font, fill=INK, anchor=anchor)
+        axes = _axes(camera or self._camera, self._unit)
+        place = (
+            round(self.size[0] - 92 * self._unit - axes.width / 2),
+            round(self.size[1] - 62 * self._unit - axes.height / 2),
+        )
+        image.paste(axes.convert(image.mode), place, axes.getchannel("A"))
         return np.asarray(image)
 
     def _draw(self, title: str, field: str, scale: ColourScale, camera: Camera) -> np.ndarray:
@@ -101,7 +136,8 @@ class Page:
         from matplotlib.figure import Figure
 
         width, height = self.size
-        figure = Figure(figsize=(width / 100, height / 100), dpi=100, facecolor="white")
+        figure = Figure(figsize=(width / 100, height / 100), dpi=100)
+        figure.patch.set(facecolor="white", alpha=0.0 if self._transparent else 1.0)
         canvas = FigureCanvasAgg(figure)
         left, top, inner_width, inner_height = self.region
         # space for the time is left empty
@@ -114,11 +150,22 @@ class Page:
             title = title[:-2].rstrip(" …") + "…"
             text.set_text(literal(title))
         self._colour_bar(figure, field, scale)
-        if camera.parallel:
+        if camera.parallel and self._still:
             self._length_scale(figure, 2 * camera.half_height / self._drawn_height, left)
-        self._axes(figure, camera)
+        self._marks(figure)
         canvas.draw()
-        return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+        page = np.asarray(canvas.buffer_rgba())
+        return page.copy() if self._transparent else page[..., :3].copy()
+
+    def _marks(self, figure: Figure) -> None:
+        width, height = self.size
+        x = self.region[0] + self.region[2]
+        for text, colour in reversed(self._legend):
+            x -= (44 + 10 * len(text)) * self._unit
+            style = {"va": "center_baseline", "fontsize": self._points(16)}
+            y, shade = 22 * self._unit / height, tuple(value / 255 for value in colour)
+            figure.text(x / width, y, "\u25ac", color=shade, weight="bold", **style)
+            figure.text((x + 22 * self._unit) / width, y, text, color=INK, **style)
 
     def _points(self, pixels: float) -> float:
         """Return the font size in points (at 100 dots per inch) for pixels of a page of 1280 by 720."""
@@ -187,41 +234,40 @@ class Page:
             fontsize=self._points(16),
         )
 
-    def _axes(self, figure: Figure, camera: Camera) -> None:
-        """Draw the coordinate axes as seen by the camera, below the colour bar."""
-        width, height = self.size
-        size = 34 * self._unit
-        centre = np.array([width - 92 * self._unit, 62 * self._unit])
-        for name, direction in zip("xyz", np.eye(3), strict=True):
-            arrow = np.array([direction @ camera.right, direction @ camera.up])
-            if np.linalg.norm(arrow) < 0.05:
-                continue
-            tip, label = centre + size * arrow, centre + (size * 1.0 + 11 * self._unit / np.linalg.norm(arrow)) * arrow
-            figure.add_artist(
-                _arrow(figure, centre / (width, height), tip / (width, height), 9 * self._unit, 1.3 * self._unit)
-            )
-            figure.text(
-                label[0] / width,
-                label[1] / height,
-                name,
-                color=PALE,
-                ha="center",
-                va="center",
-                fontsize=self._points(15),
-            )
+
+def _lay_over(page: np.ndarray, picture: np.ndarray) -> None:
+    """Lay a picture (h, w, 4) over a part of a page (h, w, 3 or 4), which is changed."""
+    opacity = picture[..., 3:].astype(np.float32) / 255.0
+    if page.shape[2] == 3:
+        page[:] = (picture[..., :3] * opacity + page * (1.0 - opacity) + 0.5).astype(np.uint8)
+        return
+    below = page[..., 3:].astype(np.float32) / 255.0 * (1.0 - opacity)
+    whole = opacity + below
+    mixed = (picture[..., :3] * opacity + page[..., :3] * below) / np.where(whole > 0.0, whole, 1.0)
+    page[:] = np.concatenate([mixed + 0.5, 255.0 * whole + 0.5], axis=2).clip(0, 255).astype(np.uint8)
 
 
-def _arrow(figure: Figure, start: np.ndarray, end: np.ndarray, head: float, line: float) -> FancyArrowPatch:
-    from matplotlib.patches import FancyArrowPatch
+def _axes(camera: Camera, unit: float) -> Image.Image:
+    """Return the coordinate axes as seen by the camera, in a square."""
+    from matplotlib import font_manager
+    from PIL import Image, ImageDraw, ImageFont
 
-    return FancyArrowPatch(
-        tuple(start),
-        tuple(end),
-        transform=figure.transFigure,
-        arrowstyle="-|>",
-        mutation_scale=head,
-        linewidth=line,
-        color=PALE,
-        shrinkA=0,
-        shrinkB=0,
-    )
+    fine = 4  # drawn larger and reduced, for smooth edges
+    side, size = round(112 * unit), 34 * unit * fine
+    image = Image.new("RGBA", (side * fine, side * fine), (255, 255, 255, 0))
+    pen = ImageDraw.Draw(image)
+    font = ImageFont.truetype(font_manager.findfont("DejaVu Sans"), max(9, round(15 * unit)) * fine)
+    middle = np.full(2, side * fine / 2)
+    for name, way in sorted(zip("xyz", np.eye(3)), key=lambda axis: float(axis[1] @ camera.towards)):
+        arrow = np.array([way @ camera.right, -(way @ camera.up)])
+        length = float(np.linalg.norm(arrow))
+        if length < 0.05:
+            continue
+        tip, along = middle + size * arrow, arrow / length
+        across, head = np.array([-along[1], along[0]]), 8 * unit * fine
+        pen.line((*middle, *tip), fill=PALE, width=max(1, round(1.4 * unit * fine)))
+        wings = [tip, *(tip - head * along + sign * 0.4 * head * across for sign in (1, -1))]
+        pen.polygon([tuple(map(float, corner)) for corner in wings], fill=PALE)
+        label = tip + 11 * unit * fine * along
+        pen.text((float(label[0]), float(label[1])), name, font=font, fill=PALE, anchor="mm")
+    return image.resize((side, side), Image.Resampling.LANCZOS)

@@ -1,36 +1,47 @@
-"""Pictures and films of a result, without a display."""
+"""Pictures and films of results, without a display or a graphics library."""
 
 from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import nullcontext
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import ExitStack, nullcontext
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..errors import InputError
-from ..fields import STATUS
-from ..output.units import prefix_for
-from .camera import VIEWS, Camera, aim
+from ..parallel.agreement import agreed
 from .fields import ColourField, ColourScale
-from .headless import require_rendering
-from .walls import Surface, wall_shifts, wall_surfaces, walls_present
+from .files import emptied, save
+from .film import Film, Look
+from .frames import Resampled, chosen_frames, even_times
+from .motion import Motion, Overlays
+from .radii import radii_of
+from .scene import TUBE_LIMIT, Style
+from .shots import Moves
+
+if TYPE_CHECKING:
+    from mpi4py import MPI
 
 __all__ = ["render"]
 
-VIDEOS = ("mp4", "gif", "both", "none")
-MOST_FRAMES = 300  # default limit: more frames make a film of over ten seconds
-POSTER_TILES = 6
+VIDEOS = {
+    "mp4": ("mp4",),
+    "gif": ("gif",),
+    "both": ("mp4", "gif"),
+    "none": (),
+    "webm": ("webm",),
+    "webp": ("webp",),
+}
+STYLES = ("auto", "tubes", "lines")
 SHORT = 2.0  # seconds below which a film is too short to follow
 TELL = 5.0  # seconds between two progress messages
 
 
 def render(
-    result_path: Path | str | Any,
+    result_path: Path | str | Any | Sequence[Path | str | Any],
     output: Path | str | None = None,
     *,
     field: str = "stress",
@@ -38,38 +49,68 @@ def render(
     frames: int | Iterable[int] | None = None,
     fps: float = 24,
     size: tuple[int, int] = (1280, 720),
-    view: str = "auto",
-    video: str = "mp4",
+    view: str | Sequence[float] = "auto",
+    video: str | None = None,
     poster: bool = True,
     clim: tuple[float, float] | None = None,
+    symmetric: bool = False,
     cmap: Any = None,
     scale: float = 1.0,
+    style: str = "auto",
+    radius_scale: float = 1.0,
     bar_width: float | None = None,
     nodes: bool | None = None,
+    ghost: bool = False,
+    marks: Sequence[str] = (),
+    trails: Sequence[str] = (),
+    inset: str | None = None,
+    zoom: float = 1.0,
+    orbit: float = 0.0,
+    path: Any = None,
+    follow: str | None = None,
+    rate: float | None = None,
+    span: Sequence[float] | None = None,
+    labels: Sequence[str] | None = None,
+    transparent: bool = False,
     title: str | None = None,
     note: Callable[[str], None] = print,
+    comm: MPI.Comm | None = None,
 ) -> list[Path]:
-    """Draw a result: ``frames/frame_0000.png`` ..., a film ``render.mp4`` or ``.gif``, and a poster ``render.png``.
+    """Draw a result: ``frames/frame_0000.png`` ..., a film ``render.mp4`` or another, and a poster ``render.png``.
 
     Parameters
     ----------
-    result_path : result file or its folder, or an open result
-    output : folder of the pictures; None: beside the result
+    result_path : result file or its folder, or an open result; or several of them, which are drawn side by side
+    output : folder of the pictures; None: beside the result, of several: ``side_by_side`` beside the first
     field : point or cell field that colours the bars
     component : "x", "y" or "z" of a vector field; None: its length
     frames : numbers of snapshots, or how many of them (evenly spaced); None: all, up to 300
     fps : frames per second of the film
     size : of a frame in pixels
-    view : "xy", "xz", "yz", "iso", or "auto": along the flat direction of a flat structure, oblique otherwise
-    video : "mp4", "gif", "both" or "none"
+    view : "xy", "xz", "yz", "iso", "front", "back", "left", "right", "top", "bottom", the direction (3,) from the
+        structure to the eye, or "auto": along the flat direction of a flat structure, oblique otherwise
+    video : "mp4", "gif", "both", "webm", "webp" or "none"; None: "mp4", "webm" with a transparent background
     poster : also draw six instants on one page
     clim : range of the colours in the field's SI unit; None: from the snapshots, symmetric for signed fields
+    symmetric : whether the range is symmetric about zero for any field
     cmap : matplotlib colour map or its name
     scale : factor on the nodes' displacements since the first snapshot; walls are not scaled
-    bar_width : in pixels
+    style : "tubes" of the radii of the sections, "lines", or "auto": tubes for up to 20,000 bars
+    radius_scale : factor on the radii of tubes
+    bar_width : least width of bars in pixels
     nodes : whether to draw nodes as balls; None: for small models
+    ghost : whether to draw the first snapshot, pale, behind the others
+    marks : "broken" bars as stubs, "yielded" ones with a rim
+    trails : names of probes whose trajectories are drawn
+    inset : column of the history, drawn as a curve with a marker in a corner
+    zoom, orbit, path, follow : of the camera, see :class:`~pfem_petsc.post.shots.Moves`
+    rate : frames per simulated second, between snapshots if need be; None: frames are snapshots
+    span : first and last time [s] of the film
+    labels : of several results; None: the names of their folders
+    transparent : whether frames and film have a transparent background
     title : None: that of the case
     note : receives messages, such as walls that cannot be drawn, and progress
+    comm : its ranks divide the frames, and the first one makes the film; None: this process draws all
 
     Returns
     -------
@@ -78,44 +119,87 @@ def render(
     Raises
     ------
     InputError
-        For options that do not fit the result, a folder that cannot be written, or if rendering is not available.
+        For options that do not fit the result, or a folder that cannot be written.
     """
-    if view not in VIEWS:
-        raise InputError(f"render: view = {view!r} is not known; it is one of {', '.join(VIEWS)}")
-    if video not in VIDEOS:
-        raise InputError(f"render: video = {video!r} is not known; it is one of {', '.join(VIDEOS)}")
-    if min(size) < 160 or max(size) > 8192:
-        raise InputError(f"render: size = {size[0]} x {size[1]} pixels is out of range; each side takes 160 to 8192")
-    if not fps > 0:
-        raise InputError(f"render: fps = {fps:g} must be positive")
-    require_rendering()
-    with _opened(result_path) as result:
-        folder = Path(output) if output is not None else Path(result.path).parent
-        chosen = _chosen(frames, len(result.times), note)
-        colour = ColourField(result, field, component)
-        scale_of_colours = ColourScale(clim or colour.limits(chosen), cmap, colour.unit)
-        film = _Film(result, colour, scale_of_colours, chosen, view, scale, note)
-        style = {"bar_width": bar_width, "nodes": nodes}
-        if video != "none" and len(chosen) > 1 and len(chosen) / fps < SHORT:
-            slower = max(1, round(len(chosen) / 5.0))
-            lasts = f"the film of {len(chosen)} frames lasts {len(chosen) / fps:.1f} s"
-            note(f"{lasts}; with fps = {slower} (--fps {slower}) it lasts about 5 s")
-        heading = title if title is not None else (result.case.title or result.case.name)
-        pictures = _draw_frames(film, _emptied(folder / "frames"), size, heading, style)
+    first = comm is None or comm.rank == 0
+    tell = note if first else _nothing
+    kinds = _checked_options(video, fps, size, style, radius_scale, bar_width, transparent)
+    moves = Moves(view, zoom, orbit, path, follow).checked()
+    many = isinstance(result_path, (list, tuple))
+    with ExitStack() as stack:
+        results = [stack.enter_context(opened(each)) for each in (result_path if many else [result_path])]
+        if not results:
+            raise InputError("render: no result to draw")
+        names = _labels(results, labels)
+        folder = _folder(results, output)
+        if inset is not None and len(results) > 1:
+            raise InputError("render: inset is for one result; leave it out, or draw one result")
+        shown, chosen = _timed(results, frames, rate, span, tell)
+        colours = [ColourField(result, field, component) for result in shown]
+        limits = limits_of(clim, symmetric, [colour.limits(chosen) for colour in colours] if clim is None else [])
+        overlays = Overlays(ghost, tuple(marks), tuple(trails))
+        motions = [Motion(result, chosen, scale, overlays, tell) for result in shown]
+        look = Look(
+            [_style(result, style, radius_scale, bar_width, nodes) for result in results],
+            *(moves, tuple(marks), inset, names, transparent),
+        )
+        heading = title if title is not None else (results[0].case.title or results[0].case.name)
+        film = Film(motions, colours, ColourScale(limits, cmap, colours[0].unit), heading, look)
+        _tell_length(film, fps, rate, kinds, tell)
+        pictures = _draw_frames(film, folder / "frames", size, tell, comm)
         written = []
-        if poster:
-            written.append(_draw_poster(film, folder / "render.png", heading, style))
-        if video != "none":
+        if first and poster:
+            written.append(save(film.poster(), folder / "render.png"))
+        if first and kinds:
             from .video import encode
 
-            pattern = folder / "frames" / "frame_%04d.png"
-            written += [
-                encode(pattern, folder / f"render.{kind}", fps) for kind in ("mp4", "gif") if video in (kind, "both")
-            ]
+            written += [encode(folder / "frames" / "frame_%04d.png", folder / f"render.{k}", fps) for k in kinds]
+    if comm is not None:
+        written = comm.bcast(written)
     return written + pictures
 
 
-def _opened(result: Path | str | Any) -> Any:
+def _nothing(text: str) -> None:
+    """Receive messages of ranks that do not print."""
+
+
+def _checked_options(
+    video: str | None,
+    fps: float,
+    size: tuple[int, int],
+    style: str,
+    radius_scale: float,
+    bar_width: float | None,
+    transparent: bool,
+) -> tuple[str, ...]:
+    """Return the kinds of films to make, after checks."""
+    video = video or ("webm" if transparent else "mp4")
+    if video not in VIDEOS:
+        raise InputError(f"render: video = {video!r} is not known; it is one of {', '.join(VIDEOS)}")
+    if transparent and video in ("mp4", "both"):
+        raise InputError(f"render: video = {video!r}: MP4 has no transparent background; take webm, webp, gif or none")
+    if size[0] < 160 or size[1] < 120 or max(size) > 8192:
+        raise InputError(
+            f"render: size = {size[0]} x {size[1]} pixels is out of range; widths are 160 to 8192, heights 120 to 8192"
+        )
+    if not fps > 0:
+        raise InputError(f"render: fps = {fps:g} must be positive")
+    checked_style(style, radius_scale)
+    if bar_width is not None and not (np.isfinite(bar_width) and bar_width > 0.0):
+        raise InputError(f"render: bar_width = {bar_width:g} must be positive")
+    return VIDEOS[video]
+
+
+def checked_style(style: str, radius_scale: float) -> None:
+    """Refuse a style that is not known."""
+    if style not in STYLES:
+        raise InputError(f"render: style = {style!r} is not known; it is one of {', '.join(STYLES)}")
+    if not (np.isfinite(radius_scale) and radius_scale > 0.0):
+        raise InputError(f"render: radius_scale = {radius_scale:g} must be positive")
+
+
+def opened(result: Path | str | Any) -> Any:
+    """Return a context of a result that is open, or opened by its path."""
     if not isinstance(result, (str, os.PathLike)):
         return nullcontext(result)
     from ..output.result import open_result
@@ -123,203 +207,89 @@ def _opened(result: Path | str | Any) -> Any:
     return open_result(result)
 
 
-def _chosen(frames: int | Iterable[int] | None, count: int, note: Callable[[str], None]) -> list[int]:
-    if count == 0:
+def _labels(results: Sequence[Any], labels: Sequence[str] | None) -> list[str]:
+    if labels is None:
+        return [Path(result.path).absolute().parent.name for result in results]
+    if len(labels) != len(results):
+        raise InputError(f"render: {len(labels)} labels for {len(results)} results; give one for each")
+    return list(labels)
+
+
+def _folder(results: Sequence[Any], output: Path | str | None) -> Path:
+    if output is not None:
+        return Path(output)
+    beside = Path(results[0].path).parent
+    return beside / "side_by_side" if len(results) > 1 else beside
+
+
+def _timed(
+    results: Sequence[Any],
+    frames: int | Iterable[int] | None,
+    rate: float | None,
+    span: Sequence[float] | None,
+    note: Callable[[str], None],
+) -> tuple[list[Any], list[int]]:
+    """Return the results at common times, and the numbers of those that are drawn."""
+    times = np.asarray(results[0].times, dtype=float)
+    if any(len(result.times) == 0 for result in results):
         raise InputError("render: the result holds no snapshots; set [output] fields_every and run again")
-    if frames is None and count > MOST_FRAMES:
-        note(f"{MOST_FRAMES} of {count} snapshots are drawn; ask for more with frames = {count}")
-        frames = MOST_FRAMES
-    if frames is None:
-        return list(range(count))
-    if isinstance(frames, (int, np.integer)):
-        if frames < 1:
-            raise InputError(f"render: frames = {frames} must be positive")
-        return [int(k) for k in np.unique(np.linspace(0, count - 1, min(int(frames), count)).round())]
-    chosen = [int(k) for k in frames]
-    for k in chosen:
-        if not -count <= k < count:
-            raise InputError(f"render: frame {k} does not exist; the result holds snapshots 0 to {count - 1}")
-    if not chosen:
-        raise InputError("render: frames is an empty list")
-    return [k % count for k in chosen]
+    if rate is not None:
+        if frames is not None:
+            raise InputError("render: frames and rate both choose the frames; give one of the two")
+        times = even_times(times, rate, span)
+        return [Resampled(result, times) for result in results], list(range(len(times)))
+    chosen = chosen_frames(frames, times, note, span)
+    return [results[0], *(Resampled(result, times) for result in results[1:])], chosen
 
 
-def _emptied(folder: Path) -> Path:
-    """Create the folder of the frames and remove frames of an earlier film, which would end up in this one."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for old in folder.glob("frame_*.png"):
-            old.unlink()
-    except OSError as error:
-        raise InputError(
-            f"{folder}: pictures cannot be written here ({error.strerror}); give another folder"
-        ) from error
-    return folder
+def limits_of(
+    clim: tuple[float, float] | None, symmetric: bool, found: Sequence[tuple[float, float]]
+) -> tuple[float, float]:
+    """Return the range of colours: the one given, or that of all found, symmetric if asked for."""
+    low, high = clim or (min(pair[0] for pair in found), max(pair[1] for pair in found))
+    if symmetric:
+        high = max(abs(low), abs(high))
+        low = -high
+    return low, high
 
 
-@dataclass
-class _Film:
-    """Data shared by all frames: motion of the structure and its walls, and colours."""
-
-    result: Any
-    colour: ColourField
-    colours: ColourScale
-    frames: Sequence[int]
-    view: str
-    scale: float
-    note: Callable[[str], None]
-
-    def __post_init__(self) -> None:
-        self.bars = np.asarray(self.result.bars)
-        self.start = np.asarray(self.result.positions(0), dtype=float)
-        low, high = np.full(3, np.inf), np.full(3, -np.inf)
-        for frame in self.frames:
-            points = self._held(frame)
-            low, high = np.fmin(low, points.min(axis=0)), np.fmax(high, points.max(axis=0))
-        self.bounds = np.array([low, high])
-        walls = self.result.case.every_wall
-        self.surfaces = self._moved(walls)
-        self.normals = [np.asarray(wall.normal, dtype=float) for wall in walls if hasattr(wall, "normal")]
-        self.normals = [normal / np.linalg.norm(normal) for normal in self.normals]
-        times = np.asarray(self.result.times, dtype=float)
-        self.time_factor, self.time_unit = prefix_for(float(np.abs(times).max()), self.result.axis.unit)
-
-    def _moved(self, walls: Sequence[Any]) -> dict[int, list[Surface]]:
-        """Return, by frame, the surfaces of the walls at that time; a wall at rest has the same one in all frames.
-
-        ``self.shown`` says which of them are there: those that a stage does not have are not drawn.
-        """
-        times = self.result.times[list(self.frames)]
-        displacements = dict(zip(self.frames, wall_shifts(self.result, times), strict=True))
-        present = dict(zip(self.frames, walls_present(self.result, times), strict=True))
-        still = {surface.name: surface for surface in wall_surfaces(walls, self.bounds, self.note)}
-        drawn = [wall.name in still for wall in walls]
-        self.shown = {frame: present[frame][drawn].tolist() for frame in self.frames}
-        surfaces: dict[int, list[Surface]] = {frame: [] for frame in self.frames}
-        for k, wall in enumerate(walls):
-            if wall.name not in still:
-                continue
-            for frame in self.frames:
-                surface, shift = still[wall.name], displacements[frame][k]
-                if shift.any():
-                    point = tuple((np.asarray(wall.point) + shift).tolist())
-                    (surface,) = wall_surfaces([wall.model_copy(update={"point": point})], self.bounds)
-                surfaces[frame].append(surface)
-        return surfaces
-
-    @property
-    def places(self) -> Iterator[np.ndarray]:
-        """Yield the points (n, 3) [m] of all distinct wall surfaces that are drawn."""
-        drawn = (
-            surface
-            for frame, surfaces in self.surfaces.items()
-            for surface, shown in zip(surfaces, self.shown[frame], strict=True)
-            if shown
-        )
-        for surface in {id(surface): surface for surface in drawn}.values():
-            yield surface.points
-
-    def positions(self, frame: int) -> np.ndarray:
-        points = np.asarray(self.result.positions(frame), dtype=float)
-        return points if self.scale == 1.0 else self.start + self.scale * (points - self.start)
-
-    def gone(self, frame: int) -> np.ndarray | None:
-        """Return the bars (b,) that have left the model, None if the result does not tell."""
-        if "status" not in self.result.cell_fields:
-            return None
-        return np.asarray(self.result.field("status", frame)) == STATUS.index("broken")
-
-    def _held(self, frame: int) -> np.ndarray:
-        """Return the positions of nodes with bars: others may fly far away, and would shrink the picture."""
-        points, gone = self.positions(frame), self.gone(frame)
-        if gone is None or gone.all():
-            return points
-        return points[np.unique(self.bars[~gone])]
-
-    def time(self, frame: int) -> str:
-        if hasattr(self.result, "caption"):
-            return self.result.caption(frame)
-        axis, time = self.result.axis, self.result.times[frame]
-        return f"{axis.symbol} = {time * self.time_factor:.2f} {self.time_unit}" if axis.unit else axis.place(time)
-
-    def camera(self, aspect: float) -> Camera:
-        corners = np.array(np.meshgrid(*self.bounds.T)).reshape(3, -1).T
-        near = [corners]
-        size = float(np.linalg.norm(self.bounds[1] - self.bounds[0])) or 1.0
-        for points in self.places:
-            # a distant wall would shrink the structure to a dot: it is drawn but does not affect the view
-            gap = np.maximum(points.min(axis=0) - self.bounds[1], self.bounds[0] - points.max(axis=0))
-            if gap.max() < 0.6 * size:
-                near.append(points)
-        return aim(np.concatenate(near), self.bounds, self.normals, self.view, aspect, self._upward())
-
-    def _upward(self) -> tuple[float, float, float]:
-        gravity = getattr(self.result.case, "gravity", None)
-        if gravity is not None:
-            pull = np.asarray(gravity.mean, dtype=float)
-            axis = int(np.argmax(np.abs(pull)))
-            if np.count_nonzero(pull) == 1 and axis == 1:
-                return (0.0, -float(np.sign(pull[1])), 0.0)
-        return (0.0, 0.0, 1.0)
-
-    def scene(self, camera: Camera, size: tuple[int, int], style: dict[str, Any]) -> Any:
-        from .scene import Scene
-
-        return Scene(self.start, self.bars, camera, self.bounds, self.surfaces[self.frames[0]], size, **style)
-
-    def draw(self, scene: Any, frame: int) -> np.ndarray:
-        colours = self.colours.colours(self.colour.values(frame))
-        walls = self.surfaces[frame], self.shown[frame]
-        return scene.draw(self.positions(frame), colours, self.colour.on_nodes, *walls, self.gone(frame))
+def _style(result: Any, style: str, radius_scale: float, bar_width: float | None, nodes: bool | None) -> Style:
+    tubes = len(result.bars) <= TUBE_LIMIT if style == "auto" else style == "tubes"
+    radius = radii_of(result) if tubes else None
+    return Style(tubes, None if radius is None else radius_scale * radius, bar_width, nodes)
 
 
-def _draw_frames(film: _Film, folder: Path, size: tuple[int, int], title: str, style: dict[str, Any]) -> list[Path]:
-    from .page import Page
+def _tell_length(film: Film, fps: float, rate: float | None, kinds: Sequence[str], note: Callable[[str], None]) -> None:
+    """Say how long the film lasts where that is not what one expects."""
+    if rate is not None and film.motions[0].result.axis.unit == "s":
+        slower = rate / fps
+        pace = f"{slower:.3g} times slower" if slower >= 1.0 else f"{1.0 / slower:.3g} times faster"
+        note(f"{film.count} frames last {film.count / fps:.1f} s: {pace} than simulated")
+    elif kinds and film.count > 1 and film.count / fps < SHORT:
+        slower = max(1, round(film.count / 5.0))
+        lasts = f"the film of {film.count} frames lasts {film.count / fps:.1f} s"
+        note(f"{lasts}; with fps = {slower} (--fps {slower}) it lasts about 5 s")
 
-    _, _, width, height = Page.region_of(size)
-    camera = film.camera(width / height)
-    page = Page(size, title, film.colour.title, film.colours, camera)
-    scene = film.scene(camera, (width, height), style)
-    files = []
+
+def _draw_frames(
+    film: Film, folder: Path, size: tuple[int, int], note: Callable[[str], None], comm: MPI.Comm | None
+) -> list[Path]:
+    """Draw the frames of this rank; return the files of all."""
+    rank, ranks = (comm.rank, comm.size) if comm is not None else (0, 1)
+    if comm is None:
+        emptied(folder)
+    else:
+        with agreed(comm):
+            if rank == 0:
+                emptied(folder)
+    film.start(size)
     told = time.monotonic()
-    for number, frame in enumerate(film.frames):
+    files = [folder / f"frame_{number:04d}.png" for number in range(film.count)]
+    for number in range(rank, film.count, ranks):
         if time.monotonic() - told > TELL:
             told = time.monotonic()
-            film.note(f"{number} of {len(film.frames)} frames are drawn")
-        files.append(folder / f"frame_{number:04d}.png")
-        _save(page.compose(film.draw(scene, frame), film.time(frame)), files[-1])
-    scene.close()
+            note(f"{number} of {film.count} frames are drawn")
+        save(film.frame(number), files[number])
+    if comm is not None:
+        comm.Barrier()
     return files
-
-
-def _draw_poster(film: _Film, file: Path, title: str, style: dict[str, Any]) -> Path:
-    """Six instants on one page, in a grid that suits the shape of the motion."""
-    from .page import Page
-    from .poster import grid, instants
-
-    own = getattr(film.result, "instants", None)
-    tiles = instants(film.result, film.frames, POSTER_TILES) if own is None else own(POSTER_TILES)
-    look = film.camera(1.0)
-    corners = np.array(np.meshgrid(*film.bounds.T)).reshape(3, -1).T
-    shape = [np.ptp(np.concatenate([corners, *film.places]) @ way) for way in (look.right, look.up)]
-    size = (1600, 900)
-    _, _, width, height = Page.region_of(size)
-    columns, rows = grid(len(tiles), shape[0] / max(shape[1], 1e-3 * shape[0]), (width, height))
-    tile = (width // columns, height // rows - Page.strip_of(size))
-    camera = film.camera(tile[0] / tile[1])
-    page = Page(size, title, film.colour.title, film.colours, camera, drawn_height=tile[1])
-    scene = film.scene(camera, tile, style)
-    drawings = [film.draw(scene, frame) for frame in tiles]
-    scene.close()
-    return _save(page.compose_tiles(drawings, [film.time(frame) for frame in tiles], columns), file)
-
-
-def _save(picture: np.ndarray, file: Path) -> Path:
-    from PIL import Image
-
-    try:
-        # fast compression, because a film has hundreds of frames
-        Image.fromarray(picture).save(file, compress_level=3)
-    except OSError as error:
-        raise InputError(f"{file}: the picture cannot be written ({error}); give another folder") from error
-    return file

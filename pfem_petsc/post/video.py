@@ -1,4 +1,4 @@
-"""Encodes numbered pictures to an MP4 or a GIF with ffmpeg."""
+"""Encodes numbered pictures to films with ffmpeg."""
 
 from __future__ import annotations
 
@@ -16,6 +16,10 @@ _FILTERS = {
         "-vf",
         "scale='min(800,iw)':-2:flags=lanczos,split[a][b];[a]palettegen=stats_mode=diff[p];[b][p]paletteuse=dither=none",
     ],
+    # with a transparent background
+    "webm": ["-c:v", "libvpx-vp9", "-pix_fmt", "yuva420p", "-crf", "24", "-b:v", "0", "-row-mt", "1", "-cpu-used", "4"],
+    # moving pictures for web pages
+    "webp": ["-vf", "scale='min(960,iw)':-2:flags=lanczos", "-c:v", "libwebp_anim", "-q:v", "70", "-loop", "0"],
 }
 
 
@@ -25,7 +29,8 @@ def encode(pattern: Path, target: Path, fps: float) -> Path:
     Parameters
     ----------
     pattern : path with a ``%04d`` for the number, from 0
-    target : ``.mp4`` (H.264, yuv420p) or ``.gif`` (at most 800 pixels wide)
+    target : ``.mp4`` (H.264, yuv420p), ``.gif`` (at most 800 pixels wide), ``.webm`` (VP9, with transparency) or
+        ``.webp`` (at most 960 pixels wide, with transparency)
     fps : pictures per second
 
     Raises

@@ -125,7 +125,7 @@ def test_walls_are_drawn_in_the_stages_that_have_them(tmp_path):
         "mesh": {"generator": "rod", "length": 1.0, "elements": 2},
         "node_set": {"all": {"all": True}, "base": {"nearest": [0.0, 0.0, 0.0]}},
         "material": {"m": {"young_modulus": 1e6, "density": 1000.0}},
-        "section": {"s": {"area": 1e-2, "material": "m"}},
+        "section": {"s": {"area": 1e-5, "material": "m"}},
         "support": [{"node_set": "all", "fix": "yz"}, {"node_set": "base", "fix": "x"}],
         "output": {"fields_every": 1},
         "modes": {"count": 1},

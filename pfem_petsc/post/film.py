@@ -1,0 +1,174 @@
+"""The film of one result, or of several side by side: colours, cameras, and the page of each frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from .contrast import MARKS
+from .fields import ColourField, ColourScale
+from .inset import Inset
+from .motion import Motion
+from .page import Page
+from .poster import grid, instants
+from .scene import Scene, Style
+from .shots import Moves, at_one_scale, shots
+
+__all__ = ["Film", "Look"]
+
+_POSTER = (1600, 900)
+_TILES = 6
+
+
+@dataclass(frozen=True)
+class Look:
+    """What a film looks like, apart from what it shows.
+
+    Parameters
+    ----------
+    styles : how the bars of each result are drawn
+    moves : of the camera
+    marks : what is marked
+    inset : column of the history, None for none
+    labels : of the results, when there are several
+    transparent : whether the background is
+    """
+
+    styles: Sequence[Style]
+    moves: Moves
+    marks: Sequence[str] = ()
+    inset: str | None = None
+    labels: Sequence[str] = field(default_factory=tuple)
+    transparent: bool = False
+
+
+class Film:
+    """Frames of results, side by side when there are several; all have the same number of frames.
+
+    Parameters
+    ----------
+    motions, colours : of each result
+    scale : colours of all
+    title : of the page
+    look : what it looks like
+    """
+
+    def __init__(
+        self,
+        motions: Sequence[Motion],
+        colours: Sequence[ColourField],
+        scale: ColourScale,
+        title: str,
+        look: Look,
+    ) -> None:
+        self.motions, self.colours, self.scale, self.title, self.look = motions, colours, scale, title, look
+        self.count = len(motions[0].frames)
+
+    def start(self, size: tuple[int, int]) -> None:
+        """Prepare frames of a size."""
+        _, _, width, height = Page.region_of(size)
+        aspect = np.mean([self._aspect(motion) for motion in self.motions])
+        self._columns, self._tile = 1, (width, height)
+        several = len(self.motions) > 1
+        if several:
+            self._columns, rows = grid(len(self.motions), float(aspect), (width, height))
+            self._tile = (width // self._columns, height // rows - Page.strip_of(size))
+        self._cameras = self._shots(self._tile)
+        self._page = self._new_page(size, self._cameras[0][0], self._tile[1])
+        self._scenes = self._new_scenes(self._tile, self._cameras)
+        self._inset = None
+        if self.look.inset is not None and not several:
+            wide = max(0.24 * width, min(width, 200.0))
+            room = round(wide), round(0.62 * wide)
+            self._inset = Inset(self.motions[0].result, self.look.inset, room)
+            self._corner = self._emptiest_corner(room)
+
+    def frame(self, number: int) -> np.ndarray:
+        """Return a page (height, width, 3 or 4) uint8."""
+        drawings = [self._draw(k, number, self._scenes[k], self._cameras[k]) for k in range(len(self.motions))]
+        motion, camera = self.motions[0], self._cameras[0][number]
+        time = motion.time(motion.frames[number])
+        if len(drawings) > 1:
+            return self._page.compose_tiles(drawings, list(self.look.labels), self._columns, camera, time)
+        inset = None
+        if self._inset is not None:
+            inset = self._inset.at(float(motion.times[number])), self._corner
+        return self._page.compose(drawings[0], time, camera, inset)
+
+    def poster(self) -> np.ndarray:
+        """Return six instants on one page, in a grid that suits the shape of the motion."""
+        motion, several = self.motions[0], len(self.motions) > 1
+        own = getattr(motion.result, "instants", None)
+        wanted = max(2, _TILES // len(self.motions))
+        chosen = instants(motion.result, motion.frames, wanted) if own is None else own(wanted)
+        numbers = [motion.frames.index(frame) for frame in chosen]
+        _, _, width, height = Page.region_of(_POSTER)
+        columns, rows = grid(len(chosen), self._aspect(motion), (width, height))
+        if several:
+            columns, rows = len(chosen), len(self.motions)
+        tile = (width // columns, height // rows - Page.strip_of(_POSTER))
+        cameras = self._shots(tile)
+        page = self._new_page(_POSTER, cameras[0][0], tile[1])
+        scenes = self._new_scenes(tile, cameras)
+        drawings, texts = [], []
+        for k in range(len(self.motions)):
+            for number, frame in zip(numbers, chosen, strict=True):
+                drawings.append(self._draw(k, number, scenes[k], cameras[k]))
+                texts.append(f"{self.look.labels[k]}, {motion.time(frame)}" if several else motion.time(frame))
+        return page.compose_tiles(drawings, texts, columns)
+
+    def _draw(self, k: int, number: int, scene: Scene, cameras: list[Any]) -> np.ndarray:
+        motion, colour, camera = self.motions[k], self.colours[k], cameras[number]
+        frame = motion.frames[number]
+        shades = self.scale.colours(colour.values(frame))
+        layers = motion.layers(frame, scene, camera)
+        surfaces, gone = motion.surfaces[frame], motion.gone(frame)
+        return scene.draw(motion.positions(frame), shades, colour.on_nodes, camera, surfaces, gone, layers)
+
+    def _shots(self, tile: tuple[int, int]) -> list[list[Any]]:
+        films = [shots(motion, self.look.moves, tile[0] / tile[1]) for motion in self.motions]
+        return at_one_scale(films) if len(films) > 1 and self.look.moves.path is None else films
+
+    def _new_scenes(self, tile: tuple[int, int], cameras: list[list[Any]]) -> list[Scene]:
+        made = []
+        for motion, style, film in zip(self.motions, self.look.styles, cameras, strict=True):
+            # widths are those of bars at the closest
+            closest = min(film, key=lambda camera: camera.half_height)
+            bounds, bars = motion.bounds, motion.bars
+            made.append(Scene(motion.start, bars, closest, bounds, tile, style, self.look.transparent))
+        return made
+
+    def _new_page(self, size: tuple[int, int], camera: Any, height: int) -> Page:
+        legend = [(MARKS[mark].text, MARKS[mark].colour) for mark in self.look.marks]
+        still = self.look.moves.path is None
+        options: dict[str, Any] = {"still": still, "transparent": self.look.transparent, "legend": legend}
+        return Page(size, self.title, self.colours[0].title, self.scale, camera, height, **options)
+
+    def _aspect(self, motion: Motion) -> float:
+        """Return the width of the motion over its height, in the picture."""
+        look, points = shots(motion, self.look.moves, 1.0)[0], motion.surroundings
+        across, along = (float(np.ptp(points @ way)) for way in (look.right, look.up))
+        return across / max(along, 1e-3 * across, 1e-300)
+
+    def _emptiest_corner(self, room: tuple[int, int]) -> tuple[int, int]:
+        """Return the place of the inset that covers least of the structure and its walls over the film."""
+        width, height = self._tile
+        places = [(x, y) for y in (0, height - room[1]) for x in (0, width - room[0])]
+        covered = np.zeros(len(places))
+        motion = self.motions[0]
+        for number in np.unique(np.linspace(0, self.count - 1, 7).astype(int)):
+            points, camera = motion.positions(motion.frames[number]), self._cameras[0][number]
+            ends = points[motion.bars]
+            along = np.concatenate([ends[:, 0] + part * (ends[:, 1] - ends[:, 0]) for part in (0.0, 0.3, 0.6)])
+            x, y, _, _ = camera.project(along, self._tile)
+            inside = [(x > a) & (x < a + room[0]) & (y > b) & (y < b + room[1]) for a, b in places]
+            covered += [float(each.mean()) for each in inside]
+            for surface in motion.surfaces[motion.frames[number]]:
+                x, y, _, _ = camera.project(np.asarray(surface.points), self._tile)
+                for k, (a, b) in enumerate(places):
+                    overlap = x.min() < a + room[0] and x.max() > a and y.min() < b + room[1] and y.max() > b
+                    covered[k] += 1e-3 * overlap
+        return places[int(np.argmin(covered))]

@@ -1,0 +1,233 @@
+"""The motion of a result for pictures: where its nodes, walls and probes are in each frame, and what is marked."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ..errors import InputError
+from ..fields import STATUS
+from ..output.units import prefix_for
+from ..registry import nearest
+from .contrast import GHOST, MARKS, TRAILS
+from .scene import Layer, Scene
+from .walls import Surface, wall_shifts, wall_surfaces, walls_present
+
+__all__ = ["Motion", "Overlays"]
+
+_STUB = 0.35  # of the initial length: the part of a broken bar that is drawn at each of its nodes
+_MOST_POINTS = 1000  # of a trajectory
+
+
+@dataclass(frozen=True)
+class Overlays:
+    """What is drawn in addition to the bars.
+
+    Parameters
+    ----------
+    ghost : whether to draw the bars of the first snapshot, pale
+    marks : of "broken", "yielded"
+    trails : names of probes whose paths are drawn; empty: none
+    """
+
+    ghost: bool = False
+    marks: Sequence[str] = ()
+    trails: Sequence[str] = field(default_factory=tuple)
+
+
+class Motion:
+    """What the frames of one result have in common.
+
+    Parameters
+    ----------
+    result : an open result
+    frames : numbers of its snapshots
+    scale : factor on displacements since the first snapshot
+    overlays : what is drawn in addition to the bars
+    note : receives messages
+
+    Attributes
+    ----------
+    bounds : (2, 3) [m], corners of the motion
+    boxes : (frames, 2, 3) [m], corners of the structure in each frame
+    times : (frames,) [s]
+
+    Raises
+    ------
+    InputError
+        For marks and probes that the result does not have.
+    """
+
+    def __init__(
+        self, result: Any, frames: Sequence[int], scale: float, overlays: Overlays, note: Callable[[str], None]
+    ) -> None:
+        self.result, self.frames, self.scale, self.note, self._overlays = result, list(frames), scale, note, overlays
+        self.bars = np.asarray(result.bars)
+        self.start = np.asarray(result.positions(0), dtype=float)
+        self.times = np.asarray(result.times, dtype=float)[self.frames]
+        self.n_bars = len(self.bars)
+        self._check_marks()
+        self._trails = {name: self._trail(name) for name in overlays.trails}
+        boxes = []
+        for frame in self.frames:
+            points = self._held(frame)
+            boxes.append([points.min(axis=0), points.max(axis=0)])
+        self.boxes = np.array(boxes)
+        low, high = self.boxes[:, 0].min(axis=0), self.boxes[:, 1].max(axis=0)
+        if overlays.ghost:
+            low, high = np.fmin(low, self.start.min(axis=0)), np.fmax(high, self.start.max(axis=0))
+        self.bounds = np.array([low, high])
+        walls = result.case.every_wall
+        self.surfaces = self._moved(walls)
+        self.normals = [np.asarray(wall.normal, dtype=float) for wall in walls if hasattr(wall, "normal")]
+        self.normals = [normal / np.linalg.norm(normal) for normal in self.normals]
+        every = np.asarray(result.times, dtype=float)
+        self.time_factor, self.time_unit = prefix_for(float(np.abs(every).max()), result.axis.unit)
+
+    def _check_marks(self) -> None:
+        for mark in self._overlays.marks:
+            if mark not in MARKS:
+                raise InputError(f"render: mark = {mark!r} is not known; it is one of {', '.join(MARKS)}")
+            if MARKS[mark].field not in self.result.cell_fields:
+                raise InputError(
+                    f"render: mark = {mark!r}: the result holds no field '{MARKS[mark].field}'; "
+                    "name it in [output] fields and run again, or leave the mark out"
+                )
+
+    def _moved(self, walls: Sequence[Any]) -> dict[int, list[Surface]]:
+        """Return, by frame, the surfaces of the walls at that time; a wall at rest has the same one in all frames.
+
+        Those that a stage does not have are left out.
+        """
+        times = self.result.times[self.frames]
+        displacements = dict(zip(self.frames, wall_shifts(self.result, times), strict=True))
+        present = dict(zip(self.frames, walls_present(self.result, times), strict=True))
+        still = {surface.name: surface for surface in wall_surfaces(walls, self.bounds, self.note)}
+        surfaces: dict[int, list[Surface]] = {frame: [] for frame in self.frames}
+        for k, wall in enumerate(walls):
+            if wall.name not in still:
+                continue
+            for frame in surfaces:
+                if not present[frame][k]:
+                    continue
+                surface, shift = still[wall.name], displacements[frame][k]
+                if shift.any():
+                    point = tuple((np.asarray(wall.point) + shift).tolist())
+                    (surface,) = wall_surfaces([wall.model_copy(update={"point": point})], self.bounds)
+                surfaces[frame].append(surface)
+        return surfaces
+
+    @property
+    def places(self) -> Iterator[np.ndarray]:
+        """Yield the points (n, 3) [m] of all distinct wall surfaces that are drawn."""
+        for surface in {id(surface): surface for drawn in self.surfaces.values() for surface in drawn}.values():
+            yield surface.points
+
+    @property
+    def surroundings(self) -> np.ndarray:
+        """Points (n, 3) [m] that the camera has in view: the motion, and walls near it."""
+        near = [np.array(np.meshgrid(*self.bounds.T)).reshape(3, -1).T]
+        size = float(np.linalg.norm(self.bounds[1] - self.bounds[0])) or 1.0
+        for points in self.places:
+            # a distant wall would shrink the structure to a dot: it is drawn but does not affect the view
+            gap = np.maximum(points.min(axis=0) - self.bounds[1], self.bounds[0] - points.max(axis=0))
+            if gap.max() < 0.6 * size:
+                near.append(points)
+        return np.concatenate(near)
+
+    @property
+    def upward(self) -> np.ndarray:
+        """Upward direction (3,) of pictures: against gravity along y, else z."""
+        gravity = getattr(self.result.case, "gravity", None)
+        if gravity is not None:
+            pull = np.asarray(gravity.mean, dtype=float)
+            axis = int(np.argmax(np.abs(pull)))
+            if np.count_nonzero(pull) == 1 and axis == 1:
+                return np.array([0.0, -float(np.sign(pull[1])), 0.0])
+        return np.array([0.0, 0.0, 1.0])
+
+    def positions(self, frame: int) -> np.ndarray:
+        """Positions (nodes, 3) [m] as drawn."""
+        points = np.asarray(self.result.positions(frame), dtype=float)
+        return points if self.scale == 1.0 else self.start + self.scale * (points - self.start)
+
+    def gone(self, frame: int) -> np.ndarray | None:
+        """Return the bars (b,) that have left the model, None if the result does not tell."""
+        if "status" not in self.result.cell_fields:
+            return None
+        return np.asarray(self.result.field("status", frame)) == STATUS.index("broken")
+
+    def _held(self, frame: int) -> np.ndarray:
+        """Return the positions of nodes with bars: others may fly far away, and would shrink the picture."""
+        points, gone = self.positions(frame), self.gone(frame)
+        if gone is None or gone.all():
+            return points
+        return points[np.unique(self.bars[~gone])]
+
+    def time(self, frame: int) -> str:
+        """What stands above a frame."""
+        if hasattr(self.result, "caption"):
+            return self.result.caption(frame)
+        axis, time = self.result.axis, self.result.times[frame]
+        return f"{axis.symbol} = {time * self.time_factor:.2f} {self.time_unit}" if axis.unit else axis.place(time)
+
+    def probe(self, name: str) -> np.ndarray:
+        """Mean positions (frames, 3) [m] of the nodes of a probe as drawn."""
+        when, places = self._probe_rows(name)
+        middle = places.mean(axis=1)
+        return np.stack([np.interp(self.times, when, middle[:, axis]) for axis in range(3)], axis=1)
+
+    def _probe_rows(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        history, column = self.result.history, f"probe/{name}/position"
+        known = [key.split("/")[1] for key in history if key.startswith("probe/") and key.endswith("/position")]
+        if column not in history:
+            raise InputError(
+                f"render: the result has no probe '{name}'{nearest(name, known)}; "
+                + (f"its probes are {', '.join(known)}" if known else "give the case an [[output.probe]] and run again")
+            )
+        when, places = np.asarray(history["time"], dtype=float), np.asarray(history[column], dtype=float)
+        return when, places if self.scale == 1.0 else places[0] + self.scale * (places - places[0])
+
+    def _trail(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        when, places = self._probe_rows(name)
+        rows = np.unique(np.linspace(0, len(when) - 1, _MOST_POINTS).astype(int))
+        return when[rows], places[rows]
+
+    def layers(self, frame: int, scene: Scene, camera: Any) -> list[Layer]:
+        """Return what is drawn in addition to the bars of a frame."""
+        made, points = [], self.positions(frame)
+        if self._overlays.ghost:
+            made.append(Layer(self.start, self.bars, GHOST, max(1.0, min(1.6, scene.width)), "behind"))
+        gone = self.gone(frame)
+        if "yielded" in self._overlays.marks:
+            yielded = np.asarray(self.result.field("plastic_strain", frame)) != 0.0
+            if gone is not None:
+                yielded &= ~gone
+            if yielded.any():
+                made.append(scene.halo(points, np.flatnonzero(yielded), MARKS["yielded"].colour, camera))
+        if "broken" in self._overlays.marks and gone is not None and gone.any():
+            made.append(self._stubs(points, gone, scene.width))
+        for number, (when, places) in enumerate(self._trails.values()):
+            past = max(1, int(np.searchsorted(when, self.result.times[frame], side="right")))
+            rows = np.stack([np.arange(past - 1), np.arange(1, past)], axis=1)
+            for node in range(places.shape[1]):
+                colour = TRAILS[number % len(TRAILS)]
+                made.append(Layer(places[:, node], rows, colour, 2.2, "above"))
+        return made
+
+    def _stubs(self, points: np.ndarray, gone: np.ndarray, width: float) -> Layer:
+        """Return both ends of each broken bar, which point at each other."""
+        bars = self.bars[gone]
+        one, two = points[bars[:, 0]], points[bars[:, 1]]
+        along = two - one
+        now = np.linalg.norm(along, axis=1)
+        initial = np.linalg.norm(self.start[bars[:, 1]] - self.start[bars[:, 0]], axis=1)
+        part = (_STUB * np.minimum(1.0, initial / np.where(now > 0.0, now, 1.0)))[:, None] * along
+        count = len(bars)
+        numbers = np.arange(2 * count)
+        lines = np.stack([numbers, numbers + 2 * count], axis=1)
+        stubs = np.concatenate([one, two, one + part, two - part])
+        return Layer(stubs, lines, MARKS["broken"].colour, max(2.0, width), "within")

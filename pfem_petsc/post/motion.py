@@ -184,10 +184,12 @@ class Motion:
         history, column = self.result.history, f"probe/{name}/position"
         known = [key.split("/")[1] for key in history if key.startswith("probe/") and key.endswith("/position")]
         if column not in history:
-            raise InputError(
-                f"render: the result has no probe '{name}'{nearest(name, known)}; "
-                + (f"its probes are {', '.join(known)}" if known else "give the case an [[output.probe]] and run again")
+            way = (
+                f"its probes are {', '.join(known)}{nearest(name, known)}"
+                if known
+                else "give the case an [[output.probe]]"
             )
+            raise InputError(f"render: the result has no probe '{name}'; {way}")
         when, places = np.asarray(history["time"], dtype=float), np.asarray(history[column], dtype=float)
         return when, places if self.scale == 1.0 else places[0] + self.scale * (places - places[0])
 

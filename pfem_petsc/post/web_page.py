@@ -75,7 +75,7 @@ def render_html(
             "shades": _text(shades if colour.on_nodes else shades[there], np.uint8),
             "onNodes": colour.on_nodes,
             "walls": _text(_walls(motion, number, centre), np.float32),
-            "size": 1.1 * (float(np.linalg.norm(corners, axis=1).max()) or 1.0),
+            "size": 1.25 * (float(np.linalg.norm(corners, axis=1).max()) or 1.0),
             "width": next((width for most, width in _WIDTHS if motion.n_bars <= most), 1.2),
             **ways,
         }

@@ -39,14 +39,13 @@ def show(
             "render: --window: there is no display (DISPLAY is not set); take --html, which writes a page for a browser"
         )
     with opened(result_path) as result:
-        plotter_of(result, frame, note, **options).show()
+        plotter_of(result, frame, note, **options)[0].show()
 
 
-def plotter_of(result: Any, frame: int, note: Callable[[str], None], off_screen: bool = False, **options: Any) -> Any:
-    """Return a window (a pyvista plotter) with a slider that moves the nodes and changes the colours.
-
-    The slider's function of the number of a snapshot is its attribute ``go_to``.
-    """
+def plotter_of(
+    result: Any, frame: int, note: Callable[[str], None], off_screen: bool = False, **options: Any
+) -> tuple[Any, Callable[[float], None]]:
+    """Return a window (a pyvista plotter) with a slider, and the function of a snapshot that the slider calls."""
     import pyvista
 
     from .web_page import state
@@ -88,5 +87,4 @@ def plotter_of(result: Any, frame: int, note: Callable[[str], None], off_screen:
     last = len(result.times) - 1
     if last:
         plotter.add_slider_widget(go_to, (0, last), value=motion.frames[0], title="snapshot", fmt="%.0f", color="black")
-    plotter.go_to = go_to
-    return plotter
+    return plotter, go_to

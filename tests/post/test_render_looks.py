@@ -1,0 +1,332 @@
+"""What pictures show beyond coloured bars: radii, marks, trajectories, curves, cameras, results side by side."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+
+import imageio_ffmpeg
+import numpy as np
+import pytest
+from helpers.synthetic import SyntheticResult, lattice, ring
+from PIL import Image
+
+from pfem_petsc import Case, Simulation, open_result
+from pfem_petsc.cli.main import main
+from pfem_petsc.errors import InputError
+from pfem_petsc.post.camera import aim
+from pfem_petsc.post.contrast import GHOST, MARKS, TRAILS
+from pfem_petsc.post.frames import Resampled
+from pfem_petsc.post.page import Page
+from pfem_petsc.post.radii import radii_of
+from pfem_petsc.post.render import render
+from pfem_petsc.post.scene import Scene, Style
+from pfem_petsc.post.shots import Moves, camera_path, shots
+
+TINY = (240, 160)
+
+
+def draw(folder, result, **options):
+    options = {"size": TINY, "video": "none", "poster": False, "note": lambda text: None, **options}
+    return render(result, folder, **options)
+
+
+def pixels(file) -> np.ndarray:
+    return np.asarray(Image.open(file).convert("RGBA")).astype(int)
+
+
+def drawing(file) -> np.ndarray:
+    picture = pixels(file)
+    left, top, width, height = Page.region_of((picture.shape[1], picture.shape[0]))
+    return picture[top : top + height, left : left + width]
+
+
+def near(picture: np.ndarray, colour, within: int = 40) -> np.ndarray:
+    return (np.abs(picture[..., :3] - np.array(colour)).max(axis=2) < within).nonzero()
+
+
+def box(picture: np.ndarray) -> tuple[int, int, int, int]:
+    rows, columns = (picture[..., :3].min(axis=2) < 200).nonzero()
+    return rows.min(), rows.max(), columns.min(), columns.max()
+
+
+@pytest.fixture
+def flying(tmp_path):
+    return SyntheticResult(tmp_path / "x" / "result.vtkhdf", *ring(), walls=())
+
+
+@pytest.fixture(scope="module")
+def bars_of_sections(tmp_path_factory):
+    """Three bars: solid, a tube, and one with an area of a field."""
+    points = [[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
+    data = {
+        "mesh": {
+            "generator": "arrays",
+            "points": points,
+            "bars": [[0, 1], [0, 2], [0, 3]],
+            "bar_groups": {"pipe": [1], "graded": [2]},
+            "bar_fields": {"area": [1.0, 1.0, 4e-4]},
+        },
+        "node_set": {"all": {"all": True}},
+        "material": {"m": {"young_modulus": 1e9, "density": 1e3}},
+        "section": {
+            "rod": {"area": 1e-4, "material": "m"},
+            "pipe": {"bars": "pipe", "area": 2e-4, "shape": "tube", "thickness": 1e-3, "material": "m"},
+            "graded": {"bars": "graded", "area_field": "area", "material": "m"},
+        },
+        "support": [{"node_set": "all", "fix": "xyz"}],
+        "time": {"integrator": "central_differences", "step": 1e-6, "end": 1e-6},
+    }
+    folder = tmp_path_factory.mktemp("radii") / "result"
+    with Simulation(Case.from_dict(data), output=folder, quiet=True) as simulation:
+        simulation.run()
+    return folder
+
+
+def test_radii_are_those_of_sections_and_fields(bars_of_sections):
+    outer = 2e-4 / (2 * math.pi * 1e-3) + 0.5e-3
+    expected = [math.sqrt(1e-4 / math.pi), outer, math.sqrt(4e-4 / math.pi)]
+    assert radii_of(open_result(bars_of_sections)) == pytest.approx(expected, rel=1e-12)
+
+
+def test_radii_without_the_mesh(flying):
+    """The only area is that of all bars; which of several a bar has is not known."""
+    section = Case.load("rod_impact").section["default"].model_copy(update={"area": math.pi * 0.01})
+    flying.case.source, flying.case.node_set, flying.case.temperature, flying.case.remove = "case", {}, (), ()
+    flying.case.mesh = SimpleNamespace(generator=None, file="is/not/there.h5")
+    flying.case.section = {"one": section}
+    assert radii_of(flying) == pytest.approx(np.full(flying.n_bars, 0.1))
+    flying.case.section = {"one": section, "two": section}
+    assert radii_of(flying) is None
+
+
+@pytest.mark.parametrize("view", ["xy", "iso"])
+def test_tubes_have_their_radius(view):
+    """A bar of radius r across the view, and its nodes, are drawn 2 r wide and l + 2 r long, with round ends."""
+    points, bars, radius = np.array([[-0.5, 0, 0], [0.5, 0, 0.0]]), np.array([[0, 1]]), 0.1
+    size = (400, 300)
+    bounds = np.array([[-0.5, -0.5, -0.5], [0.5, 0.5, 0.5]])
+    corners = np.array(np.meshgrid(*bounds.T)).reshape(3, -1).T
+    camera = aim(corners, bounds, [], "xy" if view == "xy" else (0.0, -1.0, 0.0), 4 / 3)
+    scene = Scene(points, bars, camera, bounds, size, Style(radius=np.array([radius]), nodes=False))
+    picture = scene.draw(points, np.full((1, 3), 90, dtype=np.uint8), False, camera).astype(int)
+    rows, columns = (picture.min(axis=2) < 250).nonzero()
+    scale = size[1] / (2 * camera.half_height)
+    assert np.ptp(rows) + 1 == pytest.approx(2 * radius * scale, abs=1.6)
+    assert np.ptp(columns) + 1 == pytest.approx(1.2 * scale, abs=1.6)
+    area = (2 * radius + math.pi * radius**2) * scale**2
+    assert len(rows) == pytest.approx(area, rel=0.04)
+
+
+@pytest.mark.parametrize("parallel", [True, False], ids=["parallel", "perspective"])
+def test_what_is_nearer_hides(parallel):
+    """Two crossed bars in both orders, a red one in front; and a vertical one that pierces a horizontal one."""
+    points = np.array([[-1, 0, 0.1], [1, 0, 0.1], [0, -1, -0.1], [0, 1, -0.1]], dtype=float)
+    red, blue = (200, 0, 0), (0, 0, 200)
+    bounds = np.array([[-1.0, -1, -1], [1, 1, 1]])
+    camera = aim(np.array(np.meshgrid(*bounds.T)).reshape(3, -1).T, bounds, [], "xy" if parallel else (0, 0, 1), 1.0)
+    for bars, colours in (([[0, 1], [2, 3]], (red, blue)), ([[2, 3], [0, 1]], (blue, red))):
+        style = Style(radius=np.full(2, 0.15), nodes=False)
+        scene = Scene(points, np.array(bars), camera, bounds, (160, 160), style)
+        middle = scene.draw(points, np.array(colours, dtype=np.uint8), False, camera).astype(int)[80, 80]
+        assert middle[0] > middle[2] + 60
+
+
+def test_lines_and_tubes_are_chosen_by_the_number_of_bars(monkeypatch):
+    points, bars = lattice(3)
+    bounds = np.array([points.min(axis=0), points.max(axis=0)])
+    camera = aim(points, bounds, [], "iso", 1.5)
+    assert Scene(points, bars, camera, bounds, TINY).tubes
+    monkeypatch.setattr("pfem_petsc.post.scene.TUBE_LIMIT", len(bars) - 1)
+    assert not Scene(points, bars, camera, bounds, TINY).tubes
+    assert Scene(points, bars, camera, bounds, TINY, Style(tubes=True)).tubes
+
+
+def test_small_models_are_not_hair_thin(tmp_path, flying):
+    """The bars of a slender ring cover some hundredths of its frame with no option at all."""
+    picture = drawing(draw(tmp_path, flying, frames=[0], size=(640, 360))[0])
+    assert (picture[..., :3].min(axis=2) < 200).mean() > 0.04
+    top, bottom, _, _ = box(picture)
+    assert bottom - top > 0.85 * picture.shape[0]
+
+
+def test_ghost_stays_where_the_structure_was(tmp_path, flying):
+    options = {"frames": [6], "size": (960, 640)}
+    plain, ghost = (drawing(draw(tmp_path, flying, ghost=on, **options)[0]) for on in (False, True))
+    pale = near(ghost, GHOST, 3)
+    assert len(pale[0]) > 5 * len(near(plain, GHOST, 3)[0]) + 300
+    # the ring has flown to the right
+    assert pale[1].min() < box(ghost)[2] - 10
+
+
+def test_yielded_and_broken_bars_are_marked(tmp_path, flying):
+    flying.cell_fields = [*flying.cell_fields, "status"]
+    gone = np.zeros(flying.n_bars, dtype=int)
+    gone[:3] = 1
+    fields = {"plastic_strain": np.where(np.arange(flying.n_bars) >= flying.n_bars - 5, 0.1, 0.0), "status": gone}
+    plain = flying.field
+    flying.field = lambda name, i: fields[name] if name in fields else plain(name, i)
+    options = {"frames": [0], "nodes": False, "size": (480, 320)}
+    without = drawing(draw(tmp_path, flying, **options)[0])
+    marked = drawing(draw(tmp_path, flying, marks=["broken", "yielded"], **options)[0])
+    for mark in MARKS.values():
+        assert len(near(marked, mark.colour)[0]) > len(near(without, mark.colour)[0]) + 20, mark.text
+
+
+def test_trajectories_grow(tmp_path, flying):
+    files = draw(tmp_path, flying, frames=[2, 5], trails=["tip"], size=(960, 640))
+    early, late = (near(drawing(file), TRAILS[0])[0] for file in files)
+    assert 0 < len(early) < len(late)
+    with pytest.raises(InputError, match="no probe 'tap'; its probes are tip, did you mean 'tip'"):
+        draw(tmp_path, flying, trails=["tap"])
+
+
+def test_marker_moves_along_the_curve(tmp_path, flying):
+    files = draw(tmp_path, flying, frames=[1, 11], inset="kinetic_energy", size=(640, 360), cmap="Greys")
+    first, last = (near(drawing(file), (217, 72, 43), 25) for file in files)
+    assert last[1].mean() > first[1].mean() + 50
+    assert draw(tmp_path, flying, frames=[0], inset="centre_of_mass.x")
+    for name, text in (("kinetic_enrgy", "did you mean"), ("kinetic_energy.x", "one value only")):
+        with pytest.raises(InputError, match=text):
+            draw(tmp_path, flying, inset=name)
+
+
+def test_transparent_background(tmp_path, flying):
+    file = draw(tmp_path, flying, frames=[0], transparent=True)[0]
+    picture = pixels(file)
+    left, top, width, height = Page.region_of(TINY)
+    alpha = picture[top : top + height, left : left + width, 3]
+    assert alpha.min() == 0 and alpha.max() == 255 and (alpha == 0).mean() > 0.5
+    plain = pixels(draw(tmp_path / "plain", flying, frames=[0])[0])
+    over = picture[..., :3] * (picture[..., 3:] / 255) + 255 - picture[..., 3:]
+    assert np.abs(over - plain[..., :3])[top : top + height, left : left + width].max() <= 3
+    with pytest.raises(InputError, match="webm"):
+        draw(tmp_path, flying, transparent=True, video="mp4")
+
+
+def test_results_side_by_side(tmp_path, flying):
+    """Two rings at one scale beside each other, the second at half the size."""
+    points, bars = ring()
+    other = SyntheticResult(tmp_path / "y" / "result.vtkhdf", 0.5 * points, bars, walls=())
+    file = draw(tmp_path, [flying, other], frames=[0], size=(640, 300), nodes=False)[0]
+    picture = drawing(file)
+    middle = picture.shape[1] // 2
+    strip = Page.strip_of((640, 300))
+    boxes = [box(half) for half in (picture[strip:, :middle], picture[strip:, middle:])]
+    heights = [bottom - top for top, bottom, _, _ in boxes]
+    assert heights[1] == pytest.approx(0.5 * heights[0], abs=3)
+    with pytest.raises(InputError, match="3 labels for 2 results"):
+        draw(tmp_path, [flying, other], labels=["a", "b", "c"])
+    with pytest.raises(InputError, match="inset is for one result"):
+        draw(tmp_path, [flying, other], inset="kinetic_energy")
+
+
+def test_slow_motion_is_between_snapshots(tmp_path, flying):
+    """0.05 s at 1000 frames a second from 13 snapshots: the middle of two of them is the mean of their positions."""
+    told = []
+    files = draw(tmp_path, flying, rate=1000, span=(0.0, 0.0201), note=told.append, fps=20)
+    assert len(files) == 21 and "21 frames last 1.1 s" in told[0] and "50 times slower" in told[0]
+    half = 0.5 * (flying.times[3] + flying.times[4])
+    mean = 0.5 * (flying.positions(3) + flying.positions(4))
+    slow = Resampled(flying, np.array([half, 1.0]))
+    assert slow.positions(0) == pytest.approx(mean, abs=1e-12)
+    assert (slow.positions(1) == flying.positions(12)).all()
+
+
+def motion_of(result):
+    from pfem_petsc.post.motion import Motion, Overlays
+
+    return Motion(result, list(range(len(result.times))), 1.0, Overlays(), print)
+
+
+def test_orbit_and_path_keep_everything_in_view(tmp_path, flying):
+    motion = motion_of(flying)
+    path = np.array([[0.0, -90.0, 10.0, 1.0], [0.05, 90.0, 40.0, 1.0]])
+    for moves in (Moves(orbit=180.0, view="iso"), Moves(path=path)):
+        cameras = shots(motion, moves.checked(), 1.5)
+        assert len(cameras) == 13 and cameras[0].towards @ cameras[-1].towards < 0.5
+        for camera in cameras:
+            x, y, _, _ = camera.project(motion.surroundings, (300, 200))
+            assert x.min() >= -0.5 and x.max() <= 300.5 and y.min() >= -0.5 and y.max() <= 200.5
+    first, last = (cameras[k].towards for k in (0, -1))
+    tilt = math.radians(10.0), math.radians(40.0)
+    assert first == pytest.approx([0.0, -math.cos(tilt[0]), math.sin(tilt[0])], abs=1e-12)
+    assert last == pytest.approx([0.0, math.cos(tilt[1]), math.sin(tilt[1])], abs=1e-12)
+
+
+def test_followed_structure_stays_in_the_middle(flying):
+    motion = motion_of(flying)
+    for camera, box in zip(shots(motion, Moves(follow="structure"), 1.5), motion.boxes, strict=True):
+        x, y, _, _ = camera.project(box.mean(axis=0)[None, :], (300, 200))
+        assert (x[0], y[0]) == pytest.approx((150.0, 100.0))
+    assert len(shots(motion, Moves(follow="tip"), 1.5)) == 13
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"style": "ribbons"}, "auto, tubes, lines"),
+        ({"radius_scale": -1.0}, "radius_scale"),
+        ({"marks": ["slack"]}, "broken, yielded"),
+        ({"marks": ["broken"]}, "no field 'status'"),
+        ({"zoom": 0.0}, "zoom = 0"),
+        ({"view": (0.0, 0.0, 0.0)}, "no direction"),
+        ({"rate": 1e9}, "give 2 to 20000 frames"),
+        ({"rate": 100.0, "frames": 3}, "give one of the two"),
+        ({"span": (0.4, 0.3)}, "two increasing times"),
+        ({"orbit": 10.0, "path": [[0, 0, 0, 1]]}, "give one of the two"),
+        ({"path": [[0, 0, 95, 1]]}, "elevations"),
+        ({"follow": "tap"}, "no probe 'tap'"),
+    ],
+)
+def test_refused_looks(tmp_path, flying, options, message):
+    with pytest.raises(InputError, match=message):
+        draw(tmp_path, flying, **options)
+
+
+def test_path_files(tmp_path):
+    file = tmp_path / "path.csv"
+    file.write_text("time,azimuth,elevation,zoom\n0,0,10,1\n# closer\n1,90,20,2\n")
+    assert camera_path(file).tolist() == [[0, 0, 10, 1], [1, 90, 20, 2]]
+    file.write_text("0,0,10,1\n1,90,20\n")
+    with pytest.raises(InputError, match="line 2 is not four numbers"):
+        camera_path(file)
+    with pytest.raises(InputError, match="cannot be read"):
+        camera_path(tmp_path / "none.csv")
+
+
+def test_films_for_web_pages(tmp_path, flying):
+    for video, transparent in (("webp", False), ("webm", True)):
+        draw(tmp_path / video, flying, frames=3, video=video, transparent=transparent, size=(160, 120))
+    assert Image.open(tmp_path / "webp" / "render.webp").n_frames == 3
+    count, _ = imageio_ffmpeg.count_frames_and_secs(str(tmp_path / "webm" / "render.webm"))
+    assert count == 3
+
+
+@pytest.mark.parallel
+def test_ranks_divide_the_frames(shared_tmp_path, comm):
+    """The same frames on any number of ranks, which the first rank makes a film of."""
+    alone = SyntheticResult(shared_tmp_path / "x" / "result.vtkhdf", *ring(), walls=())
+    options = {"size": (160, 120), "poster": False, "note": lambda text: None, "frames": 4}
+    written = render(alone, shared_tmp_path / "together", video="gif", comm=comm, **options)
+    assert len(written) == 5 and all(path.is_file() for path in written)
+    if comm.rank == 0:
+        own = render(alone, shared_tmp_path / "alone", video="none", **options)
+        assert [path.read_bytes() for path in written[1:]] == [path.read_bytes() for path in own]
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["--view", "1,a,0"], "not a direction"),
+        (["--size", "5k"], "720p, 1080p, 4k"),
+        (["--html", "--window"], "one of the two"),
+        (["--html", "--frames", "1,2"], "number of one snapshot"),
+        (["--modes", "--rate", "10"], "--rate"),
+        (["--path", "is/not/there.csv"], "cannot be read"),
+        (["--", "-log_view"], "no PETSc options"),
+    ],
+)
+def test_refused_words(bars_of_sections, words, text, capsys):
+    assert main(["render", str(bars_of_sections), *words]) == 2
+    assert text in capsys.readouterr().err

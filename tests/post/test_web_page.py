@@ -1,0 +1,82 @@
+"""A state as a web page: what it holds, and in a browser: drawn, turned by dragging, nothing from a network."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from helpers.browser import PROGRAM, Browser
+from helpers.synthetic import SyntheticResult, lattice, ring
+
+from pfem_petsc.errors import InputError
+from pfem_petsc.post.web_page import render_html
+from pfem_petsc.post.window import plotter_of, show
+
+
+@pytest.fixture
+def result(tmp_path):
+    return SyntheticResult(tmp_path / "result.vtkhdf", *lattice(3))
+
+
+def test_one_file_without_addresses(tmp_path, result):
+    result.case.title = "</script><b>Ring & wall"
+    page = render_html(result, tmp_path / "out").read_text()
+    assert "http" not in page and page.count("</script>") == 2 and "<b>Ring" not in page
+    assert "&lt;/script&gt;&lt;b&gt;Ring &amp; wall</title>" in page
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"field": "stres"}, "did you mean 'stress'"),
+        ({"frame": 99}, "snapshots 0 to 12"),
+        ({"style": "dots"}, "auto, tubes, lines"),
+    ],
+)
+def test_refused_pages(tmp_path, result, options, message):
+    with pytest.raises(InputError, match=message):
+        render_html(result, tmp_path, **options)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(PROGRAM is None, reason="there is no Chromium")
+def test_page_turns_in_a_browser(tmp_path, result):
+    file = render_html(result, tmp_path, frame=6)
+    with Browser(file) as browser:
+        before = browser.picture()
+        browser.drag((320, 220), (420, 260))
+        after = browser.picture()
+        browser.value("document.getElementById('reset').click()")
+        browser.settle()
+        again = browser.picture()
+        browser.value("shape.value = 0; shape.dispatchEvent(new Event('input'))")
+        browser.settle()
+        initial = browser.picture()
+        assert browser.errors == []
+        assert browser.requests == [file.absolute().as_uri()]
+    drawn = [(picture[100:400, :500].min(axis=2) < 200).sum() for picture in (before, after)]
+    assert min(drawn) > 3000
+    assert (before != after).any(axis=2).sum() > 5000
+    assert (before == again).all()
+    assert (before != initial).any(axis=2).sum() > 500
+
+
+def test_window_moves_the_nodes(tmp_path, result):
+    from pfem_petsc.post.headless import require_rendering
+
+    require_rendering()
+    plotter, go_to = plotter_of(result, 0, print, off_screen=True)
+    pictures = []
+    for snapshot in (0, 6):
+        go_to(snapshot)
+        plotter.render()
+        pictures.append(np.asarray(plotter.screenshot(return_img=True)).astype(int))
+    plotter.close()
+    assert (pictures[0] != pictures[1]).any(axis=2).sum() > 300
+
+
+def test_window_without_a_display(tmp_path, monkeypatch):
+    monkeypatch.setattr("sys.platform", "linux")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(InputError, match="no display.*--html"):
+        show(SyntheticResult(tmp_path / "result.vtkhdf", *ring()))

@@ -81,7 +81,7 @@ class Film:
         self._scenes = self._new_scenes(self._tile, self._cameras)
         self._inset = None
         if self.look.inset is not None and not several:
-            wide = max(0.24 * width, min(width, 200.0))
+            wide = max(0.28 * width, min(width, 220.0))
             room = round(wide), round(0.62 * wide)
             self._inset = Inset(self.motions[0].result, self.look.inset, room)
             self._corner = self._emptiest_corner(room)

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..errors import InputError
-from ..parallel.agreement import agreed
 from .parser import PROGRAM, surviving
 
 if TYPE_CHECKING:
@@ -164,6 +163,8 @@ def run(arguments: argparse.Namespace, comm: MPI.Comm) -> int:
 
 def _checked_once(result: str, comm: MPI.Comm) -> Path:
     """Return the result file after one rank has examined it."""
+    from ..parallel.agreement import agreed
+
     with agreed(comm):
         path = surviving(result) if comm.rank == 0 else None
     return comm.bcast(path)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
+from .headless import require_rendering
 
 __all__ = ["plotter_of", "show"]
 
@@ -46,6 +47,8 @@ def plotter_of(
     result: Any, frame: int, note: Callable[[str], None], off_screen: bool = False, **options: Any
 ) -> tuple[Any, Callable[[float], None]]:
     """Return a window (a pyvista plotter) with a slider, and the function of a snapshot that the slider calls."""
+    if off_screen:
+        require_rendering()
     import pyvista
 
     from .web_page import state

@@ -151,8 +151,8 @@ def test_numpy_values_in_a_case():
 
 
 def test_an_unknown_option_names_the_help_of_its_verb(capsys):
-    assert "unrecognized arguments: --zoom; see python -m pfem_petsc render --help" in refused(
-        capsys, "render", "results", "--zoom"
+    assert "unrecognized arguments: --blur; see python -m pfem_petsc render --help" in refused(
+        capsys, "render", "results", "--blur"
     )
 
 

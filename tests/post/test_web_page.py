@@ -61,9 +61,6 @@ def test_page_turns_in_a_browser(tmp_path, result):
 
 
 def test_window_moves_the_nodes(tmp_path, result):
-    from pfem_petsc.post.headless import require_rendering
-
-    require_rendering()
     plotter, go_to = plotter_of(result, 0, print, off_screen=True)
     pictures = []
     for snapshot in (0, 6):

@@ -11,7 +11,9 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
-from .headless import require_rendering
+from .headless import VARIABLE, require_rendering
+from .scene import TUBE_LIMIT
+from .shots import Moves, shots
 
 __all__ = ["plotter_of", "show"]
 
@@ -39,6 +41,8 @@ def show(
         raise InputError(
             "render: --window: there is no display (DISPLAY is not set); take --html, which writes a page for a browser"
         )
+    # a window that is shown is not one of those that draw without a display
+    os.environ.pop(VARIABLE, None)
     with opened(result_path) as result:
         plotter_of(result, frame, note, **options)[0].show()
 
@@ -68,25 +72,31 @@ def plotter_of(
     cells = np.column_stack([np.full(motion.n_bars, 2), motion.bars]).ravel()
     mesh = pyvista.PolyData(motion.positions(motion.frames[0]).astype(np.float32), lines=cells)
     values = mesh.point_data if colour.on_nodes else mesh.cell_data
-    values["colour"] = scale.colours(colour.values(motion.frames[0]))
-    tubes = motion.n_bars <= 5000
+    values["value"] = scale.factor * colour.values(motion.frames[0])
+    tubes = motion.n_bars <= TUBE_LIMIT if options.get("style", "auto") == "auto" else options["style"] == "tubes"
     plotter.add_mesh(
         mesh,
-        scalars="colour",
-        rgb=True,
+        scalars="value",
         preference="point" if colour.on_nodes else "cell",
+        cmap=scale.cmap,
+        clim=(scale.factor * scale.low, scale.factor * scale.high),
         line_width=4.0 if tubes else 1.5,
         render_lines_as_tubes=tubes,
         lighting=tubes,
+        scalar_bar_args={"title": colour.title + (f" [{scale.unit}]" if scale.unit else ""), "color": "black"},
     )
     title = plotter.add_text(motion.time(motion.frames[0]), font_size=10, color="black")
 
     def go_to(value: float) -> None:
         k = round(value)
         mesh.points = motion.positions(k).astype(np.float32)
-        values["colour"] = scale.colours(colour.values(k))
+        values["value"] = scale.factor * colour.values(k)
         title.SetText(2, motion.time(k))
 
+    camera = shots(motion, Moves(shown["view"]), 4 / 3)[0]
+    plotter.camera.position = camera.centre + camera.distance * camera.towards
+    plotter.camera.focal_point, plotter.camera.up = camera.centre, camera.up
+    plotter.reset_camera()
     last = len(result.times) - 1
     if last:
         plotter.add_slider_widget(go_to, (0, last), value=motion.frames[0], title="snapshot", fmt="%.0f", color="black")

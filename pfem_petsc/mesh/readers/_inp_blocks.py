@@ -18,6 +18,9 @@ __all__ = ["Block", "blocks"]
 _DEEPEST = 20
 """Number of files that include one another."""
 
+_SHORT = 200
+"""Number of letters up to which lines are read one by one, which is faster then."""
+
 _STAR = re.compile(rb"^[ \t]*\*", re.MULTILINE)
 _PARAMETERS = re.compile(r'(?:"[^"]*"|[^,"])+')
 _BLANKS = bytes.maketrans(b",Dd\r", b" ee ")  # of Fortran's exponents as well: 1.D+3
@@ -94,7 +97,7 @@ class Block:
 
 
 def _rows(piece: Piece, width: int, least: int, keyword: str) -> np.ndarray:
-    alike = _alike(piece.text)
+    alike = _alike(piece.text) if len(piece.text) > _SHORT else None
     if alike is not None and least <= alike.shape[1] <= width:
         padded = np.full((len(alike), width), np.nan)
         padded[:, : alike.shape[1]] = alike

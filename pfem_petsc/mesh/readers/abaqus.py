@@ -173,7 +173,7 @@ def _without_made(
 
     The sets are no groups then.
     """
-    made = [name for name in sections if name.startswith(MADE) and flat.is_internal(name)]
+    made = {name for name in sections if name.startswith(MADE) and flat.is_internal(name)}
     materials = {sections[name].get("material") for name in made}
     if not made or not whole or len(materials) > 1:
         return sections

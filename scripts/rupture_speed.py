@@ -20,7 +20,7 @@ import numpy as np
 from pfem_petsc import Case, Simulation, write_mesh
 from pfem_petsc.mesh.generators import lattice
 
-BATCH = 5  # steps
+BATCH = 2  # steps; few, so that some batches are not interrupted on a machine with other load
 YOUNG, DENSITY, AREA, PITCH = 1e9, 1000.0, 1e-6, 0.1
 
 
@@ -29,7 +29,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cells", type=int, default=16, metavar="N", help="cells along each edge (default: 16)")
     parser.add_argument("--share", type=float, default=0.1, help="of the bars that break (default: 0.1)")
-    parser.add_argument("--batches", type=int, default=600, metavar="N", help="of 5 steps each (default: 600)")
+    parser.add_argument("--batches", type=int, default=1500, metavar="N", help="of 2 steps each (default: 1500)")
     parser.add_argument("--law", choices=("elastic", "elastoplastic"), default="elastic")
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="rupture-speed-") as folder:
@@ -86,7 +86,7 @@ def case_of(folder: Path, limit: float, arguments: argparse.Namespace) -> Case:
                 "step": step,
                 "end": step * BATCH * (2 * arguments.batches + 8),
             },
-            "output": {"fields_every": 0, "history_every": BATCH},
+            "output": {"fields_every": 0, "history_every": 1000},
         },
         folder=folder,
     )

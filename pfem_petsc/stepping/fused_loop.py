@@ -16,42 +16,34 @@ from functools import cache
 import numpy as np
 
 from ..contact.flat import press_planes
-from ..contact.impact_loops import join_nodes, plane_gaps, stop_nodes, unpressed
 from ..contact.log import compare_contacts
-from ..integrators._leapfrog import advance, advance_loaded, centre, drift, kick
+from ..integrators._leapfrog import centre
 from ..mechanics.bar_geometry import first_inverted
-from ..mechanics.compiled import inlined, kernel
+from ..mechanics.compiled import kernel
 from ..mechanics.rows import CHUNK
 from ..mesh.ordering import NODE_BLOCK
 from ..output.sums import HEAD
 from .balance_loops import (
     CONTACT,
     INTERNAL,
-    REACTIONS,
-    add_drags,
-    add_loads,
-    add_powers,
-    add_sparse_forces,
     add_sparse_powers,
-    book_row,
     clear_forces,
     clear_sums,
     new_sums,
     start_of_step,
     sum_balance,
 )
-from .book_loops import WORKS, new_lanes, spread
+from .book_loops import WORKS, new_lanes
+from .fused_blocks import advance_block, finish_block, move_block, solve_block
+from .fused_rows import complete, fill_row, push_particles, stop_at_walls
 from .ghost_loops import trade_positions
-from .impulses import WALLS, fill_impulses
-from .node_loops import accelerations, explicit_increments, hold, hold_still, react
-from .sum_loops import add_totals, fill_bars, fill_probes, fill_walls, fill_works
+from .sum_loops import fill_walls
 
 __all__ = ["make_fused_loop"]
 
 
-_HEAD, _KINETIC = HEAD.width, HEAD.first("kinetic_energy")  # constants of the machine code
-_CONTACTS, _ALARM = HEAD.first("active_contacts"), HEAD.first("alarm")
-_SLACK, _IMPACT = HEAD.first("slack_bars"), HEAD.first("impact_dissipation")
+_HEAD, _ALARM = HEAD.width, HEAD.first("alarm")  # constants of the machine code
+_IMPACT = HEAD.first("impact_dissipation")
 
 
 @cache
@@ -81,16 +73,6 @@ def make_fused_loop(
     that touch walls, and those that have touched them.
     """
 
-    @inlined
-    def move_block(block, n, x, h, half, f):
-        """Move the nodes of a block, and set their forces to zero."""
-        first = NODE_BLOCK * block
-        last = min(first + NODE_BLOCK, n)
-        where, sums = x[first:last].reshape(-1), f[first:last].reshape(-1)
-        drift(where, h, half[first:last].reshape(-1), where)
-        for j in range(len(sums)):
-            sums[j] = 0.0
-
     @kernel
     def fused_loop(
         count,
@@ -118,13 +100,12 @@ def make_fused_loop(
         energies = state.energies
         alpha = 1.0 / (h * h)
         eta = 0.5 / h
-        nothing = np.empty((0, 3))
         supported, loaded = len(nodes.support_nodes) > 0, len(nodes.external) > 0
         damped = len(nodes.damping) > 0
         # increments are kept where forces alone do not determine them
         kept = n_walls > 0 or damped
         predictor = np.empty((n if kept else 0, 3))
-        inverse, inverses = np.empty(3 * NODE_BLOCK), np.empty(0 if kept else n)
+        factors, inverses = np.empty(3 * NODE_BLOCK), np.empty(0 if kept else n)
         for i in range(len(inverses)):
             inverses[i] = 1.0 / (alpha * nodes.mass[i])
         u = np.empty((n, 3))
@@ -134,8 +115,7 @@ def make_fused_loop(
         ends, totals, lanes, room = np.empty(len(WORKS)), np.zeros((6, 3)), new_sums(), new_lanes()
         row_lanes, after = new_sums(), np.empty(len(WORKS))
         work = np.empty(work_rows * CHUNK)
-        pushes, push_u = np.zeros(impulses.v.shape), np.empty(impulses.v.shape)
-        counted, still = np.ones(n_walls, dtype=np.bool_), np.zeros((n_walls, 3))
+        push_u = np.empty(impulses.v.shape)
         near = np.empty(0, dtype=np.int64)
         stuck_offsets = np.empty((0, n_walls))
         force, moment = np.zeros((n_walls, 3)), np.zeros((n_walls, 3))
@@ -217,11 +197,6 @@ def make_fused_loop(
                             walls.touching, touched, near, touching, walls.present, walls.releases
                         )
                 for block in range(n_blocks):
-                    first = NODE_BLOCK * block
-                    last = min(first + NODE_BLOCK, n)
-                    begin, end = nodes.support_starts[block], nodes.support_starts[block + 1]
-                    part_u, part_stiffness = u[first:last], stiffness[first:last]
-                    ahead = half[first:last].reshape(-1)
                     if stage == 0:
                         while moved < min(block + 1 + bars.reach, n_blocks):
                             move_block(moved, n, x, h, half, f)
@@ -247,92 +222,43 @@ def make_fused_loop(
                             shortened = shortened or short
                             changed += broke
                         if not kept:
-                            here = speeds[: 3 * (last - first)]
-                            factors = inverse[: 3 * (last - first)]
-                            spread(inverses[first:last], factors)
-                            hold_still(
-                                begin,
-                                end,
-                                first,
-                                nodes.support_nodes,
-                                nodes.support_components,
-                                nodes.support_positions,
-                                nodes.mass,
-                                nodes.external,
-                                f,
+                            advance_block(
+                                block,
+                                nodes,
                                 x,
+                                f,
                                 half,
                                 h,
                                 alpha,
+                                eta,
+                                inverses,
                                 factors,
+                                speeds,
                                 held,
                                 support,
-                            )
-                            pulls = f[first:last].reshape(-1)
-                            if loaded:
-                                load_here = nodes.external[first:last].reshape(-1)
-                                advance_loaded(pulls, load_here, factors, alpha, eta, h, ahead, here, lanes[INTERNAL])
-                                add_loads(load_here, here, lanes)
-                            else:
-                                advance(pulls, factors, alpha, eta, h, ahead, lanes[INTERNAL])
-                            for k in range(begin, end):
-                                i, c = nodes.support_nodes[k], nodes.support_components[k]
-                                half[i, c] += h * (alpha * held[k])
-                            add_sparse_forces(
-                                begin, end, nodes.support_nodes, nodes.support_components, support, lanes[REACTIONS]
+                                lanes,
                             )
                             continue
-                        explicit_increments(
-                            nodes.external[first:last] if loaded else nothing,
-                            f[first:last],
-                            nodes.mass[first:last],
-                            nodes.damping[first:last] if damped else nodes.damping,
-                            alpha,
-                            eta,
-                            nothing,
-                            half[first:last] if damped else nothing,
-                            part_stiffness,
-                            part_u,
-                        )
-                        where = predictor[first:last]
-                        drift(x[first:last].reshape(-1), h, ahead, where.reshape(-1))
-                        hold(
-                            begin,
-                            end,
-                            first,
-                            nodes.support_nodes,
-                            nodes.support_components,
-                            nodes.support_positions,
-                            where,
-                            part_stiffness,
-                            part_u,
-                            load,
-                        )
+                        solve_block(block, nodes, x, f, half, h, alpha, eta, predictor, stiffness, u, load)
                         if n_walls > 0:
                             continue
-                    react(
-                        begin,
-                        end,
-                        first,
-                        nodes.support_nodes,
-                        nodes.support_components,
-                        load,
+                    finish_block(
+                        block,
+                        nodes,
+                        f,
+                        half,
+                        h,
+                        alpha,
+                        eta,
                         contact,
-                        part_stiffness,
-                        part_u,
+                        stiffness,
+                        u,
+                        load,
+                        speeds,
+                        drag,
                         support,
+                        lanes,
                     )
-                    increments, here = part_u.reshape(-1), speeds[: 3 * (last - first)]
-                    kick(increments, alpha, h, ahead)
-                    centre(increments, eta, ahead, here)
-                    add_powers(f[first:last].reshape(-1), here, lanes[INTERNAL])
-                    add_sparse_forces(
-                        begin, end, nodes.support_nodes, nodes.support_components, support, lanes[REACTIONS]
-                    )
-                    if loaded:
-                        add_loads(nodes.external[first:last].reshape(-1), here, lanes)
-                    if damped:
-                        add_drags(nodes.damping[first:last], here, drag, lanes)
             impact = 0.0
             if len(near) > 0:
                 for i in near:
@@ -340,55 +266,19 @@ def make_fused_loop(
                 clear_sums(lanes[CONTACT], n)
                 add_sparse_powers(near, contact, v, lanes[CONTACT])
             if len(touched) > 0 or len(met) > 0:
-                around = join_nodes(met, touched, walls.present)
-                for i in around:
-                    centre(u[i], eta, half[i], v[i])
-                    accelerations(u[i], alpha, a[i])
-                all_normals, gaps = plane_gaps(around, x, walls.normals, walls.offsets)
-                free_v, free_a = unpressed(around, v, a, contact, nodes.mass, nodes.damping, alpha, eta)
-                impact, met = stop_nodes(
-                    around,
-                    walls.touching,
-                    walls.closed,
-                    all_normals,
-                    gaps,
-                    free_v,
-                    free_a,
-                    still,
-                    still,
-                    nodes.mass,
-                    walls.fixed,
-                    walls.restitution,
-                    counted,
-                    walls.slack,
-                    np.empty(gaps.shape),
-                )
+                impact, met = stop_at_walls(x, half, nodes, walls, alpha, eta, u, v, a, contact, touched, met)
             after[:] = powers
             sum_balance(lanes, n, h, supported, loaded, len(near) > 0, damped, totals, after)
-            pushes[:WALLS] = totals[3:]
-            for k in range(n_walls):
-                pushes[WALLS + k] = force[k]
-            for k in range(len(pushes)):
-                for c in range(3):
-                    push_u[k, c] = pushes[k, c] / alpha
-            kick(push_u.reshape(-1), alpha, h, impulses.half.reshape(-1))
+            push_particles(totals, force, alpha, h, impulses, push_u)
             ledger[_IMPACT] += impact
-            at = _HEAD
             if n_walls > 0:
-                row[at] = changes
-                at = fill_walls(row, at + 1, force, moment, impulses.v, contacts, walls.releases)
+                row[_HEAD] = changes
+                fill_walls(row, _HEAD + 1, force, moment, impulses.v, contacts, walls.releases)
             done += 1
             wrong = failed >= 0 or infeasible >= 0 or changed > 0 or not np.isfinite(after[INTERNAL])
             if due[step] or shortened or wrong or step == count - 1:
-                if not kept:
-                    explicit_increments(
-                        nodes.external, f[:n], nodes.mass, nodes.damping, alpha, eta, nothing, nothing, stiffness, u
-                    )
-                    for k in range(len(held)):
-                        u[nodes.support_nodes[k], nodes.support_components[k]] = held[k]
                 turned = -1
-                centre(u.reshape(-1), eta, half.reshape(-1), v.reshape(-1))
-                accelerations(u.reshape(-1), alpha, a.reshape(-1))
+                complete(n, f, half, nodes, alpha, eta, kept, held, stiffness, u, a, v)
                 if shortened or wrong or step == count - 1:
                     start_of_step(x[:n].reshape(-1), h, v.reshape(-1), a.reshape(-1), before[:n].reshape(-1))
                 if failed < 0 and shortened:
@@ -398,44 +288,28 @@ def make_fused_loop(
                 for k in range(len(energies)):
                     energies[k] = 0.0
                 sum_energies(work, energies)
-                stored = 0.0
-                for k in range(len(energies)):
-                    stored += energies[k]
-                pushed = contact if len(near) > 0 else nothing
-                kinetic = book_row(
-                    x[:n],
-                    nodes.mass,
-                    v,
-                    a,
-                    f[:n],
-                    nodes.external,
-                    nodes.damping,
-                    pushed,
+                kinetic = fill_row(
+                    x,
                     h,
+                    alpha,
+                    eta,
+                    bars,
+                    nodes,
+                    probes,
+                    state,
+                    impulses,
+                    push_u,
+                    (force, moment, contacts, walls.releases),
+                    len(near),
+                    powers,
                     row_lanes,
                     room,
                     totals,
                     ends,
+                    ledger,
+                    row,
                 )
-                fill_works(ledger, powers, ends, stored)
-                add_totals(ledger, totals)
-                centre(push_u.reshape(-1), eta, impulses.half.reshape(-1), impulses.v.reshape(-1))
-                accelerations(push_u.reshape(-1), alpha, impulses.a.reshape(-1))
-                fill_impulses(ledger, impulses.v)
-                ledger[_KINETIC] = kinetic
-                row[:_HEAD] = ledger
-                fill_bars(row, energies)
-                row[_CONTACTS] = len(near)
                 row[_ALARM] = 1.0 if failed >= 0 or turned >= 0 or infeasible >= 0 else 0.0
-                if bars.slack >= 0:
-                    slack = 0.0
-                    for k in range(bars.counted):
-                        slack += bars.history[bars.slack, k]
-                    row[_SLACK] = slack
-                if n_walls > 0:
-                    at = fill_walls(row, _HEAD + 1, force, moment, impulses.v, contacts, walls.releases)
-                reaction = support if supported else nothing
-                fill_probes(row, at, probes.nodes, probes.places, probes.counts, x, v, a, contact, reaction)
             powers[:] = after
             if wrong and not several:
                 break

@@ -1,0 +1,132 @@
+"""The passes of the fused loop over a block of nodes: move it, solve its balances, and finish its step.
+
+``nodes`` are a :class:`~pfem_petsc.stepping.fused_arrays.NodeArrays`; ``alpha``, ``eta`` and ``h`` are the scheme's,
+see :mod:`~pfem_petsc.integrators._leapfrog`; ``lanes`` are the sums of the balance, see
+:mod:`~pfem_petsc.stepping.balance_loops`. Other arrays have a row for each owned node, except buffers of a block.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..integrators._leapfrog import advance, advance_loaded, centre, drift, kick
+from ..mechanics.compiled import kernel
+from ..mesh.ordering import NODE_BLOCK
+from .balance_loops import INTERNAL, REACTIONS, add_drags, add_loads, add_powers, add_sparse_forces
+from .book_loops import spread
+from .node_loops import explicit_increments, hold, hold_still, react
+
+__all__ = ["advance_block", "finish_block", "move_block", "solve_block"]
+
+
+@kernel
+def move_block(block, n, x, h, half, f):
+    """Move the nodes of a block, and set their forces to zero."""
+    first = NODE_BLOCK * block
+    last = min(first + NODE_BLOCK, n)
+    where, sums = x[first:last].reshape(-1), f[first:last].reshape(-1)
+    drift(where, h, half[first:last].reshape(-1), where)
+    for j in range(len(sums)):
+        sums[j] = 0.0
+
+
+@kernel
+def advance_block(block, nodes, x, f, half, h, alpha, eta, inverses, factors, speeds, held, support, lanes):
+    """Finish the step of a block without walls and damping in one pass: forces alone determine its increments.
+
+    ``inverses`` (n,) of the stiffness; ``factors`` and ``speeds`` (3 NODE_BLOCK,) buffers; the increments of prescribed
+    components are written to ``held`` (k,), their reactions to ``support``.
+    """
+    first = NODE_BLOCK * block
+    last = min(first + NODE_BLOCK, len(half))
+    begin, end = nodes.support_starts[block], nodes.support_starts[block + 1]
+    components = nodes.support_components
+    here, factor = speeds[: 3 * (last - first)], factors[: 3 * (last - first)]
+    spread(inverses[first:last], factor)
+    hold_still(
+        begin,
+        end,
+        first,
+        nodes.support_nodes,
+        components,
+        nodes.support_positions,
+        nodes.mass,
+        nodes.external,
+        f,
+        x,
+        half,
+        h,
+        alpha,
+        factor,
+        held,
+        support,
+    )
+    force, ahead = f[first:last].reshape(-1), half[first:last].reshape(-1)
+    if len(nodes.external) > 0:
+        load = nodes.external[first:last].reshape(-1)
+        advance_loaded(force, load, factor, alpha, eta, h, ahead, here, lanes[INTERNAL])
+        add_loads(load, here, lanes)
+    else:
+        advance(force, factor, alpha, eta, h, ahead, lanes[INTERNAL])
+    for k in range(begin, end):
+        half[nodes.support_nodes[k], components[k]] += h * (alpha * held[k])
+    add_sparse_forces(begin, end, nodes.support_nodes, components, support, lanes[REACTIONS])
+
+
+@kernel
+def solve_block(block, nodes, x, f, half, h, alpha, eta, predictor, stiffness, u, load):
+    """Compute predictors, stiffness and increments ``u`` of a block without contact, and ``load`` (k,), the forces that
+    would move its prescribed components [N]."""
+    first = NODE_BLOCK * block
+    last = min(first + NODE_BLOCK, len(half))
+    nothing = np.empty((0, 3))
+    damped = len(nodes.damping) > 0
+    explicit_increments(
+        nodes.external[first:last] if len(nodes.external) > 0 else nothing,
+        f[first:last],
+        nodes.mass[first:last],
+        nodes.damping[first:last] if damped else nodes.damping,
+        alpha,
+        eta,
+        nothing,
+        half[first:last] if damped else nothing,
+        stiffness[first:last],
+        u[first:last],
+    )
+    where = predictor[first:last]
+    drift(x[first:last].reshape(-1), h, half[first:last].reshape(-1), where.reshape(-1))
+    hold(
+        nodes.support_starts[block],
+        nodes.support_starts[block + 1],
+        first,
+        nodes.support_nodes,
+        nodes.support_components,
+        nodes.support_positions,
+        where,
+        stiffness[first:last],
+        u[first:last],
+        load,
+    )
+
+
+@kernel
+def finish_block(block, nodes, f, half, h, alpha, eta, contact, stiffness, u, load, speeds, drag, support, lanes):
+    """Finish the step of a block from its increments: reactions, velocities half a step later, and powers.
+
+    ``speeds`` and ``drag`` (3 NODE_BLOCK,) are buffers, the latter empty without damping.
+    """
+    first = NODE_BLOCK * block
+    last = min(first + NODE_BLOCK, len(half))
+    begin, end = nodes.support_starts[block], nodes.support_starts[block + 1]
+    held, components = nodes.support_nodes, nodes.support_components
+    react(begin, end, first, held, components, load, contact, stiffness[first:last], u[first:last], support)
+    increments, ahead = u[first:last].reshape(-1), half[first:last].reshape(-1)
+    here = speeds[: 3 * (last - first)]
+    kick(increments, alpha, h, ahead)
+    centre(increments, eta, ahead, here)
+    add_powers(f[first:last].reshape(-1), here, lanes[INTERNAL])
+    add_sparse_forces(begin, end, held, components, support, lanes[REACTIONS])
+    if len(nodes.external) > 0:
+        add_loads(nodes.external[first:last].reshape(-1), here, lanes)
+    if len(drag) > 0:
+        add_drags(nodes.damping[first:last], here, drag, lanes)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,26 @@ from ..errors import InputError
 from ..mechanics.sections import area_fields, bar_shapes, named_groups, section_of_bars
 from ..mesh import load_slab
 
-__all__ = ["radii_of"]
+__all__ = ["STOUT", "drawn_radii", "radii_of"]
+
+STOUT = 0.2
+"""Largest radius of a drawn bar as a fraction of its length; nodes of stouter ones would hide their bars."""
+
+
+def drawn_radii(result: Any, note: Callable[[str], None] | None = None) -> np.ndarray | None:
+    """Return the radius of each bar (bars,) [m] as it is drawn, None where it is not known; ``note`` receives a remark
+    on bars that are drawn thinner than they are."""
+    radius = radii_of(result)
+    if radius is None:
+        return None
+    most = STOUT * _lengths(result)
+    stout = int(np.count_nonzero(radius > most))
+    if stout and note is not None:
+        note(
+            f"{stout} of {len(radius)} bars have a radius above {STOUT:g} of their length ({radius.max():.3g} m at most) "
+            "and are drawn with that; --radius-scale changes it"
+        )
+    return np.minimum(radius, most)
 
 
 def radii_of(result: Any) -> np.ndarray | None:
@@ -24,19 +44,24 @@ def radii_of(result: Any) -> np.ndarray | None:
     sections = list(getattr(case, "section", {}).values())
     if not sections:
         return None
-    start, bars = np.asarray(result.positions(0), dtype=float), np.asarray(result.bars)
-    length = np.linalg.norm(start[bars[:, 1]] - start[bars[:, 0]], axis=1)
+    length = _lengths(result)
     try:
-        numbers, areas = _sections_and_areas(case, len(bars))
+        numbers, areas = _sections_and_areas(case, len(length))
     except (InputError, OSError):
         if len(sections) > 1 or sections[0].area is None:
             return None
-        numbers, areas = np.zeros(len(bars), dtype=int), np.full(len(bars), sections[0].area)
-    radius = np.full(len(bars), np.inf)
+        numbers, areas = np.zeros(len(length), dtype=int), np.full(len(length), sections[0].area)
+    radius = np.full(len(length), np.inf)
     for number, section in enumerate(sections):
         own = numbers == number
         radius[own] = bar_shapes(section, length[own], areas[own]).radius
     return np.where(np.isfinite(radius), radius, radius.min())
+
+
+def _lengths(result: Any) -> np.ndarray:
+    """Return the length of each bar (bars,) in the first snapshot [m]."""
+    start, bars = np.asarray(result.positions(0), dtype=float), np.asarray(result.bars)
+    return np.linalg.norm(start[bars[:, 1]] - start[bars[:, 0]], axis=1)
 
 
 def _sections_and_areas(case: Any, count: int) -> tuple[np.ndarray, np.ndarray]:

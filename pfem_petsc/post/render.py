@@ -18,7 +18,7 @@ from .files import emptied, save
 from .film import Film, Look
 from .frames import Resampled, chosen_frames, even_times
 from .motion import Motion, Overlays
-from .radii import radii_of
+from .radii import drawn_radii
 from .scene import TUBE_LIMIT, Style
 from .shots import Moves
 
@@ -140,7 +140,7 @@ def render(
         overlays = Overlays(ghost, tuple(marks), tuple(trails))
         motions = [Motion(result, chosen, scale, overlays, tell) for result in shown]
         look = Look(
-            [_style(result, style, radius_scale, bar_width, nodes) for result in results],
+            [_style(result, style, radius_scale, bar_width, nodes, note) for result in results],
             *(moves, tuple(marks), inset, names, transparent),
         )
         heading = title if title is not None else (results[0].case.title or results[0].case.name)
@@ -253,9 +253,16 @@ def limits_of(
     return low, high
 
 
-def _style(result: Any, style: str, radius_scale: float, bar_width: float | None, nodes: bool | None) -> Style:
+def _style(
+    result: Any,
+    style: str,
+    radius_scale: float,
+    bar_width: float | None,
+    nodes: bool | None,
+    note: Callable[[str], None],
+) -> Style:
     tubes = len(result.bars) <= TUBE_LIMIT if style == "auto" else style == "tubes"
-    radius = radii_of(result) if tubes else None
+    radius = drawn_radii(result, note if style == "tubes" else None) if tubes else None
     return Style(tubes, None if radius is None else radius_scale * radius, bar_width, nodes)
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from ..errors import InputError
 from .fields import ColourField, ColourScale
 from .motion import Motion, Overlays
-from .radii import radii_of
+from .radii import drawn_radii
 from .scene import TUBE_LIMIT
 from .shots import Moves, shots
 
@@ -124,7 +124,7 @@ def state(
     colour = ColourField(result, field, component)
     limits = limits_of(clim, symmetric, [colour.limits(chosen)] if clim is None else [])
     tubes = len(result.bars) <= TUBE_LIMIT if style == "auto" else style == "tubes"
-    radius = radii_of(result) if tubes else None
+    radius = drawn_radii(result, note if style == "tubes" else None) if tubes else None
     return {
         "motion": Motion(result, chosen, scale, Overlays(), note),
         "colour": colour,

@@ -18,7 +18,7 @@ from pfem_petsc.post.camera import aim
 from pfem_petsc.post.contrast import GHOST, MARKS, TRAILS
 from pfem_petsc.post.frames import Resampled
 from pfem_petsc.post.page import Page
-from pfem_petsc.post.radii import radii_of
+from pfem_petsc.post.radii import drawn_radii, radii_of
 from pfem_petsc.post.render import render
 from pfem_petsc.post.scene import Scene, Style
 from pfem_petsc.post.shots import Moves, camera_path, shots
@@ -89,12 +89,28 @@ def test_radii_are_those_of_sections_and_fields(bars_of_sections):
     assert radii_of(open_result(bars_of_sections)) == pytest.approx(expected, rel=1e-12)
 
 
+def without_mesh(result, area):
+    """The result with one section of an area, whose mesh is gone."""
+    section = Case.load("rod_impact").section["default"].model_copy(update={"area": area})
+    result.case.source, result.case.node_set, result.case.temperature, result.case.remove = "case", {}, (), ()
+    result.case.mesh = SimpleNamespace(generator=None, file="is/not/there.h5")
+    result.case.section = {"one": section}
+    return section
+
+
+def test_stout_bars_are_drawn_thinner_with_a_remark(flying):
+    """Balls of such a radius at the nodes would hide all that happens."""
+    without_mesh(flying, 100.0 * math.pi)
+    said = []
+    start = flying.positions(0)
+    length = np.linalg.norm(start[flying.bars[:, 1]] - start[flying.bars[:, 0]], axis=1)
+    assert drawn_radii(flying, said.append) == pytest.approx(0.2 * length)
+    assert f"{flying.n_bars} of {flying.n_bars} bars" in said[0] and "(10 m at most)" in said[0]
+
+
 def test_radii_without_the_mesh(flying):
     """The only area is that of all bars; which of several a bar has is not known."""
-    section = Case.load("rod_impact").section["default"].model_copy(update={"area": math.pi * 0.01})
-    flying.case.source, flying.case.node_set, flying.case.temperature, flying.case.remove = "case", {}, (), ()
-    flying.case.mesh = SimpleNamespace(generator=None, file="is/not/there.h5")
-    flying.case.section = {"one": section}
+    section = without_mesh(flying, math.pi * 0.01)
     assert radii_of(flying) == pytest.approx(np.full(flying.n_bars, 0.1))
     flying.case.section = {"one": section, "two": section}
     assert radii_of(flying) is None

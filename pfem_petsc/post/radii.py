@@ -27,8 +27,8 @@ def drawn_radii(result: Any, note: Callable[[str], None] | None = None) -> np.nd
     stout = int(np.count_nonzero(radius > most))
     if stout and note is not None:
         note(
-            f"{stout} of {len(radius)} bars have a radius above {STOUT:g} of their length ({radius.max():.3g} m at most) "
-            "and are drawn with that; --radius-scale changes it"
+            f"{stout} of {len(radius)} bars have a radius above {STOUT:g} of their length "
+            f"({radius.max():.3g} m at most), and are drawn with that; --radius-scale changes it"
         )
     return np.minimum(radius, most)
 

@@ -76,6 +76,6 @@ def test_table_of_formats():
 
 def test_actions_of_the_verb():
     named = set(re.findall(r"^\| `(\w+) ", TEXT.partition("## The verb")[2], flags=re.MULTILINE))
-    parser, _ = program._parser()
+    parser, _ = program.make_parser()
     verb = parser._subparsers._group_actions[0].choices["mesh"]
     assert named == set(verb._subparsers._group_actions[0].choices)

@@ -19,7 +19,7 @@ from ..contact.flat import press_planes
 from ..contact.log import compare_contacts
 from ..integrators._leapfrog import centre
 from ..mechanics.bar_geometry import first_inverted
-from ..mechanics.compiled import kernel
+from ..mechanics.compiled import inlined, kernel
 from ..mechanics.rows import CHUNK
 from ..mesh.ordering import NODE_BLOCK
 from ..output.sums import HEAD
@@ -72,6 +72,12 @@ def make_fused_loop(
     increments (n, 3); the results of :func:`~pfem_petsc.contact.flat.press_planes` for nodes and walls; and the nodes
     that touch walls, and those that have touched them.
     """
+
+    @inlined
+    def pull(x, bars, begun, ended, h, f, work):
+        """Add the forces of some chunks of bars."""
+        law = (bars.parameters, bars.area, h, bars.history)
+        return forces(x, bars.sweep, begun, ended, bars.far, bars.rest, bars.heat, *law, True, f, work)
 
     @kernel
     def fused_loop(
@@ -154,22 +160,7 @@ def make_fused_loop(
                 lost = trade_positions(messages, x, before, True)
                 if lost != 0:
                     break
-                failed, shortened, changed = forces(
-                    x,
-                    bars.sweep,
-                    bars.sweep.counted,
-                    len(bars.sweep.diagonal),
-                    bars.far,
-                    bars.rest,
-                    bars.heat,
-                    bars.parameters,
-                    bars.area,
-                    h,
-                    bars.history,
-                    True,
-                    f,
-                    work,
-                )
+                failed, shortened, changed = pull(x, bars, bars.sweep.counted, len(bars.sweep.diagonal), h, f, work)
             clear_energies(work)
             # Blocks of nodes pass once through the cache: each moves shortly before its first bar, and is finished
             # after its last one, which belongs to its own block or to one before. Walls take all nodes in between.
@@ -202,21 +193,8 @@ def make_fused_loop(
                             move_block(moved, n, x, h, half, f)
                             moved += 1
                         if block < len(bars.sweep.parts) - 1:
-                            at, short, broke = forces(
-                                x,
-                                bars.sweep,
-                                bars.sweep.parts[block],
-                                bars.sweep.parts[block + 1],
-                                bars.far,
-                                bars.rest,
-                                bars.heat,
-                                bars.parameters,
-                                bars.area,
-                                h,
-                                bars.history,
-                                True,
-                                f,
-                                work,
+                            at, short, broke = pull(
+                                x, bars, bars.sweep.parts[block], bars.sweep.parts[block + 1], h, f, work
                             )
                             failed = at if failed < 0 else failed
                             shortened = shortened or short

@@ -35,6 +35,11 @@ def stop_at_walls(x, half, nodes, walls, alpha, eta, u, v, a, contact, touched, 
         accelerations(u[i], alpha, a[i])
     all_normals, gaps = plane_gaps(around, x, walls.normals, walls.offsets)
     free_v, free_a = unpressed(around, v, a, contact, nodes.mass, nodes.damping, alpha, eta)
+    for j in range(len(around)):
+        i = around[j]
+        for c in range(3):
+            if walls.fixed[i, c]:  # wall forces do not change prescribed components
+                free_v[j, c], free_a[j, c] = v[i, c], a[i, c]
     still = np.zeros(walls.normals.shape)
     return stop_nodes(
         around,

@@ -29,6 +29,10 @@ CASES = {
     "damped": {"material": DAMPED, "support": [{"node_set": "foot", "fix": "z"}]},
     "held by feet": {"support": [{"node_set": "foot", "fix": "xyz"}]},
     "walls": {"wall": [FLOOR, SIDE]},
+    "held on an inclined wall": {
+        "support": [{"node_set": "foot", "fix": "x"}],
+        "wall": [FLOOR | {"normal": [0.5, 0.1, 1.0], "point": [0, 0, -2e-4]}],
+    },
     "held": {"support": [{"node_set": "foot", "fix": "xz"}], "gravity": {"acceleration": [0.0, 0.0, -1e4]}},
     "held and loaded": {
         "material": DAMPED,

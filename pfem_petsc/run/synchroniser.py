@@ -15,6 +15,7 @@ from .stop import StopRequest
 __all__ = ["Synchroniser"]
 
 _INTERVAL = 0.2  # seconds between synchronisations
+_NONE = -(2**62)  # for ranks without a fault
 _MOST = 100  # maximum number of steps between them, so that all ranks know of a fault within a bounded number of steps
 
 
@@ -77,9 +78,10 @@ class Synchroniser:
         Raises
         ------
         PfemError
-            On all ranks: the fault of the lowest rank that has one.
+            On all ranks: the earliest fault, of the lowest rank that has one; later ones may be its consequences.
         """
         fault, step = self._analysis.fault, self._analysis.stepper.number
+        since = self._analysis.stepper.fault_step if fault is not None else step
         try:
             self._lock.renew()
         except SimulationFailure as lost:
@@ -88,11 +90,12 @@ class Synchroniser:
         steps, seconds = step - self._last[0], now - self._last[1]
         ahead = int(np.clip(steps * _INTERVAL / seconds, 1, _MOST)) if steps > 0 and seconds > 0.0 else 1
         late = self.interval is not None and now - self._last_checkpoint >= self.interval
-        mine = np.array([self.comm.size - self.comm.rank if fault is not None else 0, self.stop.code, late, -ahead])
+        order = -(since * self.comm.size + self.comm.rank) if fault is not None else _NONE
+        mine = np.array([order, self.stop.code, late, -ahead])
         self.comm.Allreduce(MPI.IN_PLACE, mine, op=MPI.MAX)
         first, code, late, ahead = (int(number) for number in mine)
-        if first:
-            raise self.comm.bcast(fault, root=self.comm.size - first)
+        if first != _NONE:
+            raise self.comm.bcast(fault, root=-first % self.comm.size)
         self.checkpoint_due = bool(late)
         self._last = (step, now)
         self._next = step - ahead

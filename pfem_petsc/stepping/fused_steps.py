@@ -159,14 +159,13 @@ class Batch:
         if changed:
             stepper.ruptures.note()
             self.sums[done - 1, _BROKEN] = stepper.ruptures.count
-        if failed >= 0 or turned >= 0:
+        if known is not None:  # of earlier steps; the ranks have not synchronised since
+            self.sums[: len(due), _ALARM] = 1.0
+        elif failed >= 0 or turned >= 0:
             stepper.fault = SimulationFailure(stepper.collapse(max(failed, turned)))
         elif infeasible >= 0:
             text = self.model.contact.infeasible_message(touched[3][infeasible], offsets[infeasible])
             stepper.fault = SimulationFailure(f"{stepper.when(stepper.balance)}: {text}")
-        if known is not None:  # of earlier steps; the ranks have not synchronised since
-            stepper.fault = known
-            self.sums[: len(due), _ALARM] = 1.0
         done = done if self.model.comm.size == 1 else len(due)
         state.step, state.time = begin + done, (begin + done) * stepper.h
         ledger.impacts.met = met

@@ -37,7 +37,8 @@ class Stepper(ABC):
     energy : StrainEnergy of this rank's bars at the state's positions
     solution : of the last balance
     balance : the last balance
-    fault : a failure that only this rank knows; raised on all ranks at the next synchronisation
+    fault : a failure that only this rank knows; the earliest is raised on all ranks at the next synchronisation
+    fault_step : number of the last finished step when the fault was found
     h : the case's time step [s]; ``part`` the size of the current part, ``smallest`` the smallest part of the last step
     treatment : of impact, None for the scheme's own formulas
     booking : called after each part of a step; bars_removed : after bars are removed between steps
@@ -83,7 +84,8 @@ class Stepper(ABC):
         mesh = model.mesh
         owned = mesh.n_owned
         self.energy = StrainEnergy()
-        self.fault: SimulationFailure | None = None
+        self._fault: SimulationFailure | None = None
+        self.fault_step = 0
         self.balance: Balance | None = None
         self.zero = np.zeros((owned, 3))  # read-only placeholder for absent forces
         self.state = State(
@@ -112,6 +114,15 @@ class Stepper(ABC):
         self.walls_at_start = np.zeros((len(model.contact.names), 3))
         self.links_at_start = model.links.totals()
         self.solution = Solution(self.zero, self.state.f, model.contact.nothing)
+
+    @property
+    def fault(self) -> SimulationFailure | None:
+        """A failure that only this rank knows; setting it stores the number of the last finished step."""
+        return self._fault
+
+    @fault.setter
+    def fault(self, fault: SimulationFailure | None) -> None:
+        self._fault, self.fault_step = fault, self.number
 
     def start(self) -> None:
         """Initialise velocity, internal force and acceleration of the state. Collective."""

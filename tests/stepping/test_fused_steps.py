@@ -118,3 +118,14 @@ def test_a_failure_is_that_of_single_steps(shared_tmp_path):
         steps.append(open_result(shared_tmp_path / str(together)).history["step"])
     assert "bar" in texts[0] and texts[0] == texts[1]
     np.testing.assert_array_equal(steps[0], steps[1])
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize("every", [1, 1000])
+def test_the_first_failure_is_reported(every, shared_tmp_path):
+    """A bar fails on one rank; before the ranks synchronise, more fail on others as a consequence."""
+    crushed = {"mesh": LATTICE["mesh"] | {"cells": [2, 4, 3]}, "initial": {"velocity": [0.0, 0.0, -2e4]}}
+    output = {"history_every": every, "fields_every": 0}
+    for together in (False, True):
+        with pytest.raises(SimulationFailure, match=r"step 140, .* nodes 32 and 33 "):
+            made(case(crushed | {"wall": [FLOOR], "output": output}), shared_tmp_path / str(together), together)

@@ -111,7 +111,7 @@ def test_formulas_are_drawn_by_the_browser(site):
 
 
 def models() -> Iterator[type[StrictModel]]:
-    """Every model with keys of a case file that there is, however it is found; not of modules that tests have removed."""
+    """Every model with keys of a case file, however it is found, but those of modules that tests have removed."""
     folders = r"\.(case|contact\.(walls|constraints)|integrators|materials|generators|lattices|methods)\."
     for module in pkgutil.walk_packages(pfem_petsc.__path__, "pfem_petsc."):
         if re.search(folders, module.name):

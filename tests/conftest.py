@@ -99,14 +99,14 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 def thinned(items: list[pytest.Item], ranks: int) -> list[pytest.Item]:
     """Return all tests except the thorough ones, with some of their sets of parameters.
 
-    Tests with several sets run with every eighth of them (every twelfth on three ranks), slow tests with a quarter of
+    Tests with several sets run with every tenth of them (eighth, twelfth on two, three ranks), slow tests with a quarter of
     these. Of the parallel tests one half runs on two ranks, the other on three.
     """
     sets: dict[tuple[Path, str], list[pytest.Item]] = {}
     for item in items:
         if item.get_closest_marker("thorough") is None:
             sets.setdefault((item.path, getattr(item, "originalname", item.name)), []).append(item)
-    stride = 12 if ranks > 2 else 8
+    stride = {1: 10, 2: 8}.get(ranks, 12)
     chosen: set[pytest.Item] = set()
     for group in list(sets.values())[ranks % 2 :: 2] if ranks > 1 else list(sets.values()):
         slow = group[0].get_closest_marker("slow") is not None

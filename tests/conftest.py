@@ -99,7 +99,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 def thinned(items: list[pytest.Item], ranks: int) -> list[pytest.Item]:
     """Return all tests except the thorough ones, with some of their sets of parameters.
 
-    Tests with several sets run with every tenth of them (eighth, twelfth on two, three ranks), slow tests with a quarter of
+    Tests with several sets run with every tenth of them (two ranks: eighth, three: twelfth), slow tests with a quarter of
     these. Of the parallel tests one half runs on two ranks, the other on three.
     """
     sets: dict[tuple[Path, str], list[pytest.Item]] = {}

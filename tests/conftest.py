@@ -99,8 +99,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 def thinned(items: list[pytest.Item], ranks: int) -> list[pytest.Item]:
     """Return all tests except the thorough ones, with some of their sets of parameters.
 
-    Tests with several sets run with every tenth of them (two ranks: eighth, three: twelfth), slow tests with a quarter of
-    these. Of the parallel tests one half runs on two ranks, the other on three.
+    Tests with several sets run with every tenth of them (eighth on two ranks, twelfth on three), slow tests with a
+    quarter of these. Of the parallel tests one half runs on two ranks, the other on three.
     """
     sets: dict[tuple[Path, str], list[pytest.Item]] = {}
     for item in items:

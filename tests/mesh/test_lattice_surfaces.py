@@ -9,7 +9,7 @@ import pytest
 from helpers.gathered import whole
 from mpi4py import MPI
 
-from pfem_petsc import Case, cases
+from pfem_petsc import Case, Simulation, cases
 from pfem_petsc.errors import InputError
 from pfem_petsc.mesh.checks import check_mesh
 from pfem_petsc.mesh.generators import lattice
@@ -292,6 +292,59 @@ def test_too_coarse_a_lattice_is_refused(tmp_path):
         filled(kind="kelvin", pitch=5.0, surface={"file": str(path)})
 
 
+@pytest.mark.parametrize("kind", ["octet", "tetrahedral_octahedral"])
+@pytest.mark.parametrize("below", [None, 0.02])
+def test_graded_cells_cover_the_surface(tmp_path, kind, below):
+    """Without ``cells`` the mesh is that of a block which is given with more cells than the surface needs."""
+    low = np.array([0.25, -0.5, 0.125])
+    path = write_stl(tmp_path / "cube.stl", CORNERS + low, CUBE)
+    factor = "0.5 + x/2" if below is None else "0.5 + (x - 0.02)/2"
+    keys = {"kind": kind, "pitch": 0.2, "surface": {"file": str(path)}, "grading": (factor, 1.0, 1.0)}
+    begin = (low - (below or 0.0, 0.0, 0.0)).tolist()
+    own = filled(**keys, **({} if below is None else {"origin": begin}))
+    wide = filled(**keys, origin=begin, cells=(12, 8, 24))
+    assert own.n_bars == wide.n_bars > 100
+    assert np.array_equal(np.sort(lengths(own)), np.sort(lengths(wide)))
+    reached = own.points.max(axis=0) - low
+    assert (reached > 0.6).all() and (reached <= 1.0 + 1e-9).all()
+    columns = np.unique(own.points[:, 0].round(9))
+    assert columns[-1] - columns[-2] > 1.5 * (columns[1] - columns[0])  # the cells grow along x
+
+
+@pytest.mark.parametrize(
+    "factor, origin, told",
+    [
+        (
+            "1 + z",
+            [0.0, 0.0, 0.2],
+            r"mesh.grading\[2\] = '1 \+ z'.*0, 0.125\) to \(1, 1, 1.125\) m; use z = 0.125",
+        ),
+        ("1 - 2*z", None, r"mesh.grading\[2\]: '1 - 2\*z' is 0 at z = 0.5 m; .* is measured from z = 0.125 m"),
+        ("1e-9", None, r"mesh.grading\[2\]: '1e-9' takes more than 20,000 cells over 1 m, and reaches 5e-06 m"),
+    ],
+)
+def test_gradings_that_do_not_fit_the_surface(tmp_path, factor, origin, told, monkeypatch):
+    path = write_stl(tmp_path / "cube.stl", CORNERS + (0.0, 0.0, 0.125), CUBE)
+    monkeypatch.setattr("pfem_petsc.mesh.lattices.shape._STEPS", 1)
+    with pytest.raises(InputError, match=told):
+        filled(kind="cubic", pitch=0.25, surface={"file": str(path)}, grading=(1, 1, factor), origin=origin)
+
+
+def test_the_graded_bracket_of_the_page_runs(tmp_path, monkeypatch):
+    page = (Path(__file__).parents[2] / "docs/lattices.md").read_text()
+    (text,) = [block for block in page.split("```toml\n")[1:] if 'title = "Graded bracket"' in block]
+    monkeypatch.chdir(tmp_path)
+    Path("bracket.stl").write_bytes(Path(cases.__file__).with_name("bracket.stl").read_bytes())
+    Path("graded.toml").write_text(text.split("```")[0])
+    case = Case.load("graded.toml", ["mesh.pitch=0.008"])
+    with Simulation(case, comm=MPI.COMM_SELF, quiet=True) as simulation:
+        simulation.run()
+        points, bars = simulation.mesh.points, simulation.mesh.n_bars
+        lowest = simulation.state.position[:, 2] - points[:, 2] if len(points) else np.zeros(1)
+    assert bars > 500
+    assert -1e-3 < lowest.min() < 0.0  # it sags under its weight
+
+
 def test_file_is_relative_to_the_case(tmp_path):
     write_stl(tmp_path / "cube.stl", CORNERS, CUBE)
     case = {
@@ -312,6 +365,7 @@ def test_file_is_relative_to_the_case(tmp_path):
         {"surface": {"cut": "trim"}},
         {"kind": "kelvin", "surface": {"cut": "clip"}, "perturbation": 0.02, "missing": 0.05, "seed": 2},
         {"kind": "diamond", "pitch": 0.9, "surface": {"cut": "trim"}},
+        {"surface": {"cut": "clip"}, "grading": (1.5, "1 + y/2", 1.0), "origin": (0.1, -1.1, 0.2)},
         {
             "cells": (12, 10, 2),
             "origin": (0.1, -1.2, 0.0),

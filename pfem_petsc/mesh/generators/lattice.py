@@ -48,7 +48,8 @@ class Parameters(StrictModel):
     nearest neighbours. ``bcc``: corners and centres, the eight half diagonals of each cube and the cube edges
     (without which it would be a mechanism). ``cell``: the unit cell of the key ``cell``. docs/lattices.md has all."""
     cells: PositiveInts3 | None = None
-    """Number of cubic cells along x, y and z; with ``surface``, default: as many as cover it."""
+    """Number of cubic cells along x, y and z; with ``surface``, default: as many as cover it, from ``origin`` on where
+    ``grading`` is an expression."""
     pitch: PositiveFloat
     """Edge of the cubic cell [m]."""
     angle: Annotated[float, Field(gt=0.0, lt=45.0)] | None = None
@@ -56,7 +57,7 @@ class Parameters(StrictModel):
     cell: CellKeys | None = None
     """The unit cell of the kind ``cell``: ``points``, ``struts``, ``groups``."""
     grading: Any = None
-    """Three factors on the pitch along x, y and z: numbers, or expressions of the one coordinate [m]."""
+    """Three factors on the pitch along x, y and z: numbers, or expressions of the one coordinate from ``origin`` [m]."""
     perturbation: Annotated[float, Field(ge=0.0, lt=0.5)] | None = None
     """Random displacement of nodes along each axis, at most this fraction of the pitch."""
     missing: Annotated[float, Field(ge=0.0, lt=1.0)] | None = None
@@ -64,7 +65,8 @@ class Parameters(StrictModel):
     seed: NonNegativeInt | None = None
     """Seed of ``perturbation`` and ``missing``; default: 0."""
     origin: Vector3 | None = None
-    """Where the corner of the first cell goes, after ``curved`` the centre of the shell [m]; default: the origin."""
+    """Where the corner of the first cell goes, after ``curved`` the centre of the shell [m]; default: the origin, with
+    ``surface`` and without ``cells`` the lower corner of the box around it."""
     surface: SurfaceKeys | None = None
     """A closed surface that the lattice fills: ``file``, ``scale``, ``cut``, ``shortest``."""
     dangling: Literal["remove", "keep"] | None = None

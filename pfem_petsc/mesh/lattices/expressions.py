@@ -113,7 +113,8 @@ class Expression:
             return
         operators, parts = _parts(node)
         if not all(type(operator) in _OPERATORS for operator in operators):
-            raise ValueError(f"{ast.unparse(node)!r}: this operator is not known")
+            hint = "; powers are **" if any(isinstance(operator, ast.BitXor) for operator in operators) else ""
+            raise ValueError(f"{ast.unparse(node)!r}: this operator is not known{hint}")
         for part in parts:
             self._check(part)
 

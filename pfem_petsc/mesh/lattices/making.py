@@ -14,7 +14,7 @@ from .cell import UnitCell
 from .expressions import Expression
 from .keys import COORDINATES
 from .kinds import ANGLE, KINDS, auxetic
-from .shape import cylinder_map, graded_levels, perturbation, sphere_map
+from .shape import cylinder_map, graded_count, graded_levels, perturbation, sphere_map
 from .surface import Surface
 
 if TYPE_CHECKING:
@@ -115,21 +115,28 @@ def _curve(block: Block, keys: Parameters, extents: np.ndarray) -> float:
 def fit_to_surface(keys: Parameters, surface: Surface) -> Parameters:
     """Return the keys with cells that cover the surface, if they give none: from a corner of cells at ``origin``.
 
+    Along an axis whose grading is an expression the block begins at ``origin``, which must not be above the lower side
+    of the surface. All ranks compute the same.
+
     Raises
     ------
     InputError
-        For a grading by expressions, which needs a place where it begins.
+        For a pitch that takes too many cells, and an origin or an expression that does not fit the surface.
     """
     if keys.cells is not None:
         return keys
-    if any(isinstance(factor, str) for factor in keys.grading or ()):
-        raise InputError("mesh.grading: an expression needs mesh.cells, and mesh.origin where the block begins")
-    cell = cell_of_kind(keys)
-    edges = keys.pitch * cell.edges * np.array(keys.grading or (1.0, 1.0, 1.0))
+    cell, factors = cell_of_kind(keys), keys.grading or (1.0, 1.0, 1.0)
     low, high = surface.bounds
     origin = np.array(keys.origin if keys.origin is not None else low)
-    first = np.floor((low - origin) / edges + 1e-9)
-    count = np.maximum(np.ceil((high - origin) / edges - 1e-9) - first, 1.0)
+    start, count = origin.copy(), np.ones(3)
+    for axis, factor in enumerate(factors):
+        edge = keys.pitch * cell.edges[axis]
+        if isinstance(factor, str):
+            count[axis] = _graded_count(factor, axis, edge, (low, high), origin)
+            continue
+        first = np.floor((low[axis] - origin[axis]) / (edge * factor) + 1e-9)
+        count[axis] = max(np.ceil((high[axis] - origin[axis]) / (edge * factor) - 1e-9) - first, 1.0)
+        start[axis] += first * edge * factor
     limit = float(np.iinfo(np.int64).max) / 16.0
     if not (count < limit).all():
         raise InputError(f"mesh.pitch = {keys.pitch!r}: too small for a surface of {high - low} m")
@@ -138,7 +145,29 @@ def fit_to_surface(keys: Parameters, surface: Surface) -> Parameters:
         "mesh.pitch, with cells that cover the surface",
     )
     cells = tuple((count.astype(np.int64) * np.array(cell.layers)).tolist())
-    return keys.model_copy(update={"cells": cells, "origin": tuple((origin + first * edges).tolist())})
+    return keys.model_copy(update={"cells": cells, "origin": tuple(start.tolist())})
+
+
+def _graded_count(factor: str, axis: int, edge: float, box: tuple[np.ndarray, np.ndarray], origin: np.ndarray) -> int:
+    """Return the number of cells along an axis, from ``origin`` to the upper side of the surface."""
+    name, (low, high) = COORDINATES[axis], box
+    around = f"the surface is in the box from {_place(low)} to {_place(high)} m"
+    if origin[axis] > low[axis] + 1e-9 * edge:
+        raise InputError(
+            f"mesh.grading[{axis}] = {factor!r}: an expression begins at mesh.origin, and the surface below it would "
+            f"stay empty: {around}; use {name} = {low[axis]:.9g} or less in mesh.origin, or leave mesh.origin out"
+        )
+    try:
+        return graded_count(float(high[axis] - origin[axis]), edge, Expression(factor, (name,)), name)
+    except ValueError as error:
+        raise InputError(
+            f"mesh.grading[{axis}]: {error}; {around}, and {name} of the expression is measured from "
+            f"{name} = {origin[axis]:.9g} m"
+        ) from None
+
+
+def _place(point: np.ndarray) -> str:
+    return f"({', '.join(f'{x:.6g}' for x in point.tolist())})"
 
 
 def longest_bar(block: Block, keys: Parameters) -> float:

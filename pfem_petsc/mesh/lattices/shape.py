@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from itertools import islice
+
 import numpy as np
 
 from .block import Block, Move
 from .expressions import Expression
 from .numbering import Places
 
-__all__ = ["cylinder_map", "graded_levels", "perturbation", "random_numbers", "sphere_map"]
+__all__ = [
+    "cylinder_map",
+    "graded_count",
+    "graded_levels",
+    "perturbation",
+    "random_numbers",
+    "sphere_map",
+]
 
 _STEPS = 16
 """Runge-Kutta steps within a cell of graded pitch."""
@@ -58,6 +68,30 @@ def graded_levels(cells: int, edge: float, factor: Expression, axis: str) -> np.
     ValueError
         If the factor is not positive somewhere.
     """
+    levels = list(islice(_borders(edge, factor, axis), cells + 1))
+    # no expression has to hold beyond the last cell: what lies there only completes the arithmetic
+    levels.append(2.0 * levels[-1] - levels[-2])
+    return np.array(levels)
+
+
+def graded_count(length: float, edge: float, factor: Expression, axis: str, most: int = 20_000) -> int:
+    """Return the least number of graded cells that cover a length [m] from x = 0 on.
+
+    Raises
+    ------
+    ValueError
+        If the factor is not positive somewhere, or more than ``most`` cells are needed.
+    """
+    start = 0.0
+    for count, end in enumerate(islice(_borders(edge, factor, axis), 1, most + 1), 1):
+        if end >= length - 1e-9 * (end - start):
+            return count
+        start = end
+    raise ValueError(f"{factor.text!r} takes more than {most:,} cells over {length:g} m, and reaches {start:g} m")
+
+
+def _borders(edge: float, factor: Expression, axis: str) -> Iterator[float]:
+    """Yield the coordinates [m] of the borders of graded cells, from 0 on."""
 
     def slope(x: float) -> float:
         value = float(factor({axis: np.array([x])})[0])
@@ -65,17 +99,15 @@ def graded_levels(cells: int, edge: float, factor: Expression, axis: str) -> np.
             raise ValueError(f"{factor.text!r} is {value:g} at {axis} = {x:g} m; expected a factor > 0 in the block")
         return edge * value
 
-    x, h, levels = 0.0, 1.0 / _STEPS, [0.0]
-    for _ in range(cells):
+    x, h = 0.0, 1.0 / _STEPS
+    yield x
+    while True:
         for _ in range(_STEPS):
             k1 = slope(x)
             k2 = slope(x + 0.5 * h * k1)
             k3 = slope(x + 0.5 * h * k2)
             x += h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + slope(x + h * k3))
-        levels.append(x)
-    # no expression has to hold beyond the last cell: what lies there only completes the arithmetic
-    levels.append(2.0 * levels[-1] - levels[-2])
-    return np.array(levels)
+        yield x
 
 
 def cylinder_map(radius: float, length: float | None) -> Move:

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 from ..errors import InputError
-from ..registry import nearest
 from . import settings as s
 from . import tables as t
 from .containers import KeyPath, Rows, Tables
 from .editing import attribute_of, changed_data, copied, key_path, merge, merged_stages, settle
+from .names import checked_name, nearest_key
 from .reading import KEYS
 from .stages import TABLES
 
@@ -69,15 +69,12 @@ class Editable:
     editor: tuple[Self, Callable[[str], KeyPath]]
 
     def __setattr__(self, key: str, value: Any) -> None:
-        if key == "name" and self.editor[0] is not self:
-            self._edit({("name",): value})
-            return
-        if key == "name" and isinstance(value, str) and not self.fixed:
-            self.__dict__[key] = value
+        if key == "name":
+            self.update({key: value})
             return
         known = [attribute_of(table) for table in KEYS]
         if key not in known:
-            hint = "; nodal masses are point_mass" if key == "mass" else nearest(key, known)
+            hint = "; nodal masses are point_mass" if key == "mass" else nearest_key(key, known)
             raise InputError(f"{self.source}: {key}: a case has no table of this name{hint}")
         self._edit({("mass" if key == "point_mass" else key,): value})
 
@@ -102,11 +99,7 @@ class Editable:
         InputError
             The case is as it was.
         """
-        if self.fixed:
-            raise InputError(
-                f"{self.source}: the case of a simulation cannot be changed; change the case that it was made from, "
-                "and make another simulation"
-            )
+        self._check_not_fixed()
         new = type(self).from_dict(changed_data(self, changes), name=self.name, source=self.source, folder=self.folder)
         settle(self, attached=False)
         for key in (*map(attribute_of, KEYS), "removes_bars"):
@@ -114,29 +107,43 @@ class Editable:
             self.__dict__[key] = merging(self.__dict__[key], new.__dict__[key])
         settle(self)
 
-    def update(self, changes: Mapping[str, Any]) -> None:
+    def _check_not_fixed(self) -> None:
+        if self.fixed:
+            raise InputError(
+                f"{self.source}: the case of a simulation cannot be changed; change the case that it was made from, "
+                "and make another simulation"
+            )
+
+    def update(self, changes: Mapping[str, Any] | None = None, /, **named: Any) -> None:
         """Make several changes, which are validated together.
 
         Parameters
         ----------
         changes : values by key, ``{"time.step": 1e-5, "wall[0].point": [0, 0, 1]}``; None removes a key
+        named : values of top-level keys, as those of the constructor: ``name="stiff"``, ``wall=[]``
 
         Raises
         ------
         InputError
             The case is as it was.
         """
-        self._edit({key_path(self, key): value for key, value in changes.items()})
+        values = {**(changes or {}), **named}
+        of_stage = self.editor[0] is not self
+        name = None if of_stage or "name" not in values else checked_name(values.pop("name"), self.source)
+        self._check_not_fixed()
+        if values:
+            self._edit({key_path(self, key): value for key, value in values.items()})
+        if name is not None:
+            self.__dict__["name"] = name
 
-    def copy(self, changes: Mapping[str, Any] | None = None, *, fixed: bool = False) -> Self:
+    def copy(self, changes: Mapping[str, Any] | None = None, /, *, fixed: bool = False, **named: Any) -> Self:
         """Return a copy, with changes as of :meth:`update`; if ``fixed``, it cannot be changed any more."""
         made = copied(self)
         if self.number or self.editor[0] is not self:  # of a stage
             made.__dict__.update(number=0, given=())
         made.__dict__["fixed"] = False
         settle(made)
-        if changes:
-            made.update(changes)
+        made.update(changes, **named)
         made.__dict__["fixed"] = fixed
         return made
 

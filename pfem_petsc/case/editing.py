@@ -140,7 +140,7 @@ def _plain_tables(value: Any) -> Any:
 
 
 def key_path(case: Case, key: str) -> KeyPath:
-    """Return the parts of a dotted key such as ``wall[0].point``.
+    """Return the parts of a dotted key such as ``wall[0].point``; the attribute ``point_mass`` is the key ``mass``.
 
     Raises
     ------
@@ -150,6 +150,7 @@ def key_path(case: Case, key: str) -> KeyPath:
     parts = split_key(key) if isinstance(key, str) else None
     if parts is None:
         raise InputError(f"{case.source}: {key!r}: expected a key like time.step or wall[0].point")
+    parts[0] = "mass" if parts[0] == "point_mass" else parts[0]
     return tuple(int(part) if part.isascii() and part.isdigit() else part for part in parts)
 
 

@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from ..errors import InputError
-from ..registry import choices, lookup, nearest
+from ..registry import choices, lookup
 from . import settings as s
 from . import tables as t
 from .base import StrictModel, with_absolute_paths
 from .load_reading import read_loads, read_tabled, read_varying
 from .materials import read_materials
+from .names import nearest_key
 from .problems import Path as KeyPath
 from .problems import Problems, table_list
 from .table_files import TableFiles
@@ -95,7 +96,7 @@ def read_tables(data: Mapping[str, Any], folder: Path, problems: Problems) -> di
     """
     for key in data:
         if key not in KEYS:
-            problems.add((key,), f"unknown key{nearest(key, KEYS)}")
+            problems.add((key,), f"unknown key{nearest_key(key, KEYS)}")
     files = TableFiles(folder)
     title = data.get("title")
     if title is not None and not isinstance(title, str):

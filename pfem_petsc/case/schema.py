@@ -15,6 +15,7 @@ from .checks import check_names
 from .containers import CaseTables
 from .editable import Editable
 from .editing import attribute_of, settle
+from .names import checked_name
 from .overrides import apply_overrides
 from .problems import Problems
 from .reading import KEYS, parse_toml, read_tables
@@ -221,7 +222,7 @@ class Case(Editable):
             check_names(tables, stage.data, stage.problems)
             stages.append((stage, tables))
         problems.raise_if_any()
-        name = Path(source).stem if name is None else name
+        name = Path(source).stem if name is None else checked_name(name, source)
         attributes["title"] = name if attributes["title"] is None else attributes["title"]
         case = cls._of(attributes, name=name, source=source, folder=Path(folder))
         case.__dict__["overrides"] = overrides

@@ -160,6 +160,30 @@ def test_copies_are_independent(case):
     assert repr(changed) == repr(case)
 
 
+def test_copies_and_updates_take_what_the_constructor_takes(case):
+    renamed = case.copy({"name": "short", "time.end": 2.0})
+    assert (renamed.name, renamed.time.end, case.name) == ("short", 2.0, "rod")
+    assert case.copy({"time.end": 2.0}, name="b", title="B").title == "B"
+    renamed.update(name="again", point_mass=[{"node_set": "tip", "value": 3.0}])
+    renamed.update({"point_mass[0].value": 4.0})
+    assert (renamed.name, renamed.point_mass[0].value) == ("again", 4.0)
+    with pytest.raises(InputError, match=r"time\.end = -1"):
+        renamed.update({"name": "lost", "time.end": -1})
+    for wrong in ("", 5, None, "/tmp/a", "../a"):
+        with pytest.raises(InputError, match="name = .*: expected"):
+            renamed.name = wrong
+        with pytest.raises(InputError, match="name = .*: expected"):
+            renamed.copy({"name": wrong})
+    assert renamed.name == "again"
+    with pytest.raises(InputError, match="the case of a simulation cannot be changed"):
+        case.copy(fixed=True).name = "other"
+    for key in ("folder", "source", "overrides"):
+        with pytest.raises(InputError, match=f"{key}: unknown key; it is an argument of Case"):
+            case.copy({key: "x"})
+    with pytest.raises(InputError, match="name: unknown key; the name of a case is that of its file"):
+        Case.from_toml('name = "x"\n' + case.to_toml())
+
+
 def test_case_of_tables_by_name(case, case_file):
     tables = case.to_dict()
     assert Case(tables) == Case(**tables) == case

@@ -57,7 +57,7 @@ class Parameters(StrictModel):
     cell: CellKeys | None = None
     """The unit cell of the kind ``cell``: ``points``, ``struts``, ``groups``."""
     grading: Any = None
-    """Three factors on the pitch along x, y and z: numbers, or expressions of the one coordinate from ``origin`` [m]."""
+    """Three factors on the pitch along x, y and z: numbers, or expressions of one coordinate from ``origin`` [m]."""
     perturbation: Annotated[float, Field(ge=0.0, lt=0.5)] | None = None
     """Random displacement of nodes along each axis, at most this fraction of the pitch."""
     missing: Annotated[float, Field(ge=0.0, lt=1.0)] | None = None

@@ -15,6 +15,8 @@ __all__ = ["skeleton", "tables_of"]
 
 _STEEL = {"young_modulus": 210e9, "density": 7850.0}
 _AREA = 1e-4
+_PROBED = 100
+"""Number of nodes up to which a node set with a load has a probe."""
 _CONDITIONS = ("support", "load", "gravity")
 
 
@@ -56,22 +58,38 @@ def tables_of(mesh: WholeMesh) -> tuple[dict[str, Any], list[str]]:
     return {"node_set": node_sets, "material": materials, "section": sections, **conditions}, made
 
 
+def _probes(mesh: WholeMesh) -> list[dict[str, str]]:
+    """Return probes for the node sets with loads, but for large ones: each node has columns of the history."""
+    loaded = [name for name in mesh.tables.get("load", {}) if len(mesh.node_groups[name]) <= _PROBED]
+    return [{"name": name, "node_set": name} for name in loaded]
+
+
 def skeleton(mesh: WholeMesh, file: Path, case: Path) -> str:
     """Return the text of a case file at ``case`` for a mesh file, which can be checked and run."""
     tables, made = tables_of(mesh)
     relative = os.path.relpath(file.absolute(), case.absolute().parent)
-    lines = [f"# A case for {file.name}. Replace what is not known from it:\n"]
-    lines += [f"#   {key}\n" for key in made]
     known = [name for name in _CONDITIONS if name in tables]
-    told = "the analysis, which is an explicit one of a millisecond" if known else "supports, loads, and the analysis"
-    lines += [f"#   {told}\n\n"]
+    analysis = mesh.tables.get("analysis", {})
+    if not known:
+        made.append("supports and loads" if analysis else "supports, loads, and the analysis")
+    elif not analysis:
+        made.append("the analysis, which is an explicit one of a millisecond")
+    told = (
+        "Replace what is not known from it:"
+        if made
+        else "Supports, loads and the analysis are those of the first step."
+    )
+    lines = [f"# A case for {file.name}. {told}\n", *(f"#   {key}\n" for key in made), "\n"]
     data = {
         "title": file.stem,
         "mesh": {"file": relative},
         **{name: table for name, table in tables.items() if table},
         **({} if known else {"gravity": {"acceleration": [0.0, 0.0, -9.81]}}),
-        "time": {"integrator": "central_differences", "step": "auto", "end": 1e-3},
+        **(analysis or {"time": {"integrator": "central_differences", "step": "auto", "end": 1e-3}}),
     }
+    probes = _probes(mesh) if "static" in data or "time" in data else []
+    if probes:
+        data["output"] = {"probe": probes}
     text = table_text(data)
     if "support" in tables:
         return "".join(lines) + text

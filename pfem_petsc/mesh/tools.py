@@ -183,6 +183,8 @@ def merged(meshes: Sequence[WholeMesh], tolerance: float | None = None) -> tuple
     for mesh in meshes:
         together.warnings += mesh.warnings
         for table, rows in mesh.tables.items():
+            if table == "analysis" and table in together.tables:
+                rows = together.tables[table]  # that of the first file that has one
             into: dict[str, Any] = together.tables.setdefault(table, {})
             differing = [name for name, keys in rows.items() if into.setdefault(name, keys) != keys]
             told = "differs from that of a file before, which is kept"
@@ -228,6 +230,8 @@ def scaled(mesh: WholeMesh, scale: float) -> WholeMesh:
     """
     if not 0.0 < scale < np.inf:
         raise InputError(f"scale: {scale!r} is not a positive number of metres in a unit of the file")
+    if scale == 1.0:
+        return mesh
     fields = {name: values * scale**2 if name == "area" else values for name, values in mesh.bar_fields.items()}
     tables: dict[str, dict[str, Any]] = {}
     for table, rows in mesh.tables.items():
@@ -246,9 +250,14 @@ def scaled(mesh: WholeMesh, scale: float) -> WholeMesh:
 
 def _scaled_keys(keys: dict[str, Any], scale: float) -> dict[str, Any]:
     powers = {**_POWERS, "area": 2, "thickness": 1}
-    found = {key: value * scale ** powers[key] if key in powers else value for key, value in keys.items()}
+    found = {key: _converted(value * scale ** powers[key]) if key in powers else value for key, value in keys.items()}
     if "curve" in found:
-        found["curve"] = [[strain, stress * scale**-2] for strain, stress in found["curve"]]
+        found["curve"] = [[strain, _converted(stress * scale**-2)] for strain, stress in found["curve"]]
     if "acceleration" in found:
-        found["acceleration"] = [component * scale for component in found["acceleration"]]
+        found["acceleration"] = [_converted(component * scale) for component in found["acceleration"]]
     return found
+
+
+def _converted(value: float) -> float:
+    """Return a product with a unit as people write it, to 15 digits: 2e-4 and not 1.9999999999999998e-4."""
+    return float(f"{value:.15g}")

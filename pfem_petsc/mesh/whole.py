@@ -30,8 +30,8 @@ class WholeMesh:
     bar_fields: dict[str, np.ndarray] = field(default_factory=dict)
     """(n_bars,) float64; the field ``area`` has the areas of cross-sections [m2]."""
     tables: dict[str, dict[str, Any]] = field(default_factory=dict)
-    """What a file has besides the mesh: ``material``, ``section``, ``support`` and ``load`` (by node group), and
-    ``gravity``, each with the keys of a case by name."""
+    """What a file has besides the mesh: ``material``, ``section``, ``support`` and ``load`` (by node group),
+    ``gravity``, each with the keys of a case by name, and ``analysis``: ``static``, ``time`` and ``modes``."""
     warnings: list[str] = field(default_factory=list)
     known_fields: list[str] | None = None
     """Names of all fields of a file; None: those in ``bar_fields``."""

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from pfem_petsc import Case, Simulation, Truss
+from pfem_petsc import Case, Simulation, Truss, open_result
 from pfem_petsc.cli.main import main
 from pfem_petsc.mesh import load_slab
 from pfem_petsc.mesh.readers import read_whole
@@ -32,16 +32,21 @@ def test_a_file_in_millimetres_becomes_a_case_that_runs(mesh, tmp_path):
     assert (status, err) == (0, "")
     assert "4 nodes merged with others" in out and "tower.vtu: 12 nodes, 26 bars" in out
     text = Path("tower.toml").read_text()
-    assert "not known" in text and "steel" not in text  # all about materials is in the file
+    assert "not known" not in text and "steel" not in text  # all is in the file
+    assert "area = 0.000314159265\n" in text and "young_modulus = 210000000000.0\n" in text
     case = Case.load("tower.toml")
     assert case.material["Steel"].young_modulus == pytest.approx(2.1e11)
     assert case.section["Legs"].area == pytest.approx(314.159265e-6) and case.section["Braces"].bars == "Braces"
     assert set(case.node_set) == {"Feet", "Head"}
     assert [(entry.node_set, entry.fix) for entry in case.support] == [("Feet", "xyz")]
     assert case.load[0].force == (250.0, 0.0, -1000.0) and case.gravity.acceleration == pytest.approx((0, 0, -9.81))
-    with Simulation(case.copy({"time.end": 1e-4}), output=tmp_path / "out", quiet=True) as run:
+    assert (case.static.parameters.step, case.static.parameters.max_step, case.time) == (0.1, 1.0, None)
+    with Simulation(case, output=tmp_path / "out", quiet=True) as run:
         run.run()
         mass = run.model.total_mass
+    head = open_result(tmp_path / "out").history["probe/Head/position"]
+    moved = head[-1] - head[0]
+    assert (moved[:, 0] > 1e-5).all() and moved[:, 2].mean() < -1e-5  # where its loads push it
     truss = Truss.read("tower.vtu")
     volume = truss.lengths @ truss.bar_fields["area"]
     assert mass == pytest.approx(7850.0 * volume, rel=1e-6)  # of the geometry in metres
@@ -124,7 +129,7 @@ def test_a_case_for_a_mesh_that_tells_nothing(mesh):
         (["clean", MESHES / "ring.msh", "a.h5", "--tolerance", "x"], "'x' is not a positive number"),
         (["picture", MESHES / "ring.msh", "-o", "a.svg"], "a.svg: a picture is written as .png"),
         (["picture", MESHES / "ring.msh", "--size", "9x9"], "'9x9' is not a size in pixels"),
-        (["picture", MESHES / "ring.msh", "--view", "top"], "view = 'top' is not known"),
+        (["picture", MESHES / "ring.msh", "--view", "askew"], "view = 'askew' is not known"),
         (["generate", "rod", "a.h5"], "mesh generate rod: mesh.length: this key is missing"),
         (
             ["generate", "rod", "a.h5", "--set", "pitch=1"],

@@ -8,6 +8,7 @@ import pytest
 from pfem_petsc import Case, Truss
 from pfem_petsc.errors import InputError
 from pfem_petsc.mesh.readers import read_whole
+from pfem_petsc.mesh.skeleton import skeleton
 
 MESHES = Path(__file__).parents[2] / "meshes"
 
@@ -358,3 +359,53 @@ def test_plastic_curves_that_no_law_has_are_told(tmp_path):
         assert any("*PLASTIC" in warning and "left out" in warning for warning in mesh.warnings)
     mesh = read_whole(written(tmp_path, FLAT.replace("*DENSITY", "*PLASTIC\n2.E8\n*DENSITY")))
     assert mesh.tables["material"]["Steel"]["yield_stress"] == 2e8
+
+
+STEPS = [
+    ("*STATIC\n0.1, 2., 1e-5, 0.5", {"static": {"step": 0.05, "max_step": 0.25, "min_step": 5e-6}}, ""),
+    ("*STATIC", {"static": {"step": 1.0}}, ""),
+    ("*STATIC, DIRECT\n0.25, 1.", {"static": {"step": 0.25}}, ""),
+    ("*STATIC, RIKS\n0.05, 1., , , 3.", {"static": {"method": "arc_length", "step": 0.05, "end": 3.0}}, ""),
+    ("*DYNAMIC, EXPLICIT\n, 2e-3", {"time": {"integrator": "central_differences", "step": "auto", "end": 2e-3}}, ""),
+    (
+        "*DYNAMIC\n1e-4, 0.02",
+        {"time": {"integrator": "generalized_alpha", "step": 1e-4, "end": 0.02}},
+        "line 47: *DYNAMIC: step = 0.0001 s is the first increment, for all steps",
+    ),
+    ("*DYNAMIC", {}, "line 47: *DYNAMIC: the period is missing: the first step is left out"),
+    ("*FREQUENCY, EIGENSOLVER=LANCZOS\n6,", {"modes": {"count": 6, "kind": "vibration"}}, ""),
+    ("*BUCKLE\n3,", {"static": {"step": 1.0}, "modes": {"count": 3, "kind": "buckling"}}, ""),
+    (
+        "*HEAT TRANSFER\n1., 1.",
+        {},
+        "line 47: *HEAT TRANSFER: the first step is left out: the program has no *HEAT TRANSFER",
+    ),
+]
+
+
+@pytest.mark.parametrize("procedure, tables, told", STEPS)
+def test_the_first_step_is_the_analysis(tmp_path, procedure, tables, told):
+    """It makes a valid case with the loads, which a probe watches; what the program lacks is told."""
+    mesh = read_whole(
+        path := written(tmp_path, FLAT.replace("*STEP\n", f"*BOUNDARY\nFeet, PINNED\n*STEP\n{procedure}\n"))
+    )
+    assert mesh.tables.get("analysis", {}) == tables
+    assert [text.partition("a.inp: ")[2] for text in mesh.warnings[1:]] == [told] * bool(told)
+    text = skeleton(mesh, path, tmp_path / "a.toml")
+    assert ("which is an explicit one of a millisecond" in text) == (not tables)
+    case = Case.from_toml(text, tmp_path)
+    assert (case.static is not None, case.modes is not None) == ("static" in tables, "modes" in tables)
+    assert [probe.node_set for probe in case.output.probe] == ["node_21"] * (set(tables) != {"modes"})
+    assert read_whole(path, fields=()).warnings == mesh.warnings[:1]  # a run takes the mesh alone
+
+
+def test_keywords_that_are_left_out_are_named(tmp_path):
+    more = "*AMPLITUDE, NAME=ramp\n0., 0., 1., 1.\n*INITIAL CONDITIONS, TYPE=VELOCITY\n21, 3, -1.\n*STEP"
+    text = FLAT.replace("*STEP", more).replace("*CLOAD", "*STATIC\n*CLOAD, AMPLITUDE=ramp")
+    text += "*OUTPUT, FIELD\n*STEP\n*FREQUENCY\n5\n*END STEP\n*STEP\n*DYNAMIC\n1., 1.\n*END STEP\n"
+    told = [text.partition("a.inp: ")[2] for text in read_whole(written(tmp_path, text)).warnings[1:]]
+    assert told == [
+        "line 50: *CLOAD: AMPLITUDE=ramp is left out: give the table over time in the case",
+        "left out *AMPLITUDE, *INITIAL CONDITIONS: keywords that are not read",
+        "left out the steps after the first one: *FREQUENCY, *DYNAMIC",
+    ]

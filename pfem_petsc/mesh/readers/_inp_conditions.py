@@ -25,6 +25,9 @@ def add_conditions(mesh: WholeMesh, flat: Flat, found: list[Block]) -> None:
     forces: dict[str, list[float]] = {}
     gravity = np.zeros(3)
     for block in found:
+        if block.get("AMPLITUDE"):
+            told = f"AMPLITUDE={block.get('AMPLITUDE')} is left out: give the table over time in the case"
+            mesh.warnings.append(f"{block.where}: {told}")
         for _, line, words in block.words():
             where = f"{block.path}: line {line}: *{block.keyword}"
             if block.keyword == "DLOAD":

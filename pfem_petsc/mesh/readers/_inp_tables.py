@@ -23,8 +23,7 @@ class Materials:
         self._current: dict[str, Any] = {}
         self.warnings: list[str] = []
 
-    def begin(self, block: Block) -> None:
-        """Read ``*MATERIAL``."""
+    def _begin(self, block: Block) -> None:
         name = block.required("NAME")
         self._names.setdefault(name.upper(), name)
         self._current = self._found.setdefault(name.upper(), {})
@@ -34,7 +33,10 @@ class Materials:
         return self._names.get(name.upper(), name)
 
     def add(self, block: Block) -> None:
-        """Read what belongs to a material."""
+        """Read ``*MATERIAL``, and what belongs to a material."""
+        if block.keyword == "MATERIAL":
+            self._begin(block)
+            return
         if block.keyword == "DAMPING":
             for name, key in (("ALPHA", "alpha"), ("BETA", "stiffness_damping")):
                 if block.get(name):

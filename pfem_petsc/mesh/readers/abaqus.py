@@ -2,8 +2,8 @@
 
 T3D2 and T2D2 are bars; other trusses and beams are read as bars with a warning, other elements are left out with
 one. Node sets and element sets are groups. Sections give the bar field ``area``; sections and materials are tables of
-a case, as are fixed nodes, nodal forces and gravity up to the end of the first step. Included files are read. Keywords
-that generate nodes and elements are refused.
+a case, as are fixed nodes, nodal forces and gravity up to the end of the first step, and its analysis. Included files
+are read. Keywords that generate nodes and elements are refused.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from ._inp_blocks import Block, blocks
 from ._inp_conditions import CONDITION_KEYWORDS, add_conditions
 from ._inp_flat import Flat
 from ._inp_model import Model, Scope
+from ._inp_steps import Steps
 from ._inp_tables import MATERIAL_KEYWORDS, Materials, section_of
 
 __all__ = ["MADE", "SUFFIXES", "read"]
@@ -30,6 +31,8 @@ _REFUSED = ("NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "SYSTEM", "PARA
 MADE = "_section_"
 """Beginning of the names of element sets that the writer makes for areas."""
 _CONSTRAINTS = ("TIE", "EQUATION", "MPC", "COUPLING", "RIGID BODY", "EMBEDDED ELEMENT", "MULTIPLE POINT CONSTRAINT")
+_MODEL = ("NODE", "ELEMENT", "NSET", "ELSET")
+"""Keywords of the model that steps may have; those of steps are not read."""
 _SECTIONS = ("SOLID SECTION", "BEAM SECTION", "BEAM GENERAL SECTION")
 
 
@@ -42,7 +45,8 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
         Naming file and line, for any content that is not a mesh of bars.
     """
     model, materials = Model(), Materials()
-    constraints, conditions = _collect(path, model, materials)
+    steps = Steps()
+    constraints, conditions = _collect(path, model, materials, steps)
     flat = Flat(path, model)
     mesh = WholeMesh(flat.points, flat.bars, flat.groups("NSET"), dict(flat.groups("ELSET")))
     mesh.warnings = flat.warnings + materials.warnings
@@ -53,6 +57,8 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     mesh.tables = {"material": found} if found else {}
     _add_sections(mesh, flat, materials)
     add_conditions(mesh, flat, conditions)
+    if fields is None:  # of no interest to a run, which takes mesh and groups alone
+        steps.finish(mesh, path)
     if flat.labels_left_out:
         first = ", ".join(str(label) for label in flat.labels_left_out[:5])
         more = ", ..." if len(flat.labels_left_out) > 5 else ""
@@ -62,8 +68,8 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     return mesh
 
 
-def _collect(path: Path, model: Model, materials: Materials) -> tuple[list[str], list[Block]]:
-    """Read all keywords up to the end of the first step, and of steps only conditions.
+def _collect(path: Path, model: Model, materials: Materials, steps: Steps) -> tuple[list[str], list[Block]]:
+    """Read all keywords up to the end of the first step, and of steps only conditions and procedures.
 
     Returns
     -------
@@ -71,16 +77,17 @@ def _collect(path: Path, model: Model, materials: Materials) -> tuple[list[str],
     """
     constraints: dict[str, None] = {}
     conditions: list[Block] = []
-    in_step = False
+    in_step = ended = False
     scope = model.root
     outer = scope
     for block in blocks(path):
         keyword = block.keyword
-        if keyword == "END STEP":
-            break
+        ended = ended or keyword == "END STEP"
         in_step = in_step or keyword == "STEP"
-        if keyword in CONDITION_KEYWORDS:
+        if keyword in CONDITION_KEYWORDS and not ended:
             conditions.append(block)
+        elif in_step and (ended or keyword not in _MODEL):
+            steps.add(block, first=not ended)
         if in_step:
             continue
         if keyword in _REFUSED:
@@ -100,12 +107,12 @@ def _collect(path: Path, model: Model, materials: Materials) -> tuple[list[str],
             model.add_set(scope, block, keyword)
         elif keyword in _SECTIONS:
             scope.sections.append((block, block.required("ELSET")))
-        elif keyword == "MATERIAL":
-            materials.begin(block)
-        elif keyword in MATERIAL_KEYWORDS and not (keyword == "DAMPING" and not block.parameters):
+        elif keyword in ("MATERIAL", *MATERIAL_KEYWORDS):
             materials.add(block)
         elif keyword in _CONSTRAINTS:
             constraints[f"*{keyword}"] = None
+        elif keyword not in CONDITION_KEYWORDS:
+            steps.add(block, first=True)
     return list(constraints), conditions
 
 

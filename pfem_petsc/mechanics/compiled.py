@@ -6,6 +6,7 @@ import functools
 import hashlib
 import os
 import pickle
+import threading
 import time
 import warnings
 from collections.abc import Callable
@@ -256,15 +257,18 @@ class Compilation(event.Listener):
 
     Parameters
     ----------
-    begun : called before the first compilation, with the name of the loop
+    begun : called once, with the name of the loop that is compiled then; with ``patience``, in another thread
     took : called after each compilation, with its time [s]
+    patience : time [s] of all compilations before ``begun`` is called; those that take less are not reported
     """
 
-    def __init__(self, begun: Callable[[str], None], took: Callable[[float], None]) -> None:
+    def __init__(self, begun: Callable[[str], None], took: Callable[[float], None], patience: float = 0.0) -> None:
         self._begun, self._took = begun, took
         self._told = False
         self._nested = 0  # loops compiled for a loop that calls them
         self._begin = 0.0
+        self._patience = patience
+        self._timer: threading.Timer | None = None
 
     def __enter__(self) -> Compilation:
         event.register("numba:compile", self)
@@ -273,18 +277,40 @@ class Compilation(event.Listener):
     def __exit__(self, *_: object) -> None:
         event.unregister("numba:compile", self)
         self._nested = 0
+        self._stop_timer()
 
     def on_start(self, event: event.Event) -> None:
         """Handle the start of a compilation."""
         if self._nested == 0:
             self._begin = time.perf_counter()
             if not self._told:
-                self._told = True
-                self._begun(getattr(getattr(event.data.get("dispatcher"), "py_func", None), "__name__", "a loop"))
+                name = getattr(getattr(event.data.get("dispatcher"), "py_func", None), "__name__", "a loop")
+                self._tell_later(name)
         self._nested += 1
+
+    def _tell_later(self, name: str) -> None:
+        if self._patience <= 0.0:
+            self._tell_now(name)
+            return
+        self._timer = threading.Timer(self._patience, self._tell_now, (name,))
+        self._timer.daemon = True
+        self._timer.start()
+
+    def _stop_timer(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer.join()  # so that what it says comes before what follows
+            self._timer = None
+
+    def _tell_now(self, name: str) -> None:
+        self._told = True
+        self._begun(name)
 
     def on_end(self, event: event.Event) -> None:
         """Handle the end of a compilation, successful or not."""
         self._nested -= 1
         if self._nested == 0:
-            self._took(time.perf_counter() - self._begin)
+            seconds = time.perf_counter() - self._begin
+            self._patience -= seconds
+            self._stop_timer()
+            self._took(seconds)

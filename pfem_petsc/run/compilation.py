@@ -10,8 +10,12 @@ from ..output.progress import Progress
 __all__ = ["ReportedCompilation"]
 
 
+_PATIENCE = 2.0
+"""Time [s] of compilations up to which nothing is said."""
+
+
 class ReportedCompilation(Compilation):
-    """Reports once that loops are compiled, and excludes the compilation time from the rate of steps.
+    """Reports once that loops are compiled, if that takes long, and excludes the time from the rate of steps.
 
     Attributes
     ----------
@@ -19,13 +23,14 @@ class ReportedCompilation(Compilation):
     """
 
     def __init__(self, comm: MPI.Comm, quiet: bool) -> None:
-        super().__init__(self._tell, self._leave_out)
+        super().__init__(self._tell, self._leave_out, _PATIENCE)
         self.progress: Progress | None = None
         self._speaks = comm.rank == 0 and not quiet
 
     def _tell(self, name: str) -> None:
         text = (
-            f"compiling loops for this machine (once, up to a minute): {name} and others that this kind of case needs"
+            f"compiling loops for this machine (once, up to a minute in all): {name}, and others that this kind of "
+            "case needs; later runs load them"
         )
         if self.progress is not None:
             self.progress.message(text)

@@ -67,7 +67,21 @@ def test_compiling_is_noticed_once_and_loading_is_not(module):
     assert len(took) == 2
 
 
-def test_run_says_that_it_compiles(tmp_path, monkeypatch, capsys):
+def test_short_compilations_are_not_reported():
+    """They count together; a report comes while the loop that makes them long is compiled."""
+    told, took = [], []
+    with Compilation(told.append, took.append, patience=60.0):
+        numba.njit(lambda x: x + 1.0)(1.0)
+    assert (told, len(took)) == ([], 1)
+    with Compilation(told.append, took.append, patience=1e-6):
+        numba.njit(lambda x: x + 1.0)(1.0)
+        numba.njit(lambda x: x + 2.0)(1.0)
+    assert (told, len(took)) == (["<lambda>"], 3)
+
+
+@pytest.mark.parametrize("patience, times", [(0.0, 1), (1e-4, 1), (600.0, 0)])
+def test_run_says_that_it_compiles(tmp_path, monkeypatch, capsys, patience, times):
+    monkeypatch.setattr("pfem_petsc.run.compilation._PATIENCE", patience)
     step = ExplicitStepper.step
 
     def compiling(self):
@@ -78,7 +92,7 @@ def test_run_says_that_it_compiles(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(ExplicitStepper, "step", compiling)
     Simulation(Case.load("rod_impact", ["time.end=0.2"]), output=tmp_path / "it").run()
     said = capsys.readouterr().out
-    assert said.count("compiling loops for this machine (once") == 1
+    assert said.count("compiling loops for this machine (once") == times
 
 
 def test_machine_code_is_never_older_than_what_a_loop_inlines(tmp_path, monkeypatch):

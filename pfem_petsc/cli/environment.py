@@ -249,7 +249,12 @@ def _drawing(bring: dict[str, str], run: Callable[[list[str]], tuple[int, str]])
     code = "from pfem_petsc.post.headless import require_rendering as r; r(); import os; "
     status, output = run(_python(code + "print(os.environ.get('VTK_DEFAULT_OPENGL_WINDOW', 'default'))"))
     if status:
-        return Finding("OpenGL", "optional", "nothing draws without a display (render, report)", bring["drawing"])
+        return Finding(
+            "OpenGL",
+            "optional",
+            "windows of pyvista need a display (grid.plot(); render, plot and report draw without)",
+            bring["drawing"],
+        )
     return Finding("OpenGL", "ok", output.strip().splitlines()[-1].removeprefix("vtk"))
 
 

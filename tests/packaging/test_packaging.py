@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import subprocess
 import sys
 import tomllib
@@ -12,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from pfem_petsc import open_result
+from pfem_petsc.cli.main import _parse
 
 ROOT = Path(__file__).parents[2]
 PACKAGING = ROOT / "packaging"
@@ -97,6 +99,15 @@ def test_data_files_are_in_the_wheel():
             continue
         package = ".".join(path.parent.relative_to(ROOT).parts)
         assert any(path.match(pattern) for pattern in project.get(package, ())), path
+
+
+def test_set_up_compiles_what_the_first_commands_need():
+    """Loops of runs and of drawing; the commands of setup.sh are accepted."""
+    text = (ROOT / "scripts" / "setup.sh").read_text().replace('"$folder/rod"', "rod").replace("\\\n", " ")
+    commands = re.findall(r'"\$python" -m pfem_petsc ([^\n&|>]*)', text)
+    assert {command.split()[0] for command in commands} == {"bench", "rod_impact", "render"}
+    for command in commands:
+        _parse(shlex.split(command))
 
 
 def test_scripts_are_valid_shell():

@@ -17,7 +17,6 @@ from pfem_petsc import Case, InputError, LivePlot, Simulation, Truss, open_resul
 from pfem_petsc.output import bar
 from pfem_petsc.output.progress import Progress
 from pfem_petsc.post import inline
-from pfem_petsc.post.headless import require_rendering
 
 
 def images(html: str) -> list[np.ndarray]:
@@ -64,7 +63,6 @@ def test_a_case_shows_what_it_computes(tmp_path, monkeypatch):
 
 
 def test_a_result_shows_its_last_snapshot_and_its_energies(result):
-    require_rendering()
     html = result._repr_html_()
     snapshot, curves = images(html)
     assert snapshot.shape == (360, 640, 3) and curves.shape[1] == 640
@@ -76,9 +74,9 @@ def test_a_result_shows_its_last_snapshot_and_its_energies(result):
     assert [line.get_label() for line in figure.axes[0].lines] == [f"wall/wall/force.{axis}" for axis in "xyz"]
 
 
-def test_without_a_library_to_draw_a_result_shows_lines(result, monkeypatch):
+def test_a_result_that_cannot_be_drawn_shows_lines(result, monkeypatch):
     def refuse(*arguments, **options):
-        raise InputError("no OpenGL")
+        raise InputError("the result holds no snapshots")
 
     monkeypatch.setattr("pfem_petsc.post.render.render", refuse)
     assert len(images(result._repr_html_())) == 2

@@ -85,9 +85,9 @@ def test_readme_is_short():
 
 @pytest.mark.slow
 def test_first_commands_run(tmp_path):
-    """Those after the set-up, without the large one."""
+    """Those after the set-up and the activation, without the large one."""
     commands = next(block for block in blocks("") if "activate" in block).splitlines()
-    asked = [line.partition("#")[0].split() for line in commands[1:] if "mpirun" not in line]
+    asked = [line.partition("#")[0].split() for line in commands[2:] if "mpirun" not in line]
     assert len(asked) == 4
     for words in asked:
         command = [sys.executable, *words[1:], *(["--frames", "3"] if "render" in words else [])]

@@ -18,6 +18,7 @@ from .integrators.base import State
 from .mechanics.state_forces import ForceState
 from .output.lock import FolderLock
 from .parallel.agreement import on_root
+from .parallel.heap import return_freed_memory
 from .parallel.petsc_log import instrument, staged
 from .preflight.forecast import forecast
 from .preflight.inspection import inspect, warnings_before
@@ -84,6 +85,7 @@ class Simulation(WithEquations):
                 f"Simulation: expected a Case, got {case!r:.80}; Case.load reads one from a file, "
                 "Case.from_dict from tables"
             )
+        return_freed_memory()  # PETSc and what it is linked to are loaded by now
         self._stop = StopRequest(wall_time)
         # later changes of the case are those of other simulations
         self.case = case = case.copy(fixed=True)

@@ -174,9 +174,7 @@ def _alone(mesh: DistributedMesh, slab: MeshSlab, section: np.ndarray, keep: boo
     _arrange_bars(mesh, ends, None, section, groups, slab.bar_fields)
 
 
-def _among_ranks(
-    mesh: DistributedMesh, slab: MeshSlab, section: np.ndarray, owners: np.ndarray, keep: bool
-) -> None:
+def _among_ranks(mesh: DistributedMesh, slab: MeshSlab, section: np.ndarray, owners: np.ndarray, keep: bool) -> None:
     """Distribute over several ranks: number nodes on their owners, then send bars to the owners of their ends."""
     comm = mesh.comm
     to_owner = Router(comm, owners)

@@ -54,9 +54,10 @@ def test_a_plain_explicit_run_holds_few_bytes_a_bar_after_its_set_up(tmp_path, f
 
 def test_memory_of_large_arrays_goes_back_to_the_system_when_they_are_freed():
     program = """
+import contextlib
 import ctypes
 import numpy as np
-from pfem_petsc.parallel.heap import return_freed_memory
+from pfem_petsc.parallel.heap import returning_freed_memory
 
 def resident():
     return next(int(line.split()[1]) for line in open("/proc/self/status") if line.startswith("VmRSS")) / 1024
@@ -64,13 +65,13 @@ def resident():
 library = ctypes.CDLL(None)
 library.mallopt(-4, 0)  # as SuperLU_DIST does
 library.mallopt(-1, -1)
-for call in (lambda: None, return_freed_memory):
-    call()
-    large, above = np.ones(1 << 23), np.ones(1000)
-    before = resident()
-    del large
-    print(before - resident())
-    del above
+for within in (contextlib.nullcontext, returning_freed_memory):
+    with within():
+        large, above = np.ones(1 << 23), np.ones(1000)
+        before = resident()
+        del large
+        print(before - resident())
+        del above
 """
     if not Path("/proc/self/status").exists() or sys.platform != "linux":
         pytest.skip("reads /proc")

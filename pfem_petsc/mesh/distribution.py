@@ -16,6 +16,8 @@ from .slab import MeshSlab, index_type, slab_of
 
 __all__ = ["Block", "DistributedMesh", "distribute"]
 
+_PIECE = 1 << 18  # number of bars whose ends are looked up at a time, to keep temporary arrays small
+
 
 @dataclass(frozen=True)
 class Block:
@@ -227,12 +229,13 @@ def _fetch_bars(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Return ends (PETSc numbers), mesh numbers, sections, group memberships and fields of bars connected to owned
     nodes."""
-    wanted, place = np.unique(slab.bars, return_inverse=True)
-    asking = Router(comm, slab_of(wanted, slab.n_nodes, comm.size))
-    asked = asking.send(wanted.astype(np.int64)) - slab.first_node
-    numbers = asking.reply(directory[asked]).astype(index_type(slab.n_nodes))
-    numbers = numbers[place.reshape(-1, 2)]
-    del wanted, place, asking, asked
+    numbers = np.empty(slab.bars.shape, index_type(slab.n_nodes))
+    # all ranks take as many pieces as the one with most bars
+    for start in range(0, -(-slab.n_bars // comm.size), _PIECE):
+        wanted, place = np.unique(slab.bars[start : start + _PIECE], return_inverse=True)
+        asking = Router(comm, slab_of(wanted, slab.n_nodes, comm.size))
+        asked = asking.send(wanted.astype(np.int64)) - slab.first_node
+        numbers[start : start + _PIECE] = asking.reply(directory[asked])[place.reshape(-1, 2)]
 
     owner = _owner(numbers, starts)
     both = np.flatnonzero(owner[:, 0] != owner[:, 1])

@@ -18,6 +18,7 @@ from .integrators.base import State
 from .mechanics.state_forces import ForceState
 from .output.lock import FolderLock
 from .parallel.agreement import on_root
+from .parallel.heap import returning_freed_memory
 from .parallel.petsc_log import instrument, staged
 from .preflight.forecast import forecast
 from .preflight.inspection import inspect, warnings_before
@@ -102,7 +103,8 @@ class Simulation(WithEquations):
         found = find_restart(case, self.comm, self.folder, None if check_only else restart)
         self.restart = found if isinstance(found, Restart) else None
         self.notes = [found] if isinstance(found, str) else []
-        with self._compilation:
+        # PETSc and what it is linked to are loaded by now
+        with self._compilation, returning_freed_memory():
             self._prepare()
 
     def _prepare(self) -> None:
@@ -248,9 +250,10 @@ class Simulation(WithEquations):
         try:
             on_root(self.comm, self._lock.take)
             self._stop.watch()
-            self.outputs.open(self.restart, self.notes)
-            instrument(self)
-            self.outputs.record_start()
+            with returning_freed_memory():
+                self.outputs.open(self.restart, self.notes)
+                instrument(self)
+                self.outputs.record_start()
         except PfemError:
             self._finish("failed")
             raise

@@ -104,6 +104,8 @@ def section_of_bars(case: Case, slab: MeshSlab) -> np.ndarray:
     InputError
         If a section names a group that the mesh does not have, or a bar has two sections or none.
     """
+    if [section.bars for section in case.section.values()] == [None]:
+        return np.broadcast_to(np.int32(0), len(slab.bars))  # without memory of its own
     chosen = np.full(len(slab.bars), -1, dtype=np.int32)
     for index, (name, section) in enumerate(case.section.items()):
         if section.bars is None:

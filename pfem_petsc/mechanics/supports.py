@@ -62,10 +62,9 @@ class Supports:
                 self.fixed[members, axis] = True
             if motion is not None:
                 motions.append((members, axes, motion))
+        self._motions = motions
         self._index()
         self._start = self._origin[self.fixed]
-        self._moved = np.zeros((3, mesh.n_owned, 3))  # displacements, velocities, accelerations
-        self._motions = motions
         self._gone: set[str] = set()
         self._turned = np.flatnonzero(turned)
         self.inclined: Directions | None = None
@@ -143,6 +142,11 @@ class Supports:
     def _index(self) -> None:
         self.nodes, self.components = np.nonzero(self.fixed)
         self.at = (self.nodes, self.components)
+        # where the components of each motion stand among those prescribed, as far as they still are
+        keys = 3 * self.nodes + self.components
+        self._places = [
+            [np.flatnonzero(np.isin(keys, 3 * members + axis)) for axis in axes] for members, axes, _ in self._motions
+        ]
 
     @property
     def every_node(self) -> np.ndarray:
@@ -183,11 +187,11 @@ class Supports:
         return v, a
 
     def _at(self, time: float, span: float) -> np.ndarray:
-        for members, axes, motion in self._motions:
+        along_axes = np.zeros((3, len(self.nodes)))  # displacements, velocities, accelerations
+        for (_, axes, motion), places in zip(self._motions, self._places, strict=True):
             moved = motion.at(time, span)
-            for axis in axes:
-                self._moved[:, members, axis] = moved[:, axis, None]
-        along_axes = self._moved[:, self.nodes, self.components]
+            for axis, of_axis in zip(axes, places, strict=True):
+                along_axes[:, of_axis] = moved[:, axis, None]
         if self.inclined is None:
             return along_axes
         return np.concatenate([along_axes, self.inclined.displacements(time, span)], axis=1)

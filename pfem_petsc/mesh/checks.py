@@ -21,6 +21,8 @@ LARGE = 1e150
 
 _SHOWN = 5
 
+_PIECE = 1 << 18  # number of bars that are checked at a time, to keep temporary arrays small
+
 _NO_LINES = (
     "; where there are physical groups, Gmsh saves nothing else: put the lines into one "
     '(Physical Curve("bars") = {:}), or save all (Mesh.SaveAll = 1)'
@@ -52,16 +54,33 @@ def check_mesh(slab: MeshSlab, comm: MPI.Comm) -> list[str]:
         raise InputError(f"{slab.source}: {slab.n_nodes} nodes and {slab.n_bars} bars: nothing to simulate{hint}")
     _check_points(slab, comm)
     _check_ends(slab, comm)
-    # Each end of a bar is sent to the rank whose slab contains it, which then knows all nodes in use.
-    ends, place = np.unique(slab.bars, return_inverse=True)
-    asking = Router(comm, slab_of(ends, slab.n_nodes, comm.size))
-    asked = asking.send(ends) - slab.first_node
-    _check_bare_nodes(slab, comm, asked)
-    points = asking.reply(slab.points[asked])
-    warnings = warnings + _check_lengths(slab, comm, points, place.reshape(-1, 2))
-    del points, place, asking, asked, ends
+    used, length = _lengths(slab, comm)
+    _check_bare_nodes(slab, comm, used)
+    warnings = warnings + _check_lengths(slab, comm, length)
+    del used, length
     _check_duplicates(slab, comm)
     return warnings
+
+
+def _lengths(slab: MeshSlab, comm: MPI.Comm) -> tuple[np.ndarray, np.ndarray]:
+    """Return which nodes of the slab bars end at, (nodes here,) bool, and the lengths [m] of its bars, in pieces.
+    Collective."""
+    used, length = np.zeros(len(slab.points), bool), np.empty(len(slab.bars))
+    # all ranks take as many pieces as the one with most bars
+    for start in range(0, -(-slab.n_bars // comm.size), _PIECE):
+        bars = slab.bars[start : start + _PIECE]
+        # Each end of a bar is sent to the rank whose slab contains it, which then knows all nodes in use.
+        ends, place = np.unique(bars, return_inverse=True)
+        asking = Router(comm, slab_of(ends, slab.n_nodes, comm.size))
+        asked = asking.send(ends) - slab.first_node
+        used[asked] = True
+        points = asking.reply(slab.points[asked])
+        place = place.reshape(-1, 2)
+        with np.errstate(over="ignore"):
+            across = points[place[:, 1]]
+            across -= points[place[:, 0]]
+            length[start : start + _PIECE] = np.sqrt(np.einsum("ij,ij->i", across, across))
+    return used, length
 
 
 def _check_points(slab: MeshSlab, comm: MPI.Comm) -> None:
@@ -81,9 +100,7 @@ def _check_ends(slab: MeshSlab, comm: MPI.Comm) -> None:
 
 
 def _check_bare_nodes(slab: MeshSlab, comm: MPI.Comm, used: np.ndarray) -> None:
-    bare = np.ones(len(slab.points), bool)
-    bare[used] = False
-    bad = np.flatnonzero(bare)
+    bad = np.flatnonzero(~used)
     lines = [f"node {slab.first_node + i}" for i in bad[:_SHOWN]]
     remedy = "remove them: a node without bars has neither mass nor stiffness" + _way(slab)
     if slab.source.endswith(".msh"):
@@ -94,11 +111,7 @@ def _check_bare_nodes(slab: MeshSlab, comm: MPI.Comm, used: np.ndarray) -> None:
     _refuse(slab, comm, lines, len(bad), "nodes belong to no bar", remedy)
 
 
-def _check_lengths(slab: MeshSlab, comm: MPI.Comm, points: np.ndarray, ends: np.ndarray) -> list[str]:
-    with np.errstate(over="ignore"):
-        length = points[ends[:, 1]]
-        length -= points[ends[:, 0]]
-        length = np.sqrt(np.einsum("ij,ij->i", length, length))
+def _check_lengths(slab: MeshSlab, comm: MPI.Comm, length: np.ndarray) -> list[str]:
     bad = np.flatnonzero(~((length > 0.0) & (length < np.inf)))
     lines = [f"{_bar(slab, i)}, length {length[i]:g}" for i in bad[:_SHOWN]]
     remedy = "merge the nodes at its ends, or correct their positions" + _way(slab)
@@ -112,6 +125,11 @@ def _check_lengths(slab: MeshSlab, comm: MPI.Comm, points: np.ndarray, ends: np.
 
 def _check_duplicates(slab: MeshSlab, comm: MPI.Comm) -> None:
     """Refuse bars between the same two nodes: the rank whose slab has the lower end sorts them next to each other."""
+    key = _pairs_of_ends(slab, comm)
+    key.sort()
+    if not comm.allreduce(int((key[1:] == key[:-1]).any())):
+        return
+    # the bars are named by sending all of them once more, with their numbers
     key = slab.bars.min(axis=1).astype(np.int64)
     router = Router(comm, slab_of(key, slab.n_nodes, comm.size))
     key *= slab.n_nodes
@@ -127,6 +145,23 @@ def _check_duplicates(slab: MeshSlab, comm: MPI.Comm) -> None:
         lines.append(f"bars {one} and {other} (nodes {ends // slab.n_nodes} and {ends % slab.n_nodes})")
     what = "bars join the same two nodes as another bar"
     _refuse(slab, comm, lines, len(again), what, "keep one of each, with the sum of the areas" + _way(slab))
+
+
+def _pairs_of_ends(slab: MeshSlab, comm: MPI.Comm) -> np.ndarray:
+    """Return a number for the two ends of each bar whose lower end is in this rank's slab of nodes. Collective."""
+    arriving = np.zeros(comm.size, np.int64)
+    for start in range(0, len(slab.bars), _PIECE):
+        lower = slab.bars[start : start + _PIECE].min(axis=1)
+        arriving += np.bincount(slab_of(lower, slab.n_nodes, comm.size), minlength=comm.size)
+    comm.Allreduce(MPI.IN_PLACE, arriving)
+    keys, at = np.empty(arriving[comm.rank], np.int64), 0
+    for start in range(0, -(-slab.n_bars // comm.size), _PIECE):
+        bars = slab.bars[start : start + _PIECE].astype(np.int64)
+        lower = bars.min(axis=1)
+        piece = Router(comm, slab_of(lower, slab.n_nodes, comm.size)).send(lower * slab.n_nodes + bars.max(axis=1))
+        keys[at : at + len(piece)] = piece
+        at += len(piece)
+    return keys
 
 
 def _way(slab: MeshSlab) -> str:

@@ -16,6 +16,8 @@ from .slab import MeshSlab, index_type, slab_of
 
 __all__ = ["Block", "DistributedMesh", "distribute"]
 
+_PIECE = 1 << 18  # number of bars whose ends are looked up at a time, to keep temporary arrays small
+
 
 @dataclass(frozen=True)
 class Block:
@@ -117,7 +119,9 @@ class DistributedMesh:
         self._exchange.close()
 
 
-def distribute(slab: MeshSlab, bar_section: np.ndarray, comm: MPI.Comm, partitioner: str = "auto") -> DistributedMesh:
+def distribute(
+    slab: MeshSlab, bar_section: np.ndarray, comm: MPI.Comm, partitioner: str = "auto", keep: bool = True
+) -> DistributedMesh:
     """Distribute a mesh over the ranks. Collective; no rank ever has the whole mesh.
 
     Parameters
@@ -129,6 +133,8 @@ def distribute(slab: MeshSlab, bar_section: np.ndarray, comm: MPI.Comm, partitio
     comm : MPI.Comm
     partitioner : str
         ``"auto"``, ``"ptscotch"`` or ``"coordinates"``; see :func:`~pfem_petsc.mesh.partition.partition`.
+    keep : bool
+        False: the slab loses its points and bars on the way, which saves memory.
 
     Returns
     -------
@@ -141,14 +147,14 @@ def distribute(slab: MeshSlab, bar_section: np.ndarray, comm: MPI.Comm, partitio
     bar_section = np.asarray(bar_section, dtype=np.int32)
     if comm.size == 1:
         mesh.partitioner = partition(slab, comm, partitioner)[1]
-        _alone(mesh, slab, bar_section)
+        _alone(mesh, slab, bar_section, keep)
     else:
         owners, mesh.partitioner = partition(slab, comm, partitioner)
-        _among_ranks(mesh, slab, bar_section, owners)
+        _among_ranks(mesh, slab, bar_section, owners, keep)
     return mesh
 
 
-def _alone(mesh: DistributedMesh, slab: MeshSlab, section: np.ndarray) -> None:
+def _alone(mesh: DistributedMesh, slab: MeshSlab, section: np.ndarray, keep: bool) -> None:
     """Reorder nodes and bars on one rank, with few temporary arrays of the size of the mesh."""
     order = node_order(sweep_keys(slab.points))
     place = np.empty(len(order), np.int32)
@@ -158,18 +164,26 @@ def _alone(mesh: DistributedMesh, slab: MeshSlab, section: np.ndarray) -> None:
     mesh.node_ids = order.astype(np.int64, copy=False)
     mesh.ghost_numbers = np.empty(0, np.int64)
     mesh.points = slab.points[order]
+    if not keep:
+        slab.points = slab.points[:0].copy()
     mesh._exchange = GhostExchange(mesh.comm, np.array([0, slab.n_nodes]), mesh.ghost_numbers)
     mesh.node_groups = {name: np.sort(place[members]) for name, members in slab.node_groups.items()}
     groups = {name: _membership(members, len(slab.bars)) for name, members in slab.bar_groups.items()}
-    _arrange_bars(mesh, place[slab.bars], None, section, groups, slab.bar_fields)
+    ends = place[slab.bars]
+    if not keep:
+        slab.bars = slab.bars[:0].copy()
+    del place
+    _arrange_bars(mesh, ends, None, section, groups, slab.bar_fields)
 
 
-def _among_ranks(mesh: DistributedMesh, slab: MeshSlab, section: np.ndarray, owners: np.ndarray) -> None:
+def _among_ranks(mesh: DistributedMesh, slab: MeshSlab, section: np.ndarray, owners: np.ndarray, keep: bool) -> None:
     """Distribute over several ranks: number nodes on their owners, then send bars to the owners of their ends."""
     comm = mesh.comm
     to_owner = Router(comm, owners)
-    ids = to_owner.send(np.arange(slab.first_node, slab.first_node + len(slab.points)))
+    ids = to_owner.send(np.arange(slab.first_node, slab.first_node + len(owners)))
     points = to_owner.send(slab.points)
+    if not keep:
+        slab.points = slab.points[:0].copy()
     order = node_order(sweep_keys(points), ids)
     n_owned = len(ids)
     starts = np.concatenate([[0], np.cumsum(comm.allgather(n_owned))]).astype(np.int64)
@@ -177,8 +191,11 @@ def _among_ranks(mesh: DistributedMesh, slab: MeshSlab, section: np.ndarray, own
     numbers[order] = np.arange(starts[comm.rank], starts[comm.rank + 1])
     # The directory has the PETSc numbers (and with `starts` the owners) of the slab's nodes on the rank of the slab.
     directory = to_owner.reply(numbers)
+    del to_owner, numbers
 
     bars, bar_ids, section, groups, fields = _fetch_bars(slab, section, directory, starts, comm)
+    if not keep:
+        slab.bars = slab.bars[:0].copy()
 
     first, last = starts[comm.rank], starts[comm.rank + 1]
     elsewhere = bars[(bars < first) | (bars >= last)]
@@ -212,12 +229,13 @@ def _fetch_bars(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Return ends (PETSc numbers), mesh numbers, sections, group memberships and fields of bars connected to owned
     nodes."""
-    wanted, place = np.unique(slab.bars, return_inverse=True)
-    asking = Router(comm, slab_of(wanted, slab.n_nodes, comm.size))
-    asked = asking.send(wanted.astype(np.int64)) - slab.first_node
-    numbers = asking.reply(directory[asked]).astype(index_type(slab.n_nodes))
-    numbers = numbers[place.reshape(-1, 2)]
-    del wanted, place, asking, asked
+    numbers = np.empty(slab.bars.shape, index_type(slab.n_nodes))
+    # all ranks take as many pieces as the one with most bars
+    for start in range(0, -(-slab.n_bars // comm.size), _PIECE):
+        wanted, place = np.unique(slab.bars[start : start + _PIECE], return_inverse=True)
+        asking = Router(comm, slab_of(wanted, slab.n_nodes, comm.size))
+        asked = asking.send(wanted.astype(np.int64)) - slab.first_node
+        numbers[start : start + _PIECE] = asking.reply(directory[asked])[place.reshape(-1, 2)]
 
     owner = _owner(numbers, starts)
     both = np.flatnonzero(owner[:, 0] != owner[:, 1])
@@ -248,7 +266,7 @@ def _arrange_bars(
     del borrowed
     order = bar_order(ends, kind, mesh.n_local)
     mesh.bars = ends[order]
-    mesh.bar_ids = order if bar_ids is None else bar_ids[order]
+    mesh.bar_ids = (order if bar_ids is None else bar_ids[order]).astype(index_type(mesh.n_bars), copy=False)
     mesh.bar_groups = {name: np.flatnonzero(mask[order]).astype(np.int32) for name, mask in groups.items()}
     mesh.bar_fields = {name: values[order] for name, values in fields.items()}
     counts = np.bincount(kind) if kind is not None else np.array([len(ends)])

@@ -22,6 +22,8 @@ _OF_NODE = 4  # work of a node in an explicit step, where that of a bar is 2
 # Candidate positions tested at once for each border between two ranks.
 _CANDIDATES = 256
 
+_PIECE = 1 << 18  # number of bars whose ends are sent at a time, to keep temporary arrays small
+
 
 def partition(slab: MeshSlab, comm: MPI.Comm, partitioner: str = "auto") -> tuple[np.ndarray, str]:
     """Compute the owner of every node of this rank's slab. Collective.
@@ -67,9 +69,13 @@ def bounding_cube(points: np.ndarray, comm: MPI.Comm) -> tuple[np.ndarray, float
 
 def _works(slab: MeshSlab, comm: MPI.Comm) -> np.ndarray:
     """Return the work of a step for each node of the slab (int64), in halves of that for a bar. Collective."""
-    ends = slab.bars.reshape(-1).astype(np.int64)
-    ends = Router(comm, slab_of(ends, slab.n_nodes, comm.size)).send(ends)
-    return _OF_NODE + np.bincount(ends - slab.first_node, minlength=len(slab.points))
+    works = np.full(len(slab.points), _OF_NODE, np.int64)
+    # all ranks take as many pieces as the one with most bars
+    for start in range(0, -(-slab.n_bars // comm.size), _PIECE):
+        ends = slab.bars[start : start + _PIECE].reshape(-1)
+        ends = Router(comm, slab_of(ends, slab.n_nodes, comm.size)).send(ends)
+        works += np.bincount(ends - slab.first_node, minlength=len(slab.points))
+    return works
 
 
 def _is_even(owners: np.ndarray, slab: MeshSlab, comm: MPI.Comm) -> bool:
@@ -132,11 +138,20 @@ def _adjacency(slab: MeshSlab, comm: MPI.Comm) -> tuple[np.ndarray, np.ndarray]:
     """Return the neighbours of every node of the slab, ascending and unique, as row starts and columns."""
     from petsc4py import PETSc
 
-    ends = np.concatenate([slab.bars, slab.bars[:, ::-1]]).astype(np.int64)
-    router = Router(comm, slab_of(ends[:, 0], slab.n_nodes, comm.size))
-    ends = router.send(ends)
-    pairs = np.unique((ends[:, 0] - slab.first_node) * slab.n_nodes + ends[:, 1])
+    parts = []
+    # all ranks take as many pieces as the one with most bars
+    for start in range(0, -(-slab.n_bars // comm.size), _PIECE):
+        bars = slab.bars[start : start + _PIECE]
+        ends = np.concatenate([bars, bars[:, ::-1]]).astype(np.int64)
+        ends = Router(comm, slab_of(ends[:, 0], slab.n_nodes, comm.size)).send(ends)
+        parts.append((ends[:, 0] - slab.first_node) * slab.n_nodes + ends[:, 1])
+    pairs = np.concatenate([np.empty(0, np.int64), *parts])
+    del parts
+    pairs.sort()
+    if len(pairs):
+        pairs = pairs[np.append(True, pairs[1:] != pairs[:-1])]
     node, neighbour = np.divmod(pairs, slab.n_nodes)
+    del pairs
     rows = np.zeros(len(slab.points) + 1, PETSc.IntType)
     rows[1:] = np.cumsum(np.bincount(node, minlength=len(slab.points)))
     return rows, neighbour.astype(PETSc.IntType)

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 __all__ = ["write_connectivity"]
 
-_PIECE = 2**20  # number of bars whose connectivity is written at once on one rank
+_PIECE = 2**18  # number of bars whose connectivity is written at once on one rank
 
 
 def write_connectivity(file: h5py.File, comm: MPI.Comm, path: Path, mesh: DistributedMesh) -> None:

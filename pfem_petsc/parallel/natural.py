@@ -59,7 +59,7 @@ class NaturalOrder:
         self._owned_rows = np.full(self.n_global, -1, dtype=kind)
         self._owned_rows[ids] = np.arange(self.n_owned, dtype=kind)
         once = self.n_owned == self.n_global and (not self.n_global or int(self._owned_rows.min()) >= 0)
-        self._identity = once and bool((np.diff(self._owned_rows) == 1).all())
+        self._identity = once and bool((ids[:-1] < ids[1:]).all())
         return once
 
     def _order_among_ranks(self, ids: np.ndarray, share: int, rest: int) -> bool:

@@ -123,7 +123,7 @@ class Model:
         with agreed(comm):
             sections = section_of_bars(case, slab)
             check_areas(case, slab, sections)
-        mesh = distribute(slab, sections, comm)
+        mesh = distribute(slab, sections, comm, keep=connected(case))
         if connected(case):
             slab, sections = add_connectors(case, resolve_node_sets(case, mesh), mesh, slab, sections)
             bars = mesh.n_bars

@@ -44,6 +44,9 @@ class Ruptures:
 
     def begin(self) -> None:
         """Take the bars that are broken now as known, after their state was restored."""
+        self.count = self.told = 0
+        if not self._bars.can_break:
+            return
         self._known = self._bars.rupture() > 0.0
         self._counted = np.zeros(len(self._known), dtype=bool)
         self._counted[self._mesh.counted] = True

@@ -12,7 +12,7 @@ from mpi4py import MPI
 
 from pfem_petsc.errors import InputError
 from pfem_petsc.mesh.checks import check_mesh
-from pfem_petsc.mesh.readers import hdf5, read_slab
+from pfem_petsc.mesh.readers import read_slab
 
 ALONE = MPI.COMM_SELF
 TEXT = {version: GMSH[f"{version} ascii"].decode() for version in ("2.2", "4.1")}
@@ -220,28 +220,6 @@ def mutate_and_read(path, content, changes, cut):
     else:
         assert len(slab.points) == slab.n_nodes
         assert len(slab.bars) == slab.n_bars
-
-
-def test_read_only_the_own_slab_of_hdf5(tmp_path):
-    """The reader asks the file for its own rows alone."""
-    path = tmp_path / "truss.h5"
-    write_hdf5(path)
-
-    class Third:
-        """A communicator's face of rank 1 of 3, for a reader that needs no messages after the file's description."""
-
-        rank, size = 1, 3
-
-        def bcast(self, value, root=0):
-            return value if value is not None else hdf5._describe(path)
-
-        def allreduce(self, value, op=None):
-            return self.size
-
-    slab = hdf5.read_on(path, Third())
-    np.testing.assert_array_equal(slab.points, POINTS[2:3])
-    np.testing.assert_array_equal(slab.bars, BARS[2:4])
-    assert slab.bar_groups["legs"].tolist() == [3]
 
 
 @pytest.mark.parametrize("name", ["mesh.inp", "parts.inp", "mesh.3mf", "mesh_bars.csv", "mesh_nodes.csv", "mesh.stl"])

@@ -14,7 +14,7 @@ import numpy as np
 __all__ = ["CellByCell", "ItemByItem", "Numbering", "Places"]
 
 # Number of nodes or bars generated at a time, to keep temporary arrays small.
-_PIECE = 1 << 19
+_PIECE = 1 << 17
 
 
 class Places(NamedTuple):

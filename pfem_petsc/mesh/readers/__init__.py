@@ -2,7 +2,8 @@
 
 Each module of this folder reads one format. It has ``SUFFIXES``, the suffixes of its files in small letters, and
 ``read(path, fields) -> WholeMesh``, which rank 0 calls: the mesh with those of the named bar fields that the file has
-(None: all). A format that all ranks read together has ``read_on(path, comm, fields) -> MeshSlab`` as well.
+(None: all). A format that all ranks read together has ``read_on(path, comm, fields) -> MeshSlab | None`` as well; None
+for files that it leaves to ``read``.
 """
 
 from __future__ import annotations
@@ -64,8 +65,9 @@ def read_slab(path: Path, comm: MPI.Comm, fields: Mapping[str, str] | None = Non
 
     reader = lookup(__name__, on_root(comm, _reader_name, path), "")
     wanted = fields or {}
-    if hasattr(reader, "read_on"):
-        return reader.read_on(path, comm, wanted)
+    slab = reader.read_on(path, comm, wanted) if hasattr(reader, "read_on") else None
+    if slab is not None:
+        return slab
 
     def read(path: Path) -> WholeMesh:
         from ...errors import InputError

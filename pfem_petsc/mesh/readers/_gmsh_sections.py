@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 
 from ...errors import InputError
 from ._text import numbers_of
 
-__all__ = ["Format", "Numbers", "sections"]
+__all__ = ["Format", "Numbers", "find_sections", "sections"]
 
 
 class Format:
@@ -167,6 +168,35 @@ def sections(path: Path, content: bytes) -> dict[str, list[bytes]]:
         found.setdefault(name.decode(), []).append(content[newline + 1 : end])
         at = end + 4 + len(name)
     return found
+
+
+def find_sections(path: Path, file: IO[bytes]) -> dict[str, list[tuple[int, int]]]:
+    """Return where in a file the payloads of its sections begin and end, by name, without reading it whole."""
+    found: dict[str, list[tuple[int, int]]] = {}
+    at = 0
+    while (at := _find(file, b"$", at)) >= 0:
+        file.seek(at + 1)
+        line = file.readline(200)
+        name = line.strip()
+        end = _find(file, b"$End" + name, at + 1 + len(line)) if name.isalnum() and line.endswith(b"\n") else -1
+        if end < 0:
+            raise InputError(f"{path}: section {_shown(name)!r} has no end")
+        found.setdefault(name.decode(), []).append((at + 1 + len(line), end))
+        at = end + 4 + len(name)
+    return found
+
+
+def _find(file: IO[bytes], text: bytes, at: int) -> int:
+    """Return the first place of a text in a file from ``at`` on, -1 if there is none."""
+    file.seek(at)
+    rest = b""
+    while block := file.read(1 << 20):
+        place = (rest + block).find(text)
+        if place >= 0:
+            return at - len(rest) + place
+        at += len(block)
+        rest = (rest + block)[-(len(text) - 1) :] if len(text) > 1 else b""
+    return -1
 
 
 def _parse(where: str, text: bytes) -> np.ndarray:

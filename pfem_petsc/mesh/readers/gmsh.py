@@ -8,17 +8,25 @@ surfaces and volumes are ignored with a warning. Nodes are numbered from 0 in fi
 from __future__ import annotations
 
 import codecs
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ...errors import InputError
 from ..whole import WholeMesh
 from ._gmsh_lines import element_data, in_order, once
+from ._gmsh_parts import parse
 from ._gmsh_sections import Format, Numbers, sections
+from ._gmsh_slab import assemble
 
-__all__ = ["ORDERED", "SUFFIXES", "read"]
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
+    from ..slab import MeshSlab
+
+__all__ = ["ORDERED", "SUFFIXES", "read", "read_on"]
 
 SUFFIXES = (".msh",)
 
@@ -79,6 +87,22 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     for payload in parts.get("ElementData", []):
         element_data(path, payload, layout, bar_tags, mesh)
     return mesh
+
+
+def read_on(path: Path, comm: MPI.Comm, fields: Mapping[str, str]) -> MeshSlab | None:
+    """Return this rank's slab of a file of version 4.1 without data of elements, which rank 0 parses in pieces; None on
+    all ranks for files that are read whole, and for those with something wrong. Collective."""
+    if fields:
+        return None
+    found = parse(path, comm, _LINE, _POINT, _nodes_of)
+    if found is None:
+        return None
+    parsed, texts = found
+    try:
+        names = _physical_names(path, texts.get("PhysicalNames", b"0"))
+    except InputError:
+        return None  # the same on all ranks
+    return assemble(parsed, comm, names, ORDERED in texts.get("Comments", b""), str(path))
 
 
 def _physical_names(path: Path, payload: bytes) -> dict[tuple[int, int], str]:

@@ -6,7 +6,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
 from math import prod
 from pathlib import Path
 from typing import Any
@@ -19,13 +20,11 @@ from ...parallel.agreement import agreed, on_root
 from ..slab import MeshSlab, check_size, slab_range
 from ..whole import WholeMesh
 from . import missing_field
+from ._shares import damaged, read_ends, route_members, share_of
 
 __all__ = ["SUFFIXES", "read", "read_on", "write_hdf5"]
 
 SUFFIXES = (".h5",)
-
-# Number of group members read or written at a time.
-_PIECE = 1 << 20
 
 # HDF5 filters compress real meshes by less than this; a dataset beyond it was never written.
 _COMPRESSION = 1100
@@ -61,27 +60,38 @@ def read_on(path: Path, comm: MPI.Comm, fields: Mapping[str, str] | None = None)
     first_node, last_node = slab_range(n_nodes, comm.rank, comm.size)
     first_bar, last_bar = slab_range(n_bars, comm.rank, comm.size)
     # Every rank opens the file read-only: this needs no MPI driver, which a serial h5py lacks.
-    with agreed(comm), _opened(path) as file:
-        try:
-            return MeshSlab(
+    with agreed(comm):
+        file = _opened(path)
+    with file:
+        with agreed(comm), _told(path):
+            slab = MeshSlab(
                 n_nodes=n_nodes,
                 n_bars=n_bars,
                 first_node=first_node,
-                points=file["points"][first_node:last_node].astype(np.float64, copy=False),
+                points=share_of(file["points"], first_node, last_node),
                 first_bar=first_bar,
-                bars=file["bars"][first_bar:last_bar].astype(np.int64, copy=False),
-                node_groups=_groups(path, file, "node_groups", node_names, n_nodes, first_node, last_node),
-                bar_groups=_groups(path, file, "bar_groups", bar_names, n_bars, first_bar, last_bar),
-                bar_fields={
-                    name: file["bar_fields"][name][first_bar:last_bar].astype(np.float64, copy=False)
-                    for name in fields or {}
-                },
+                bars=read_ends(file["bars"], first_bar, last_bar, n_nodes),
+                bar_fields={name: share_of(file["bar_fields"][name], first_bar, last_bar) for name in fields or {}},
                 source=str(path),
             )
-        except MemoryError:
-            raise InputError(f"{path}: the mesh does not fit in memory; use more ranks") from None
-        except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
-            raise InputError(f"{path}: cannot be read ({error}); the file may be damaged: write it again") from None
+        for kind, names, n, groups in (
+            ("node_groups", node_names, n_nodes, slab.node_groups),
+            ("bar_groups", bar_names, n_bars, slab.bar_groups),
+        ):
+            for name in names:
+                groups[name] = route_members(file[kind][name], n, comm, path)
+    return slab
+
+
+@contextmanager
+def _told(path: Path) -> Iterator[None]:
+    """Context that raises what HDF5 and NumPy raise for a damaged file as an InputError."""
+    try:
+        yield
+    except MemoryError:
+        raise InputError(f"{path}: the mesh does not fit in memory; use more ranks") from None
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
+        raise InputError(damaged(path, error)) from None
 
 
 def write_hdf5(path: Path, slab: MeshSlab, comm: MPI.Comm) -> None:
@@ -176,18 +186,3 @@ def _names(path: Path, file: Any, kind: str) -> list[str]:
         if not isinstance(dataset, h5py.Dataset) or dataset.ndim != 1 or dataset.dtype.kind not in "iu":
             raise InputError(f"{path}: /{kind}/{name} is not a list of integers")
     return names
-
-
-def _groups(path: Path, file: Any, kind: str, names: list[str], n: int, first: int, last: int) -> dict[str, np.ndarray]:
-    groups = {}
-    for name in names:
-        dataset = file[kind][name]
-        found = [np.empty(0, np.int64)]
-        for start in range(0, len(dataset), _PIECE):
-            members = dataset[start : start + _PIECE].astype(np.int64)
-            wrong = members[(members < 0) | (members >= n)]
-            if len(wrong):
-                raise InputError(f"{path}: /{kind}/{name} has member {wrong[0]}, but numbers go from 0 to {n - 1}")
-            found.append(members[(members >= first) & (members < last)])
-        groups[name] = np.unique(np.concatenate(found))
-    return groups

@@ -14,16 +14,22 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ...errors import InputError
 from ..whole import WholeMesh
-from . import _vtk_extract
+from . import _vtk_extract, _vtkhdf
 
-__all__ = ["SUFFIXES", "read"]
+if TYPE_CHECKING:
+    from mpi4py import MPI
+
+    from ..slab import MeshSlab
+
+__all__ = ["SUFFIXES", "read", "read_on"]
 
 SUFFIXES = (".vtu", ".vtkhdf")
 
@@ -63,3 +69,8 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
                     getattr(mesh, kind)[name] = arrays[key]
             mesh.known_fields = arrays["cell_fields"].tolist()
     return mesh
+
+
+def read_on(path: Path, comm: MPI.Comm, fields: Mapping[str, str]) -> MeshSlab | None:
+    """Return this rank's slab of a .vtkhdf file of lines alone; None for files that VTK has to read. Collective."""
+    return _vtkhdf.read_on(path, comm, fields) if path.suffix.lower() == ".vtkhdf" else None

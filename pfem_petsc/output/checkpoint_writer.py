@@ -17,7 +17,17 @@ from mpi4py import MPI
 from ..errors import InputError, SimulationFailure
 from ..parallel.natural import NaturalOrder
 from .disk import fsync_all, require_room
-from .hdf5 import create_new, open_shared, release, require_parallel_hdf5, set_text, write_rows, writing
+from .hdf5 import (
+    create_new,
+    first_of_machine,
+    open_shared,
+    release,
+    require_parallel_hdf5,
+    set_text,
+    write_rows,
+    writes_together,
+    writing,
+)
 from .integrity import checksum, seal, seal_size
 
 __all__ = ["write_checkpoint"]
@@ -64,12 +74,13 @@ def write_checkpoint(
     except InputError as error:
         raise SimulationFailure(f"{path}: no checkpoint could be written: {error}") from error
 
+    together = writes_together(comm)
     with writing(comm, temporary):
         file = open_shared(temporary, comm)
     try:
         for name, slab in slabs.items():
             with writing(comm, temporary):
-                write_rows(file["arrays"][name], arrays[name][0].first, slab, collective=comm.size > 1)
+                write_rows(file["arrays"][name], arrays[name][0].first, slab, collective=together)
         with writing(comm, temporary):
             file.flush()
     except SimulationFailure:
@@ -82,8 +93,10 @@ def write_checkpoint(
     with writing(comm, temporary):
         if comm.rank == 0:
             seal(temporary)
+    first = first_of_machine(comm)
     with writing(comm, temporary):
-        fsync_all(temporary)
+        if first:  # a machine has one cache of the file
+            fsync_all(temporary)
     with writing(comm, path):
         if comm.rank == 0:
             _put_in_place(temporary, path)

@@ -10,7 +10,7 @@ import numpy as np
 from mpi4py import MPI
 
 from .digests import CHECKS, mesh_digest
-from .hdf5 import write_rows, writing
+from .hdf5 import write_rows, writes_together, writing
 from .integrity import word_sum
 
 if TYPE_CHECKING:
@@ -27,13 +27,13 @@ def write_connectivity(file: h5py.File, comm: MPI.Comm, path: Path, mesh: Distri
     Bars that are evaluated on two ranks are written by the rank that counts them.
     """
     vtk, order = file["VTKHDF"], mesh.bar_order
-    first, count, together = order.first, order.count, comm.size > 1
+    first, count, together = order.first, order.count, writes_together(comm)
     # one rank may have all bars: pieces keep the working arrays small
-    piece = count if together else min(count, _PIECE)
+    piece = count if comm.size > 1 else min(count, _PIECE)
     total = 0
     for start in range(0, max(count, 1), max(piece, 1)):
         stop = min(start + piece, count)
-        if together:
+        if comm.size > 1:
             ends = order.to_slab(mesh.node_ids[mesh.bars[mesh.counted]].astype(np.int64).reshape(-1, 2))
         else:
             ends = mesh.node_ids[mesh.bars[order.owned_rows(start, stop)]].astype(np.int64)

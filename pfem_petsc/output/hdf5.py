@@ -24,6 +24,7 @@ __all__ = [
     "create_new",
     "dataset_names",
     "first_line",
+    "first_of_machine",
     "grow",
     "open_shared",
     "release",
@@ -31,6 +32,7 @@ __all__ = [
     "set_text",
     "set_unit",
     "write_rows",
+    "writes_together",
     "writing",
 ]
 
@@ -105,10 +107,11 @@ def create_new(
             ) from error
 
     on_root(comm, create)
+    first = first_of_machine(comm)
     with agreed(comm):
         # A network file system may show a new file on other machines with a delay.
         deadline = time.monotonic() + 5.0
-        while not temporary.exists():
+        while first and not temporary.exists():
             if time.monotonic() > deadline:
                 raise InputError(
                     f"{path}: made by rank 0, but rank {comm.rank} on {MPI.Get_processor_name()} does not see it: "
@@ -179,6 +182,25 @@ def dataset_names(group: h5py.Group) -> list[str]:
     names: list[str] = []
     group.visititems(lambda name, item: names.append(name) if isinstance(item, h5py.Dataset) else None)
     return names
+
+
+def first_of_machine(comm: MPI.Comm) -> bool:
+    """Return whether this rank is the first one of those on its machine. Collective."""
+    if comm.size == 1:
+        return True
+    machine = comm.Split_type(MPI.COMM_TYPE_SHARED)
+    first = machine.rank == 0
+    machine.Free()
+    return first
+
+
+def writes_together(comm: MPI.Comm) -> bool:
+    """Return whether ranks write arrays by collective transfers: on several machines. Collective.
+
+    These pass all data to one rank of each machine, which writes them: on a single machine it takes four times as long
+    as each rank's writing of its own rows.
+    """
+    return comm.allreduce(int(first_of_machine(comm))) > 1
 
 
 def write_rows(dataset: h5py.Dataset, first: int, rows: np.ndarray | None, collective: bool = False) -> None:

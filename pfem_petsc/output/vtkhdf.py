@@ -24,6 +24,7 @@ from .hdf5 import (
     release,
     require_parallel_hdf5,
     write_rows,
+    writes_together,
     writing,
 )
 from .history import RowTables
@@ -107,6 +108,7 @@ class ResultWriter:
         self.path, self.comm = Path(path), comm
         self.n_nodes, self.n_bars = int(mesh.n_nodes), int(mesh.n_bars)
         self._precision = np.dtype(precision)
+        self._together = writes_together(comm)
         # Bars evaluated on two ranks are written by the rank that counts them.
         self.counted = mesh.counted
         self.node_order = mesh.node_order
@@ -191,7 +193,7 @@ class ResultWriter:
                     grow(self._data[name], (n + 1) * order.n_global)
                 with writing(self.comm, self.path):
                     first = n * order.n_global + order.first
-                    write_rows(self._data[name], first, slab, collective=self.comm.size > 1)
+                    write_rows(self._data[name], first, slab, collective=self._together)
             self._index.append(n, step, time, digests)
             self._rows.write()
             with writing(self.comm, self.path):

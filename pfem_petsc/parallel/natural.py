@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from mpi4py import MPI
 
 __all__ = ["NaturalOrder"]
+
+_TAG = 7300
 
 
 class NaturalOrder:
     """Moves arrays between the rows that a rank owns (any order) and its slab of the mesh numbering.
 
     Rank r of p has the r-th contiguous range of the n rows; the first n mod p ranks have one more row (as in PETSc).
-    Everything that does not depend on the values is computed once. A transfer is then one ``Alltoallv``, and on one
-    rank a permutation, or nothing if the numberings are equal.
+    Everything that does not depend on the values is computed once. A transfer is then one message between each two
+    ranks that share rows, while rows that stay on a rank are copied; on one rank it is a permutation, or nothing if the
+    numberings are equal.
 
     Parameters
     ----------
@@ -66,17 +71,17 @@ class NaturalOrder:
         comm = self.comm
         ids = np.ascontiguousarray(ids, dtype=np.int64)
         # Sorted by number, rows are also sorted by the rank of their slab.
-        self._owned_rows = np.argsort(ids, kind="stable")
+        rows = np.argsort(ids, kind="stable")
         bounds = np.array([r * share + min(r, rest) for r in range(comm.size + 1)])
-        self._owned_counts = np.diff(np.searchsorted(ids[self._owned_rows], bounds))
-        self._slab_counts = np.empty_like(self._owned_counts)
-        comm.Alltoall(self._owned_counts, self._slab_counts)
-        self._owned_starts = np.cumsum(self._owned_counts) - self._owned_counts
-        self._slab_starts = np.cumsum(self._slab_counts) - self._slab_counts
-        self._slab_rows = self._exchange(ids[self._owned_rows], to_slab=True) - self.first
-        return len(self._slab_rows) == self.count and bool(
-            (np.bincount(self._slab_rows, minlength=self.count) == 1).all()
-        )
+        leaving = np.diff(np.searchsorted(ids[rows], bounds))
+        arriving = np.empty_like(leaving)
+        comm.Alltoall(leaving, arriving)
+        self._owned = dict(_parts(rows, leaving))
+        # until it is known where rows go to in the slab, they are put in the order of ranks
+        self._slab = dict(_parts(np.arange(arriving.sum(), dtype=rows.dtype), arriving))
+        places = self._move(ids, int(arriving.sum()), self._owned, self._slab) - self.first
+        self._slab = {rank: places[at].astype(rows.dtype) for rank, at in self._slab.items()}
+        return len(places) == self.count and bool((np.bincount(places, minlength=self.count) == 1).all())
 
     def owned_rows(self, first: int, last: int) -> np.ndarray:
         """Return the rows of the numbers first to last - 1; on one rank only."""
@@ -92,36 +97,50 @@ class NaturalOrder:
             return array
         if self.alone:
             return array[self._owned_rows]
-        received = self._exchange(array[self._owned_rows], to_slab=True)
-        slab = np.empty_like(received)
-        slab[self._slab_rows] = received
-        return slab
+        return self._move(array, self.count, self._owned, self._slab)
 
     def from_slab(self, slab: np.ndarray) -> np.ndarray:
         """Move this rank's slab (count, ...) to owned rows (n_owned, ...); inverse of :meth:`to_slab`. Collective."""
         self._check(slab, self.count)
         if self._identity:
             return slab
-        received = slab if self.alone else self._exchange(slab[self._slab_rows], to_slab=False)
-        array = np.empty_like(received)
-        array[self._owned_rows] = received
-        return array
+        if self.alone:
+            array = np.empty_like(slab)
+            array[self._owned_rows] = slab
+            return array
+        return self._move(slab, self.n_owned, self._slab, self._owned)
 
-    def _exchange(self, rows: np.ndarray, to_slab: bool) -> np.ndarray:
-        rows = np.ascontiguousarray(rows)
-        owned, slab = (self._owned_counts, self._owned_starts), (self._slab_counts, self._slab_starts)
-        sending, receiving = (owned, slab) if to_slab else (slab, owned)
-        received = np.empty((int(receiving[0].sum()), *rows.shape[1:]), dtype=rows.dtype)
+    def _move(
+        self, array: np.ndarray, n_rows: int, leaving: dict[int, np.ndarray], arriving: dict[int, np.ndarray]
+    ) -> np.ndarray:
+        """Return an array of ``n_rows`` rows made of the rows of ``array`` on all ranks; rows by rank."""
+        comm = self.comm
+        result = np.empty((n_rows, *array.shape[1:]), array.dtype)
         # Counts in rows instead of bytes stay within the 32-bit integers of MPI.
-        row = MPI.BYTE.Create_contiguous(rows.dtype.itemsize * int(np.prod(rows.shape[1:], dtype=np.int64)))
-        row.Commit()
+        row = MPI.BYTE.Create_contiguous(array.dtype.itemsize * int(np.prod(array.shape[1:], dtype=np.int64))).Commit()
         try:
-            self.comm.Alltoallv([rows, sending, row], [received, receiving, row])
+            others = [(rank, at) for rank, at in arriving.items() if rank != comm.rank]
+            parts = {rank: np.empty((len(at), *array.shape[1:]), array.dtype) for rank, at in others}
+            requests = [comm.Irecv([part, len(part), row], rank, _TAG) for rank, part in parts.items()]
+            sent = [(rank, array.take(at, axis=0)) for rank, at in leaving.items() if rank != comm.rank]
+            requests += [comm.Isend([part, len(part), row], rank, _TAG) for rank, part in sent]
+            if comm.rank in leaving:
+                result[arriving[comm.rank]] = array.take(leaving[comm.rank], axis=0)
+            MPI.Request.Waitall(requests)
         finally:
             row.Free()
-        return received
+        for rank, part in parts.items():
+            result[arriving[rank]] = part
+        return result
 
     @staticmethod
     def _check(array: np.ndarray, n_rows: int) -> None:
         if len(array) != n_rows:
             raise ValueError(f"array has {len(array)} rows, expected {n_rows}")
+
+
+def _parts(rows: np.ndarray, counts: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
+    """Divide rows sorted by rank; only ranks with rows."""
+    ends = np.cumsum(counts)
+    for rank in np.flatnonzero(counts):
+        yield int(rank), rows[ends[rank] - counts[rank] : ends[rank]]

@@ -102,6 +102,10 @@ class DistributedMesh:
         """Fill the ghost rows of ``array`` (n_local, k) float64, C-contiguous, with the owners' values. Collective."""
         self._exchange.update(array)
 
+    def traffic(self, array: np.ndarray) -> tuple[int, int, int, int]:
+        """Return messages sent and received, and bytes sent and received, by :meth:`update_ghosts` of an array."""
+        return self._exchange.traffic(array.dtype.itemsize * array.size // max(len(array), 1))
+
     def begin_update(self, array: np.ndarray) -> None:
         """Start :meth:`update_ghosts`; do not change owned rows or read ghosts before :meth:`end_update`."""
         self._exchange.begin(array)

@@ -160,6 +160,10 @@ class GhostExchange:
         """Owned rows that are ghosts on other ranks, in the order in which they are sent, repeated for each rank."""
         return self._rows
 
+    def traffic(self, row: int) -> tuple[int, int, int, int]:
+        """Return messages sent and received, and bytes sent and received, by an update of rows of ``row`` bytes."""
+        return len(self._leaving), len(self._arriving), row * len(self._rows), row * self._n_ghosts
+
     @property
     def alone(self) -> bool:
         """Whether this rank sends nothing and receives nothing."""

@@ -14,6 +14,7 @@ __all__ = ["DIRECT", "LinearChoice", "choose_linear", "configure", "has_mumps", 
 DIRECT = ("lu", "mumps")
 """Direct solvers: PETSc's own factorisation, for small matrices, and MUMPS if PETSc has it."""
 
+_MULTIGRID = "conjugate gradients, multigrid on a background grid, matrix-free"
 _DIRECT_BELOW = 500  # unknowns; a lattice of 3,993 takes 0.06 s to factorise, and 1 to 4 ms with conjugate gradients
 # Step, relative to the explicit limit, up to which each is chosen; see scripts/linear_solvers.py,
 # docs/linear_solvers.md
@@ -36,7 +37,7 @@ class LinearChoice:
     @property
     def lagged(self) -> bool:
         """Whether the preconditioner has its own matrix from an earlier iteration."""
-        return self.preconditioner == "gamg" or (self.matrix_free and self.preconditioner in DIRECT)
+        return self.preconditioner in ("gamg", "multigrid") or (self.matrix_free and self.preconditioner in DIRECT)
 
 
 def choose_linear(
@@ -74,6 +75,10 @@ def choose_linear(
     """
     if operator == "matrix_free" and not symmetric:
         raise InputError('solver.operator = "matrix_free": this integrator needs a matrix; take "assembled" or "auto"')
+    if request == "multigrid" and not symmetric:
+        raise InputError('solver.linear = "multigrid": the matrix of this integrator is not symmetric; take "gamg"')
+    if request == "multigrid" and operator == "assembled":
+        raise InputError('solver.linear = "multigrid" has no matrix: take operator = "matrix_free", or linear = "gamg"')
     free = operator != "assembled" and symmetric
     krylov, method = ("cg", "conjugate gradients") if symmetric else ("gmres", "GMRES")
     direct = DIRECT[unknowns > _DIRECT_BELOW]
@@ -83,6 +88,8 @@ def choose_linear(
         return LinearChoice("preonly", direct, "direct (asked for)")
     if request == "auto" and operator != "matrix_free" and unknowns <= _DIRECT_BELOW:
         return LinearChoice("preonly", direct, f"direct ({unknowns} unknowns, at most {_DIRECT_BELOW})")
+    if request == "multigrid":
+        return LinearChoice(krylov, "multigrid", f"{_MULTIGRID} (asked for)", True)
     words = f"{method}, lagged multigrid, {'matrix-free' if free else 'assembled'}"
     if request == "gamg":
         return LinearChoice(krylov, "gamg", f"{words} (asked for)", free)

@@ -64,7 +64,7 @@ class Transform:
 
     @cached_property
     def nodewise(self) -> bool:
-        """Whether w differs from u by the frames of nodes only, and the Hessian is symmetric. Collective at first use."""
+        """Whether w differs from u by frames of nodes only, and the Hessian is symmetric. Collective at first use."""
         return not self.links and not self.mesh.comm.allreduce(int(len(self.sliding.nodes) > 0))
 
     def _share_frames(self) -> None:

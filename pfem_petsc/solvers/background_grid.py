@@ -12,116 +12,16 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ..mechanics.compiled import inlined, kernel
 from ..mesh.exchange import GhostExchange, Router
+from .grid_kernels import bar_boxes, distinct, find, node_boxes, pair_keys, sort_by_count
 from .grid_planes import grid_coordinates, grid_planes
 
 if TYPE_CHECKING:
     from ..mesh.distribution import DistributedMesh
 
-__all__ = ["BackgroundGrid", "Elements", "corner_weights"]
+__all__ = ["BackgroundGrid", "Elements"]
 
-_RECENT = 8192  # boxes that are remembered while bars are visited, a power of two
 _TAG = 7500  # of the messages of corners, beside those of nodes
-
-
-@inlined
-def corner_weights(t, node, base, box, weights, first):
-    """Write the eight weights of a node in a box to ``weights`` from ``first``; z varies fastest."""
-    fx = t[node, 0] - base[box, 0]
-    fy = t[node, 1] - base[box, 1]
-    fz = t[node, 2] - base[box, 2]
-    for i in range(8):
-        w = fx if i & 4 else 1.0 - fx
-        w *= fy if i & 2 else 1.0 - fy
-        w *= fz if i & 1 else 1.0 - fz
-        weights[first + i] = w
-
-
-@inlined
-def _box(low, shape):
-    """Return the number of the box that starts at the planes ``low`` (3,)."""
-    return (low[0] * shape[1] + low[1]) * shape[2] + low[2]
-
-
-@kernel
-def _node_boxes(t, shape, out):
-    low = np.zeros(3, np.int64)
-    for k in range(len(t)):
-        for i in range(3):
-            low[i] = max(min(int(t[k, i]), shape[i] - 2), 0)
-        out[k] = _box(low, shape)
-
-
-@kernel
-def _bar_boxes(t, shape, bars, start, stop, out):
-    """Write the box with all corners that have a weight at either end of each bar, -1 if there is none."""
-    low = np.zeros(3, np.int64)
-    for k in range(start, stop):
-        fits = True
-        for i in range(3):
-            p, q = t[bars[k, 0], i], t[bars[k, 1], i]
-            low[i] = max(min(int(min(p, q)), shape[i] - 2), 0)
-            fits &= max(p, q) <= low[i] + 1.0
-        out[k] = _box(low, shape) if fits else -1
-
-
-@kernel
-def _distinct(values, out):
-    """Return the number of values >= 0 without those seen shortly before; write them unless ``out`` is empty."""
-    seen = np.full(_RECENT, -1, np.int64)
-    count = 0
-    for value in values:
-        if value >= 0 and seen[value % _RECENT] != value:
-            seen[value % _RECENT] = value
-            if len(out) > 0:
-                out[count] = value
-            count += 1
-    return count
-
-
-@kernel
-def _find(sorted_values, values, out):
-    """Write the places of values among sorted ones, -1 for negative values."""
-    seen = np.full(_RECENT, -1, np.int64)
-    places = np.zeros(_RECENT, np.int64)
-    for k in range(len(values)):
-        value = values[k]
-        if value < 0:
-            out[k] = -1
-            continue
-        at = value % _RECENT
-        if seen[at] != value:
-            seen[at] = value
-            places[at] = np.searchsorted(sorted_values, value)
-        out[k] = places[at]
-
-
-@kernel
-def _pair_keys(bars, own, boxes, n, out):
-    """Write the key of the pair of boxes of each bar that has no own one, else -1."""
-    for k in range(len(bars)):
-        out[k] = -1
-        if own[k] == -1:
-            one, other = boxes[bars[k, 0]], boxes[bars[k, 1]]
-            out[k] = min(one, other) * n + max(one, other)
-
-
-@kernel
-def _sort(numbers, starts, order):
-    """Sort by counting: write the indices of numbers 0, 1, ..., without negative ones, and where each starts."""
-    for number in numbers:
-        if number >= 0:
-            starts[number + 1] += 1
-    for k in range(1, len(starts)):
-        starts[k] += starts[k - 1]
-    for k in range(len(numbers)):
-        if numbers[k] >= 0:
-            order[starts[numbers[k]]] = k
-            starts[numbers[k]] += 1
-    for k in range(len(starts) - 1, 0, -1):
-        starts[k] = starts[k - 1]
-    starts[0] = 0
 
 
 class Elements(NamedTuple):
@@ -163,10 +63,10 @@ class BackgroundGrid:
         self.t = grid_coordinates(mesh.points, planes)
         shape = np.array([len(each) for each in planes], dtype=np.int64)
         node_box = np.empty(mesh.n_local, np.int64)
-        _node_boxes(self.t, shape, node_box)
+        node_boxes(self.t, shape, node_box)
         bar_box = np.full(len(mesh.bars), -2, np.int64)  # not counted here
         for block in mesh.blocks:
-            _bar_boxes(self.t, shape, mesh.bars, block.start, block.counted, bar_box)
+            bar_boxes(self.t, shape, mesh.bars, block.start, block.counted, bar_box)
         boxes = np.unique(np.concatenate([_few(node_box), _few(bar_box)]))
         self._make_elements(mesh, boxes, node_box, bar_box)
         low = np.stack([boxes // (shape[1] * shape[2]), boxes // shape[2] % shape[1], boxes % shape[2]], axis=1)
@@ -187,16 +87,16 @@ class BackgroundGrid:
         self, mesh: DistributedMesh, boxes: np.ndarray, node_box: np.ndarray, bar_box: np.ndarray
     ) -> None:
         place = np.empty(len(node_box), np.int32)
-        _find(boxes, node_box, place)
+        find(boxes, node_box, place)
         self.box = place[: mesh.n_owned].copy()
         n = max(len(boxes), 1)
         keys = np.empty(len(bar_box), np.int64)
-        _pair_keys(mesh.bars, bar_box, place, n, keys)
+        pair_keys(mesh.bars, bar_box, place, n, keys)
         pairs = np.unique(_few(keys))
         element = np.empty(len(bar_box), np.int32)
-        _find(boxes, bar_box, element)
+        find(boxes, bar_box, element)
         second = np.empty(len(bar_box), np.int32)
-        _find(pairs, keys, second)
+        find(pairs, keys, second)
         crossing = second >= 0
         element[crossing] = len(boxes) + second[crossing]
         both = np.full((len(boxes) + len(pairs), 2), -1, np.int32)
@@ -261,15 +161,14 @@ class BackgroundGrid:
 
 def _few(values: np.ndarray) -> np.ndarray:
     """Return the distinct values >= 0, some of them several times."""
-    out = np.empty(_distinct(values, np.empty(0, np.int64)), np.int64)
+    out = np.empty(distinct(values, np.empty(0, np.int64)), np.int64)
     if len(out):
-        _distinct(values, out)
+        distinct(values, out)
     return np.unique(out)
 
 
 def _sorted(numbers: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     starts = np.zeros(count + 1, np.int64)
     order = np.empty(int(np.count_nonzero(numbers >= 0)), np.int32)
-    _sort(numbers, starts, order)
+    sort_by_count(numbers, starts, order)
     return order, starts
-

@@ -10,7 +10,7 @@ from mpi4py import MPI
 if TYPE_CHECKING:
     from ..mesh.distribution import DistributedMesh
 
-__all__ = ["grid_coordinates", "grid_planes"]
+__all__ = ["fills_block", "grid_coordinates", "grid_planes"]
 
 # Spacing of the planes over the mean length of the bars. Lattices of 10^5 bars, iterations to 1e-6 and time: 2 is best
 # of 1.5, 2, 2.5, 3.
@@ -18,25 +18,45 @@ _SPACING = 2.0
 _FINEST = 4  # nodes for a box of a filled block: more boxes would make the coarse problem as large as the fine one
 _CLOSE = 1e-6  # distance of coordinates that are one layer, and of nodes that are on a plane, over the spacing
 _LAYERS = 8  # most layers between two planes
+_PIECE = 1 << 16  # bars at a time, so that temporary arrays stay small
+# A block has this extent in mean lengths of bars, and this many nodes in a cube of this length; lattices have 1.3 to 2.
+_THICK = 4.0
+_FILLED = 0.5
 
 
 def grid_planes(mesh: DistributedMesh) -> list[np.ndarray]:
     """Return the coordinates [m] of the planes along x, y and z, ascending. Collective."""
-    comm = mesh.comm
+    low, high = _extremes(mesh)
+    spacing = max(_SPACING * _mean_length(mesh), _least(high - low, mesh.n_nodes))
     points = mesh.points[: mesh.n_owned]
-    low = np.empty(3)
-    high = np.empty(3)
-    comm.Allreduce(points.min(axis=0, initial=np.inf), low, op=MPI.MIN)
-    comm.Allreduce(points.max(axis=0, initial=-np.inf), high, op=MPI.MAX)
+    return [_planes(mesh.comm, points[:, axis], low[axis], high[axis], spacing) for axis in range(3)]
+
+
+def fills_block(mesh: DistributedMesh) -> bool:
+    """Whether a truss is several bars thick in all directions and has nodes everywhere between its extremes, so that
+    the functions of the grid describe its soft motions. Slender and hollow trusses bend within a box. Collective."""
+    low, high = _extremes(mesh)
+    length = _mean_length(mesh)
+    extents = high - low
+    return bool(extents.min() >= _THICK * length and mesh.n_nodes * length**3 >= _FILLED * np.prod(extents))
+
+
+def _extremes(mesh: DistributedMesh) -> tuple[np.ndarray, np.ndarray]:
+    points = mesh.points[: mesh.n_owned]
+    low, high = np.empty(3), np.empty(3)
+    mesh.comm.Allreduce(points.min(axis=0, initial=np.inf), low, op=MPI.MIN)
+    mesh.comm.Allreduce(points.max(axis=0, initial=-np.inf), high, op=MPI.MAX)
+    return low, high
+
+
+def _mean_length(mesh: DistributedMesh) -> float:
+    """Return the mean length of the bars [m], rounded, because the sum depends on the number of ranks. Collective."""
     counted = mesh.bars[mesh.counted]
     total = 0.0
-    for first in range(0, len(counted), 1 << 16):
-        some = counted[first : first + (1 << 16)]
+    for first in range(0, len(counted), _PIECE):
+        some = counted[first : first + _PIECE]
         total += float(np.linalg.norm(mesh.points[some[:, 1]] - mesh.points[some[:, 0]], axis=1).sum())
-    # rounded, because the sum depends on the number of ranks
-    length = float(f"{comm.allreduce(total) / mesh.n_bars:.3g}")
-    spacing = max(_SPACING * length, _least(high - low, mesh.n_nodes))
-    return [_planes(comm, points[:, axis], low[axis], high[axis], spacing) for axis in range(3)]
+    return float(f"{mesh.comm.allreduce(total) / mesh.n_bars:.3g}")
 
 
 def _least(extents: np.ndarray, n_nodes: int) -> float:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = ["MatrixFreeHessian", "full_blocks"]
 
+
 class MatrixFreeHessian:
     """Matrix-free replacement of :class:`~pfem_petsc.solvers.matrix.HessianMatrix` for symmetric schemes.
 

@@ -14,11 +14,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from petsc4py import PETSc
 
-from ..mechanics.compiled import kernel
-from .background_grid import BackgroundGrid, corner_weights
+from .background_grid import BackgroundGrid
+from .grid_kernels import interpolate, restrict
 from .grid_matrix import CoarseMatrix
 from .matrix_free import MatrixFreeHessian, full_blocks
 from .reproducible import reproducible_products
+from .smoothing_kernels import invert, smooth
 
 if TYPE_CHECKING:
     from ..stepping.model import Model
@@ -29,73 +30,6 @@ __all__ = ["GridMultigrid"]
 _PREFIX = "pfem_coarse_"
 _DEGREE = 2  # of the polynomials; 1 takes twice as many iterations, 3 and 4 save few
 _LARGEST = 2.0  # bound on the eigenvalues of D^-1 K
-
-
-@kernel
-def _invert(blocks):
-    """Invert symmetric matrices (n, 6): xx, xy, xz, yy, yz, zz, in place; singular ones become zero."""
-    for k in range(len(blocks)):
-        a, b, c, d, e, f = blocks[k]
-        xx, xy, xz = d * f - e * e, c * e - b * f, b * e - c * d
-        determinant = a * xx + b * xy + c * xz
-        inverse = 1.0 / determinant if determinant > 0.0 else 0.0
-        blocks[k, 0] = xx * inverse
-        blocks[k, 1] = xy * inverse
-        blocks[k, 2] = xz * inverse
-        blocks[k, 3] = (a * f - c * c) * inverse
-        blocks[k, 4] = (b * c - a * e) * inverse
-        blocks[k, 5] = (a * d - b * b) * inverse
-
-
-@kernel
-def _smooth(inverse, product, of_last, of_residual, r, z, x):
-    """Subtract the product from the residual r, and make a step z of the polynomial: all (n, 3)."""
-    for k in range(len(r)):
-        r0 = r[k, 0] - product[k, 0]
-        r1 = r[k, 1] - product[k, 1]
-        r2 = r[k, 2] - product[k, 2]
-        r[k, 0] = r0
-        r[k, 1] = r1
-        r[k, 2] = r2
-        z0 = of_last * z[k, 0] + of_residual * (inverse[k, 0] * r0 + inverse[k, 1] * r1 + inverse[k, 2] * r2)
-        z1 = of_last * z[k, 1] + of_residual * (inverse[k, 1] * r0 + inverse[k, 3] * r1 + inverse[k, 4] * r2)
-        z2 = of_last * z[k, 2] + of_residual * (inverse[k, 2] * r0 + inverse[k, 4] * r1 + inverse[k, 5] * r2)
-        z[k, 0] = z0
-        z[k, 1] = z1
-        z[k, 2] = z2
-        x[k, 0] += z0
-        x[k, 1] += z1
-        x[k, 2] += z2
-
-
-@kernel
-def _interpolate(t, box, base, corners, coarse, fine):
-    """Write the values (owned, 3) of nodes from those of corners."""
-    w = np.zeros(8)
-    for k in range(len(fine)):
-        corner_weights(t, k, base, box[k], w, 0)
-        x = y = z = 0.0
-        for i in range(8):
-            at = corners[box[k], i]
-            x += w[i] * coarse[at, 0]
-            y += w[i] * coarse[at, 1]
-            z += w[i] * coarse[at, 2]
-        fine[k, 0] = x
-        fine[k, 1] = y
-        fine[k, 2] = z
-
-
-@kernel
-def _restrict(t, box, base, corners, fine, coarse):
-    """Add the transpose of :func:`_interpolate`."""
-    w = np.zeros(8)
-    for k in range(len(fine)):
-        corner_weights(t, k, base, box[k], w, 0)
-        for i in range(8):
-            at = corners[box[k], i]
-            coarse[at, 0] += w[i] * fine[k, 0]
-            coarse[at, 1] += w[i] * fine[k, 1]
-            coarse[at, 2] += w[i] * fine[k, 2]
 
 
 class GridMultigrid:
@@ -158,7 +92,7 @@ class GridMultigrid:
         to_x = inverse @ kept
         full = np.swapaxes(to_x, 1, 2) @ full_blocks(blocks[at]) @ to_x + problem.scale * (np.eye(3) - kept)
         blocks[at] = full.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
-        _invert(blocks)
+        invert(blocks)
         self._inverse = blocks
         self._special, self._turned = at, kept @ basis
         self._make_coarse(problem, *self._shared(at, to_x @ basis))
@@ -259,7 +193,7 @@ class GridMultigrid:
             if k > 1:
                 self.product.extension.times(self._z, self._product)
             of_last, of_residual = (2 * k - 3) / (2 * k + 1), (8 * k - 4) / ((2 * k + 1) * _LARGEST)
-            _smooth(self._inverse, self._product, of_last, of_residual, self._r, self._z, self._x)
+            smooth(self._inverse, self._product, of_last, of_residual, self._r, self._z, self._x)
 
     def _correct(self) -> None:
         """Add the coarse correction of the residual to the solution."""
@@ -270,13 +204,13 @@ class GridMultigrid:
             r = self._e
             r[at] = np.einsum("kji,kj->ki", self._turned, r[at])
         coarse[:] = 0.0
-        _restrict(grid.t, grid.box, grid.base, grid.corners, r, coarse)
+        restrict(grid.t, grid.box, grid.base, grid.corners, r, coarse)
         grid.give(coarse)
         self._right.setArray(coarse[: grid.n_owned].ravel())
         self._solver.apply(self._right, self._left)
         coarse[: grid.n_owned] = self._left.getArray(readonly=True).reshape(-1, 3)
         grid.bring(coarse)
-        _interpolate(grid.t, grid.box, grid.base, grid.corners, coarse, self._e)
+        interpolate(grid.t, grid.box, grid.base, grid.corners, coarse, self._e)
         self._e[at] = np.einsum("kij,kj->ki", self._turned, self._e[at])
         self._x += self._e
 

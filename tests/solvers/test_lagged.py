@@ -1,4 +1,4 @@
-"""Matrix-free operators with a lagged preconditioner from an assembled matrix."""
+"""Lagged preconditioners."""
 
 import numpy as np
 import pytest
@@ -56,7 +56,8 @@ def test_one_set_up_serves_many_steps(comm, shared_tmp_path, solver):
     case = {"initial": STRETCHED}
     expected, *_ = simulate(comm, shared_tmp_path / "cg", {"linear": "cg"}, step, steps, **case)
     found, newton, linear, made = simulate(comm, shared_tmp_path / "lagged", solver, step, steps, **case)
-    assert made == [0]
+    # that of multigrid on a background grid is cheap, and is made again sooner
+    assert made == [0] or solver["linear"] == "multigrid" and len(made) <= 2
     assert newton >= 2 * steps
     assert linear < 12 * newton
     start = found.mesh.points[: found.mesh.n_owned]

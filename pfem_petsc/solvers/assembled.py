@@ -64,7 +64,7 @@ class AssembledPreconditioner:
         if self.product is not None:
             self.product.linearise(problem)
             self.product.make_definite()
-            stored = self.product.stored
+            stored = self._vectors()
             self.product.extension.kept = np.flatnonzero(held[: self.mesh.n_owned] == 0.0)
 
         def add(values: np.ndarray) -> None:
@@ -80,6 +80,14 @@ class AssembledPreconditioner:
                 options["mat_coarsen_type"] = "hem"
                 self._set_up(final, problem)
                 options.delValue("mat_coarsen_type")
+
+    def _vectors(self) -> np.ndarray:
+        """Return vectors and stiffnesses (5, b) of the bars for :meth:`HessianMatrix.add_bars`."""
+        ends, x = self.mesh.bars, self.product.x
+        stored = np.empty((5, len(ends)))
+        np.subtract(x[ends[:, 1]].T, x[ends[:, 0]].T, out=stored[:3])
+        stored[3:] = self.product.stored
+        return stored
 
     def fill(self) -> float:
         """Return the entries of multigrid's coarse matrices relative to the finest. Collective."""

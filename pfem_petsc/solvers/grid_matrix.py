@@ -65,19 +65,20 @@ class CoarseMatrix:
     def make(
         self,
         ends: np.ndarray,
+        x: np.ndarray,
         stored: np.ndarray,
         nodal: np.ndarray,
         place: np.ndarray,
         turned: np.ndarray,
         extra: np.ndarray,
     ) -> PETSc.Mat:
-        """Return the matrix for bars with ``stored`` (5, b), nodal inertia (owned,), and matrices of some local nodes,
-        see :func:`~pfem_petsc.solvers.grid_sums.assemble`. Collective."""
+        """Return the matrix for bars at ``x`` (local, 3) with ``stored`` (2, b), nodal inertia (owned,), and matrices
+        of some local nodes, see :func:`~pfem_petsc.solvers.grid_sums.assemble`. Collective."""
         grid = self.grid
         each = grid.elements
         blocks = np.zeros((len(self._columns), 3, 3))
         assemble(
-            grid.t, grid.base, each.boxes, each.corners, each.bars, each.bar_starts, ends, stored,
+            grid.t, grid.base, each.boxes, each.corners, each.bars, each.bar_starts, ends, x, stored,
             each.nodes, each.node_starts, nodal, extra, place, turned, self._ptr, self._columns, blocks,
         )  # fmt: skip
         arrived = self._router.send(blocks[self._n_own :].reshape(-1, 9)).reshape(-1, 3, 3)

@@ -55,7 +55,7 @@ def _flush(corners, element, m, dense, ptr, columns, blocks):
 
 
 @inlined
-def _turned_difference(stored, bar, a, b, direction, place, turned, w, m, v):
+def _turned_difference(difference, a, b, direction, place, turned, w, m, v):
     """Write to ``v`` how a component of the end difference of a bar depends on the corners."""
     for i in range(3 * m):
         v[i] = 0.0
@@ -63,14 +63,14 @@ def _turned_difference(stored, bar, a, b, direction, place, turned, w, m, v):
         node = b if end else a
         at = place[node]
         for q in range(3):
-            x = 0.0
+            part = 0.0
             for p in range(3):
-                along = stored[p, bar] if direction == 3 else (1.0 if p == direction else 0.0)
-                x += along * (turned[at, p, q] if at >= 0 else (1.0 if p == q else 0.0))
+                along = difference[p] if direction == 3 else (1.0 if p == direction else 0.0)
+                part += along * (turned[at, p, q] if at >= 0 else (1.0 if p == q else 0.0))
             if end == 0:
-                x = -x
+                part = -part
             for i in range(m):
-                v[3 * i + q] += x * w[end, i]
+                v[3 * i + q] += part * w[end, i]
 
 
 @inlined
@@ -91,8 +91,8 @@ def _add_turned_node(extra, nodal, turn, w, dense):
 
 @kernel
 def assemble(
-    t, base, boxes, corners, bar_order, bar_starts, ends, stored, node_order, node_starts, nodal, extra, place, turned,
-    ptr, columns, blocks
+    t, base, boxes, corners, bar_order, bar_starts, ends, x, stored, node_order, node_starts, nodal, extra, place,
+    turned, ptr, columns, blocks
 ):  # fmt: skip
     """Add everything to ``blocks``.
 
@@ -104,11 +104,12 @@ def assemble(
     d = np.zeros(16)
     w = np.zeros((2, 16))
     v = np.zeros(48)
+    difference = np.zeros(3)
     for element in range(len(boxes)):
         m = 8 if boxes[element, 1] < 0 else 16
         for k in range(bar_starts[element], bar_starts[element + 1]):
             bar = bar_order[k]
-            c, g = stored[3, bar], stored[4, bar]
+            c, g = stored[0, bar], stored[1, bar]
             if c == 0.0 and g == 0.0:
                 continue
             a, b = ends[bar, 0], ends[bar, 1]
@@ -122,20 +123,22 @@ def assemble(
                     first = 1
                 corner_weights(t, a, base, boxes[element, first], w[0], 8 * first)
                 corner_weights(t, b, base, boxes[element, 1 - first], w[1], 8 - 8 * first)
-            nx, ny, nz = stored[0, bar], stored[1, bar], stored[2, bar]
+            difference[0] = x[b, 0] - x[a, 0]
+            difference[1] = x[b, 1] - x[a, 1]
+            difference[2] = x[b, 2] - x[a, 2]
             if place[a] < 0 and place[b] < 0:
                 for i in range(m):
                     d[i] = w[1, i] - w[0, i]
-                    v[3 * i] = d[i] * nx
-                    v[3 * i + 1] = d[i] * ny
-                    v[3 * i + 2] = d[i] * nz
+                    v[3 * i] = d[i] * difference[0]
+                    v[3 * i + 1] = d[i] * difference[1]
+                    v[3 * i + 2] = d[i] * difference[2]
                 _add_square(v, c, 3 * m, dense)
                 if g != 0.0:
                     _add_square(d, g, m, same)
                 continue
             # in the three directions of space with g, and along the bar with c
             for direction in range(4):
-                _turned_difference(stored, bar, a, b, direction, place, turned, w, m, v)
+                _turned_difference(difference, a, b, direction, place, turned, w, m, v)
                 _add_square(v, c if direction == 3 else g, 3 * m, dense)
         for k in range(node_starts[element], node_starts[element + 1]):
             node = node_order[k]

@@ -1,7 +1,7 @@
 """The Hessian as a matrix-free operator: the stiffness is applied bar by bar and never assembled.
 
-Five numbers per bar are stored (n and the two stiffnesses) instead of 36 matrix entries and their columns, so a product
-reads a quarter of the memory. Contact problems use the restriction of the operator to their inactive unknowns.
+Two numbers per bar are stored instead of 36 matrix entries and their columns, so a product reads a tenth of the memory.
+Contact problems use the restriction of the operator to their inactive unknowns.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from petsc4py import PETSc
 
 from ..mechanics.mass import consistent_product
 from .outlive import at_exit, outlive
-from .product_kernels import add_blocks, add_products
+from .product_kernels import add_blocks, add_diagonals, add_products, drop_negative
 from .restricted import Context, Extension
 
 if TYPE_CHECKING:
@@ -31,7 +31,8 @@ class MatrixFreeHessian:
     ----------
     mat : PETSc matrix of type python
     bounded : the matrix of steps with bounds, equal to ``mat``
-    stored : (5, b) data of each bar for the product, see :meth:`~pfem_petsc.mechanics.bars.Bars.linearise`
+    x : (local, 3) positions at the last :meth:`linearise` [m]
+    stored : (2, b) data of each bar for the product, see :meth:`~pfem_petsc.mechanics.bars.Bars.stiffnesses`
     """
 
     _extension: Extension | None = None
@@ -46,7 +47,8 @@ class MatrixFreeHessian:
         self.mat.setUp()
         at_exit(outlive, self.mat)
         self.bounded = self.mat
-        self.stored = np.zeros((5, len(mesh.bars)))
+        self.stored = np.zeros((2, len(mesh.bars)))
+        self.x = np.zeros((mesh.n_local, 3))
         self._u = np.zeros((mesh.n_local, 3))
         self._out = np.zeros((mesh.n_local, 3))
         self._problem = None
@@ -61,13 +63,12 @@ class MatrixFreeHessian:
         """As :meth:`update`, at the current positions of the problem."""
         self._problem = problem
         self._left = problem.transform.left()
-        self.model.bars.linearise(problem.x, problem.balance.weight, self.stored)
+        self.x[:] = problem.x
+        self.model.bars.stiffnesses(self.x, problem.balance.weight, self.stored)
 
     def make_definite(self) -> None:
         """Drop negative eigenvalues of the bars' stiffness, due to compression or softening laws."""
-        axial = np.maximum(self.stored[3] + self.stored[4], 0.0)
-        np.maximum(self.stored[4], 0.0, out=self.stored[4])
-        np.subtract(axial, self.stored[4], out=self.stored[3])
+        drop_negative(self.mesh.bars, self.x, self.stored)
 
     @property
     def extension(self) -> Extension:
@@ -108,7 +109,7 @@ class MatrixFreeHessian:
                 moved = inertia.redistribution
                 out[moved.touched] += problem.balance.alpha * np.einsum("kij,kj->ki", moved.tensors, u[moved.touched])
         for block in bars.blocks:
-            add_products(block.sweep, bars.far, self.stored, u, out)
+            add_products(block.sweep, bars.far, self.x, self.stored, u, out)
         if bars.springs is not None:
             bars.springs.add_product(problem.balance.weight, u, out)
         problem.transform.linear(self._left, u, out)
@@ -122,11 +123,13 @@ class MatrixFreeHessian:
 
     def diagonal(self) -> np.ndarray:
         """Return the diagonal of H (owned, 3)."""
-        problem = self._problem
-        blocks = self.blocks()
-        diagonal = blocks[:, [0, 3, 5]]
-        problem.transform.diagonal(self._left, lambda nodes: full_blocks(blocks[nodes]), diagonal)
-        supports = self.model.supports
+        problem, supports = self._problem, self.model.supports
+        if problem.transform.identity and supports.inclined is None:
+            diagonal = self._plain_diagonal()
+        else:
+            blocks = self.blocks()
+            diagonal = blocks[:, [0, 3, 5]]
+            problem.transform.diagonal(self._left, lambda nodes: full_blocks(blocks[nodes]), diagonal)
         if supports.any:
             diagonal[supports.fixed] = problem.scale
         if supports.inclined is not None:
@@ -135,22 +138,40 @@ class MatrixFreeHessian:
             diagonal[at] = np.einsum("mii->mi", full)
         return diagonal
 
+    def _plain_diagonal(self) -> np.ndarray:
+        """Return the diagonal (owned, 3), without supports and transform."""
+        owned, bars = self.mesh.n_owned, self.model.bars
+        minus, plus = np.zeros((2, self.mesh.n_local, 3))
+        for block in bars.blocks:
+            add_diagonals(block.sweep, bars.far, self.x, self.stored, minus, plus)
+        diagonal = plus[:owned]
+        diagonal -= minus[:owned]
+        for nodes, extra in self._additions():
+            diagonal[nodes] += np.einsum("kii->ki", extra)
+        diagonal += self._nodal()[:, None]
+        return diagonal
+
     def blocks(self) -> np.ndarray:
         """Return the blocks on the diagonal of H (owned, 6): xx, xy, xz, yy, yz, zz; without supports and transform."""
-        problem, inertia, owned = self._problem, self.model.inertia, self.mesh.n_owned
         blocks = np.zeros((self.mesh.n_local, 6))
-        add_blocks(self.mesh.bars, self.stored, blocks)
-        blocks = blocks[:owned]
+        add_blocks(self.mesh.bars, self.x, self.stored, blocks)
+        blocks = blocks[: self.mesh.n_owned]
         for nodes, extra in self._additions():
             blocks[nodes] += extra.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
-        nodal = problem.nodal
-        if inertia.consistent:  # the diagonal of the bars' consistent mass is two thirds of the lumped one
-            nodal = 2.0 / 3.0 * nodal
-            if inertia.points.any:
-                nodal += inertia.points.nodal(problem.balance.alpha, problem.balance.eta) / 3.0
+        nodal = self._nodal()
         for axis in (0, 3, 5):
             blocks[:, axis] += nodal
         return blocks
+
+    def _nodal(self) -> np.ndarray:
+        """Return what inertia adds to the diagonal (owned,)."""
+        problem, inertia = self._problem, self.model.inertia
+        if not inertia.consistent:
+            return problem.nodal
+        nodal = 2.0 / 3.0 * problem.nodal  # the diagonal of the bars' consistent mass is two thirds of the lumped one
+        if inertia.points.any:
+            nodal += inertia.points.nodal(problem.balance.alpha, problem.balance.eta) / 3.0
+        return nodal
 
     def _additions(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return owned nodes (k,) and what they add to their blocks on the diagonal (k, 3, 3), besides bars and

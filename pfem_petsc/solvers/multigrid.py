@@ -123,7 +123,7 @@ class GridMultigrid:
         return nodes, np.ascontiguousarray(shared[nodes, 1:]).reshape(-1, 3, 3)
 
     def _make_coarse(self, problem: StepProblem, nodes: np.ndarray, turned: np.ndarray) -> None:
-        mesh, model, product = self.mesh, self.model, self.product
+        mesh, product = self.mesh, self.product
         extra_nodes, extra = product.extra_blocks()
         every = np.union1d(nodes, extra_nodes)
         place = np.full(mesh.n_local, -1, np.int32)
@@ -132,7 +132,7 @@ class GridMultigrid:
         matrices[place[nodes]] = turned
         further = np.zeros((len(every), 3, 3))
         further[place[extra_nodes]] = extra
-        matrix = self.pattern.make(model.mesh.bars, product.stored, problem.nodal, place, matrices, further)
+        matrix = self.pattern.make(mesh.bars, product.x, product.stored, problem.nodal, place, matrices, further)
         self._new_solver(matrix)
         self._solver.setCoordinates(self._positions(problem)[: self.grid.n_owned])
         with reproducible_products(mesh.comm):

@@ -14,7 +14,7 @@ from petsc4py import PETSc
 
 from ..mechanics.mass import consistent_product
 from .outlive import at_exit, outlive
-from .product_kernels import add_blocks, add_diagonals, add_products, drop_negative
+from .product_kernels import add_blocks, add_diagonals, add_products, drop_negative, inertia_products
 from .restricted import Context, Extension
 
 if TYPE_CHECKING:
@@ -82,7 +82,8 @@ class MatrixFreeHessian:
         owned = self.mesh.n_owned
         self._u[:owned] = x.getArray(readonly=True).reshape(owned, 3)
         self.apply()
-        y.setArray(self._out[:owned].ravel())
+        with y as out:
+            out[:] = self._out[:owned].reshape(-1)
 
     def apply(self) -> None:
         """Apply H to the owned rows of :attr:`_u`, and write those of :attr:`_out`. Collective."""
@@ -103,8 +104,7 @@ class MatrixFreeHessian:
             if inertia.points.any:
                 out[:owned] += inertia.points.nodal(problem.balance.alpha, problem.balance.eta)[:, None] * u[:owned]
         else:
-            np.multiply(problem.nodal[:, None], u[:owned], out=out[:owned])
-            out[owned:] = 0.0
+            inertia_products(problem.nodal, u, out)
             if inertia.redistribution is not None:
                 moved = inertia.redistribution
                 out[moved.touched] += problem.balance.alpha * np.einsum("kij,kj->ki", moved.tensors, u[moved.touched])

@@ -10,7 +10,19 @@ from __future__ import annotations
 from ..mechanics.compiled import inlined, kernel
 from ..mechanics.product_strips import add_stiffness_diagonals, add_stiffness_products
 
-__all__ = ["add_blocks", "add_diagonals", "add_products", "drop_negative"]
+__all__ = ["add_blocks", "add_diagonals", "add_products", "drop_negative", "inertia_products"]
+
+
+@kernel
+def inertia_products(nodal, u, out):
+    """Write the products of nodal inertia (owned,) to ``out`` (local, 3), zeros for ghosts."""
+    owned = len(nodal)
+    for k in range(owned):
+        for i in range(3):
+            out[k, i] = nodal[k] * u[k, i]
+    for k in range(owned, len(out)):
+        for i in range(3):
+            out[k, i] = 0.0
 
 
 @kernel

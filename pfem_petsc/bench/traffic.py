@@ -15,7 +15,8 @@ ASSUMED = {
     "plastic bar": 16,  # plastic and accumulated plastic strain
     "explicit node": 6 * _VECTOR + 8,  # x, v, f read and written; mass read
     "residual node": 4 * _VECTOR + 8,  # increment, predictor, known terms read, residual written; mass read
-    "linearised bar": 40,  # direction and two stiffnesses
+    "linearised bar": 16,  # two stiffnesses
+    "product node": _VECTOR,  # positions, from which bars have their directions
     "matrix entry": 12,  # value 8, column 4
     "conjugate gradients node": 12 * _VECTOR,  # x, r, p read and written; A p, z written and read; r . z; diagonal
 }
@@ -44,7 +45,7 @@ def bytes_per_step(
         matrix = entries * size["matrix entry"]
         update = bars * (bar + 16) + 8 * entries  # indices of a bar's four blocks, and their values
     else:
-        matrix = bars * (8 + size["linearised bar"])
+        matrix = bars * (8 + size["linearised bar"]) + nodes * size["product node"]
         update = bars * (bar + size["linearised bar"])
     iteration = matrix + nodes * size["conjugate gradients node"]
     return float(total + (newton + 1.0) * evaluation + newton * update + linear * iteration)

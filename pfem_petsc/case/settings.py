@@ -165,7 +165,7 @@ class ContactSettings(StrictModel):
 class Solver(StrictModel):
     """Solution of the nonlinear and linear systems."""
 
-    linear: Literal["auto", "cg", "gamg", "mumps"] = "auto"
+    linear: Literal["auto", "cg", "multigrid", "gamg", "mumps"] = "auto"
     """linear solver"""
     operator: Literal["auto", "assembled", "matrix_free"] = "auto"
     """form of the Hessian"""

@@ -9,6 +9,7 @@ it is the identity.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -55,6 +56,16 @@ class Transform:
         self.sliding = self._frames.sliding or Sliding.none(walls)
         if self._oblique:
             self._share_frames()
+
+    @property
+    def frames(self) -> NodalFrames:
+        """Frames of owned nodes whose coordinates are not those of x."""
+        return self._frames
+
+    @cached_property
+    def nodewise(self) -> bool:
+        """Whether w differs from u by frames of nodes only, and the Hessian is symmetric. Collective at first use."""
+        return not self.links and not self.mesh.comm.allreduce(int(len(self.sliding.nodes) > 0))
 
     def _share_frames(self) -> None:
         mesh, frames = self.mesh, self._frames

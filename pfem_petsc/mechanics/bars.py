@@ -175,6 +175,13 @@ class Bars:
         for block in self.blocks:
             block.kernels.linearise(*self._arguments(x, block), block.start, block.stop, weight, stored)
 
+    def stiffnesses(self, x: np.ndarray, weight: float, stored: np.ndarray) -> None:
+        """Fill ``stored`` (2, b) with c = (dN/dl - N/l)/l^2 [N/m3] and g = N/l [N/m], times ``weight``: the stiffness
+        of a bar with end difference d is c d d^T + g I; without springs."""
+        for block in self.blocks:
+            law = (block.parameters, block.area, self.step, block.history)
+            block.kernels.stiffnesses(x, block.sweep, self.far, self.rest, self.heat, *law, weight, stored)
+
     def step_forces(self, x0: np.ndarray, x: np.ndarray, f: np.ndarray) -> None:
         """Compute discrete-gradient forces ``f`` (local nodes, 3) [N] of a step from ``x0`` to ``x``."""
         f[:] = 0.0

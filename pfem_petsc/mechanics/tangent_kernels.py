@@ -6,16 +6,19 @@ import math
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
+
 from .compiled import inlined, kernel
 from .law_rows import last_row, no_bar_data, no_variables
 from .materials.base import Law
-from .rows import bar_value, extend, take
+from .rows import CHUNK, bar_value, extend, take
+from .strips import differences
 
 __all__ = ["make_tangent_kernels"]
 
 
 def make_tangent_kernels(law: Law, measure: Callable) -> dict[str, Any]:
-    """Make ``tangents``, ``product`` and ``linearise``.
+    """Make ``tangents``, ``product``, ``linearise`` and ``stiffnesses``.
 
     Arguments: see :func:`~pfem_petsc.mechanics.kernels.make_kernels`.
     """
@@ -148,4 +151,49 @@ def make_tangent_kernels(law: Law, measure: Callable) -> dict[str, Any]:
             stored[3, k] = weight * (axial - geometric)
             stored[4, k] = weight * geometric
 
-    return {"tangents": tangents, "product": product, "linearise": linearise}
+    @kernel
+    def stiffnesses(x, sweep, far, rest, heat, p, area, step, history, weight, stored):
+        """Write (dN/dl - N/l)/l^2 and N/l of each bar [N/m3], [N/m] times ``weight`` to ``stored`` (2, b).
+
+        ``sweep``, ``far``: see :func:`~pfem_petsc.mechanics.force_kernels.make_force_kernels`.
+        """
+        has_thermal = heat.shape[1] > 0
+        heads, fars, starts, chunks = sweep.heads, sweep.fars, sweep.starts, sweep.chunks
+        work = np.empty(3 * CHUNK)
+        xs, ys, zs = work[:CHUNK], work[CHUNK : 2 * CHUNK], work[2 * CHUNK :]
+        origin = starts[0]
+        for chunk in range(len(sweep.diagonal)):
+            first = starts[chunks[chunk]]
+            stop = starts[chunks[chunk + 1]]
+            n = stop - first
+            for run in range(chunks[chunk], chunks[chunk + 1]):
+                at = starts[run]
+                if sweep.diagonal[chunk]:
+                    differences(x, heads[run], fars[run], starts[run + 1] - at, xs, ys, zs, at - first)
+                    continue
+                a = heads[run]
+                for k in range(at, starts[run + 1]):
+                    b = far[k]
+                    xs[k - first] = x[b, 0] - x[a, 0]
+                    ys[k - first] = x[b, 1] - x[a, 1]
+                    zs[k - first] = x[b, 2] - x[a, 2]
+            rests, displacements, warmths = rest[first:stop], heat[0][first:stop], heat[1][first:stop]
+            along, across = stored[0, first:stop], stored[1, first:stop]
+            begin = first - origin  # column of the history
+            for i in range(n):
+                shift = 0.0
+                warmth = 0.0
+                if has_thermal:
+                    shift = displacements[i]
+                    warmth = warmths[i]
+                q = take(history, begin + i, like)
+                before = history[last, begin + i] if by_rate else 0.0
+                given = extend(p, history, n_rows, begin + i, of_bar)
+                section = bar_value(area, begin + i)
+                axial, geometric, inverse = stiffness(
+                    xs[i], ys[i], zs[i], rests[i], shift, warmth, given, section, step, before, q
+                )
+                along[i] = weight * ((axial - geometric) * inverse * inverse)
+                across[i] = weight * geometric
+
+    return {"tangents": tangents, "product": product, "linearise": linearise, "stiffnesses": stiffnesses}

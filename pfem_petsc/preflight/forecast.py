@@ -25,7 +25,15 @@ __all__ = ["checkpoint_bytes", "forecast", "memory_of_machine", "memory_warning"
 # Resident memory of a rank per bar, in excess of an empty process [B]; measured with lattices of 10^5 to 5 x 10^5 bars:
 # 131 explicit, 171 matrix-free, 510 assembled, 1580 with multigrid; factorised by MUMPS 4,200 at 2.7 x 10^4 and 8,200
 # at 1.7 x 10^5 bars.
-_PER_BAR = {"": 150.0, "jacobi": 200.0, "pbjacobi": 550.0, "icc": 800.0, "ilu": 800.0, "gamg": 1700.0}
+_PER_BAR = {
+    "": 150.0,
+    "jacobi": 200.0,
+    "multigrid": 350.0,
+    "pbjacobi": 550.0,
+    "icc": 800.0,
+    "ilu": 800.0,
+    "gamg": 1700.0,
+}
 _PER_BAR_FACTORISED, _FACTORISED_AT = 4200.0, 2.7e4
 _EMPTY = 2.2e8  # of a process with all libraries loaded [B]
 # Seconds per bar and step or iteration on one core, and additional seconds per step.

@@ -1,9 +1,8 @@
-"""A lagged preconditioner from an assembled Hessian, reused for many Newton iterations with and without bounds.
+"""A lagged preconditioner, reused for many Newton iterations with and without bounds.
 
-The matrix contains the geometric stiffness of bars in tension only, so it is definite beyond buckling, where the
-Hessian is not. It covers all unknowns. Rows and columns of active unknowns are those of the identity, and the residual
-of the reduced system of inactive unknowns is extended by zeros. This preserves the 3 x 3 blocks and the rigid body
-modes that multigrid needs, and a change of the active set requires no set-up.
+What it does is in :mod:`~pfem_petsc.solvers.assembled` and :mod:`~pfem_petsc.solvers.multigrid`, and when it is set up
+again is decided here. It covers all unknowns: the residual of the reduced system of inactive ones is extended by zeros,
+so a change of the active set requires no set-up.
 """
 
 from __future__ import annotations
@@ -14,9 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from petsc4py import PETSc
 
-from .linear import set_preconditioner
-from .matrix import HessianMatrix
-from .matrix_free import MatrixFreeHessian
+from .assembled import AssembledPreconditioner
+from .multigrid import GridMultigrid
 from .outlive import at_exit
 
 if TYPE_CHECKING:
@@ -29,9 +27,7 @@ __all__ = ["LaggedPreconditioner", "Preconditioning"]
 # A set-up costs about as much as this many iterations: it is repeated when the iterations in excess of those of the
 # first solve after the last set-up add up to this number. 101,706 bars, one core: multigrid 0.33 s and 3.7 ms, MUMPS
 # 2.3 s and 0.04 s.
-_SET_UP = {"gamg": 90, "lu": 40, "mumps": 55}
-_DENSE = 3.0  # entries of coarse matrices relative to the finest; cubic and octet lattices have 0.2 to 0.5
-_PREFIX = "pfem_assembled_"
+_SET_UP = {"gamg": 90, "lu": 40, "mumps": 55, "multigrid": 15}
 
 
 class LaggedPreconditioner:
@@ -41,19 +37,15 @@ class LaggedPreconditioner:
     are constant and the unknowns are nodal displacements (no oblique walls, no links in contact). After a restart it
     can then be set up again from the positions and the bars' history at its last set-up, which checkpoints contain.
 
-    Options: prefix ``pfem_assembled_``.
-
     Parameters
     ----------
     model : Model
-    kind : of preconditioner, ``gamg``, ``lu`` or ``mumps``
-    symmetric : whether the Hessian, including friction, is symmetric
-    definite : whether the Hessian without friction is symmetric, and thus has a definite part
-    matrix_free : whether multigrid smooths on the finest level with matrix-free products of the same matrix, which
-        saves a third of the time
+    kind : of preconditioner: ``gamg``, ``lu``, ``mumps``; ``multigrid``
+    symmetric, definite, matrix_free : see :class:`~pfem_petsc.solvers.assembled.AssembledPreconditioner`
 
     Attributes
     ----------
+    inner : the preconditioner
     place : (owned, 6) positions at which the Hessian was evaluated [m], and whether a component was active; (owned, 0)
         if the next problem needs a set-up
     history : (b, names) data of the material laws there, see ``Bars.history``; (b, 0) if they keep none
@@ -66,10 +58,10 @@ class LaggedPreconditioner:
         mesh = model.mesh
         self.mesh = mesh
         self.kind = kind
-        # for symmetric schemes: the stiffness of the bars and its products
-        self.product = MatrixFreeHessian(model) if definite else None
-        self._smooth = matrix_free and kind == "gamg"
-        self.matrix = HessianMatrix(mesh, model.supports, symmetric)
+        if kind == "multigrid":
+            self.inner = GridMultigrid(model)
+        else:
+            self.inner = AssembledPreconditioner(model, kind, symmetric, definite, matrix_free)
         self.bars = model.bars
         self.remembers = len(model.bars.kept_names) > 0
         self.outlasts = not model.bars_vary and not model.inertia.varies
@@ -77,12 +69,11 @@ class LaggedPreconditioner:
         self.history = np.zeros((len(mesh.bars), 0))
         self.count = [0.0] * 6
         self.carried = False
-        self._inner: PETSc.PC | None = None
         self._supports = model.supports
         self._problem = None
         self._kept: np.ndarray | None = None
-        self._right, self._left = self.matrix.mat.createVecs()
-        self._new_inner(self.matrix.mat)  # reports invalid PETSc options before the first step
+        self._right = PETSc.Vec().createMPI((3 * mesh.n_owned, 3 * mesh.n_nodes), bsize=3, comm=mesh.comm)
+        self._left = self._right.duplicate()
 
     def drop(self) -> None:
         """Require a set-up in the next Newton iteration."""
@@ -143,75 +134,19 @@ class LaggedPreconditioner:
             self.bars.put_history(history)
 
     def _make(self, problem: StepProblem, held: np.ndarray) -> None:
-        matrix = self.matrix
-        self.mesh.update_ghosts(held)
-
-        stored = None
-        if self.product is not None:
-            self.product.linearise(problem)
-            self.product.make_definite()
-            stored = self.product.stored
-            self.product.extension.kept = np.flatnonzero(held[: self.mesh.n_owned] == 0.0)
-
-        def add(values: np.ndarray) -> None:
-            problem.hessian_here(matrix, values, stored)
-
-        final = matrix.fill_held(add, held, problem.scale, problem.transform)
-        self._set_up(final, problem)
-        if self._inner.getType() == "gamg" and self._fill() > _DENSE:
-            # the independent sets of PETSc 3.18 hardly coarsen a body-centred lattice: set-up and steps take 5 x as
-            # long
-            options = PETSc.Options(_PREFIX)
-            if not options.hasName("mat_coarsen_type"):
-                options["mat_coarsen_type"] = "hem"
-                self._set_up(final, problem)
-                options.delValue("mat_coarsen_type")
-
-    def _fill(self) -> float:
-        """Return the entries of multigrid's coarse matrices relative to the finest. Collective."""
-        solvers = [self._inner.getMGSmoother(level) for level in range(1, self._inner.getMGLevels())]
-        solvers.insert(0, self._inner.getMGCoarseSolve())
-        entries = [solver.getOperators()[1].getInfo()["nz_used"] for solver in solvers]
-        return sum(entries[:-1]) / max(entries[-1], 1.0)
-
-    def _set_up(self, matrix: PETSc.Mat, problem: StepProblem) -> None:
-        # from scratch: a reused hierarchy would differ from that after a restart
-        self._new_inner(matrix)
-        x = problem.x[: self.mesh.n_owned]
-        centre = self.mesh.comm.allreduce(x.sum(axis=0)) / self.mesh.n_nodes
-        # multigrid builds the rigid body modes from them, which it must not damp. MatNullSpaceCreateRigidBody would
-        # orthogonalise them, with rounding that is not reproducible in PETSc 3.26
-        self._inner.setCoordinates(x - centre)
-        options = PETSc.Options()
-        ours = self.mesh.comm.size > 1 and not options.hasName("matptap_via")
-        if ours:
-            # PETSc's default sums contributions of other ranks in the order of arrival, so runs are not reproducible
-            options["matptap_via"] = "allatonce_merged"
-        self._inner.setUp()
-        if ours:
-            options.delValue("matptap_via")
-
-    def _new_inner(self, matrix: PETSc.Mat) -> None:
-        if self._inner is not None:
-            self._inner.destroy()
-        self._inner = PETSc.PC().create(self.mesh.comm)
-        self._inner.setOptionsPrefix(_PREFIX)
-        self._inner.setOperators(self.product.extension.mat if self._smooth else matrix, matrix)
-        set_preconditioner(self._inner, self.kind)
-        self._inner.setUseAmat(self._smooth)
-        self._inner.setFromOptions()
+        self.inner.make(problem, held)
 
     def apply(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Compute y = P x for the unknowns kept, see :meth:`renew`. Collective."""
         self.count[-1] += 1.0
         kept = self._kept
         if kept is None:
-            self._inner.apply(x, y)
+            self.inner.apply(x, y)
             self._hold(y)
             return
         self._right.set(0.0)
         self._right.array[kept] = x.getArray(readonly=True)
-        self._inner.apply(self._right, self._left)
+        self.inner.apply(self._right, self._left)
         self._hold(self._left)
         y.setArray(self._left.getArray(readonly=True)[kept])
 
@@ -224,9 +159,8 @@ class LaggedPreconditioner:
     def destroy(self) -> None:
         """Free the PETSc objects."""
         self._problem = None
-        for thing in (self._inner, self._right, self._left, self.matrix, self.product):
-            if thing is not None:
-                thing.destroy()
+        for thing in (self.inner, self._right, self._left):
+            thing.destroy()
 
 
 class Preconditioning:

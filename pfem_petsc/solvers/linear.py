@@ -14,10 +14,12 @@ __all__ = ["DIRECT", "LinearChoice", "choose_linear", "configure", "has_mumps", 
 DIRECT = ("lu", "mumps")
 """Direct solvers: PETSc's own factorisation, for small matrices, and MUMPS if PETSc has it."""
 
+_MULTIGRID = "conjugate gradients, multigrid on a background grid, matrix-free"
 _DIRECT_BELOW = 500  # unknowns; a lattice of 3,993 takes 0.06 s to factorise, and 1 to 4 ms with conjugate gradients
 # Step, relative to the explicit limit, up to which each is chosen; see scripts/linear_solvers.py,
 # docs/linear_solvers.md
 _JACOBI_FREE_UP_TO = 30.0
+_JACOBI_BLOCK_UP_TO = 10.0  # where the truss fills a block
 _MULTIGRID_FROM = 10  # steps after which the first set-up pays off
 # with an assembled matrix
 _JACOBI_UP_TO = 5.0
@@ -36,7 +38,7 @@ class LinearChoice:
     @property
     def lagged(self) -> bool:
         """Whether the preconditioner has its own matrix from an earlier iteration."""
-        return self.preconditioner == "gamg" or (self.matrix_free and self.preconditioner in DIRECT)
+        return self.preconditioner in ("gamg", "multigrid") or (self.matrix_free and self.preconditioner in DIRECT)
 
 
 def choose_linear(
@@ -47,13 +49,14 @@ def choose_linear(
     operator: str = "auto",
     steps: int = _MULTIGRID_FROM,
     impact: bool = False,
+    block: bool = False,
 ) -> LinearChoice:
     """Resolve ``solver.linear`` and ``solver.operator``.
 
     Parameters
     ----------
     request : str
-        ``auto``, ``cg``, ``gamg`` or ``mumps``.
+        ``auto``, ``cg``, ``multigrid``, ``gamg`` or ``mumps``.
     unknowns : int
         Number of unknowns of the whole model.
     step_ratio : float
@@ -66,14 +69,15 @@ def choose_linear(
         Number of steps of the run.
     impact : bool
         Whether there is contact or yielding, with which tangents change too fast for a lagged preconditioner.
+    block : bool
+        Whether the truss fills a block, see :func:`~pfem_petsc.solvers.grid_planes.fills_block`.
 
     Raises
     ------
     InputError
-        If a matrix-free operator is requested together with a method that needs a matrix.
+        If a matrix-free operator is requested together with a method that needs a matrix, or the reverse.
     """
-    if operator == "matrix_free" and not symmetric:
-        raise InputError('solver.operator = "matrix_free": this integrator needs a matrix; take "assembled" or "auto"')
+    _check(request, operator, symmetric)
     free = operator != "assembled" and symmetric
     krylov, method = ("cg", "conjugate gradients") if symmetric else ("gmres", "GMRES")
     direct = DIRECT[unknowns > _DIRECT_BELOW]
@@ -83,11 +87,15 @@ def choose_linear(
         return LinearChoice("preonly", direct, "direct (asked for)")
     if request == "auto" and operator != "matrix_free" and unknowns <= _DIRECT_BELOW:
         return LinearChoice("preonly", direct, f"direct ({unknowns} unknowns, at most {_DIRECT_BELOW})")
+    if request == "multigrid":
+        return LinearChoice(krylov, "multigrid", f"{_MULTIGRID} (asked for)", True)
     words = f"{method}, lagged multigrid, {'matrix-free' if free else 'assembled'}"
     if request == "gamg":
         return LinearChoice(krylov, "gamg", f"{words} (asked for)", free)
     ratio = f"step is {step_ratio:.3g} x the explicit limit"
     if free:
+        if request == "auto" and block and not impact and step_ratio > _JACOBI_BLOCK_UP_TO:
+            return LinearChoice(krylov, "multigrid", f"{_MULTIGRID} ({ratio})", True)
         if request == "cg" or step_ratio <= _JACOBI_FREE_UP_TO:
             return LinearChoice(krylov, "jacobi", f"{method}, Jacobi, matrix-free ({ratio})", True)
         if impact or steps < _MULTIGRID_FROM:
@@ -101,6 +109,16 @@ def choose_linear(
             return LinearChoice(krylov, "icc", f"{method}, incomplete Cholesky ({ratio})")
         return LinearChoice(krylov, "ilu", f"{method}, incomplete LU ({ratio})")
     return LinearChoice(krylov, "gamg", f"{words} ({ratio})")
+
+
+def _check(request: str, operator: str, symmetric: bool) -> None:
+    """Refuse combinations that do not exist."""
+    if operator == "matrix_free" and not symmetric:
+        raise InputError('solver.operator = "matrix_free": this integrator needs a matrix; take "assembled" or "auto"')
+    if request == "multigrid" and not symmetric:
+        raise InputError('solver.linear = "multigrid": the matrix of this integrator is not symmetric; take "gamg"')
+    if request == "multigrid" and operator == "assembled":
+        raise InputError('solver.linear = "multigrid" has no matrix: take operator = "matrix_free", or linear = "gamg"')
 
 
 def unsymmetric(choice: LinearChoice) -> LinearChoice:

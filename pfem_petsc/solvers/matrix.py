@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from ..mesh.distribution import DistributedMesh
     from ..stepping.problem import StepProblem
 
-__all__ = ["BlockPattern", "HessianMatrix"]
+__all__ = ["BlockPattern", "HessianMatrix", "expand_columns"]
 
 
 class BlockPattern:
@@ -64,12 +64,13 @@ class BlockPattern:
         pointers = np.zeros(len(blocks) + 1, dtype=PETSc.IntType)
         np.cumsum(3 * blocks, out=pointers[1:])
         columns = np.empty(pointers[-1], dtype=PETSc.IntType)
-        _expand_columns(self.ptr, self.columns, columns)
+        expand_columns(self.ptr, self.columns, columns)
         return pointers, columns
 
 
 @kernel
-def _expand_columns(ptr, columns, out):
+def expand_columns(ptr, columns, out):
+    """Write the columns of a matrix in scalar compressed rows; ``ptr``, ``columns``: of its blocks."""
     for row in range(len(ptr) - 1):
         width = 3 * (ptr[row + 1] - ptr[row])
         for k in range(ptr[row], ptr[row + 1]):

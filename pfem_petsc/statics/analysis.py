@@ -14,6 +14,7 @@ from ..errors import InputError
 from ..integrators.base import Scheme
 from ..output.units import LOAD_FACTOR, POINT, Axis
 from ..registry import lookup
+from ..solvers.grid_planes import fills_block
 from ..solvers.linear import LinearChoice, choose_linear
 from ..tolerances import TIME
 
@@ -101,13 +102,17 @@ class StaticAnalysis(Analysis):
 
 
 def _linear(model: Model) -> LinearChoice:
-    """Choose the linear solver: a factorisation, which needs no definiteness, if affordable; else multigrid."""
+    """Choose the linear solver: a factorisation, which needs no definiteness, if affordable, else multigrid.
+
+    Collective.
+    """
     solver, unknowns = model.case.solver, 3 * model.mesh.n_nodes
     request = solver.linear
     if request == "auto":
         smooth = all(law_of(material).smooth for material in model.case.material.values())
         most = _DIRECT_UP_TO if smooth else _DIRECT_YIELDING_UP_TO
-        request = "mumps" if unknowns <= most and solver.operator != "matrix_free" else "gamg"
+        multigrid = "multigrid" if solver.operator != "assembled" and fills_block(model.mesh) else "gamg"
+        request = "mumps" if unknowns <= most and solver.operator != "matrix_free" else multigrid
     choice = choose_linear(request, unknowns, np.inf, True, solver.operator)
     if solver.linear == "auto":
         choice = replace(choice, why=choice.why.removesuffix(" (asked for)"))

@@ -77,7 +77,7 @@ class ImplicitStepper(Stepper):
         self.links = [link.coordinates() for link in model.links]
         self.hessian.couple(self.links)
         if self.lagged is not None:
-            self.lagged.matrix.couple(self.links)
+            self.lagged.inner.couple(self.links)
         bounded = choice if model.contact.symmetric else unsymmetric(choice)
         most = model.case.solver.max_newton
         self.newton = NewtonSolver(model.mesh, self.hessian, choice, bounded, most, model.length, self.lagged)

@@ -17,6 +17,7 @@ from ..mechanics.connectors import viscous_rate
 from ..output.units import TIME as AXIS
 from ..output.units import Axis, engineering
 from ..registry import lookup
+from ..solvers.grid_planes import fills_block
 from ..solvers.linear import LinearChoice, choose_linear
 from ..tolerances import TIME
 from .stability import Frequency, highest_frequency
@@ -214,7 +215,8 @@ def _linear(model: Model, scheme: Scheme, over: float, steps: int) -> LinearChoi
     impact = model.can_touch or not all(law_of(material).smooth for material in case.material.values())
     solver, unknowns = case.solver, 3 * model.mesh.n_nodes
     try:
-        choice = choose_linear(solver.linear, unknowns, over, scheme.symmetric, solver.operator, steps, impact)
+        block = fills_block(model.mesh)
+        choice = choose_linear(solver.linear, unknowns, over, scheme.symmetric, solver.operator, steps, impact, block)
     except InputError as error:
         raise InputError(f"{case.source}: {error}") from error
     if not model.contact.symmetric and choice.krylov == "cg":

@@ -36,14 +36,14 @@ def test_explicit_bytes_by_hand():
 
 
 def test_a_matrix_moves_more_than_bars():
-    # a product on the cubic lattice: 9 x (1 + 2 x 8.8)/8.8 entries of 12 B a bar against 48 B
+    # a product on the cubic lattice: 9 x (1 + 2 x 8.8)/8.8 entries of 12 B a bar against 24 B, and positions
     counts = {"implicit": True, "plastic": False, "newton": 0.0}
     per_product = [
         bytes_per_step(8800, 1000, assembled=assembled, linear=1.0, **counts)
         - bytes_per_step(8800, 1000, assembled=assembled, linear=0.0, **counts)
         for assembled in (False, True)
     ]
-    assert per_product[1] - per_product[0] == pytest.approx(9 * (1000 + 2 * 8800) * 12 - 48 * 8800)
+    assert per_product[1] - per_product[0] == pytest.approx(9 * (1000 + 2 * 8800) * 12 - 24 * 8800 - 24 * 1000)
 
 
 def test_memory_sees_what_was_used_and_freed():

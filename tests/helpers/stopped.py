@@ -31,6 +31,10 @@ CASES = {
         "lattice_drop",
         (*LAGGED, "time.integrator=newmark", "solver.linear=gamg", "solver.operator=matrix_free"),
     ),
+    "multigrid on a background grid": (
+        "lattice_drop",
+        (*LAGGED, "time.integrator=newmark", "solver.linear=multigrid"),
+    ),
     "lagged multigrid, assembled": (
         "lattice_drop",
         (*LAGGED, "time.integrator=energy_momentum", "solver.linear=gamg"),

@@ -1,4 +1,4 @@
-"""Matrix-free operators with a lagged preconditioner from an assembled matrix."""
+"""Lagged preconditioners."""
 
 import numpy as np
 import pytest
@@ -46,7 +46,7 @@ def positions(simulation):
     return simulation.model.comm.allreduce(found)
 
 
-LAGGED = [{"linear": linear, "operator": "matrix_free"} for linear in ("gamg", "mumps")]
+LAGGED = [{"linear": linear, "operator": "matrix_free"} for linear in ("gamg", "mumps", "multigrid")]
 
 
 @pytest.mark.parametrize("solver", [*LAGGED, {"linear": "gamg", "operator": "assembled"}], ids=str)
@@ -56,7 +56,8 @@ def test_one_set_up_serves_many_steps(comm, shared_tmp_path, solver):
     case = {"initial": STRETCHED}
     expected, *_ = simulate(comm, shared_tmp_path / "cg", {"linear": "cg"}, step, steps, **case)
     found, newton, linear, made = simulate(comm, shared_tmp_path / "lagged", solver, step, steps, **case)
-    assert made == [0]
+    # that of multigrid on a background grid is cheap, and is made again sooner
+    assert made == [0] or solver["linear"] == "multigrid" and len(made) <= 2
     assert newton >= 2 * steps
     assert linear < 12 * newton
     start = found.mesh.points[: found.mesh.n_owned]
@@ -78,7 +79,7 @@ def test_coarse_matrices_stay_small(comm, shared_tmp_path, kind):
     mesh = LATTICE["mesh"] | {"kind": kind, "cells": [8, 8, 8]}
     moving = {"velocity": [0.0, 0.0, 0.0], "angular_velocity": [5.0, 3.0, 1.0]}
     run, newton, linear, _ = simulate(comm, shared_tmp_path, LAGGED[0], 1e-4, 2, initial=moving, mesh=mesh)
-    assert 0.05 < run.stepper.lagged._fill() < 1.5
+    assert 0.05 < run.stepper.lagged.inner.fill() < 1.5
     assert linear < 15 * newton
 
 

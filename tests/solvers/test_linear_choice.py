@@ -20,6 +20,12 @@ BIG = 30_000
         ({"request": "cg", "step_ratio": 1e4}, "cg", "jacobi", True, False),
         ({"request": "gamg"}, "cg", "gamg", True, True),
         ({"request": "gamg", "operator": "assembled"}, "cg", "gamg", False, True),
+        ({"block": True, "step_ratio": 10.0}, "cg", "jacobi", True, False),
+        ({"block": True, "step_ratio": 11.0}, "cg", "multigrid", True, True),
+        ({"block": True, "step_ratio": 11.0, "steps": 1}, "cg", "multigrid", True, True),
+        ({"block": True, "step_ratio": 1e4, "impact": True}, "cg", "jacobi", True, False),
+        ({"block": True, "step_ratio": 51.0, "operator": "assembled"}, "cg", "gamg", False, True),
+        ({"request": "multigrid"}, "cg", "multigrid", True, True),
         ({"request": "mumps"}, "preonly", "mumps", False, False),
         ({"request": "mumps", "unknowns": 400}, "preonly", "lu", False, False),
         ({"request": "mumps", "operator": "matrix_free"}, "cg", "mumps", True, True),
@@ -47,7 +53,7 @@ def test_a_restart_keeps_the_choice_unless_the_case_asks_for_another(comm, tmp_p
 
     def run(steps, solver, folder="run", **options):
         case = {
-            "mesh": {"generator": "lattice", "kind": "octet", "cells": [4, 4, 3], "pitch": 0.01},
+            "mesh": {"generator": "lattice", "kind": "octet", "cells": [6, 6, 2], "pitch": 0.01},
             "material": {"m": {"young_modulus": 110e9, "density": 4500.0}},
             "section": {"s": {"area": 1e-6, "material": "m"}},
             "initial": {"velocity": [0.0, 0.0, 0.0], "angular_velocity": [5.0, 0.0, 0.0]},

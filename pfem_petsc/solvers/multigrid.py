@@ -1,0 +1,221 @@
+"""Multigrid without a matrix of the truss: polynomial smoothing by products, and a coarse matrix on a background grid.
+
+One cycle from zero: Chebyshev smoothing, correction by the coarse matrix (:mod:`~pfem_petsc.solvers.grid_matrix`),
+of which PETSc's algebraic multigrid makes one cycle, and the same smoothing again. The polynomials are of the fourth
+kind (J. Lottes, "Optimal polynomial smoothers for multigrid V-cycles", Numerical Linear Algebra with Applications 30
+(2023), e2518), which need no lower bound of the spectrum. The upper one is known: with D of the 3 x 3 blocks on the
+diagonal of a sum of bars, u_a . k u_b <= (u_a . k u_a + u_b . k u_b) / 2 gives D^-1 K <= 2.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from petsc4py import PETSc
+
+from .background_grid import BackgroundGrid
+from .grid_kernels import interpolate, restrict
+from .grid_matrix import CoarseMatrix
+from .matrix_free import MatrixFreeHessian, full_blocks
+from .reproducible import reproducible_products
+from .smoothing_kernels import invert, smooth
+
+if TYPE_CHECKING:
+    from ..stepping.model import Model
+    from ..stepping.problem import StepProblem
+
+__all__ = ["GridMultigrid"]
+
+_PREFIX = "pfem_coarse_"
+_DEGREE = 2  # of the polynomials; 1 takes twice as many iterations, 3 and 4 save few
+_LARGEST = 2.0  # bound on the eigenvalues of D^-1 K
+
+
+class GridMultigrid:
+    """Multigrid of the definite part of a Hessian. Construction is collective.
+
+    Unknowns at nodes with frames (oblique walls) are other coordinates of the same displacements. Coordinates of links,
+    which join nodes, and friction, with which the Hessian is not symmetric, do not fit: such solves have the diagonal
+    as preconditioner.
+
+    Options: prefix ``pfem_coarse_``, for the solver of the coarse matrix.
+
+    Attributes
+    ----------
+    reduced : whether the last :meth:`make` was for such a solve
+    """
+
+    def __init__(self, model: Model) -> None:
+        self.model, self.mesh = model, model.mesh
+        self.product = MatrixFreeHessian(model)
+        self.grid = BackgroundGrid(model.mesh)
+        self.pattern = CoarseMatrix(self.grid)
+        self.reduced = False
+        owned = self.mesh.n_owned
+        self._inverse = np.zeros((owned, 6))
+        self._r, self._z, self._x, self._e, self._product = (np.zeros((owned, 3)) for _ in range(5))
+        self._coarse = np.zeros((len(self.grid.numbers), 3))
+        self._special = np.empty(0, np.int64)
+        self._turned = np.empty((0, 3, 3))
+        self._solver: PETSc.PC | None = None
+        self._matrix: PETSc.Mat | None = None
+        size = (3 * self.grid.n_owned, 3 * self.grid.total)
+        self._right = PETSc.Vec().createMPI(size, bsize=3, comm=self.mesh.comm)
+        self._left = self._right.duplicate()
+        self._new_solver(None)  # reports invalid PETSc options before the first step
+
+    def couple(self, links: object) -> None:
+        """Do nothing: with coordinates of links the diagonal is the preconditioner."""
+
+    def make(self, problem: StepProblem, held: np.ndarray) -> None:
+        """Set up at the positions of a problem; ``held`` (local, 3) nonzero for active unknowns, ghosts not yet up to
+        date. Collective."""
+        owned = self.mesh.n_owned
+        product = self.product
+        product.linearise(problem)
+        product.make_definite()
+        active = held[:owned] != 0.0
+        product.extension.kept = np.flatnonzero(~active) if active.any() else None
+        self.reduced = not problem.transform.nodewise
+        if self.reduced:
+            diagonal = product.diagonal()
+            diagonal[active] = problem.scale
+            self._diagonal = diagonal
+            return
+        blocks = product.blocks()
+        frames = problem.transform.frames
+        at, kept = self._free_parts(active, frames.nodes)
+        basis, inverse = np.tile(np.eye(3), (2, len(at), 1, 1))
+        basis[np.searchsorted(at, frames.nodes)] = frames.basis
+        inverse[np.searchsorted(at, frames.nodes)] = frames.inverse
+        to_x = inverse @ kept
+        full = np.swapaxes(to_x, 1, 2) @ full_blocks(blocks[at]) @ to_x + problem.scale * (np.eye(3) - kept)
+        blocks[at] = full.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
+        invert(blocks)
+        self._inverse = blocks
+        self._special, self._turned = at, kept @ basis
+        self._make_coarse(problem, *self._shared(at, to_x @ basis))
+
+    def _free_parts(self, active: np.ndarray, framed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the owned nodes with prescribed or active components or frames (k,), ascending, and the projections
+        (k, 3, 3) of their unknowns on those left free."""
+        supports = self.model.supports
+        held = active | supports.fixed if supports.any else active
+        special = held.any(axis=1)
+        special[framed] = True
+        inclined = supports.inclined if supports.any else None
+        if inclined is not None:
+            special[inclined.nodes] = True
+        nodes = np.flatnonzero(special)
+        kept = np.eye(3) * ~held[nodes][:, :, None]
+        if inclined is not None:
+            kept[np.searchsorted(nodes, inclined.nodes)] = inclined.free
+        return nodes, kept
+
+    def _shared(self, nodes: np.ndarray, matrices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the local nodes with matrices, ghosts included, and these, from those of owned nodes. Collective."""
+        shared = np.zeros((self.mesh.n_local, 10))
+        shared[nodes, 0] = 1.0
+        shared[nodes, 1:] = matrices.reshape(-1, 9)
+        self.mesh.update_ghosts(shared)
+        nodes = np.flatnonzero(shared[:, 0])
+        return nodes, np.ascontiguousarray(shared[nodes, 1:]).reshape(-1, 3, 3)
+
+    def _make_coarse(self, problem: StepProblem, nodes: np.ndarray, turned: np.ndarray) -> None:
+        mesh, product = self.mesh, self.product
+        extra_nodes, extra = product.extra_blocks()
+        every = np.union1d(nodes, extra_nodes)
+        place = np.full(mesh.n_local, -1, np.int32)
+        place[every] = np.arange(len(every), dtype=np.int32)
+        matrices = np.tile(np.eye(3), (len(every), 1, 1))
+        matrices[place[nodes]] = turned
+        further = np.zeros((len(every), 3, 3))
+        further[place[extra_nodes]] = extra
+        matrix = self.pattern.make(mesh.bars, product.x, product.stored, problem.nodal, place, matrices, further)
+        self._new_solver(matrix)
+        self._solver.setCoordinates(self._positions(problem)[: self.grid.n_owned])
+        with reproducible_products(mesh.comm):
+            self._solver.setUp()
+
+    def _positions(self, problem: StepProblem) -> np.ndarray:
+        """Return positions (local corners, 3) of the corners, moved by the affine map that fits the nodes best, with
+        origin at the centre. Collective."""
+        mesh, owned = self.mesh, self.mesh.n_owned
+        x, points = problem.x[:owned], mesh.points[:owned]
+        sums = mesh.comm.allreduce(np.stack([x.sum(axis=0), points.sum(axis=0)])) / mesh.n_nodes
+        away = points - sums[1]
+        moments = mesh.comm.allreduce(np.concatenate([away.T @ away, (x - sums[0]).T @ away]))
+        # a plane truss determines the map in its plane only: across it the nodes stay apart as in the mesh
+        size = max(float(np.trace(moments[:3])), 1e-300)
+        weak = 1e-9 * size * np.eye(3)
+        gradient = np.linalg.solve((moments[:3] + weak).T, (moments[3:] + weak).T).T
+        return (self.grid.positions - sums[1]) @ gradient.T
+
+    def _new_solver(self, matrix: PETSc.Mat | None) -> None:
+        if self._solver is not None:
+            self._solver.destroy()
+        if self._matrix is not None:
+            self._matrix.destroy()
+        self._matrix = matrix
+        self._solver = PETSc.PC().create(self.mesh.comm)
+        self._solver.setOptionsPrefix(_PREFIX)
+        if matrix is not None:
+            self._solver.setOperators(matrix, matrix)
+        self._solver.setType("gamg")
+        self._solver.setFromOptions()
+
+    def apply(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """Compute one cycle y = P x of all unknowns. Collective."""
+        given = x.getArray(readonly=True).reshape(-1, 3)
+        if self.reduced:
+            y.setArray((given / self._diagonal).ravel())
+            return
+        r, z, found, product = self._r, self._z, self._x, self._product
+        r[:] = given
+        z[:] = 0.0
+        found[:] = 0.0
+        product[:] = 0.0
+        self._polynomial()
+        self.product.extension.times(z, product)
+        r -= product
+        product[:] = 0.0
+        self._correct()
+        self.product.extension.times(self._e, product)
+        z[:] = 0.0
+        self._polynomial()
+        y.setArray(found.ravel())
+
+    def _polynomial(self) -> None:
+        """Make the steps of the polynomial; the residual lacks the product at the start, and that of the last step at
+        the end."""
+        for k in range(1, _DEGREE + 1):
+            if k > 1:
+                self.product.extension.times(self._z, self._product)
+            of_last, of_residual = (2 * k - 3) / (2 * k + 1), (8 * k - 4) / ((2 * k + 1) * _LARGEST)
+            smooth(self._inverse, self._product, of_last, of_residual, self._r, self._z, self._x)
+
+    def _correct(self) -> None:
+        """Add the coarse correction of the residual to the solution."""
+        grid, r, coarse = self.grid, self._r, self._coarse
+        at = self._special
+        if len(at):
+            self._e[:] = r
+            r = self._e
+            r[at] = np.einsum("kji,kj->ki", self._turned, r[at])
+        coarse[:] = 0.0
+        restrict(grid.t, grid.box, grid.base, grid.corners, r, coarse)
+        grid.give(coarse)
+        self._right.setArray(coarse[: grid.n_owned].ravel())
+        self._solver.apply(self._right, self._left)
+        coarse[: grid.n_owned] = self._left.getArray(readonly=True).reshape(-1, 3)
+        grid.bring(coarse)
+        interpolate(grid.t, grid.box, grid.base, grid.corners, coarse, self._e)
+        self._e[at] = np.einsum("kij,kj->ki", self._turned, self._e[at])
+        self._x += self._e
+
+    def destroy(self) -> None:
+        """Free the PETSc objects."""
+        for thing in (self._solver, self._matrix, self._right, self._left, self.product, self.grid):
+            if thing is not None:
+                thing.destroy()

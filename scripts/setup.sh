@@ -285,7 +285,7 @@ compile_loops() {
     rm -rf "$folder"
     return $status
 }
-say "compiling loops for this machine: half a minute to a minute"
+say "compiling loops for this machine: about a minute"
 compile_loops || say "not all compiled: the first runs compile what they need"
 stamp > "$venv/setup-done"
 say "done in $((SECONDS - start)) s: ${venv#"$root"/}"

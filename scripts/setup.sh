@@ -144,8 +144,18 @@ pip_install() {
     "$python" -m pip install --disable-pip-version-check "$@" > "$log" 2>&1 || failed "$log" "pip install $*"
 }
 
+# Packages that a user installs later must not bring a NumPy with which petsc4py does not work.
+limit_numpy() {
+    rm -f "$venv/pip.conf"
+    if [[ $1 == *"<"* && $venv != *[[:space:]]* ]]; then
+        echo "$1" > "$venv/constraints.txt"
+        printf '[install]\nconstraint = %s\n' "$venv/constraints.txt" > "$venv/pip.conf"
+    fi
+}
+
 install_rest() {
     local list
+    limit_numpy "$1"
     mapfile -t list < <(requirements petsc4py mpi4py h5py)
     say "installing Python packages"
     pip_install "$@" "${list[@]}"

@@ -9,9 +9,11 @@ import sys
 
 import pytest
 
+import pfem_petsc
+from pfem_petsc import InputError
 from pfem_petsc.case.builtin import built_in_cases
 from pfem_petsc.case.schema import Case
-from pfem_petsc.cli import completion, environment
+from pfem_petsc.cli import completion, environment, launcher
 from pfem_petsc.cli.environment import Finding, inspect_environment, report
 from pfem_petsc.cli.main import VERBS, main, make_parser
 
@@ -163,6 +165,17 @@ def test_probes_run_here():
 def test_wrong_words_are_refused(words, text, capsys):
     assert main(words) == 2
     assert text in capsys.readouterr().err
+
+
+def test_a_numpy_that_is_too_new_has_its_remedy(tmp_path, monkeypatch):
+    """In Python and on the command line: what petsc4py raises then, and nothing else."""
+    (tmp_path / "binding_of_a_test.py").write_text('raise ValueError("numpy.dtype size changed, may indicate ...")')
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setitem(pfem_petsc._HOMES, "Bound", "binding_of_a_test")
+    with pytest.raises(InputError, match=r'python -m pip install "numpy<2"') as caught:
+        pfem_petsc.Bound  # noqa: B018 - imported at its first use
+    assert launcher._message(caught.value.__cause__) == (2, f"error: {caught.value}")
+    assert launcher._message(ValueError("numpy is here"))[1].startswith("internal error: ValueError")
 
 
 @pytest.fixture(scope="module")

@@ -121,6 +121,9 @@ slepc_package() {
 make_venv() {
     local made_from
     made_from=$(cat "$venv/made-from" 2>/dev/null || foundation)
+    if [[ ${made_from%% *} != "$root" && $venv != "$root"/* && -d ${made_from%% *} ]]; then
+        fail "$venv belongs to the checkout ${made_from%% *}: give PFEM_VENV another folder, or unset it"
+    fi
     if ! "$python" -c "" 2>/dev/null || [[ $made_from != "$(foundation)" ]]; then
         say "making ${venv#"$root"/} with $1"
         "$1" -m venv --clear "${@:2}" "$venv"

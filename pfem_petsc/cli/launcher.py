@@ -14,7 +14,7 @@ import traceback
 from collections.abc import Callable
 from typing import TYPE_CHECKING, TextIO
 
-from ..errors import EarlyStop, InputError, PfemError, SimulationFailure, printable
+from ..errors import NUMPY_REMEDY, EarlyStop, InputError, PfemError, SimulationFailure, numpy_is_too_new, printable
 
 if TYPE_CHECKING:
     from mpi4py import MPI

@@ -125,6 +125,20 @@ def test_later_installs_keep_numpy(tmp_path, limit, kept):
         assert Path(conf["install"]["constraint"]).read_text() == "numpy<2\n"
 
 
+def test_an_environment_of_another_checkout_is_left_alone(tmp_path):
+    text = (ROOT / "scripts" / "setup.sh").read_text()
+    (function,) = re.findall(r"^make_venv\(\) \{\n.*?^\}\n", text, re.MULTILINE | re.DOTALL)
+    other, venv = tmp_path / "other", tmp_path / "venv"
+    other.mkdir()
+    venv.mkdir()
+    (venv / "made-from").write_text(f"{other} distribution /usr/bin/python3")
+    given = f'root="{tmp_path}/own" venv="{venv}" python=false\nfail() {{ echo "$*" >&2; exit 1; }}\nsay() {{ :; }}\n'
+    code = f"{given}foundation() {{ echo changed; }}\n{function}\nmake_venv false"
+    done = subprocess.run(["bash", "-euc", code], capture_output=True, text=True)
+    assert done.returncode == 1 and f"belongs to the checkout {other}" in done.stderr
+    assert (venv / "made-from").read_text().startswith(str(other))
+
+
 def test_scripts_are_valid_shell():
     for script in PACKAGING.glob("*.sh"):
         subprocess.run(["bash", "-n", str(script)], check=True)

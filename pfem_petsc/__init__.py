@@ -56,7 +56,14 @@ def __getattr__(name: str) -> Any:
     """Import an exported name at its first use."""
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(importlib.import_module(_HOMES[name], __name__), name)
+    try:
+        value = getattr(importlib.import_module(_HOMES[name], __name__), name)
+    except (ValueError, ImportError) as error:
+        from .errors import NUMPY_REMEDY, InputError, numpy_is_too_new
+
+        if numpy_is_too_new(error):
+            raise InputError(NUMPY_REMEDY) from error
+        raise
     globals()[name] = value
     return value
 

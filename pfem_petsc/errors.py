@@ -2,12 +2,35 @@
 
 from __future__ import annotations
 
-__all__ = ["EarlyStop", "InputError", "NotConverged", "PfemError", "SimulationFailure", "printable"]
+__all__ = [
+    "NUMPY_REMEDY",
+    "EarlyStop",
+    "InputError",
+    "NotConverged",
+    "PfemError",
+    "SimulationFailure",
+    "numpy_is_too_new",
+    "printable",
+]
 
 
 def printable(text: str) -> str:
     """Return a text without control characters, except line breaks and tabs; a terminal would interpret them."""
     return "".join(c if c.isprintable() or c in "\n\t" else ascii(c)[1:-1] for c in text)
+
+
+NUMPY_REMEDY = (
+    "NumPy was replaced by a version with which the installed petsc4py, mpi4py or h5py do not work: "
+    'python -m pip install "numpy<2"'
+)
+
+
+def numpy_is_too_new(error: BaseException) -> bool:
+    """Whether an import failed because a package is compiled against another NumPy than the one that is here."""
+    text = str(error)
+    return isinstance(error, ValueError | ImportError) and (
+        "numpy.dtype size changed" in text or "compiled using NumPy 1" in text
+    )
 
 
 class PfemError(Exception):

@@ -121,6 +121,9 @@ slepc_package() {
 make_venv() {
     local made_from
     made_from=$(cat "$venv/made-from" 2>/dev/null || foundation)
+    if [[ ${made_from%% *} != "$root" && $venv != "$root"/* && -d ${made_from%% *} ]]; then
+        fail "$venv belongs to the checkout ${made_from%% *}: give PFEM_VENV another folder, or unset it"
+    fi
     if ! "$python" -c "" 2>/dev/null || [[ $made_from != "$(foundation)" ]]; then
         say "making ${venv#"$root"/} with $1"
         "$1" -m venv --clear "${@:2}" "$venv"
@@ -144,8 +147,18 @@ pip_install() {
     "$python" -m pip install --disable-pip-version-check "$@" > "$log" 2>&1 || failed "$log" "pip install $*"
 }
 
+# Packages that a user installs later must not bring a NumPy with which petsc4py does not work.
+limit_numpy() {
+    rm -f "$venv/pip.conf"
+    if [[ $1 == *"<"* && $venv != *[[:space:]]* ]]; then
+        echo "$1" > "$venv/constraints.txt"
+        printf '[install]\nconstraint = %s\n' "$venv/constraints.txt" > "$venv/pip.conf"
+    fi
+}
+
 install_rest() {
     local list
+    limit_numpy "$1"
     mapfile -t list < <(requirements petsc4py mpi4py h5py)
     say "installing Python packages"
     pip_install "$@" "${list[@]}"
@@ -285,7 +298,7 @@ compile_loops() {
     rm -rf "$folder"
     return $status
 }
-say "compiling loops for this machine: half a minute to a minute"
+say "compiling loops for this machine: about a minute"
 compile_loops || say "not all compiled: the first runs compile what they need"
 stamp > "$venv/setup-done"
 say "done in $((SECONDS - start)) s: ${venv#"$root"/}"

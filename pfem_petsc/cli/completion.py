@@ -37,26 +37,42 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def words_of(parser: Parser) -> dict[str, Any]:
-    """Return ``verbs``, ``cases``, ``keys`` of --set, ``options`` of each verb, and the ``choices`` of options."""
-    (verbs,) = (action for action in parser._actions if isinstance(action, argparse._SubParsersAction))
+    """Return what there is to complete.
+
+    Returns
+    -------
+    ``verbs``, ``keys`` of --set, and by verb, or by verb and action as "mesh generate": ``options``, ``first``, the
+    words that the first argument may be, and ``choices`` of options by (verb, option).
+    """
+    from ..registry import choices
+
+    cases = list(built_in_cases())
+    generators = list(choices("pfem_petsc.mesh.generators"))
     options: dict[str, list[str]] = {}
+    first: dict[str, list[str]] = {}
     chosen: dict[tuple[str, str], list[str]] = {}
-    with_case = []
-    for verb, sub in verbs.choices.items():
+    verbs = _subparsers(parser)
+    actions = {f"{verb} {name}": each for verb, sub in verbs.items() for name, each in _subparsers(sub).items()}
+    for verb, sub in {**verbs, **actions}.items():
         options[verb] = [text for action in sub._actions for text in action.option_strings if text.startswith("--")]
-        if any(action.dest == "case" for action in sub._actions):
-            with_case.append(verb)
+        dests = {action.dest: action for action in sub._actions}
+        if _subparsers(sub):
+            first[verb] = list(_subparsers(sub))
+        elif "case" in dests and not dests["case"].option_strings:
+            first[verb] = cases
+        elif "what" in dests:
+            first[verb] = [*generators, *cases]
+        elif "shell" in dests:
+            first[verb] = list(SHELLS)
         for action in sub._actions:
             for text in action.option_strings if action.choices else ():
                 chosen[verb, text] = [str(value) for value in action.choices or ()]
-    return {
-        "verbs": list(verbs.choices),
-        "cases": list(built_in_cases()),
-        "keys": sorted(set(keys())),
-        "options": options,
-        "choices": chosen,
-        "with_case": with_case,
-    }
+    return {"verbs": list(verbs), "keys": sorted(set(keys())), "options": options, "first": first, "choices": chosen}
+
+
+def _subparsers(parser: argparse.ArgumentParser) -> dict[str, argparse.ArgumentParser]:
+    found = [action.choices for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
+    return found[0] if found else {}
 
 
 def keys() -> Iterator[str]:
@@ -103,44 +119,46 @@ def _of_modules(package: str) -> Iterator[str]:
 
 def bash(words: dict[str, Any]) -> str:
     """Return the script for bash."""
-    options = "\n".join(f'        {verb}) options="{" ".join(found)}" ;;' for verb, found in words["options"].items())
+    options = "\n".join(f'        "{verb}") options="{" ".join(found)}" ;;' for verb, found in words["options"].items())
+    first = "\n".join(f'        "{verb}") first="{" ".join(found)}" ;;' for verb, found in words["first"].items())
     chosen = "\n".join(
         f'        "{verb} {option}") words="{" ".join(found)}" ;;' for (verb, option), found in words["choices"].items()
     )
     return f"""\
 # Completion of pfem-petsc for bash: source it.
 _pfem_petsc() {{
-    local line=$COMP_LINE current verb option words options word k
+    local line=$COMP_LINE current verb=run option= words= options= first= arguments=0 word k
     # words as typed: the shell itself also splits them at "=" and ":"
     line=${{line:0:COMP_POINT}}
     read -ra typed <<< "$line"
     if [[ $line == *[[:space:]] ]]; then typed+=(""); fi
     current=${{typed[-1]}}
-    verb=run option=
     for ((k = 1; k < ${{#typed[@]}} - 1; k++)); do
         word=${{typed[k]}}
-        if [[ $k == 1 && " {" ".join(words["verbs"])} " == *" $word "* ]]; then verb=$word; fi
-        if [[ $word == -* ]]; then option=$word; fi
+        if [[ $k == 1 && " {" ".join(words["verbs"])} " == *" $word "* ]]; then verb=$word
+        elif [[ $k == 2 && " {_compound(words)} " == *" $verb/$word "* ]]; then verb="$verb $word"
+        elif [[ $word == -* ]]; then option=$word
+        elif [[ -z $option ]]; then arguments=1
+        fi
     done
     case $verb in
 {options}
     esac
-    words=
+    case $verb in
+{first}
+    esac
+    if [[ ${{#typed[@]}} == 2 ]]; then first="{" ".join([*words["verbs"], *words["first"]["run"]])}"; fi
     if [[ $current == -* ]]; then
         words=$options
     elif [[ $option == --set || $option == --vary ]]; then
-        words="{" ".join(key + "=" for key in words["keys"])}"
+        words="{_keys(words)}"
         if [[ $current == *=* ]]; then words=; fi
         compopt -o nospace
     else
         case "$verb $option" in
 {chosen}
         *)
-            if [[ ${{#typed[@]}} == 2 ]]; then words="{" ".join([*words["verbs"], *words["cases"]])}"
-            elif [[ " {" ".join(words["with_case"])} " == *" $verb "* && -z $option ]]; then
-                words="{" ".join(words["cases"])}"
-            elif [[ $verb == completion ]]; then words="{" ".join(SHELLS)}"
-            fi ;;
+            if [[ -z $option && $arguments == 0 ]]; then words=$first; fi ;;
         esac
         compopt -o default
     fi
@@ -150,54 +168,84 @@ complete -F _pfem_petsc pfem-petsc pfem
 """
 
 
+def _keys(words: dict[str, Any]) -> str:
+    return " ".join(key + "=" for key in words["keys"])
+
+
+def _compound(words: dict[str, Any]) -> str:
+    """Return verbs with their actions, as mesh/generate."""
+    return " ".join(verb.replace(" ", "/") for verb in words["options"] if " " in verb)
+
+
 def zsh(words: dict[str, Any]) -> str:
-    """Return the script for zsh: that of bash by its compatible completion."""
+    """Return the script for zsh."""
+    chosen = {f"{verb} {option}": found for (verb, option), found in words["choices"].items()}
     return f"""\
 #compdef pfem-petsc pfem
 # Completion of pfem-petsc for zsh: source it, or put it as _pfem-petsc into a folder of $fpath.
 _pfem_petsc_zsh() {{
-    local verb=run option= word k
+    local verb=run option= word k arguments=0
     for ((k = 2; k < CURRENT; k++)); do
         word=$words[k]
-        if [[ $k == 2 && " {" ".join(words["verbs"])} " == *" $word "* ]]; then verb=$word; fi
-        if [[ $word == -* ]]; then option=$word; fi
+        if [[ $k == 2 && " {" ".join(words["verbs"])} " == *" $word "* ]]; then verb=$word
+        elif [[ $k == 3 && " {_compound(words)} " == *" $verb/$word "* ]]; then verb="$verb $word"
+        elif [[ $word == -* ]]; then option=$word
+        elif [[ -z $option ]]; then arguments=1
+        fi
     done
-    local -A options=({" ".join(f"{verb} '{' '.join(found)}'" for verb, found in words["options"].items())})
+    local -A options=({_table(words["options"])})
+    local -A first=({_table(words["first"])})
+    local -A chosen=({_table(chosen)})
+    if [[ $CURRENT == 2 ]]; then first[run]="{" ".join([*words["verbs"], *words["first"]["run"]])}"; fi
     if [[ $PREFIX == -* ]]; then
         compadd -- ${{=options[$verb]}}
     elif [[ $option == --set || $option == --vary ]]; then
-        compadd -S '' -- {" ".join(key + "=" for key in words["keys"])}
-    elif [[ $CURRENT == 2 ]]; then
-        compadd -- {" ".join([*words["verbs"], *words["cases"]])}; _files
+        compadd -S '' -- {_keys(words)}
+    elif [[ -n ${{chosen[$verb $option]}} ]]; then
+        compadd -- ${{=chosen[$verb $option]}}
     else
-        if [[ " {" ".join(words["with_case"])} " == *" $verb "* && -z $option ]]; then
-            compadd -- {" ".join(words["cases"])}
-        elif [[ $verb == completion ]]; then
-            compadd -- {" ".join(SHELLS)}
-        fi
+        if [[ -z $option && $arguments == 0 ]]; then compadd -- ${{=first[$verb]}}; fi
         _files
     fi
 }}
-compdef _pfem_petsc_zsh pfem-petsc pfem
+if [[ $funcstack[1] == _pfem-petsc ]]; then
+    _pfem_petsc_zsh "$@"
+else
+    if ! whence compdef > /dev/null; then autoload -Uz compinit; compinit; fi
+    compdef _pfem_petsc_zsh pfem-petsc pfem
+fi
 """
+
+
+def _table(named: dict[str, list[str]]) -> str:
+    return " ".join(f"'{name}' '{' '.join(found)}'" for name, found in named.items())
 
 
 def fish(words: dict[str, Any]) -> str:
     """Return the script for fish."""
-    verbs = " ".join(words["verbs"])
+    verbs, named = " ".join(words["verbs"]), "complete -c pfem-petsc"
     lines = [
         "# Completion of pfem-petsc for fish.",
-        f"complete -c pfem-petsc -n 'not __fish_seen_subcommand_from {verbs}' -a '{verbs}'",
+        "function __pfem_petsc_at  # verb, number of words before this one",
+        "    set -l typed (commandline -opc)",
+        '    test (count $typed) = $argv[2]; and string match -q -- "$argv[1]*" "$typed[2..]"',
+        "end",
+        "function __pfem_petsc_keys",
+        "    set -l typed (commandline -opc)",
+        "    set -l last (string match -- '-*' $typed)[-1]",
+        "    contains -- $last --set --vary",
+        "end",
+        f"{named} -n '__pfem_petsc_at \"\" 1' -a '{verbs} {' '.join(words['first']['run'])}'",
+        f"{named} -n '__pfem_petsc_keys' -f -a '{_keys(words)}'",
     ]
-    cases = " ".join(words["cases"])
-    lines.append(f"complete -c pfem-petsc -n 'test (count (commandline -opc)) -le 2' -a '{cases}'")
+    for verb, found in words["first"].items():
+        at = len(verb.split()) + 1
+        lines.append(f"{named} -n '__pfem_petsc_at \"{verb}\" {at}' -a '{' '.join(found)}'")
     for verb, options in words["options"].items():
-        seen = f"__fish_seen_subcommand_from {verb}" if verb != "run" else f"not __fish_seen_subcommand_from {verbs}"
+        seen = "; and ".join(f"__fish_seen_subcommand_from {word}" for word in verb.split())
+        seen = seen if verb != "run" else f"not __fish_seen_subcommand_from {verbs}; or {seen}"
         for option in options:
             found = words["choices"].get((verb, option))
             extra = f" -x -a '{' '.join(found)}'" if found else ""
-            if option in ("--set", "--vary"):
-                extra = f" -x -a '{' '.join(key + '=' for key in words['keys'])}'"
-            lines.append(f"complete -c pfem-petsc -n '{seen}' -l {option.removeprefix('--')}{extra}")
-    lines.append(f"complete -c pfem-petsc -n '__fish_seen_subcommand_from completion' -a '{' '.join(SHELLS)}'")
-    return "\n".join([*lines, ""])
+            lines.append(f"{named} -n '{seen}' -l {option.removeprefix('--')}{extra}")
+    return "\n".join([*lines, "complete -c pfem -w pfem-petsc", ""])

@@ -14,7 +14,7 @@ import traceback
 from collections.abc import Callable
 from typing import TYPE_CHECKING, TextIO
 
-from ..errors import EarlyStop, InputError, PfemError, SimulationFailure, printable
+from ..errors import NUMPY_REMEDY, EarlyStop, InputError, PfemError, SimulationFailure, numpy_is_too_new, printable
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -165,6 +165,8 @@ def _message(error: BaseException) -> tuple[int, str]:
     if isinstance(error, ModuleNotFoundError) and not str(error.name).startswith(__package__.partition(".")[0]):
         way = "scripts/setup.sh makes an environment that has it: source .venv/bin/activate"
         return InputError.exit_status, f"error: {error}; {way}"
+    if numpy_is_too_new(error):
+        return InputError.exit_status, f"error: {NUMPY_REMEDY}"
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EIO):
         where = f"{error.filename}: " if error.filename else "standard output, or a file that is being written: "
         return SimulationFailure.exit_status, f"error: {where}{error.strerror}; make room, or write elsewhere"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import configparser
 import os
 import re
 import shlex
@@ -108,6 +109,34 @@ def test_set_up_compiles_what_the_first_commands_need():
     assert {command.split()[0] for command in commands} == {"bench", "rod_impact", "render"}
     for command in commands:
         _parse(shlex.split(command))
+
+
+@pytest.mark.parametrize(("limit", "kept"), [("numpy<2", True), ("numpy", False)])
+def test_later_installs_keep_numpy(tmp_path, limit, kept):
+    """The environment has a pip.conf that pip reads, where the bindings need an old NumPy; else none is left."""
+    text = (ROOT / "scripts" / "setup.sh").read_text()
+    (function,) = re.findall(r"^limit_numpy\(\) \{\n.*?^\}\n", text, re.MULTILINE | re.DOTALL)
+    (tmp_path / "pip.conf").write_text("old")
+    subprocess.run(["bash", "-euc", f'venv="{tmp_path}"\n{function}\nlimit_numpy "{limit}"'], check=True)
+    assert (tmp_path / "pip.conf").exists() == kept
+    if kept:
+        conf = configparser.ConfigParser()
+        conf.read(tmp_path / "pip.conf")
+        assert Path(conf["install"]["constraint"]).read_text() == "numpy<2\n"
+
+
+def test_an_environment_of_another_checkout_is_left_alone(tmp_path):
+    text = (ROOT / "scripts" / "setup.sh").read_text()
+    (function,) = re.findall(r"^make_venv\(\) \{\n.*?^\}\n", text, re.MULTILINE | re.DOTALL)
+    other, venv = tmp_path / "other", tmp_path / "venv"
+    other.mkdir()
+    venv.mkdir()
+    (venv / "made-from").write_text(f"{other} distribution /usr/bin/python3")
+    given = f'root="{tmp_path}/own" venv="{venv}" python=false\nfail() {{ echo "$*" >&2; exit 1; }}\nsay() {{ :; }}\n'
+    code = f"{given}foundation() {{ echo changed; }}\n{function}\nmake_venv false"
+    done = subprocess.run(["bash", "-euc", code], capture_output=True, text=True)
+    assert done.returncode == 1 and f"belongs to the checkout {other}" in done.stderr
+    assert (venv / "made-from").read_text().startswith(str(other))
 
 
 def test_scripts_are_valid_shell():

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import itertools
-import os
 from collections.abc import Iterable, Sequence
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ from .curves import History, draw_curves, draw_spectra, make_chart, read, usual_
 from .energies import draw_energies
 from .filters import WINDOWS, Filter, make_filter
 from .forces import draw_force_displacement, draw_forces
+from .options import opened
 
 __all__ = ["plot"]
 
@@ -75,7 +75,7 @@ def plot(
     names, sines = (None if found is None else list(found) for found in (curves, spectrum))
     _check_options(paths, names, sines, against, window)
     with ExitStack() as stack, matplotlib.rc_context(STYLE):
-        results = [stack.enter_context(_opened(path)) for path in paths]
+        results = [stack.enter_context(opened(path)) for path in paths]
         folder = Path(output) if output is not None else Path(results[0].path).parent
         for result in results:
             if "time" not in result.history or len(result.history["time"]) == 0:
@@ -134,14 +134,6 @@ def _usual(
     if "csv" in suffixes and hasattr(result, "table"):
         written.append(result.table().to_csv(folder / "history.csv"))
     return written
-
-
-def _opened(result: Path | str | Any) -> Any:
-    if not isinstance(result, (str, os.PathLike)):
-        return nullcontext(result)
-    from ..output.result import open_result
-
-    return open_result(result)
 
 
 def _free(file: Path, suffixes: Sequence[str]) -> Path:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import ExitStack, nullcontext
+from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +17,7 @@ from .files import emptied, save
 from .film import Film, Look
 from .frames import Resampled, chosen_frames, even_times
 from .motion import Motion, Overlays
+from .options import kinds_of_films, limits_of, opened
 from .radii import drawn_radii
 from .scene import TUBE_LIMIT, Style
 from .shots import Moves
@@ -27,15 +27,6 @@ if TYPE_CHECKING:
 
 __all__ = ["render"]
 
-VIDEOS = {
-    "mp4": ("mp4",),
-    "gif": ("gif",),
-    "both": ("mp4", "gif"),
-    "none": (),
-    "webm": ("webm",),
-    "webp": ("webp",),
-}
-STYLES = ("auto", "tubes", "lines")
 SHORT = 2.0  # seconds below which a film is too short to follow
 TELL = 5.0  # seconds between two progress messages
 
@@ -123,7 +114,7 @@ def render(
     """
     first = comm is None or comm.rank == 0
     tell = note if first else _nothing
-    kinds = _checked_options(video, fps, size, style, radius_scale, bar_width, transparent)
+    kinds = kinds_of_films(video, fps, size, style, radius_scale, bar_width, transparent)
     moves = Moves(view, zoom, orbit, path, follow).checked()
     many = isinstance(result_path, (list, tuple))
     with ExitStack() as stack:
@@ -163,50 +154,6 @@ def _nothing(text: str) -> None:
     """Receive messages of ranks that do not print."""
 
 
-def _checked_options(
-    video: str | None,
-    fps: float,
-    size: tuple[int, int],
-    style: str,
-    radius_scale: float,
-    bar_width: float | None,
-    transparent: bool,
-) -> tuple[str, ...]:
-    """Return the kinds of films to make, after checks."""
-    video = video or ("webm" if transparent else "mp4")
-    if video not in VIDEOS:
-        raise InputError(f"render: video = {video!r} is not known; it is one of {', '.join(VIDEOS)}")
-    if transparent and video in ("mp4", "both"):
-        raise InputError(f"render: video = {video!r}: MP4 has no transparent background; take webm, webp, gif or none")
-    if size[0] < 160 or size[1] < 120 or max(size) > 8192:
-        raise InputError(
-            f"render: size = {size[0]} x {size[1]} pixels is out of range; widths are 160 to 8192, heights 120 to 8192"
-        )
-    if not fps > 0:
-        raise InputError(f"render: fps = {fps:g} must be positive")
-    checked_style(style, radius_scale)
-    if bar_width is not None and not (np.isfinite(bar_width) and bar_width > 0.0):
-        raise InputError(f"render: bar_width = {bar_width:g} must be positive")
-    return VIDEOS[video]
-
-
-def checked_style(style: str, radius_scale: float) -> None:
-    """Refuse a style that is not known."""
-    if style not in STYLES:
-        raise InputError(f"render: style = {style!r} is not known; it is one of {', '.join(STYLES)}")
-    if not (np.isfinite(radius_scale) and radius_scale > 0.0):
-        raise InputError(f"render: radius_scale = {radius_scale:g} must be positive")
-
-
-def opened(result: Path | str | Any) -> Any:
-    """Return a context of a result that is open, or opened by its path."""
-    if not isinstance(result, (str, os.PathLike)):
-        return nullcontext(result)
-    from ..output.result import open_result
-
-    return open_result(result)
-
-
 def _labels(results: Sequence[Any], labels: Sequence[str] | None) -> list[str]:
     if labels is None:
         return [Path(result.path).absolute().parent.name for result in results]
@@ -240,17 +187,6 @@ def _timed(
         return [Resampled(result, times) for result in results], list(range(len(times)))
     chosen = chosen_frames(frames, times, note, span)
     return [results[0], *(Resampled(result, times) for result in results[1:])], chosen
-
-
-def limits_of(
-    clim: tuple[float, float] | None, symmetric: bool, found: Sequence[tuple[float, float]]
-) -> tuple[float, float]:
-    """Return the range of colours: the one given, or that of all found, symmetric if asked for."""
-    low, high = clim or (min(pair[0] for pair in found), max(pair[1] for pair in found))
-    if symmetric:
-        high = max(abs(low), abs(high))
-        low = -high
-    return low, high
 
 
 def _style(

@@ -46,7 +46,7 @@ def render_html(
     InputError
         For options that do not fit the result, or a file that cannot be written.
     """
-    from .render import opened
+    from .options import opened
 
     with opened(result_path) as result:
         shown = state(result, frame, note, **options)
@@ -117,7 +117,7 @@ def state(
         For options that do not fit the result.
     """
     from .frames import chosen_frames
-    from .render import checked_style, limits_of
+    from .options import checked_style, limits_of
 
     checked_style(style, radius_scale)
     chosen = chosen_frames([frame], np.asarray(result.times), note)

@@ -35,7 +35,7 @@ def show(
     InputError
         For options that do not fit the result, and without a display.
     """
-    from .render import opened
+    from .options import opened
 
     if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise InputError(
@@ -62,7 +62,7 @@ def plotter_of(
     motion, colour, scale = shown["motion"], shown["colour"], shown["scale"]
     if options["clim"] is None:  # one range for all snapshots
         from .fields import ColourScale
-        from .render import limits_of
+        from .options import limits_of
 
         every = [colour.limits(range(len(result.times)))]
         limits = limits_of(None, options.get("symmetric", False), every)

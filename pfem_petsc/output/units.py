@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from functools import cache
 from typing import NamedTuple
 
@@ -17,12 +18,16 @@ __all__ = [
     "PREFIXES",
     "TIME",
     "Axis",
+    "common_prefix",
     "duration",
     "engineering",
     "field_unit",
     "prefix_for",
     "unit_of",
 ]
+
+_LEAST = {"Pa": 0, "N": -6, "J": -9, "m/s": -6, "m/s²": -3}
+"""Powers of the smallest prefixes in use: no one thinks in millipascal, and a picojoule is mostly rounding."""
 
 PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G", 12: "T"}
 
@@ -107,8 +112,9 @@ def _units_of_variables() -> dict[str, str]:
 def prefix_for(magnitude: float, unit: str) -> tuple[float, str]:
     """Return factor and unit that scale a magnitude to 1 .. 1000: ``(0.0024, "s")`` -> ``(1e3, "ms")``.
 
-    Powers (``m²``), temperatures and pure numbers keep their unit, because a prefix would be misread; so do zero and
-    values that are not finite. Kilograms already have a prefix.
+    Powers (``m²``), temperatures and pure numbers keep their unit, because a prefix would be misread; so do zero,
+    values that are not finite, and values too small for a prefix in use (``0.5 Pa``, ``2e-13 J``). Kilograms already
+    have a prefix.
     """
     plain = unit in ("s", "m", "m/s", "m/s²", "N", "Pa", "J", "B")
     if not plain or not math.isfinite(magnitude) or magnitude == 0.0:
@@ -118,7 +124,28 @@ def prefix_for(magnitude: float, unit: str) -> tuple[float, str]:
     if unit in ("m/s", "m/s²", "m") and power > 0:
         power = min(power, 3) if unit != "m/s²" else 0
     power = max(-12, min(12, power))
+    power = power if power >= _LEAST.get(unit, -12) else 0
     return 10.0**-power, PREFIXES[power] + unit
+
+
+def common_prefix(magnitudes: Iterable[float], unit: str) -> tuple[float, str]:
+    """Return one factor and unit for several panels: those of the largest, or of one between that and the smallest.
+
+    The latter where the smallest panel would have numbers below 0.01. Panels of rounding errors do not count.
+
+    Parameters
+    ----------
+    magnitudes : the largest number of each panel, in the unit
+    unit : as for :func:`prefix_for`
+    """
+    sizes = [abs(size) for size in magnitudes if math.isfinite(size) and size != 0.0]
+    sizes = [size for size in sizes if size > 1e-9 * max(sizes)]
+    factor, shown = prefix_for(max(sizes, default=0.0), unit)
+    if not sizes or factor * min(sizes) >= 0.01:
+        return factor, shown
+    most, least = (round(-math.log10(prefix_for(size, unit)[0])) for size in (max(sizes), min(sizes)))
+    power = least + 3 * ((most - least) // 6)
+    return (10.0**-power, PREFIXES[power] + unit) if most > least else (factor, shown)
 
 
 def engineering(value: float, unit: str, digits: int = 4) -> str:

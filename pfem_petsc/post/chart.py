@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import itertools
+import textwrap
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
-from ..output.units import TIME, Axis, prefix_for
+from ..output.units import TIME, Axis, common_prefix, prefix_for
 
 __all__ = [
     "COLOURS",
@@ -23,9 +24,9 @@ __all__ = [
     "Chart",
     "boxes_allowed",
     "check_formats",
+    "largest",
     "literal",
     "thinned",
-    "window_mean",
 ]
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#6b7280", "#000000")
@@ -64,6 +65,11 @@ STYLE: dict[str, Any] = {
     "figure.facecolor": "white",
 }
 
+_WIDTHS = {1: 8.6, 2: 10.4}
+"""Widths of pictures by the number of columns [inch]."""
+_LETTER = 0.075
+"""Width of a letter of a note [inch]."""
+
 _POINTS = 3000  # approximate maximum number of points of a curve, more than a picture has columns
 
 
@@ -83,25 +89,10 @@ def thinned(time: np.ndarray, values: np.ndarray, points: int = _POINTS) -> tupl
     return time[picked], values[picked]
 
 
-def window_mean(time: np.ndarray, values: np.ndarray, width: float) -> np.ndarray:
-    """Return the mean of a piecewise linear curve over a window [s] before each point, truncated at the start.
-
-    It depends on past values only. The integral is exact for any spacing of the points.
-    """
-    if len(time) < 2 or width <= 0:
-        return values.copy()
-    steps = np.diff(time)
-    integral = np.concatenate([[0.0], np.cumsum(0.5 * steps * (values[1:] + values[:-1]))])
-    low = np.maximum(time - width, time[0])
-
-    def primitive(at: np.ndarray) -> np.ndarray:
-        k = np.clip(np.searchsorted(time, at, side="right") - 1, 0, len(steps) - 1)
-        part = at - time[k]
-        slope = (values[k + 1] - values[k]) / np.where(steps[k] > 0, steps[k], 1.0)
-        return integral[k] + part * (values[k] + 0.5 * slope * part)
-
-    span = time - low
-    return np.where(span > 0.0, (integral - primitive(low)) / np.where(span > 0.0, span, 1.0), values)
+def largest(values: np.ndarray) -> float:
+    """Return the largest magnitude of the finite values, 0 without any."""
+    sizes = np.abs(values)
+    return float(sizes[np.isfinite(sizes)].max(initial=0.0))
 
 
 def literal(text: str) -> str:
@@ -165,7 +156,7 @@ class Chart:
         from matplotlib.figure import Figure
 
         relative = list(heights or [1.0] * rows)
-        size = (8.6 if columns == 1 else 5.2 * columns, 0.9 + 2.5 * sum(relative))
+        size = (_WIDTHS.get(columns, 4.4 * columns), 0.9 + 2.5 * sum(relative))
         self.figure = Figure(figsize=size, layout="constrained")
         FigureCanvasAgg(self.figure)
         self.axes = self.figure.subplots(rows, columns, sharex=sharex, squeeze=False, height_ratios=relative)
@@ -174,9 +165,47 @@ class Chart:
         self.factor, self.unit = prefix_for(float(np.abs(self.time).max()) if self.time.size else 0.0, axis.unit)
         self._over = axis.label(axis.unit)
         self._columns: list[tuple[str, np.ndarray, str, np.ndarray]] = []
+        self._scales: dict[str, tuple[float, str]] = {}
+        self._label = axis.label(self.unit)
         if sharex:
             for axes in self.axes[-1]:
-                axes.set_xlabel(axis.label(self.unit))
+                axes.set_xlabel(self._label)
+
+    def share(self, quantity: str, unit: str, magnitudes: Iterable[float]) -> None:
+        """Have one unit for a quantity in panels whose largest numbers are the magnitudes."""
+        self._scales[quantity] = common_prefix(magnitudes, unit)
+
+    def scale(self, quantity: str) -> tuple[float, str]:
+        """Return the factor and the unit that panels of a quantity :meth:`share`."""
+        return self._scales[quantity]
+
+    def note(self, text: str) -> None:
+        """Write a text below the panels."""
+        width = int((self.figure.get_figwidth() - 0.3) / _LETTER)
+        lines = "\n".join(textwrap.wrap(text, width))
+        self.figure.supxlabel(literal(lines), x=0.01, ha="left", fontsize=9, color="#5b6472")
+
+    def leave_out(self, places: Iterable[tuple[int, int]]) -> None:
+        """Remove the panels at these places (row, column); the lowest that is left in a column has its numbers."""
+        for place in places:
+            self.axes[place].remove()
+        gone = set(places)
+        for column in range(self.axes.shape[1]):
+            left = [row for row in range(self.axes.shape[0]) if (row, column) not in gone]
+            lowest = self.axes[left[-1], column]
+            lowest.tick_params(labelbottom=True)
+            lowest.set_xlabel(self._label)
+
+    def legend_above(self, axes: Any) -> None:
+        """Put the legend above a panel, beside the title if there is room, so that it hides no curve."""
+        texts = [line.get_label() for line in axes.get_lines() if not line.get_label().startswith("_")]
+        if not texts:
+            return
+        title, columns = axes.get_title(loc="left"), self.axes.shape[1]
+        taken = 1.4 * len(title) + sum(len(text) + 5.0 for text in texts)
+        if title and taken * _LETTER > self.figure.get_figwidth() / columns - 0.9:
+            axes.set_title(f"{title}\n")
+        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=len(texts), handlelength=1.4, borderaxespad=0.1)
 
     def curves(
         self,
@@ -188,13 +217,15 @@ class Chart:
         styles: Sequence[dict[str, Any]] | None = None,
         legend: bool = True,
         keys: Sequence[str] | None = None,
+        quantity: str = "",
     ) -> tuple[float, str]:
         """Draw named curves (n,) of one unit into a panel; return the factor and unit of its axis.
 
-        ``keys`` are the names of the curves in tables; default: label and name.
+        ``keys`` are the names of the curves in tables; default: label and name. The unit is that which panels of the
+        quantity :meth:`share`, or else suits these curves.
         """
-        finite = [np.abs(values[np.isfinite(values)]).max(initial=0.0) for _, values in curves]
-        factor, shown = prefix_for(float(max(finite, default=0.0)), unit)
+        sizes = (largest(np.asarray(values)) for _, values in curves)
+        factor, shown = self._scales.get(quantity) or prefix_for(max(sizes, default=0.0), unit)
         for number, (name, values) in enumerate(curves):
             time, thin = thinned(self.time, np.asarray(values, dtype=float) * factor)
             options = {"color": COLOURS[number % len(COLOURS)], **(styles[number] if styles else {})}

@@ -1,4 +1,4 @@
-"""Curves that are asked for by name: over time or another column, of one result or several, and their spectra."""
+"""Curves that are asked for by name: over time or another column, of one result or several."""
 
 from __future__ import annotations
 
@@ -12,16 +12,25 @@ from ..energies import LOST, STORED, SUPPLIED
 from ..errors import InputError
 from ..output.units import TIME, prefix_for, unit_of
 from ..registry import nearest
-from .chart import COLOURS, REFERENCE, Chart, literal, thinned
+from .chart import COLOURS, REFERENCE, Chart, largest, literal, thinned
 from .closed_forms import closed_form
-from .filters import AS_COMPUTED, Filter, amplitude_spectrum
+from .filters import AS_COMPUTED, Filter
 
-__all__ = ["History", "column", "draw_curves", "draw_spectra", "make_chart", "read", "usual_curves", "words"]
+__all__ = [
+    "History",
+    "column",
+    "draw_curves",
+    "labels_of",
+    "make_chart",
+    "read",
+    "unit_of_curve",
+    "usual_curves",
+    "words",
+]
 
 History = Mapping[str, np.ndarray]
 
 DASHES: tuple[Any, ...] = ("-", (0, (6, 2)), (0, (2, 1.5)), (0, (7, 2, 1.5, 2)))
-_PEAKS = 5  # of a spectrum, at most, that are told
 
 
 def read(history: History, name: str) -> np.ndarray:
@@ -113,7 +122,7 @@ def draw_curves(
         raise InputError("plot: no curves named; columns: " + ", ".join(first.history))
     if len({result.axis for result in results}) > 1 and against is None:
         raise InputError("plot: the results are over different axes: " + ", ".join({r.axis.symbol for r in results}))
-    title, labels = first.case.title or first.case.name, _labels(results)
+    title, labels = first.case.title or first.case.name, labels_of(results)
     exact = closed_form(first) if closed_forms and against is None else None
     chart = Chart(
         np.concatenate([read(result.history, "time") for result in results]),
@@ -124,15 +133,21 @@ def draw_curves(
     )
     if against is not None:
         places = [_single(result.history, against) for result in results]
-        unit = unit_of(against.rpartition(".")[0] or against) or unit_of(against)
+        unit = unit_of_curve(against)
         chart.factor, shown = prefix_for(max(float(np.nanmax(np.abs(p), initial=0.0)) for p in places), unit)
         over = f"{against} [{unit}]" if unit else against
         chart.axes[-1, 0].set_xlabel(f"{words(against)} [{shown}]" if shown else words(against))
     else:
         places = [read(result.history, "time") for result in results]
         over = first.axis.label(first.axis.unit)
-    for axes, name in zip(chart.axes[:, 0], names, strict=True):
-        found = [column(result.history, name) for result in results]
+    every = [[column(result.history, name) for result in results] for name in names]
+    sizes: dict[str, list[float]] = {}
+    for name, found in zip(names, every, strict=True):
+        parts = (values for curves in found for values in curves.values())
+        sizes.setdefault(unit_of_curve(name), []).append(max(largest(values) for values in parts))
+    for unit, magnitudes in sizes.items():
+        chart.share(unit, unit, magnitudes)
+    for axes, name, found in zip(chart.axes[:, 0], names, every, strict=True):
         _panel(chart, axes, name, found, places, labels, over, chosen, [read(r.history, "time") for r in results])
         if exact is not None:
             _draw_exact(chart, axes, exact, found[0], places[0])
@@ -140,6 +155,11 @@ def draw_curves(
         if len(axes.lines) > 1:
             axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.0, handlelength=2.2)
     return chart
+
+
+def unit_of_curve(name: str) -> str:
+    """Return the SI unit of a column or a component of one."""
+    return unit_of(name.rpartition(".")[0] or name) or unit_of(name)
 
 
 def _panel(
@@ -153,9 +173,8 @@ def _panel(
     chosen: Filter | None,
     times: Sequence[np.ndarray],
 ) -> None:
-    unit = unit_of(name.rpartition(".")[0] or name) or unit_of(name)
-    raw = [values for curves in found for values in curves.values()]
-    axes.pfem_factor, shown = prefix_for(max(float(np.nanmax(np.abs(values), initial=0.0)) for values in raw), unit)
+    unit = unit_of_curve(name)
+    axes.pfem_factor, shown = chart.scale(unit)
     parts = list(dict.fromkeys(part for curves in found for part in curves))
     several = len(found) > 1
     shared = all(np.array_equal(place, places[0]) for place in places)
@@ -193,7 +212,7 @@ def _single(history: History, name: str) -> np.ndarray:
     return found[name]
 
 
-def _labels(results: Sequence[Any]) -> list[str]:
+def labels_of(results: Sequence[Any]) -> list[str]:
     """Return names of results that tell them apart: those of their folders, or as much of the paths as it takes."""
     paths = [Path(result.path).absolute() for result in results]
     for count in range(1, max(len(path.parts) for path in paths)):
@@ -203,90 +222,3 @@ def _labels(results: Sequence[Any]) -> list[str]:
     return (
         [str(path) for path in paths] if len(set(paths)) == len(paths) else [f"{k}: {p}" for k, p in enumerate(paths)]
     )
-
-
-def draw_spectra(
-    results: Sequence[Any], names: Sequence[str], window: str = "hann", highest: float | None = None
-) -> Chart:
-    """Draw a panel with the amplitude spectrum of each named column; natural frequencies are dotted lines.
-
-    Parameters
-    ----------
-    results : open results of runs over time
-    names : columns, or components of them
-    window : see :func:`~pfem_petsc.post.filters.amplitude_spectrum`
-    highest : frequency at which the picture ends [Hz]; None: half the sampling rate
-    """
-    first = results[0]
-    if not names:
-        raise InputError("plot: no columns named for spectra; columns: " + ", ".join(first.history))
-    if highest is not None and not highest > 0.0:
-        raise InputError(f"plot: highest frequency = {highest:g} Hz must be positive")
-    for result in results:
-        if result.axis is not TIME:
-            raise InputError(f"{result.path}: spectra need a run over time, not a static analysis")
-    found = []
-    for name in names:
-        curves = {}
-        for label, result in zip(_labels(results), results, strict=True):
-            time = read(result.history, "time")
-            for part, values in column(result.history, name).items():
-                key = f"{part}: {label}" if len(results) > 1 else part
-                curves[key] = amplitude_spectrum(time, values, window)
-        found.append(curves)
-    end = highest or max(frequency[-1] for curves in found for frequency, _ in curves.values())
-    title = first.case.title or first.case.name
-    chart = Chart(np.array([0.0, end]), title, len(names), heights=[1.1] * len(names))
-    chart.factor, shown = (1e-3, "kHz") if end >= 2e3 else (1.0, "Hz")
-    chart.axes[-1, 0].set_xlabel(f"frequency [{shown}]")
-    for axes, name, curves in zip(chart.axes[:, 0], names, found, strict=True):
-        unit = unit_of(name.rpartition(".")[0] or name) or unit_of(name)
-        top = 0.0
-        for k, (key, (frequency, amplitude)) in enumerate(curves.items()):
-            inside = (frequency > 0.0) & (frequency <= end)
-            axes.semilogy(
-                frequency[inside] * chart.factor, amplitude[inside], label=literal(key), color=COLOURS[k % len(COLOURS)]
-            )
-            chart.record(key, amplitude, unit, ("frequency [Hz]", frequency))
-            top = max(top, float(amplitude[inside].max(initial=0.0)))
-            if len(curves) == 1:
-                _tell_peaks(axes, frequency[inside], amplitude[inside], chart.factor, shown)
-        if top > 0.0:
-            axes.set_ylim(1e-6 * top, 4.0 * top)
-        axes.set_xlim(0.0, end * chart.factor)
-        for value in _natural(first):
-            if 0.0 < value <= end:
-                axes.axvline(value * chart.factor, color="#6b7280", linewidth=0.8, linestyle=":", zorder=0)
-        label = words(name.rsplit("/", 1)[-1])
-        axes.set_ylabel(f"amplitude of\n{label} [{unit}]" if unit else f"amplitude of\n{label}")
-        axes.set_title(literal(f"{name}, window: {window}"))
-        if len(curves) > 1:
-            axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.0)
-    return chart
-
-
-def _natural(result: Any) -> np.ndarray:
-    modes = result.modes if getattr(result, "n_modes", 0) else None
-    return modes.frequency if modes is not None and modes.kind == "vibration" else np.zeros(0)
-
-
-def _tell_peaks(axes: Any, frequency: np.ndarray, amplitude: np.ndarray, factor: float, unit: str) -> None:
-    """Write the frequencies of the highest peaks beside them; each is higher than all within 2 % of the picture."""
-    if len(amplitude) < 3:
-        return
-    peak = np.flatnonzero((amplitude[1:-1] > amplitude[:-2]) & (amplitude[1:-1] >= amplitude[2:])) + 1
-    told: list[int] = []
-    apart = 0.06 * (frequency[-1] - frequency[0])
-    for k in peak[np.argsort(-amplitude[peak])]:
-        if len(told) == _PEAKS or amplitude[k] < 3e-3 * amplitude.max():
-            break
-        if all(abs(frequency[k] - frequency[other]) > apart for other in told):
-            told.append(int(k))
-    for k in told:
-        left, middle, right = np.log(np.maximum(amplitude[k - 1 : k + 2], 1e-300))
-        bend = left - 2.0 * middle + right
-        place = frequency[k] + (0.5 * (left - right) / bend if bend < 0.0 else 0.0) * (frequency[1] - frequency[0])
-        text = f"{place * factor:.4g} {unit}"
-        axes.annotate(
-            text, (frequency[k] * factor, amplitude[k]), xytext=(3, 4), textcoords="offset points", fontsize=8
-        )

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from ..energies import LOST, STORED, SUPPLIED
-from ..output.units import engineering, prefix_for
-from .chart import COLOURS, REFERENCE, Chart
+from ..output.units import engineering
+from .chart import COLOURS, REFERENCE, Chart, thinned
 from .closed_forms import ClosedForm
 from .curves import History, make_chart, read, words
 
@@ -41,6 +41,7 @@ def draw_energies(history: History, title: str, exact: ClosedForm | None) -> Cha
     chart = make_chart(history, title, 3, heights=(1.3, 1.3, 0.7))
     upper, middle, lower = chart.axes[:, 0]
     colours = {name: COLOURS[k % len(COLOURS)] for k, name in enumerate(moving)}
+    chart.share("energy", "J", [largest])
     _stack(chart, upper, {n: v for n, v in moving.items() if n not in SUPPLIED}, held, colours)
     pairs = [(words(name), values) for name, values in moving.items()]
     styles: list[dict[str, Any]] = [{"color": colours[name]} for name in moving]
@@ -51,18 +52,24 @@ def draw_energies(history: History, title: str, exact: ClosedForm | None) -> Cha
             pairs.append((exact.name if first else f"_{name}", exact.columns[name]))
             styles.append(REFERENCE)
             keys.append(f"{name} closed form")
-    chart.curves(middle, "energy", "J", pairs, styles=styles, keys=keys)
+    chart.curves(middle, "energy", "J", pairs, styles=styles, keys=keys, quantity="energy")
     if still:
         text = textwrap.fill("zero throughout: " + ", ".join(still), _NOTE_WIDTH)
         note = upper.annotate(text, (0, 1.02), xycoords="axes fraction", fontsize=8, color="#5b6472", va="bottom")
         note.set_in_layout(False)  # a long line must not take the width of the axes; the title makes the height for it
         upper.set_title("\n" * text.count("\n"), fontsize=9)
-    chart.curves(lower, "balance error", "J", [("balance error", error)], styles=[{"color": COLOURS[1]}])
-    worst = float(np.nanmax(np.abs(error)))
-    if largest > 0:
-        text = f"largest: {worst / largest:.1e} of {engineering(largest, 'J')}"
-        lower.annotate(text, (1.01, 0.5), xycoords="axes fraction", fontsize=9, color="#5b6472", va="center")
+    _balance(chart, lower, error, largest)
     return chart
+
+
+def _balance(chart: Chart, axes: Any, error: np.ndarray, largest: float) -> None:
+    """The error as a share of the largest energy, so that neither a prefix nor a unit hides how small it is."""
+    axes.plot(*thinned(chart.time * chart.factor, error / (largest or 1.0)), color=COLOURS[1])
+    chart.record("balance error", error, "J")
+    axes.set_ylabel("balance error,\nshare of largest" if largest > 0.0 else "balance error [J]")
+    worst = float(np.nanmax(np.abs(error))) / (largest or 1.0)
+    text = f"at most {worst:.1e}\nof {engineering(largest, 'J')}" if worst > 0.0 else "zero"
+    axes.annotate(text, (1.01, 0.5), xycoords="axes fraction", fontsize=9, color="#5b6472", va="center")
 
 
 def _stack(
@@ -73,7 +80,7 @@ def _stack(
     supplied = np.sum([values for name, values in held.items() if name in SUPPLIED], axis=0)
     available = total[0] + supplied - (supplied[0] if np.ndim(supplied) else 0.0)
     available = np.broadcast_to(available, total.shape)
-    factor, shown = prefix_for(float(np.nanmax(np.abs([*parts.values(), total]))), "J")
+    factor, shown = chart.scale("energy")
     every = max(1, len(total) // 3000)
     time = chart.time[::every] * chart.factor
     above, below = np.zeros(len(time)), np.zeros(len(time))

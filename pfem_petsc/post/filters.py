@@ -10,7 +10,6 @@ import numpy as np
 
 from ..errors import InputError
 from ..output.units import engineering
-from .chart import window_mean
 
 __all__ = [
     "AS_COMPUTED",
@@ -21,6 +20,7 @@ __all__ = [
     "cfc",
     "cfc_coefficients",
     "make_filter",
+    "window_mean",
 ]
 
 AS_COMPUTED = "as computed"
@@ -90,6 +90,27 @@ def make_filter(text: str) -> Filter:
         f"filter = {text!r} is not known; give cfc:CLASS, butterworth:FREQUENCY[:ORDER] [Hz, up to order 10], "
         "mean:SECONDS or none, like cfc:180"
     )
+
+
+def window_mean(time: np.ndarray, values: np.ndarray, width: float) -> np.ndarray:
+    """Return the mean of a piecewise linear curve over a window [s] before each point, truncated at the start.
+
+    It depends on past values only. The integral is exact for any spacing of the points.
+    """
+    if len(time) < 2 or width <= 0:
+        return values.copy()
+    steps = np.diff(time)
+    integral = np.concatenate([[0.0], np.cumsum(0.5 * steps * (values[1:] + values[:-1]))])
+    low = np.maximum(time - width, time[0])
+
+    def primitive(at: np.ndarray) -> np.ndarray:
+        k = np.clip(np.searchsorted(time, at, side="right") - 1, 0, len(steps) - 1)
+        part = at - time[k]
+        slope = (values[k + 1] - values[k]) / np.where(steps[k] > 0, steps[k], 1.0)
+        return integral[k] + part * (values[k] + 0.5 * slope * part)
+
+    span = time - low
+    return np.where(span > 0.0, (integral - primitive(low)) / np.where(span > 0.0, span, 1.0), values)
 
 
 def cfc_coefficients(size: float, interval: float) -> tuple[float, float, float, float, float]:

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from ..output.units import TIME, prefix_for
-from .chart import COLOURS, REFERENCE, Chart, literal
+from ..output.units import TIME
+from .chart import COLOURS, REFERENCE, Chart, largest, literal
 from .closed_forms import ClosedForm
 from .filters import AS_COMPUTED, Filter, make_filter
 
@@ -47,22 +47,26 @@ def draw_forces(
     heights = [h for c in counted for h in [0.9] * (2 - plain) + [0.5] * c]
     chart = Chart(time, title, len(heights), heights=heights, axis=getattr(history, "axis", TIME))
     panels = iter(chart.axes[:, 0])
+    # peaks (the inertia of a node that is stopped within a step) and means have panels of their own
+    forces = {}
+    for name in names:
+        values, label = _pressing(np.asarray(history[f"{source}/{name}/force"], dtype=float), normals.get(name))
+        forms = ((AS_COMPUTED, values, 0.9), (smoothing.name, smoothing.apply(time, values), 1.6))[: 2 - plain]
+        forces[name] = label, forms
+    chart.share("force", "N", [largest(drawn) for _, forms in forces.values() for _, drawn, _ in forms])
     for name, counts in zip(names, counted, strict=True):
-        # peaks (the inertia of a node that is stopped within a step) and means need different scales
-        column = f"{source}/{name}/force"
-        values, label = _pressing(np.asarray(history[column], dtype=float), normals.get(name))
-        smooth = smoothing.apply(time, values)
+        column, (label, forms) = f"{source}/{name}/force", forces[name]
         heading = f"{source.capitalize()} '{name}'"
         known = None if exact is None or column not in exact.columns else exact.columns[column]
-        for form, drawn, width in ((AS_COMPUTED, values, 0.9), (smoothing.name, smooth, 1.6))[: 2 - plain]:
+        for form, drawn, width in forms:
             curves, styles, keys = [(form, drawn)], [{"linewidth": width}], [f"{column} {label}, {form}"]
             if known is not None:
                 curves.append((exact.name, _pressing(known, normals.get(name))[0]))
                 styles.append(REFERENCE)
                 keys.append(f"{column} closed form")
             axes = next(panels)
-            chart.curves(axes, label, "N", curves, heading, styles, legend=False, keys=keys)
-            axes.legend(loc="best")
+            chart.curves(axes, label, "N", curves, heading, styles, legend=False, keys=keys, quantity="force")
+            chart.legend_above(axes)
             heading = ""
         if counts:
             chart.counts(next(panels), "nodes in\ncontact", history[f"{source}/{name}/contacts"], COLOURS[1])
@@ -77,15 +81,19 @@ def draw_force_displacement(
     """Draw what resists over how far it was pressed.
 
     A static analysis: the load factor over the displacement of each probe along the direction in which it moved
-    farthest. Each wall with a normal and a force: the filtered normal force over the displacement of the wall along its
-    normal, or, of a wall at rest, over that of the centre of mass towards it.
+    farthest. Each wall with a normal and a force, while it is touched: the normal force over the displacement, since
+    the first contact, of the wall along its normal, or, of a wall at rest, of the centre of mass towards it. Both have
+    passed the filter, so that neither is late.
     """
     history = result.history
     lines = _load_paths(history, result.axis, exact) if "load_factor" in history else []
-    lines += _wall_paths(result, chosen or _usual_filter(history))
+    lines += _wall_paths(result, chosen or _usual_filter(history), exact)
     if not lines:
         return None
     chart = Chart(history["time"], title, len(lines), sharex=False, axis=result.axis)
+    for unit in {line.unit for line in lines}:
+        chart.share(unit, unit, [largest(line.values) for line in lines if line.unit == unit])
+    chart.share("m", "m", [largest(line.place) for line in lines])
     for axes, line in zip(chart.axes[:, 0], lines, strict=True):
         line.draw(chart, axes)
     return chart
@@ -105,12 +113,12 @@ class _Path:
     exact: tuple[str, np.ndarray, np.ndarray] | None = None
 
     def draw(self, chart: Chart, axes: Any) -> None:
-        along, metre = prefix_for(float(np.abs(self.place).max()), "m")
-        factor, unit = prefix_for(float(np.nanmax(np.abs(self.values))), self.unit)
+        (along, metre), (factor, unit) = chart.scale("m"), chart.scale(self.unit)
         few = {"marker": "o", "markersize": 3} if len(self.place) < 80 else {}
         axes.plot(self.place * along, self.values * factor, color=COLOURS[0], label=literal(self.name), **few)
-        over = (f"{self.over} [m]", self.place)
-        chart.record(f"{self.heading} {self.label}, {self.name}", self.values, self.unit, over)
+        known = np.isfinite(self.values)
+        over = (f"{self.over} [m]", self.place[known])
+        chart.record(f"{self.heading} {self.label}, {self.name}", self.values[known], self.unit, over)
         if self.exact is not None:
             name, place, values = self.exact
             axes.plot(place * along, values * factor, label=name, **REFERENCE)
@@ -119,7 +127,7 @@ class _Path:
         axes.set_xlabel(f"{self.over} [{metre}]")
         axes.set_ylabel(f"{self.label} [{unit}]" if unit else self.label)
         axes.set_title(literal(self.heading))
-        axes.legend(loc="best")
+        chart.legend_above(axes)
 
 
 def _load_paths(history: Mapping[str, np.ndarray], axis: Any, exact: ClosedForm | None) -> list[_Path]:
@@ -144,7 +152,7 @@ def _load_paths(history: Mapping[str, np.ndarray], axis: Any, exact: ClosedForm 
     return lines
 
 
-def _wall_paths(result: Any, smoothing: Filter) -> list[_Path]:
+def _wall_paths(result: Any, smoothing: Filter, exact: ClosedForm | None) -> list[_Path]:
     history, lines = result.history, []
     time = np.asarray(history["time"], dtype=float)
     for wall in result.case.every_wall:
@@ -152,16 +160,47 @@ def _wall_paths(result: Any, smoothing: Filter) -> list[_Path]:
         if not hasattr(wall, "normal") or column not in history or not np.any(history[column]):
             continue
         normal = np.asarray(wall.normal, dtype=float) / np.linalg.norm(wall.normal)
-        force = smoothing.apply(time, np.asarray(history[column], dtype=float) @ normal)
+        force, sign, known = np.asarray(history[column], dtype=float) @ normal, 1.0, None
         if place in history and np.any(np.ptp(np.asarray(history[place]), axis=0) > 0.0):
-            moved, over = np.asarray(history[place], dtype=float), "displacement of the wall"
+            over = "displacement of the wall since contact"
         elif "centre_of_mass" in history:
-            moved, over = -np.asarray(history["centre_of_mass"], dtype=float), "displacement of the centre of mass"
+            place, sign, over = "centre_of_mass", -1.0, "displacement of the centre of mass since contact"
+            if exact is not None and {column, place} <= set(exact.columns):
+                known = (exact.columns[column] @ normal, -exact.columns[place] @ normal)
         else:
             continue
-        heading = f"Wall '{wall.name}'"
-        lines.append(_Path(heading, over, (moved - moved[0]) @ normal, "normal force", "N", force, smoothing.name))
+        moved = sign * np.asarray(history[place], dtype=float) @ normal
+        moved, smooth = smoothing.apply(time, moved), smoothing.apply(time, force)
+        shown, begin = _touching(force, smooth)
+        line = _Path(
+            f"Wall '{wall.name}'",
+            over,
+            (moved - moved[begin])[shown],
+            "normal force",
+            "N",
+            np.where(_near(force, smooth), smooth, np.nan)[shown],
+            smoothing.name,
+        )
+        if known is not None:
+            part, begin = _touching(*known[:1] * 2)
+            line.exact = (exact.name, (known[1] - known[1][begin])[part], known[0][part])
+        lines.append(line)
     return lines
+
+
+def _near(force: np.ndarray, smooth: np.ndarray) -> np.ndarray:
+    """Return which rows (n,) bool have a force as computed or filtered, or are beside such a row."""
+    felt = (force != 0.0) | (np.abs(smooth) > 1e-3 * largest(smooth))
+    near = felt.copy()
+    near[:-1] |= felt[1:]
+    near[1:] |= felt[:-1]
+    return near
+
+
+def _touching(force: np.ndarray, smooth: np.ndarray) -> tuple[slice, int]:
+    """Return the rows from before the first force to after the last one, and the last row before the first force."""
+    near = np.flatnonzero(_near(force, smooth))
+    return slice(near[0], near[-1] + 1), max(0, int(np.flatnonzero(force)[0]) - 1)
 
 
 def _usual_filter(history: Mapping[str, np.ndarray]) -> Filter:

@@ -11,14 +11,16 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
-from ..output.units import TIME, unit_of
-from .chart import COLOURS, REFERENCE, STYLE, Chart, check_formats
-from .closed_forms import ClosedForm, closed_form
-from .curves import History, draw_curves, draw_spectra, make_chart, read, usual_curves, words
+from ..output.units import TIME
+from .chart import COLOURS, STYLE, Chart, check_formats
+from .closed_forms import closed_form
+from .curves import History, draw_curves, make_chart, usual_curves
 from .energies import draw_energies
 from .filters import WINDOWS, Filter, make_filter
 from .forces import draw_force_displacement, draw_forces
 from .options import opened
+from .spectra import draw_spectra
+from .vectors import draw_momentum, draw_probes
 
 __all__ = ["plot"]
 
@@ -122,8 +124,8 @@ def _usual(
     exact = closed_form(result) if closed_forms else None
     drawn: dict[str, Chart | None] = {
         "energies": draw_energies(history, title, exact),
-        "momentum": _momentum(history, title, exact) if result.axis is TIME else None,
-        "probes": _probes(history, title, exact),
+        "momentum": draw_momentum(history, title, exact) if result.axis is TIME else None,
+        "probes": draw_probes(history, title, exact),
         "walls": draw_forces(history, "wall", case.every_wall, title, chosen, exact),
         "pairs": draw_forces(history, "pair", (), title, chosen),
         "constraints": draw_forces(history, "constraint", (), title, chosen),
@@ -141,119 +143,6 @@ def _free(file: Path, suffixes: Sequence[str]) -> Path:
     numbered = (file.with_name(f"{file.name}_{k}") for k in itertools.count(2))
     free = (p for p in itertools.chain([file], numbered) if not any(Path(f"{p}.{s}").exists() for s in suffixes))
     return next(free)
-
-
-def _components(values: np.ndarray, scale: float = 0.0) -> list[tuple[str, np.ndarray]]:
-    """Return named components of (n, 3) that are not zero up to rounding; all, as zero, if all are.
-
-    Rounding is relative to the largest value, or to ``scale`` if the vector is a difference of larger ones.
-    """
-    floor = 1e-9 * max(float(np.nanmax(np.abs(values), initial=0.0)), scale)
-    curves = [(name, values[:, k]) for k, name in enumerate("xyz")]
-    kept = [(name, v) for name, v in curves if np.nanmax(np.abs(v), initial=0.0) > floor]
-    return kept or [(name, np.zeros_like(v)) for name, v in curves]
-
-
-def _colours_of(curves: Sequence[tuple[str, np.ndarray]]) -> list[dict[str, Any]]:
-    """Return the styles of curves, with the same colours for x, y, z in all panels."""
-    return [{"color": COLOURS["xyz".index(name)]} for name, _ in curves]
-
-
-def _vector(
-    chart: Chart,
-    axes: Any,
-    label: str,
-    unit: str,
-    values: np.ndarray,
-    title: str = "",
-    scale: float = 0.0,
-    exact: np.ndarray | None = None,
-    key: str = "",
-) -> None:
-    curves = _components(values, scale)
-    styles, keys = _colours_of(curves), [f"{key or label}.{name}" for name, _ in curves]
-    for name, _ in list(curves) if exact is not None else ():
-        first = len(styles) == len(keys) and not any(label == "closed form" for label, _ in curves)
-        curves.append(("closed form" if first else f"_{name}", exact[:, "xyz".index(name)]))
-        styles.append(REFERENCE)
-        keys.append(f"{key or label}.{name} closed form")
-    chart.curves(axes, label, unit, curves, title, styles, legend=False, keys=keys)
-    axes.legend(loc="best", ncols=4, handlelength=1.4)
-
-
-def _momentum(history: History, title: str, exact: ClosedForm | None) -> Chart | None:
-    names = [name for name in ("momentum", "angular_momentum", "centre_of_mass") if name in history]
-    if not names:
-        return None
-    chart = make_chart(history, title, len(names), heights=[0.9] * len(names))
-    for axes, name in zip(chart.axes[:, 0], names, strict=True):
-        values, label, scale = read(history, name), words(name), 0.0
-        known = exact.columns.get(name) if exact is not None else None
-        if name == "centre_of_mass":
-            known = None if known is None else known - values[0]
-            values = values - values[0]
-            label = "centre of mass,\nmoved by"
-        elif name == "angular_momentum" and {"momentum", "centre_of_mass"} <= set(names):
-            arm = np.linalg.norm(read(history, "centre_of_mass"), axis=1)
-            scale = float(np.nanmax(arm * np.linalg.norm(read(history, "momentum"), axis=1)))
-        _vector(chart, axes, label, unit_of(name), values, scale=scale, exact=known, key=name)
-    return chart
-
-
-def _probes(history: History, title: str, exact: ClosedForm | None) -> Chart | None:
-    quantities = ("position", "velocity", "acceleration", "reaction")
-    probes: dict[str, dict[str, np.ndarray]] = {}
-    for name in history:
-        parts = name.split("/")
-        if parts[0] == "probe" and parts[-1] in quantities:
-            probes.setdefault("/".join(parts[1:-1]), {})[parts[-1]] = np.asarray(history[name], dtype=float)
-    if not probes:
-        return None
-    # reactions have a column only if there are any; accelerations in impacts are mostly noise
-    columns = [q for q in quantities if q != "acceleration" and any(_wanted(q, held) for held in probes.values())]
-    chart = make_chart(history, title, len(probes), len(columns))
-    labels = {"position": "displacement"}
-    for row, (probe, held) in zip(chart.axes, probes.items(), strict=True):
-        for axes, quantity in zip(row, columns, strict=True):
-            if quantity not in held:
-                axes.set_axis_off()
-                continue
-            values = held[quantity]
-            column = f"probe/{probe}/{quantity}"
-            known = exact.columns.get(column) if exact is not None else None
-            if quantity == "position":
-                known = None if known is None else known - values[:1]
-                values = values - values[:1]
-            nodes = values.shape[1]
-            # the reaction of a support is the sum over its nodes
-            total = quantity == "reaction"
-            how = f"sum of {nodes} nodes" if total else f"mean and range of {nodes} nodes"
-            name = f"{probe} ({how})" if nodes > 1 else probe
-            shown = values.sum(axis=1) if total else values.mean(axis=1)
-            known = None if known is None else known.mean(axis=1)
-            key = f"probe/{probe}/{labels.get(quantity, quantity)}"
-            _vector(chart, axes, labels.get(quantity, quantity), unit_of(quantity), shown, name, exact=known, key=key)
-            if nodes > 1 and not total:
-                _range(chart, axes, quantity, values)
-    return chart
-
-
-def _wanted(quantity: str, held: dict[str, np.ndarray]) -> bool:
-    return quantity in held and (quantity != "reaction" or bool(np.any(held[quantity])))
-
-
-def _range(chart: Chart, axes: Any, quantity: str, values: np.ndarray) -> None:
-    """Shade the range of the nodes, in the units of the panel."""
-    from ..output.units import prefix_for
-
-    mean = values.mean(axis=1)
-    factor, _ = prefix_for(float(np.nanmax(np.abs([v for _, v in _components(mean)]))), unit_of(quantity))
-    every = max(1, len(values) // 3000)
-    time = chart.time[::every] * chart.factor
-    for name, _ in _components(mean):
-        k = "xyz".index(name)
-        low, high = values[::every, :, k].min(axis=1) * factor, values[::every, :, k].max(axis=1) * factor
-        axes.fill_between(time, low, high, color=COLOURS[k], alpha=0.15, linewidth=0)
 
 
 def _solver(history: History, title: str) -> Chart | None:

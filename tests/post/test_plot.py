@@ -15,10 +15,10 @@ from PIL import Image
 from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.energies import LOST, STORED, SUPPLIED
 from pfem_petsc.errors import InputError
-from pfem_petsc.post.chart import COLOURS, thinned, window_mean
+from pfem_petsc.post.chart import COLOURS, thinned
 from pfem_petsc.post.closed_forms import closed_form
 from pfem_petsc.post.energies import balance_error
-from pfem_petsc.post.filters import cfc
+from pfem_petsc.post.filters import cfc, window_mean
 from pfem_petsc.post.plot import plot
 
 

@@ -15,7 +15,7 @@ class Mark(NamedTuple):
     text: str
 
 
-GHOST = (205, 210, 217)
+GHOST = (168, 176, 188)
 MARKS = {
     "broken": Mark("status", (0, 0, 0), "broken"),
     "yielded": Mark("plastic_strain", (240, 200, 30), "yielded"),

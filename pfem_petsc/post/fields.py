@@ -35,6 +35,10 @@ class ColourField:
     ------
     InputError
         For a field that the result does not have (with the nearest name), or a component that it does not have.
+
+    Attributes
+    ----------
+    zero : whether the last range was that of values that are zero, or rounding errors of zero
     """
 
     def __init__(self, result: Any, name: str, component: str | int | None = None) -> None:
@@ -48,7 +52,8 @@ class ColourField:
             why = f"{component!r} is not one of x, y, z" if vector else "it has one value only"
             raise InputError(f"render: field '{name}' has no such component: {why}")
         self._component = _COMPONENTS[component] if component is not None else None
-        self._result = result
+        self._result, self._rounding = result, _rounding_of(result, name)
+        self.zero = False
         title = name.replace("_", " ")
         self.title = f"{title} {'xyz'[self._component]}" if self._component is not None else title
 
@@ -79,8 +84,32 @@ class ColourField:
             # not for rounding in a field that cannot be negative
             signed = signed or bool((values < -1e-9 * sizes.max()).any())
         limit = largest if largest <= 2.0 * bulk or bulk == 0.0 else bulk
-        limit = limit or 1.0
+        self.zero = largest <= self._rounding
+        limit = 1.0 if self.zero else limit
         return (-limit, limit) if signed else (0.0, limit)
+
+
+def _rounding_of(result: Any, name: str) -> float:
+    """Return below what a field of bars is rounding: of strains, that of coordinates over the length of a bar.
+
+    A rod that flies without a force has stresses of 1e-6 Pa, which should not get all colours.
+    """
+    if name not in _SIGNED or not len(result.bars):
+        return 0.0
+    points = np.asarray(result.positions(0), dtype=float)
+    ends = points[np.asarray(result.bars)]
+    length = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1)
+    strain = 1e-13 * float(np.abs(points).max()) / max(float(np.median(length)), 1e-300)
+    case = result.case
+    moduli = [getattr(each, "young_modulus", None) for each in getattr(case, "material", {}).values()]
+    areas = [each.area for each in getattr(case, "section", {}).values()]
+    if name == "strain":
+        return strain
+    if None in moduli or not moduli:
+        return 0.0
+    if name == "stress":
+        return strain * max(moduli)
+    return strain * max(moduli) * max(areas) if areas and None not in areas else 0.0
 
 
 class ColourScale:

@@ -10,9 +10,9 @@ import numpy as np
 
 from .contrast import MARKS
 from .fields import ColourField, ColourScale
-from .inset import Inset
+from .inset import Inset, insets_of
 from .motion import Motion
-from .page import Page
+from .page import Page, lay_over
 from .poster import grid, instants
 from .scene import Scene, Style
 from .shots import Moves, at_one_scale, shots
@@ -21,6 +21,7 @@ __all__ = ["Film", "Look"]
 
 _POSTER = (1600, 900)
 _TILES = 6
+_FEW = 2000  # bars of a small model
 
 
 @dataclass(frozen=True)
@@ -78,25 +79,25 @@ class Film:
             self._tile = (width // self._columns, height // rows - Page.strip_of(size))
         self._cameras = self._shots(self._tile)
         self._page = self._new_page(size, self._cameras[0][0], self._tile[1])
-        self._scenes = self._new_scenes(self._tile, self._cameras)
-        self._inset = None
-        if self.look.inset is not None and not several:
-            wide = max(0.28 * width, min(width, 220.0))
+        self._scenes = self._new_scenes(size, self._tile, self._cameras)
+        self._insets: list[Inset] = []
+        if self.look.inset is not None:
+            wide = max(0.28 * self._tile[0], min((0.5 if several else 1.0) * self._tile[0], 220.0))
             room = round(wide), round(0.62 * wide)
-            self._inset = Inset(self.motions[0].result, self.look.inset, room)
+            self._insets = insets_of([motion.result for motion in self.motions], self.look.inset, room)
             self._corner = self._emptiest_corner(room)
 
     def frame(self, number: int) -> np.ndarray:
         """Return a page (height, width, 3 or 4) uint8."""
         drawings = [self._draw(k, number, self._scenes[k], self._cameras[k]) for k in range(len(self.motions))]
+        for motion, inset, drawing in zip(self.motions, self._insets, drawings, strict=False):
+            picture, (x, y) = inset.at(float(motion.times[number])), self._corner
+            lay_over(drawing[y : y + picture.shape[0], x : x + picture.shape[1]], picture)
         motion, camera = self.motions[0], self._cameras[0][number]
         time = motion.time(motion.frames[number])
         if len(drawings) > 1:
             return self._page.compose_tiles(drawings, list(self.look.labels), self._columns, camera, time)
-        inset = None
-        if self._inset is not None:
-            inset = self._inset.at(float(motion.times[number])), self._corner
-        return self._page.compose(drawings[0], time, camera, inset)
+        return self._page.compose(drawings[0], time, camera)
 
     def poster(self) -> np.ndarray:
         """Return six instants on one page, in a grid that suits the shape of the motion."""
@@ -112,7 +113,7 @@ class Film:
         tile = (width // columns, height // rows - Page.strip_of(_POSTER))
         cameras = self._shots(tile)
         page = self._new_page(_POSTER, cameras[0][0], tile[1])
-        scenes = self._new_scenes(tile, cameras)
+        scenes = self._new_scenes(_POSTER, tile, cameras)
         drawings, texts = [], []
         for k in range(len(self.motions)):
             for number, frame in zip(numbers, chosen, strict=True):
@@ -132,13 +133,17 @@ class Film:
         films = [shots(motion, self.look.moves, tile[0] / tile[1]) for motion in self.motions]
         return at_one_scale(films) if len(films) > 1 and self.look.moves.path is None else films
 
-    def _new_scenes(self, tile: tuple[int, int], cameras: list[list[Any]]) -> list[Scene]:
+    def _new_scenes(self, size: tuple[int, int], tile: tuple[int, int], cameras: list[list[Any]]) -> list[Scene]:
         made = []
+        _, _, width, height = Page.region_of(size)
+        share = tile[0] * tile[1] / (width * height)
         for motion, style, film in zip(self.motions, self.look.styles, cameras, strict=True):
             # widths are those of bars at the closest
             closest = min(film, key=lambda camera: camera.half_height)
             bounds, bars = motion.bounds, motion.bars
-            made.append(Scene(motion.start, bars, closest, bounds, tile, style, self.look.transparent))
+            # lines of a small model stay visible in a tile; those of a large one would merge
+            unit = min(size[0] / 1280, size[1] / 720) * share ** (0.25 if len(bars) <= _FEW else 0.5)
+            made.append(Scene(motion.start, bars, closest, bounds, tile, style, self.look.transparent, unit))
         return made
 
     def _new_page(self, size: tuple[int, int], camera: Any, height: int) -> Page:
@@ -158,17 +163,23 @@ class Film:
         width, height = self._tile
         places = [(x, y) for y in (0, height - room[1]) for x in (0, width - room[0])]
         covered = np.zeros(len(places))
-        motion = self.motions[0]
-        for number in np.unique(np.linspace(0, self.count - 1, 7).astype(int)):
-            points, camera = motion.positions(motion.frames[number]), self._cameras[0][number]
-            ends = points[motion.bars]
-            along = np.concatenate([ends[:, 0] + part * (ends[:, 1] - ends[:, 0]) for part in (0.0, 0.3, 0.6)])
-            x, y, _, _ = camera.project(along, self._tile)
-            inside = [(x > a) & (x < a + room[0]) & (y > b) & (y < b + room[1]) for a, b in places]
-            covered += [float(each.mean()) for each in inside]
-            for surface in motion.surfaces[motion.frames[number]]:
-                x, y, _, _ = camera.project(np.asarray(surface.points), self._tile)
-                for k, (a, b) in enumerate(places):
-                    overlap = x.min() < a + room[0] and x.max() > a and y.min() < b + room[1] and y.max() > b
-                    covered[k] += 1e-3 * overlap
+        for motion, cameras in zip(self.motions, self._cameras, strict=True):
+            for number in np.unique(np.linspace(0, self.count - 1, 7).astype(int)):
+                covered += self._covered(motion, motion.frames[number], cameras[number], places, room)
         return places[int(np.argmin(covered))]
+
+    def _covered(
+        self, motion: Motion, frame: int, camera: Any, places: Sequence[tuple[int, int]], room: tuple[int, int]
+    ) -> np.ndarray:
+        """Return how much of the bars is in each place, and a little for each wall that is."""
+        ends = motion.positions(frame)[motion.bars]
+        along = np.concatenate([ends[:, 0] + part * (ends[:, 1] - ends[:, 0]) for part in (0.0, 0.3, 0.6)])
+        x, y, _, _ = camera.project(along, self._tile)
+        inside = [(x > a) & (x < a + room[0]) & (y > b) & (y < b + room[1]) for a, b in places]
+        covered = np.array([float(each.mean()) for each in inside])
+        for surface in motion.surfaces[frame]:
+            x, y, _, _ = camera.project(np.asarray(surface.points), self._tile)
+            for k, (a, b) in enumerate(places):
+                overlap = x.min() < a + room[0] and x.max() > a and y.min() < b + room[1] and y.max() > b
+                covered[k] += 1e-3 * overlap
+        return covered

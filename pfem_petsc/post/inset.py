@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -9,9 +10,9 @@ import numpy as np
 from ..errors import InputError
 from ..output.units import prefix_for, unit_of
 from ..registry import nearest
-from .chart import STYLE, boxes_allowed, literal, thinned
+from .chart import STYLE, boxes_allowed, largest, literal, thinned
 
-__all__ = ["Inset", "history_curve"]
+__all__ = ["Inset", "history_curve", "insets_of"]
 
 CURVE, MARKER = "#2563b0", (217, 72, 43)
 
@@ -48,9 +49,10 @@ class Inset:
     result : an open result
     name : of a column, see :func:`history_curve`
     size : width and height in pixels
+    others : other results, whose curves are in the range of the axes as well
     """
 
-    def __init__(self, result: Any, name: str, size: tuple[int, int]) -> None:
+    def __init__(self, result: Any, name: str, size: tuple[int, int], others: Sequence[Any] = ()) -> None:
         from matplotlib import rc_context
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure
@@ -59,9 +61,10 @@ class Inset:
         self.values = history_curve(result, name)
         self.times = np.asarray(result.history["time"], dtype=float)
         unit = unit_of(name.partition(".")[0])
-        finite = np.abs(self.values[np.isfinite(self.values)])
-        factor, shown = prefix_for(float(finite.max(initial=0.0)), unit)
-        time_factor, time_unit = prefix_for(float(np.abs(self.times).max(initial=0.0)), result.axis.unit)
+        curves = [(self.times, self.values)]
+        curves += [(np.asarray(each.history["time"], dtype=float), history_curve(each, name)) for each in others]
+        factor, shown = prefix_for(max(largest(values) for _, values in curves), unit)
+        time_factor, time_unit = prefix_for(max(largest(times) for times, _ in curves), result.axis.unit)
         scale = size[1] / 180.0
         with rc_context({**STYLE, "font.size": 8.0 * scale, "lines.linewidth": 1.3 * scale}), boxes_allowed():
             figure = Figure(figsize=(size[0] / 100, size[1] / 100), dpi=100, layout="constrained")
@@ -69,6 +72,8 @@ class Inset:
             figure.patch.set_alpha(0.88)
             axes = figure.add_subplot()
             axes.patch.set_alpha(0.0)
+            for times, values in curves[1:]:  # for the range of the axes alone
+                axes.plot(*thinned(times * time_factor, values * factor, 600), alpha=0.0)
             axes.plot(*thinned(self.times * time_factor, self.values * factor, 600), color=CURVE)
             axes.xaxis.set_major_locator(MaxNLocator(nbins=5))
             axes.yaxis.set_major_locator(MaxNLocator(nbins=4))
@@ -92,3 +97,8 @@ class Inset:
             if np.isfinite([x, y]).all():
                 ImageDraw.Draw(image).ellipse((x - r, y - r, x + r, y + r), fill=(*MARKER, 255))
         return np.asarray(image)
+
+
+def insets_of(results: Sequence[Any], name: str, size: tuple[int, int]) -> list[Inset]:
+    """Return the curve of each result, all with the same axes."""
+    return [Inset(result, name, size, [*results[:k], *results[k + 1 :]]) for k, result in enumerate(results)]

@@ -86,6 +86,7 @@ class Motion:
         self.normals = [normal / np.linalg.norm(normal) for normal in self.normals]
         every = np.asarray(result.times, dtype=float)
         self.time_factor, self.time_unit = prefix_for(float(np.abs(every).max()), result.axis.unit)
+        self._decimals = _decimals(self.time_factor * self.times)
 
     def _check_marks(self) -> None:
         for mark in self._overlays.marks:
@@ -172,7 +173,9 @@ class Motion:
         if hasattr(self.result, "caption"):
             return self.result.caption(frame)
         axis, time = self.result.axis, self.result.times[frame]
-        return f"{axis.symbol} = {time * self.time_factor:.2f} {self.time_unit}" if axis.unit else axis.place(time)
+        if not axis.unit:
+            return axis.place(time)
+        return f"{axis.symbol} = {time * self.time_factor:.{self._decimals}f} {self.time_unit}"
 
     def probe(self, name: str) -> np.ndarray:
         """Mean positions (frames, 3) [m] of the nodes of a probe as drawn."""
@@ -202,7 +205,8 @@ class Motion:
         """Return what is drawn in addition to the bars of a frame."""
         made, points = [], self.positions(frame)
         if self._overlays.ghost:
-            made.append(Layer(self.start, self.bars, GHOST, max(1.0, min(1.6, scene.width)), "behind"))
+            width = scene.width / scene.unit
+            made.append(Layer(self.start, self.bars, GHOST, float(np.clip(0.6 * width, 1.2, 2.4)), -width))
         gone = self.gone(frame)
         if "yielded" in self._overlays.marks:
             yielded = np.asarray(self.result.field("plastic_strain", frame)) != 0.0
@@ -211,13 +215,13 @@ class Motion:
             if yielded.any():
                 made.append(scene.halo(points, np.flatnonzero(yielded), MARKS["yielded"].colour, camera))
         if "broken" in self._overlays.marks and gone is not None and gone.any():
-            made.append(self._stubs(points, gone, scene.width))
+            made.append(self._stubs(points, gone, scene.width / scene.unit))
         for number, (when, places) in enumerate(self._trails.values()):
             past = max(1, int(np.searchsorted(when, self.result.times[frame], side="right")))
             rows = np.stack([np.arange(past - 1), np.arange(1, past)], axis=1)
             for node in range(places.shape[1]):
                 colour = TRAILS[number % len(TRAILS)]
-                made.append(Layer(places[:, node], rows, colour, 2.2, "above"))
+                made.append(Layer(places[:, node], rows, colour, 2.4, scene.width / scene.unit))
         return made
 
     def _stubs(self, points: np.ndarray, gone: np.ndarray, width: float) -> Layer:
@@ -232,4 +236,15 @@ class Motion:
         numbers = np.arange(2 * count)
         lines = np.stack([numbers, numbers + 2 * count], axis=1)
         stubs = np.concatenate([one, two, one + part, two - part])
-        return Layer(stubs, lines, MARKS["broken"].colour, max(2.0, width), "within")
+        return Layer(stubs, lines, MARKS["broken"].colour, max(2.0, width))
+
+
+def _decimals(times: np.ndarray) -> int:
+    """Return with how many decimals times (n,) are told apart, to a twentieth of the usual step between them."""
+    steps = np.diff(np.unique(times))
+    if not len(steps):
+        return 2
+    step = float(np.median(steps))
+    most = int(np.clip(np.ceil(-np.log10(step)) + 2, 0, 6))
+    exact = (n for n in range(most) if np.abs(np.round(times, n) - times).max() < 0.05 * step)
+    return next(exact, most)

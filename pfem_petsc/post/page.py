@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from PIL import Image
 
-__all__ = ["Page"]
+__all__ = ["Page", "lay_over"]
 
 INK = "#1f242c"
 PALE = "#5b6472"
@@ -77,26 +77,16 @@ class Page:
         """Return the height of the strip above a tile, in pixels."""
         return round(34 * min(size[0] / 1280, size[1] / 720))
 
-    def compose(
-        self,
-        drawing: np.ndarray,
-        time: str,
-        camera: Camera | None = None,
-        inset: tuple[np.ndarray, tuple[int, int]] | None = None,
-    ) -> np.ndarray:
+    def compose(self, drawing: np.ndarray, time: str, camera: Camera | None = None) -> np.ndarray:
         """Return the page (height, width, 3 or 4) uint8 with a drawing of the region's size, and a text for the time.
 
         Parameters
         ----------
         camera : for the axes; None: the page's
-        inset : a picture (h, w, 4) with its left upper corner within the drawing
         """
         left, top, width, height = self.region
         page = self._background.copy()
         page[top : top + height, left : left + width] = drawing
-        if inset is not None:
-            picture, (x, y) = inset
-            _lay_over(page[top + y : top + y + picture.shape[0], left + x : left + x + picture.shape[1]], picture)
         return self._written(page, [(left + width, round(22 * self._unit), time)], "ra", camera)
 
     def compose_tiles(
@@ -235,7 +225,7 @@ class Page:
         )
 
 
-def _lay_over(page: np.ndarray, picture: np.ndarray) -> None:
+def lay_over(page: np.ndarray, picture: np.ndarray) -> None:
     """Lay a picture (h, w, 4) over a part of a page (h, w, 3 or 4), which is changed."""
     opacity = picture[..., 3:].astype(np.float32) / 255.0
     if page.shape[2] == 3:

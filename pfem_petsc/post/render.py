@@ -93,7 +93,7 @@ def render(
     ghost : whether to draw the first snapshot, pale, behind the others
     marks : "broken" bars as stubs, "yielded" ones with a rim
     trails : names of probes whose trajectories are drawn
-    inset : column of the history, drawn as a curve with a marker in a corner
+    inset : column of the history, drawn as a curve with a marker in a corner, of several results with the same axes
     zoom, orbit, path, follow : of the camera, see :class:`~pfem_petsc.post.shots.Moves`
     rate : frames per simulated second, between snapshots if need be; None: frames are snapshots
     span : first and last time [s] of the film
@@ -123,11 +123,11 @@ def render(
             raise InputError("render: no result to draw")
         names = _labels(results, labels)
         folder = _folder(results, output)
-        if inset is not None and len(results) > 1:
-            raise InputError("render: inset is for one result; leave it out, or draw one result")
         shown, chosen = _timed(results, frames, rate, span, tell)
         colours = [ColourField(result, field, component) for result in shown]
         limits = limits_of(clim, symmetric, [colour.limits(chosen) for colour in colours] if clim is None else [])
+        if colours[0].zero and all(colour.zero for colour in colours):
+            tell(f"{colours[0].title} is zero in all frames, to rounding")
         overlays = Overlays(ghost, tuple(marks), tuple(trails))
         motions = [Motion(result, chosen, scale, overlays, tell) for result in shown]
         look = Look(

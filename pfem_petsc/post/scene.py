@@ -21,7 +21,7 @@ EDGE_COLOUR = (75, 85, 99)
 NODE_COLOUR = (31, 36, 44)
 _LIGHT = np.array([-0.4, 0.7, 1.0]) / np.linalg.norm([-0.4, 0.7, 1.0])
 _DARK = np.zeros(3)
-_EVERYWHERE = 1e30  # nearness of what is in front of everything
+_EVERYWHERE = 1e30  # how much farther away walls are where they hide nothing
 
 
 @dataclass(frozen=True)
@@ -52,14 +52,17 @@ class Layer:
     lines : (m, 2) int
     colour : red, green, blue
     width : in pixels of a picture of 1280 by 720
-    place : "behind" everything, "within" the structure, "around" its bars, or "above" everything
+    shift : how much nearer to the eye than their points they are, in such pixels, so that they hide what is at the same
+        place, or are hidden by it
+    rim : whether they are as near as their axes, so that what they outline hides them
     """
 
     points: np.ndarray
     lines: np.ndarray
     colour: tuple[int, int, int]
     width: float
-    place: str
+    shift: float = 0.0
+    rim: bool = False
 
 
 class Scene:
@@ -74,6 +77,7 @@ class Scene:
     size : width and height in pixels
     style : how bars are drawn
     transparent : whether the background is
+    unit : pixels for each pixel of a page of 1280 by 720; None: by the size
     """
 
     def __init__(
@@ -85,6 +89,7 @@ class Scene:
         size: tuple[int, int],
         style: Style | None = None,
         transparent: bool = False,
+        unit: float | None = None,
     ) -> None:
         style = style or Style()
         self._bars, self._size, self._transparent = np.ascontiguousarray(bars, dtype=np.int64), size, transparent
@@ -92,12 +97,12 @@ class Scene:
         # more pixels than asked for are drawn and averaged, for smooth edges
         area = size[0] * size[1]
         self._factor = 3 if len(bars) <= TUBE_LIMIT and area <= 1.5e6 else (2 if area <= 1e7 else 1)
-        self._unit = min(size[0] / 1110, size[1] / 604)
+        self.unit = min(size[0] / 1110, size[1] / 604) if unit is None else unit
         pixels = size[1] / (2.0 * camera.half_height)
         ends = points[bars[:, 1]] - points[bars[:, 0]]
         lengths = pixels * np.linalg.norm(ends, axis=1)
         shortest = float(np.quantile(lengths, 0.1)) if len(bars) else 1.0
-        self.width = style.bar_width or _width(len(bars), lengths, shortest, self._unit)
+        self.width = style.bar_width or _width(len(bars), lengths, shortest, self.unit)
         self._radius = np.zeros(len(bars))
         if self.tubes and style.radius is not None:
             self._radius = np.ascontiguousarray(style.radius, dtype=float)
@@ -138,9 +143,6 @@ class Scene:
         size = self._image.shape[1], self._image.shape[0]
         if camera.parallel:  # walls are behind all bars, so that they hide none
             self._draw_walls(surfaces, camera, size)
-        for layer in layers:
-            if layer.place == "behind":
-                self._draw_layer(layer, camera, size)
         x, y, near, scale = camera.project(points, size)
         if not camera.parallel:
             places = points if on_nodes else 0.5 * (points[self._bars[:, 0]] + points[self._bars[:, 1]])
@@ -157,8 +159,7 @@ class Scene:
         if self.nodes:
             self._draw_nodes(x, y, near, scale, camera.lift(size))
         for layer in layers:
-            if layer.place != "behind":
-                self._draw_layer(layer, camera, size)
+            self._draw_layer(layer, camera, size)
         if not camera.parallel:
             self._draw_walls(surfaces, camera, size)
         made = np.empty((self._size[1], self._size[0], 4), dtype=np.uint8)
@@ -183,16 +184,13 @@ class Scene:
     def _draw_layer(self, layer: Layer, camera: Camera, size: tuple[int, int]) -> None:
         x, y, near, scale = camera.project(np.asarray(layer.points, dtype=float), size)
         lift = camera.lift(size)
-        if layer.place == "behind":
-            near, lift = np.full_like(near, -_EVERYWHERE), 0.0 * lift
-        elif layer.place == "above":
-            near, lift = np.full_like(near, _EVERYWHERE), 0.0 * lift
-        elif layer.place == "around":
+        near = near + layer.shift * self.unit * self._factor * (lift[0] + lift[1] * near)
+        if layer.rim:
             lift = 0.0 * lift
         lines = np.ascontiguousarray(layer.lines, dtype=np.int64)
         colours = np.tile(np.array(layer.colour, dtype=np.uint8), (len(lines), 1))
         radius, hidden = np.zeros(len(lines)), np.zeros(0, dtype=bool)
-        least = 0.5 * layer.width * self._unit * self._factor
+        least = 0.5 * layer.width * self.unit * self._factor
         draw_bars(
             self._image,
             self._depth,
@@ -204,7 +202,7 @@ class Scene:
         chosen = self._bars[bars]
         pixels = self._size[1] / (2.0 * camera.half_height)
         widest = 2.0 * pixels * float(self._radius[bars].max(initial=0.0))
-        return Layer(points, chosen, colour, max(self.width, widest) / self._unit + 4.0, "around")
+        return Layer(points, chosen, colour, max(self.width, widest) / self.unit + 4.0, rim=True)
 
     def _paler(self, colours: np.ndarray, places: np.ndarray, camera: Camera) -> np.ndarray:
         """Return colours that fade with the depth of their positions (n, 3), to show thousands of bars in space."""
@@ -239,12 +237,14 @@ class Scene:
             edge = np.ascontiguousarray(np.asarray(surface.edge, dtype=np.int64).reshape(-1, 2))
             ink = np.tile(np.array(EDGE_COLOUR, dtype=np.uint8), (len(edge), 1))
             radius, hidden = np.zeros(len(edge)), np.zeros(0, dtype=bool)
-            least = max(0.5, 0.9 * self._unit * self._factor)
+            least = max(0.5, 0.9 * self.unit * self._factor)
             draw_bars(self._image, self._depth, *projected, edge, hidden, radius, least, ink, False, _DARK, 0.0 * lift)
 
 
 def _width(count: int, lengths: np.ndarray, shortest: float, unit: float) -> float:
     """Return a width in pixels that shows the bars, and does not merge the chords of a slender truss."""
-    least = 3.8 if count <= 300 else 2.6 if count <= 2000 else 1.8 if count <= TUBE_LIMIT else 1.2
+    least = float(np.clip(3.8 * (300.0 / max(count, 1)) ** 0.25, 1.2, 4.2))
+    if count <= TUBE_LIMIT:
+        least = min(least, max(1.8, 0.4 * shortest / unit))
     wish = min(0.11 * float(lengths.mean()) if count else 1.0, 0.4 * shortest)
     return float(np.clip(wish, least * unit, 6.0 * unit))

@@ -110,7 +110,7 @@ def shots(motion: Motion, moves: Moves, aspect: float) -> list[Camera]:
         ways = [(_turned(towards, up, angle), up) for angle in angles]
     if moves.path is not None:
         parallel = False
-        azimuths, elevations, factors = (_eased(motion.times, moves.path[:, 0], moves.path[:, k]) for k in (1, 2, 3))
+        azimuths, elevations, factors = (_smooth(motion.times, moves.path[:, 0], moves.path[:, k]) for k in (1, 2, 3))
         ways = [(_towards(*np.radians(each), motion.upward), motion.upward) for each in zip(azimuths, elevations)]
         zooms = zooms * factors
     if moves.follow is None:
@@ -147,10 +147,25 @@ def _towards(azimuth: float, elevation: float, up: np.ndarray) -> np.ndarray:
     return np.cos(elevation) * around + np.sin(elevation) * up
 
 
-def _eased(times: np.ndarray, when: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Interpolate values with rates of zero at the given times, without overshoot."""
-    k = np.clip(np.searchsorted(when, times, side="right") - 1, 0, max(0, len(when) - 2))
-    after = np.minimum(k + 1, len(when) - 1)
-    span = np.where(when[after] > when[k], when[after] - when[k], 1.0)
-    u = np.clip((times - when[k]) / span, 0.0, 1.0)
-    return values[k] + (values[after] - values[k]) * (3.0 * u**2 - 2.0 * u**3)
+def _smooth(times: np.ndarray, when: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Interpolate values between given times by cubics without overshoot, at rest at both ends.
+
+    The rates at inner times are the weighted harmonic means of the slopes beside them, zero where these have different
+    signs (Fritsch and Butland 1984, eq. 5): the camera passes through them without a stop where it goes on in the same
+    direction.
+    """
+    if len(when) == 1:
+        return np.full(len(times), values[0])
+    steps = np.diff(when)
+    slopes = np.diff(values) / steps
+    rates = np.zeros(len(when))
+    before, after = slopes[:-1], slopes[1:]
+    same = before * after > 0.0
+    first, second = 2.0 * steps[1:] + steps[:-1], steps[1:] + 2.0 * steps[:-1]
+    inner = (first + second) / (first / np.where(same, before, 1.0) + second / np.where(same, after, 1.0))
+    rates[1:-1] = np.where(same, inner, 0.0)
+    k = np.clip(np.searchsorted(when, times, side="right") - 1, 0, len(when) - 2)
+    u = np.clip((times - when[k]) / steps[k], 0.0, 1.0)
+    ease = u * u * (3.0 - 2.0 * u)
+    bend = steps[k] * (rates[k] * u * (1.0 - u) ** 2 - rates[k + 1] * u * u * (1.0 - u))
+    return values[k] + (values[k + 1] - values[k]) * ease + bend

@@ -195,16 +195,18 @@ def _components(values: np.ndarray, scale: float = 0.0) -> list[tuple[str, np.nd
 
 def _tell(chart: Chart, still: Sequence[_Panel], more: str = "") -> None:
     """Say below the panels what has none because it does not change."""
-    zero, constant = [], []
+    zero: dict[str, list[str]] = {}
+    constant = []
     for panel in still:
-        label = panel.label.partition(",")[0]
-        name = f"{label} of {panel.title}" if panel.title else label
+        label, probe = panel.label.partition(",")[0], panel.title.partition(",")[0]
         mean = np.nanmean(panel.values, axis=0) if len(panel.values) else np.zeros(3)
         if np.abs(mean).max() <= _ROUNDING * panel.scale:
-            zero.append(name)
+            zero.setdefault(probe, []).append(label)
         else:
+            name = f"{label} of {probe}" if probe else label
             constant.append(f"{name} ({', '.join(f'{part:.4g}' for part in mean + 0.0)}) {panel.unit}")
-    text = more + (f"Zero throughout: {', '.join(zero)}. " if zero else "")
+    names = [" and ".join(labels) + (f" of {probe}" if probe else "") for probe, labels in zero.items()]
+    text = more + (f"Zero throughout: {', '.join(names)}. " if zero else "")
     text += f"Constant: {', '.join(constant)}." if constant else ""
     if text:
         chart.note(text.strip())

@@ -13,7 +13,9 @@ import numpy as np
 
 from ..errors import InputError
 from .fields import ColourField, ColourScale
+from .frames import chosen_frames
 from .motion import Motion, Overlays
+from .options import checked_style, limits_of, opened
 from .radii import drawn_radii
 from .scene import TUBE_LIMIT
 from .shots import Moves, shots
@@ -46,10 +48,8 @@ def render_html(
     InputError
         For options that do not fit the result, or a file that cannot be written.
     """
-    from .options import opened
-
     with opened(result_path) as result:
-        shown = state(result, frame, note, **options)
+        shown = state(result, chosen_frames([frame], np.asarray(result.times), note), note, **options)
         motion, colour, scale = shown["motion"], shown["colour"], shown["scale"]
         number = motion.frames[0]
         camera = shots(motion, Moves(shown["view"]), 1.6)[0]
@@ -95,7 +95,7 @@ def render_html(
 
 def state(
     result: Any,
-    frame: int,
+    frames: Sequence[int],
     note: Callable[[str], None],
     *,
     field: str = "stress",
@@ -109,27 +109,24 @@ def state(
     title: str | None = None,
     view: str | Sequence[float] = "auto",
 ) -> dict[str, Any]:
-    """Return what interactive pictures show of a snapshot: motion, colours, radii, title and view.
+    """Return what interactive pictures show of snapshots: motion, colours, radii, title and view.
 
     Raises
     ------
     InputError
         For options that do not fit the result.
     """
-    from .frames import chosen_frames
-    from .options import checked_style, limits_of
-
     checked_style(style, radius_scale)
-    chosen = chosen_frames([frame], np.asarray(result.times), note)
     colour = ColourField(result, field, component)
-    limits = limits_of(clim, symmetric, [colour.limits(chosen)] if clim is None else [])
+    limits = limits_of(clim, symmetric, [colour.limits(frames)] if clim is None else [])
     tubes = len(result.bars) <= TUBE_LIMIT if style == "auto" else style == "tubes"
     radius = drawn_radii(result, note if style == "tubes" else None) if tubes else None
     return {
-        "motion": Motion(result, chosen, scale, Overlays(), note),
+        "motion": Motion(result, frames, scale, Overlays(), note),
         "colour": colour,
         "scale": ColourScale(limits, cmap, colour.unit),
         "radius": None if radius is None else radius_scale * radius,
+        "tubes": tubes,
         "title": title if title is not None else (result.case.title or result.case.name),
         "view": view,
     }

@@ -247,6 +247,11 @@ def test_engineering_prefixes():
     assert engineering(-3.21e4, "N") == "-32.10 kN"
     assert engineering(2.28e8, "B") == "228.0 MB"
     assert engineering(0.0, "J") == "0 J"
+    # prefixes that nobody uses are left out, never one beside a power of ten
+    assert engineering(0.5, "Pa") == "0.5000 Pa"
+    assert engineering(2.5e-5, "Pa") == "2.500e-05 Pa"
+    assert engineering(-2.3e-16, "J") == "-2.300e-16 J"
+    assert engineering(3.1e-5, "N") == "31.00 µN"
     assert engineering(1e-3, "s") == "1.000 ms"
     assert engineering(12.5, "K") == "12.50 K"
     assert engineering(float("nan"), "s") == "nan s"

@@ -1,11 +1,10 @@
-"""What pictures show beyond coloured bars: radii, marks, trajectories, curves, cameras, results side by side."""
+"""What pictures show beyond coloured bars: radii, marks, trajectories, refused options."""
 
 from __future__ import annotations
 
 import math
 from types import SimpleNamespace
 
-import imageio_ffmpeg
 import numpy as np
 import pytest
 from helpers.synthetic import SyntheticResult, lattice, ring
@@ -16,12 +15,10 @@ from pfem_petsc.cli.main import main
 from pfem_petsc.errors import InputError
 from pfem_petsc.post.camera import aim
 from pfem_petsc.post.contrast import GHOST, MARKS, TRAILS
-from pfem_petsc.post.frames import Resampled
 from pfem_petsc.post.page import Page
 from pfem_petsc.post.radii import drawn_radii, radii_of
 from pfem_petsc.post.render import render
 from pfem_petsc.post.scene import Scene, Style
-from pfem_petsc.post.shots import Moves, camera_path, shots
 
 TINY = (240, 160)
 
@@ -197,87 +194,6 @@ def test_trajectories_grow(tmp_path, flying):
         draw(tmp_path, flying, trails=["tap"])
 
 
-def test_marker_moves_along_the_curve(tmp_path, flying):
-    files = draw(tmp_path, flying, frames=[1, 11], inset="kinetic_energy", size=(640, 360), cmap="Greys")
-    first, last = (near(drawing(file), (217, 72, 43), 25) for file in files)
-    assert last[1].mean() > first[1].mean() + 50
-    assert draw(tmp_path, flying, frames=[0], inset="centre_of_mass.x")
-    for name, text in (("kinetic_enrgy", "did you mean"), ("kinetic_energy.x", "one value only")):
-        with pytest.raises(InputError, match=text):
-            draw(tmp_path, flying, inset=name)
-
-
-def test_transparent_background(tmp_path, flying):
-    file = draw(tmp_path, flying, frames=[0], transparent=True)[0]
-    picture = pixels(file)
-    left, top, width, height = Page.region_of(TINY)
-    alpha = picture[top : top + height, left : left + width, 3]
-    assert alpha.min() == 0 and alpha.max() == 255 and (alpha == 0).mean() > 0.5
-    plain = pixels(draw(tmp_path / "plain", flying, frames=[0])[0])
-    over = picture[..., :3] * (picture[..., 3:] / 255) + 255 - picture[..., 3:]
-    assert np.abs(over - plain[..., :3])[top : top + height, left : left + width].max() <= 3
-    with pytest.raises(InputError, match="webm"):
-        draw(tmp_path, flying, transparent=True, video="mp4")
-
-
-def test_results_side_by_side(tmp_path, flying):
-    """Two rings at one scale beside each other, the second at half the size."""
-    points, bars = ring()
-    other = SyntheticResult(tmp_path / "y" / "result.vtkhdf", 0.5 * points, bars, walls=())
-    file = draw(tmp_path, [flying, other], frames=[0], size=(640, 300), nodes=False)[0]
-    picture = drawing(file)
-    middle = picture.shape[1] // 2
-    strip = Page.strip_of((640, 300))
-    boxes = [box(half) for half in (picture[strip:, :middle], picture[strip:, middle:])]
-    heights = [bottom - top for top, bottom, _, _ in boxes]
-    assert heights[1] == pytest.approx(0.5 * heights[0], abs=3)
-    with pytest.raises(InputError, match="3 labels for 2 results"):
-        draw(tmp_path, [flying, other], labels=["a", "b", "c"])
-    with pytest.raises(InputError, match="inset is for one result"):
-        draw(tmp_path, [flying, other], inset="kinetic_energy")
-
-
-def test_slow_motion_is_between_snapshots(tmp_path, flying):
-    """0.05 s at 1000 frames a second from 13 snapshots: the middle of two of them is the mean of their positions."""
-    told = []
-    files = draw(tmp_path, flying, rate=1000, span=(0.0, 0.0201), note=told.append, fps=20)
-    assert len(files) == 21 and "21 frames last 1.1 s" in told[0] and "50 times slower" in told[0]
-    half = 0.5 * (flying.times[3] + flying.times[4])
-    mean = 0.5 * (flying.positions(3) + flying.positions(4))
-    slow = Resampled(flying, np.array([half, 1.0]))
-    assert slow.positions(0) == pytest.approx(mean, abs=1e-12)
-    assert (slow.positions(1) == flying.positions(12)).all()
-
-
-def motion_of(result):
-    from pfem_petsc.post.motion import Motion, Overlays
-
-    return Motion(result, list(range(len(result.times))), 1.0, Overlays(), print)
-
-
-def test_orbit_and_path_keep_everything_in_view(tmp_path, flying):
-    motion = motion_of(flying)
-    path = np.array([[0.0, -90.0, 10.0, 1.0], [0.05, 90.0, 40.0, 1.0]])
-    for moves in (Moves(orbit=180.0, view="iso"), Moves(path=path)):
-        cameras = shots(motion, moves.checked(), 1.5)
-        assert len(cameras) == 13 and cameras[0].towards @ cameras[-1].towards < 0.5
-        for camera in cameras:
-            x, y, _, _ = camera.project(motion.surroundings, (300, 200))
-            assert x.min() >= -0.5 and x.max() <= 300.5 and y.min() >= -0.5 and y.max() <= 200.5
-    first, last = (cameras[k].towards for k in (0, -1))
-    tilt = math.radians(10.0), math.radians(40.0)
-    assert first == pytest.approx([0.0, -math.cos(tilt[0]), math.sin(tilt[0])], abs=1e-12)
-    assert last == pytest.approx([0.0, math.cos(tilt[1]), math.sin(tilt[1])], abs=1e-12)
-
-
-def test_followed_structure_stays_in_the_middle(flying):
-    motion = motion_of(flying)
-    for camera, box in zip(shots(motion, Moves(follow="structure"), 1.5), motion.boxes, strict=True):
-        x, y, _, _ = camera.project(box.mean(axis=0)[None, :], (300, 200))
-        assert (x[0], y[0]) == pytest.approx((150.0, 100.0))
-    assert len(shots(motion, Moves(follow="tip"), 1.5)) == 13
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -298,37 +214,6 @@ def test_followed_structure_stays_in_the_middle(flying):
 def test_refused_looks(tmp_path, flying, options, message):
     with pytest.raises(InputError, match=message):
         draw(tmp_path, flying, **options)
-
-
-def test_path_files(tmp_path):
-    file = tmp_path / "path.csv"
-    file.write_text("time,azimuth,elevation,zoom\n0,0,10,1\n# closer\n1,90,20,2\n")
-    assert camera_path(file).tolist() == [[0, 0, 10, 1], [1, 90, 20, 2]]
-    file.write_text("0,0,10,1\n1,90,20\n")
-    with pytest.raises(InputError, match="line 2 is not four numbers"):
-        camera_path(file)
-    with pytest.raises(InputError, match="cannot be read"):
-        camera_path(tmp_path / "none.csv")
-
-
-def test_films_for_web_pages(tmp_path, flying):
-    for video, transparent in (("webp", False), ("webm", True)):
-        draw(tmp_path / video, flying, frames=3, video=video, transparent=transparent, size=(160, 120))
-    assert Image.open(tmp_path / "webp" / "render.webp").n_frames == 3
-    count, _ = imageio_ffmpeg.count_frames_and_secs(str(tmp_path / "webm" / "render.webm"))
-    assert count == 3
-
-
-@pytest.mark.parallel
-def test_ranks_divide_the_frames(shared_tmp_path, comm):
-    """The same frames on any number of ranks, which the first rank makes a film of."""
-    alone = SyntheticResult(shared_tmp_path / "x" / "result.vtkhdf", *ring(), walls=())
-    options = {"size": (160, 120), "poster": False, "note": lambda text: None, "frames": 4}
-    written = render(alone, shared_tmp_path / "together", video="gif", comm=comm, **options)
-    assert len(written) == 5 and all(path.is_file() for path in written)
-    if comm.rank == 0:
-        own = render(alone, shared_tmp_path / "alone", video="none", **options)
-        assert [path.read_bytes() for path in written[1:]] == [path.read_bytes() for path in own]
 
 
 @pytest.mark.parametrize(

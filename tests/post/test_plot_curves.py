@@ -1,0 +1,136 @@
+"""Curves by name, their tables, spectra, and what they are thinned and averaged by."""
+
+from __future__ import annotations
+
+import csv
+
+import numpy as np
+import pytest
+from helpers.synthetic import SyntheticResult, ring
+from PIL import Image
+
+from pfem_petsc.errors import InputError
+from pfem_petsc.post.chart import thinned
+from pfem_petsc.post.filters import window_mean
+from pfem_petsc.post.plot import plot
+
+
+@pytest.fixture
+def result(tmp_path):
+    return SyntheticResult(tmp_path / "result.vtkhdf", *ring())
+
+
+def saturated(file) -> np.ndarray:
+    """Pixels (n, 3) with a colour: curves, not axes and text."""
+    picture = np.asarray(Image.open(file).convert("RGB")).reshape(-1, 3).astype(int)
+    return picture[np.ptp(picture, axis=1) > 60]
+
+
+def _columns(path):
+    head, *rows = csv.reader(path.open())
+    return head, np.array(rows, dtype=float).T
+
+
+def test_named_curves(tmp_path, result):
+    written = plot(result, tmp_path, curves=["kinetic_energy", "momentum", "probe/tip/velocity", "wall/wall/contacts"])
+    assert [path.name for path in written] == ["curves.png"] and len(saturated(written[0])) > 500
+    assert not (tmp_path / "energies.png").exists()
+
+
+def test_unknown_curve_is_refused_with_the_nearest(tmp_path, result):
+    with pytest.raises(InputError, match=r"no column 'kinetic_enrgy', did you mean 'kinetic_energy'\?"):
+        plot(result, tmp_path, curves=["kinetic_enrgy"])
+    with pytest.raises(InputError, match="no curves named"):
+        plot(result, tmp_path, curves=[])
+
+
+def test_thinned_curve_keeps_spikes_and_ends():
+    time = np.linspace(0, 1, 100_003)
+    values = np.sin(7 * time)
+    values[54_321], values[77_777] = 50.0, -50.0
+    short_time, short = thinned(time, values, 1000)
+    assert len(short) < 1010 and np.all(np.diff(short_time) > 0)
+    assert {50.0, -50.0, values[0], values[-1]} <= set(short)
+    assert short_time[np.argmax(short)] == time[54_321]
+
+
+def integral(values, time):
+    return float(np.sum(0.5 * np.diff(time) * (values[1:] + values[:-1])))
+
+
+def test_window_mean_keeps_the_impulse_of_uneven_steps():
+    random = np.random.default_rng(1)
+    time = np.cumsum(random.uniform(0.5e-3, 1.5e-3, 400))
+    values = np.where(np.abs(time - time[200]) < 0.05, random.uniform(0, 2e3, 400), 0.0)
+    smooth = window_mean(time, values, 0.03)
+    assert integral(smooth, time) == pytest.approx(integral(values, time), rel=2e-3)
+    assert smooth.max() < 0.8 * values.max()
+    line = 3.0 * time - 1.0
+    inner = slice(50, 350)
+    # of the time before each point
+    assert window_mean(time, line, 0.03)[inner] == pytest.approx(line[inner] - 3.0 * 0.015, rel=1e-9, abs=1e-12)
+
+
+def test_window_mean_does_not_rise_before_its_cause():
+    time = np.linspace(0.0, 1.0, 101)
+    values = np.where(time > 0.5, 1.0, 0.0)
+    assert not window_mean(time, values, 0.1)[time <= 0.5].any()
+
+
+def test_curves_of_an_earlier_call_stay(tmp_path, result):
+    (first,) = plot(result, tmp_path, curves=["kinetic_energy"])
+    (second,) = plot(result, tmp_path, curves=["momentum"])
+    assert [first.name, second.name] == ["curves.png", "curves_2.png"]
+
+
+def test_formats_and_tables(tmp_path, result):
+    written = plot(result, tmp_path, curves=["kinetic_energy", "wall/wall/force"], formats=["svg", "pdf", "csv"])
+    assert [path.name for path in written] == ["curves.svg", "curves.pdf", "curves.csv"]
+    assert written[0].read_text().startswith("<?xml") and written[1].read_bytes().startswith(b"%PDF")
+    head, *rows = csv.reader(written[2].open())
+    assert head == ["time [s]", "kinetic_energy [J]", "wall/wall/force.x [N]"] and len(rows) == len(
+        result.history["time"]
+    )
+    table = np.array(rows, dtype=float)
+    assert np.array_equal(table[:, 1], result.history["kinetic_energy"])
+    assert np.array_equal(table[:, 2], result.history["wall/wall/force"][:, 0])
+    (second,) = plot(result, tmp_path, curves=["momentum"], formats=["csv"])
+    assert second.name == "curves_2.csv"
+
+
+def test_forces_over_displacements(tmp_path, result):
+    (file,) = plot(result, tmp_path, curves=["wall/wall/force.x"], against="centre_of_mass.x", formats=["csv"])
+    head, (place, force) = _columns(file)
+    assert head == ["centre_of_mass.x [m]", "wall/wall/force.x [N]"]
+    assert np.array_equal(place, result.history["centre_of_mass"][:, 0])
+    assert np.array_equal(force, result.history["wall/wall/force"][:, 0])
+    with pytest.raises(
+        InputError, match=r"against = 'centre_of_mass' is a vector: name a component, centre_of_mass\.x"
+    ):
+        plot(result, tmp_path, curves=["kinetic_energy"], against="centre_of_mass")
+
+
+def test_several_results_are_drawn_over_each_other(tmp_path, result):
+    other = SyntheticResult(tmp_path / "fine" / "result.vtkhdf", *ring(), snapshots=5)
+    (file,) = plot([result, other], tmp_path / "both", formats=["csv"])
+    assert file.name == "comparison.csv"
+    head, *rows = csv.reader(file.open())
+    here = tmp_path.name
+    assert [head[0], head[2]] == [f"time [s]: {here}", "time [s]: fine"]
+    assert head[1] == f"kinetic_energy: {here} [J]" and head[3] == "kinetic_energy: fine [J]"
+    assert len(rows) == 260 and [bool(row[3]) for row in rows].count(True) == 100
+    (picture,) = plot([result, other], tmp_path / "both")
+    assert len(saturated(picture)) > 500
+
+
+def test_spectra_have_the_amplitude(tmp_path, result):
+    time = result.history["time"]
+    result.history["probe/tip/velocity"] = np.zeros((len(time), 1, 3))
+    frequency = 20 / (time[-1] * len(time) / (len(time) - 1))
+    result.history["probe/tip/velocity"][:, 0, 1] = 3.0 * np.sin(2 * np.pi * frequency * time)
+    (file,) = plot(result, tmp_path, spectrum=["probe/tip/velocity"], formats=["csv"])
+    assert file.name == "spectra.csv"
+    head, (places, amplitude) = _columns(file)
+    assert head == ["frequency [Hz]", "probe/tip/velocity.y [m/s]"]
+    assert places[20] == pytest.approx(frequency) and amplitude.argmax() == 20 and amplitude[20] == pytest.approx(3.0)
+    assert len(saturated(plot(result, tmp_path, spectrum=["probe/tip/velocity"])[0])) > 300

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ..errors import InputError
 from .contrast import MARKS
 from .fields import ColourField, ColourScale
 from .inset import Inset, insets_of
@@ -22,6 +23,7 @@ __all__ = ["Film", "Look"]
 _POSTER = (1600, 900)
 _TILES = 6
 _FEW = 2000  # bars of a small model
+_ROOM = 220  # pixels: the narrowest tile with an inset
 
 
 @dataclass(frozen=True)
@@ -83,6 +85,11 @@ class Film:
         self._insets: list[Inset] = []
         if self.look.inset is not None:
             wide = max(0.28 * self._tile[0], min((0.5 if several else 1.0) * self._tile[0], 220.0))
+            if several and self._tile[0] < _ROOM:
+                raise InputError(
+                    f"render: inset needs tiles of {_ROOM} pixels or more, and these have {self._tile[0]}: give a "
+                    "larger size, or fewer results"
+                )
             room = round(wide), round(0.62 * wide)
             self._insets = insets_of([motion.result for motion in self.motions], self.look.inset, room)
             self._corner = self._emptiest_corner(room)

@@ -203,10 +203,10 @@ class Motion:
 
     def layers(self, frame: int, scene: Scene, camera: Any) -> list[Layer]:
         """Return what is drawn in addition to the bars of a frame."""
-        made, points = [], self.positions(frame)
+        made, points, thick = [], self.positions(frame), scene.thickness(camera)
         if self._overlays.ghost:
-            width = scene.width / scene.unit
-            made.append(Layer(self.start, self.bars, GHOST, float(np.clip(0.6 * width, 1.2, 2.4)), -width))
+            width = float(np.clip(0.6 * scene.width / scene.unit, 1.2, 2.4))
+            made.append(Layer(self.start, self.bars, GHOST, width, -thick))
         gone = self.gone(frame)
         if "yielded" in self._overlays.marks:
             yielded = np.asarray(self.result.field("plastic_strain", frame)) != 0.0
@@ -221,7 +221,7 @@ class Motion:
             rows = np.stack([np.arange(past - 1), np.arange(1, past)], axis=1)
             for node in range(places.shape[1]):
                 colour = TRAILS[number % len(TRAILS)]
-                made.append(Layer(places[:, node], rows, colour, 2.4, scene.width / scene.unit))
+                made.append(Layer(places[:, node], rows, colour, 2.4, thick))
         return made
 
     def _stubs(self, points: np.ndarray, gone: np.ndarray, width: float) -> Layer:

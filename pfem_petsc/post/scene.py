@@ -199,10 +199,12 @@ class Scene:
 
     def halo(self, points: np.ndarray, bars: np.ndarray, colour: tuple[int, int, int], camera: Camera) -> Layer:
         """Return a layer that outlines bars (numbers) by a rim of two pixels."""
-        chosen = self._bars[bars]
+        return Layer(points, self._bars[bars], colour, self.thickness(camera, bars) + 4.0, rim=True)
+
+    def thickness(self, camera: Camera, bars: np.ndarray | slice = slice(None)) -> float:
+        """Return the width of the widest of some bars (numbers), in pixels of a page of 1280 by 720."""
         pixels = self._size[1] / (2.0 * camera.half_height)
-        widest = 2.0 * pixels * float(self._radius[bars].max(initial=0.0))
-        return Layer(points, chosen, colour, max(self.width, widest) / self.unit + 4.0, rim=True)
+        return max(self.width, 2.0 * pixels * float(self._radius[bars].max(initial=0.0))) / self.unit
 
     def _paler(self, colours: np.ndarray, places: np.ndarray, camera: Camera) -> np.ndarray:
         """Return colours that fade with the depth of their positions (n, 3), to show thousands of bars in space."""

@@ -83,7 +83,7 @@ def test_walls_without_a_drawing_are_named():
 class Values:
     """A result with one cell field."""
 
-    point_fields, cell_fields = [], ["stress", "plastic_strain"]
+    point_fields, cell_fields, bars = [], ["stress", "plastic_strain"], ()
 
     def __init__(self, *snapshots):
         self.snapshots = [np.asarray(s, dtype=float) for s in snapshots]

@@ -61,8 +61,20 @@ def test_results_side_by_side(tmp_path, flying):
     assert heights[1] == pytest.approx(0.5 * heights[0], abs=3)
     with pytest.raises(InputError, match="3 labels for 2 results"):
         draw(tmp_path, [flying, other], labels=["a", "b", "c"])
-    with pytest.raises(InputError, match="inset is for one result"):
-        draw(tmp_path, [flying, other], inset="kinetic_energy")
+
+
+def test_curves_of_results_side_by_side(tmp_path, flying):
+    """Each has its own curve, with one range for all: the curve of a tenth of the energy stays low."""
+    other = SyntheticResult(tmp_path / "y" / "result.vtkhdf", *ring(), walls=())
+    other.history["kinetic_energy"] = 0.1 * other.history["kinetic_energy"]
+    (file,) = draw(tmp_path, [flying, other], frames=[0], inset="kinetic_energy", size=(960, 400), cmap="Greys")
+    picture = drawing(file)
+    middle = picture.shape[1] // 2
+    heights = [near(half, (217, 72, 43), 25)[0] for half in (picture[:, :middle], picture[:, middle:])]
+    assert min(len(rows) for rows in heights) > 10
+    assert heights[1].mean() > heights[0].mean() + 40
+    with pytest.raises(InputError, match="inset needs tiles of 220 pixels or more, and these have 104"):
+        draw(tmp_path, [flying, other], inset="kinetic_energy", size=(240, 160))
 
 
 def test_slow_motion_is_between_snapshots(tmp_path, flying):
@@ -96,6 +108,36 @@ def test_orbit_and_path_keep_everything_in_view(tmp_path, flying):
     tilt = math.radians(10.0), math.radians(40.0)
     assert first == pytest.approx([0.0, -math.cos(tilt[0]), math.sin(tilt[0])], abs=1e-12)
     assert last == pytest.approx([0.0, math.cos(tilt[1]), math.sin(tilt[1])], abs=1e-12)
+
+
+def test_camera_passes_through_the_rows_of_its_path(flying):
+    """Azimuths at the given times, without overshoot between them, and without a stop where it goes on."""
+    motion = motion_of(flying)
+    motion.frames, motion.times = list(range(101)), np.linspace(0.0, 1.0, 101)
+    path = np.array([[0.0, 0.0, 10.0, 1.0], [0.5, 40.0, 10.0, 1.0], [0.8, 90.0, 10.0, 1.0], [1.0, 60.0, 10.0, 1.0]])
+    cameras = shots(motion, Moves(path=path).checked(), 1.5)
+    azimuths = np.degrees([math.atan2(camera.towards[1], camera.towards[0]) for camera in cameras])
+    assert azimuths[[0, 50, 80, 100]] == pytest.approx(path[:, 1], abs=1e-9)
+    assert azimuths.min() > -1e-9 and azimuths.max() < 90.0 + 1e-9
+    rates = np.gradient(azimuths, motion.times)
+    assert rates[50] > 80.0  # of 80 and 167 degrees a second on both sides
+    assert abs(rates[[0, 80, 100]]).max() < 30.0
+
+
+@pytest.mark.parametrize(
+    ("times", "text"),
+    [
+        (np.linspace(0.0, 5.0, 101), "t = 0.05 s"),
+        (np.linspace(0.0, 0.2, 201), "t = 1 ms"),
+        (np.linspace(0.0, 6e-4, 31), "t = 20 µs"),
+        (np.linspace(0.0, 3.0, 4), "t = 1 s"),
+        (np.arange(5) * 1.2345e-3, "t = 1.23 ms"),
+    ],
+)
+def test_times_have_the_unit_of_the_film_and_the_digits_that_tell_frames_apart(flying, times, text):
+    flying.times = times
+    flying.positions = lambda i: flying.start
+    assert motion_of(flying).time(1) == text
 
 
 def test_followed_structure_stays_in_the_middle(flying):

@@ -18,7 +18,7 @@ from pfem_petsc.post.contrast import GHOST, MARKS, TRAILS
 from pfem_petsc.post.page import Page
 from pfem_petsc.post.radii import drawn_radii, radii_of
 from pfem_petsc.post.render import render
-from pfem_petsc.post.scene import Scene, Style
+from pfem_petsc.post.scene import Layer, Scene, Style
 
 TINY = (240, 160)
 
@@ -169,7 +169,55 @@ def test_ghost_stays_where_the_structure_was(tmp_path, flying):
     pale = near(ghost, GHOST, 3)
     assert len(pale[0]) > 5 * len(near(plain, GHOST, 3)[0]) + 300
     # the ring has flown to the right
-    assert pale[1].min() < box(ghost)[2] - 10
+    assert pale[1].min() < box(plain)[2] - 10
+
+
+@pytest.mark.parametrize("parallel", [True, False], ids=["parallel", "perspective"])
+def test_what_is_added_has_its_depth(parallel):
+    """A trajectory or ghost in front of a bar is seen, one behind it hidden; at the same place, the shift decides."""
+    points = np.array([[-1.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    bounds = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+    camera = aim(np.array(np.meshgrid(*bounds.T)).reshape(3, -1).T, bounds, [], "xy" if parallel else (0, 0, 1), 1.0)
+    scene = Scene(points, np.array([[0, 1]]), camera, bounds, (200, 200), Style(bar_width=8.0, nodes=False))
+    red, green = np.array([[255, 0, 0]], dtype=np.uint8), (0, 158, 115)
+    thick = scene.thickness(camera)
+    for height, shift, seen in ((0.8, 0.0, True), (-0.8, 0.0, False), (0.0, thick, True), (0.0, -thick, False)):
+        places = np.array([[0.0, -1.0, height], [0.0, 1.0, height]])
+        layer = Layer(places, np.array([[0, 1]]), green, 12.0, shift)
+        picture = scene.draw(points, red, False, camera, layers=[layer]).astype(int)
+        assert (picture[100, 100, 1] > picture[100, 100, 0]) == seen, (height, shift)
+        assert picture[40, 100, 1] > picture[40, 100, 0]
+
+
+def test_bars_of_small_models_are_seen_in_tiles_too(tmp_path, monkeypatch):
+    """A slender tower of some hundred bars: two pixels or more in frames and in the six instants of a page."""
+    level = np.array([[1.0, 1.0, 0.0], [-1.0, 1.0, 0.0], [-1.0, -1.0, 0.0], [1.0, -1.0, 0.0]])
+    points = np.concatenate([level + [0.0, 0.0, 1.4 * k] for k in range(20)])
+    i, four = np.arange(76), np.tile([1, 1, 1, -3], 19)
+    bars = np.concatenate([np.stack(ends, axis=1) for ends in ((i, i + 4), (i, i + 4 + four), (i + 4, i + 4 + four))])
+    tower = SyntheticResult(tmp_path / "x" / "result.vtkhdf", points, bars, walls=(), snapshots=7)
+    widths = []
+
+    class Watched(Scene):
+        def __init__(self, *arguments):
+            super().__init__(*arguments)
+            widths.append(self.width)
+
+    monkeypatch.setattr("pfem_petsc.post.film.Scene", Watched)
+    draw(tmp_path, tower, frames=[0, 3, 6], poster=True, size=(960, 540))
+    assert len(widths) == 2 and min(widths) > 1.8
+
+
+def test_a_field_of_rounding_errors_has_no_colours(tmp_path, flying):
+    """Stresses of 1e-6 Pa of a ring of steel that flies without a force."""
+    flying.case.material = {"steel": SimpleNamespace(young_modulus=2.1e11)}
+    stress, told = flying.field, []
+    flying.field = lambda name, i: 1e-6 * np.sin(np.arange(flying.n_bars)) if name == "stress" else stress(name, i)
+    (file,) = draw(tmp_path, flying, frames=[0], note=told.append)
+    assert told == ["stress is zero in all frames, to rounding"]
+    picture = drawing(file)
+    inked = picture[picture[..., :3].min(axis=2) < 150][:, :3]
+    assert np.ptp(inked, axis=1).max() < 40  # grey
 
 
 def test_yielded_and_broken_bars_are_marked(tmp_path, flying):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from helpers.browser import PROGRAM, Browser
-from helpers.synthetic import SyntheticResult, lattice, ring
+from helpers.synthetic import WALL, SyntheticResult, lattice, ring
 
 from pfem_petsc.errors import InputError
 from pfem_petsc.post.web_page import render_html
@@ -69,6 +69,22 @@ def test_window_moves_the_nodes(tmp_path, result):
         pictures.append(np.asarray(plotter.screenshot(return_img=True)).astype(int))
     plotter.close()
     assert (pictures[0] != pictures[1]).any(axis=2).sum() > 300
+
+
+def test_window_has_walls_and_radii(result, monkeypatch):
+    """More of the picture is covered with a wall, and with bars of radii."""
+
+    def covered(walls, radius):
+        result.case.wall = walls
+        monkeypatch.setattr("pfem_petsc.post.web_page.drawn_radii", lambda *_: radius)
+        plotter, _ = plotter_of(result, 0, print, off_screen=True, view=(1.0, 0.3, 0.3))
+        picture = np.asarray(plotter.screenshot(return_img=True))
+        plotter.close()
+        return (picture.min(axis=2) < 250).mean()
+
+    radius = np.full(result.n_bars, 0.04)
+    plain, wall, thick = covered([], None), covered([WALL], None), covered([], radius)
+    assert wall > 1.3 * plain and thick > 1.3 * plain
 
 
 def test_window_without_a_display(tmp_path, monkeypatch):

@@ -84,15 +84,13 @@ class Film:
         self._scenes = self._new_scenes(size, self._tile, self._cameras)
         self._insets: list[Inset] = []
         if self.look.inset is not None:
-            wide = max(0.28 * self._tile[0], min((0.5 if several else 1.0) * self._tile[0], 220.0))
             if several and self._tile[0] < _ROOM:
                 raise InputError(
                     f"render: inset needs tiles of {_ROOM} pixels or more, and these have {self._tile[0]}: give a "
                     "larger size, or fewer results"
                 )
-            room = round(wide), round(0.62 * wide)
+            room, self._corner = self._room_of_insets(several)
             self._insets = insets_of([motion.result for motion in self.motions], self.look.inset, room)
-            self._corner = self._emptiest_corner(room)
 
     def frame(self, number: int) -> np.ndarray:
         """Return a page (height, width, 3 or 4) uint8."""
@@ -165,15 +163,21 @@ class Film:
         across, along = (float(np.ptp(points @ way)) for way in (look.right, look.up))
         return across / max(along, 1e-3 * across, 1e-300)
 
-    def _emptiest_corner(self, room: tuple[int, int]) -> tuple[int, int]:
-        """Return the place of the inset that covers least of the structure and its walls over the film."""
+    def _room_of_insets(self, several: bool) -> tuple[tuple[int, int], tuple[int, int]]:
+        """Return the size of insets, and the corner where they cover least of structures and walls over the film."""
         width, height = self._tile
-        places = [(x, y) for y in (0, height - room[1]) for x in (0, width - room[0])]
-        covered = np.zeros(len(places))
-        for motion, cameras in zip(self.motions, self._cameras, strict=True):
-            for number in np.unique(np.linspace(0, self.count - 1, 7).astype(int)):
-                covered += self._covered(motion, motion.frames[number], cameras[number], places, room)
-        return places[int(np.argmin(covered))]
+        best = np.inf
+        for share in (0.28, 0.25):
+            wide = max(share * width, min((0.5 if several else 1.0) * width, 220.0))
+            room = round(wide), round(0.62 * wide)
+            places = [(x, y) for y in (0, height - room[1]) for x in (0, width - room[0])]
+            covered = np.zeros(len(places))
+            for motion, cameras in zip(self.motions, self._cameras, strict=True):
+                for number in np.unique(np.linspace(0, self.count - 1, 7).astype(int)):
+                    covered += self._covered(motion, motion.frames[number], cameras[number], places, room)
+            if covered.min() < best:
+                best, found = covered.min(), (room, places[int(np.argmin(covered))])
+        return found
 
     def _covered(
         self, motion: Motion, frame: int, camera: Any, places: Sequence[tuple[int, int]], room: tuple[int, int]

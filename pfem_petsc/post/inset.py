@@ -66,7 +66,7 @@ class Inset:
         factor, shown = prefix_for(max(largest(values) for _, values in curves), unit)
         time_factor, time_unit = prefix_for(max(largest(times) for times, _ in curves), result.axis.unit)
         scale = size[1] / 180.0
-        with rc_context({**STYLE, "font.size": 8.0 * scale, "lines.linewidth": 1.3 * scale}), boxes_allowed():
+        with rc_context({**STYLE, "font.size": 9.0 * scale, "lines.linewidth": 1.3 * scale}), boxes_allowed():
             figure = Figure(figsize=(size[0] / 100, size[1] / 100), dpi=100, layout="constrained")
             canvas = FigureCanvasAgg(figure)
             figure.patch.set_alpha(0.88)
@@ -79,8 +79,10 @@ class Inset:
             axes.yaxis.set_major_locator(MaxNLocator(nbins=4))
             axes.set_xlabel(result.axis.label(time_unit), labelpad=1.0)
             axes.margins(y=0.08)
-            label = name.replace("/", " ").replace("_", " ")
-            axes.set_title(literal(f"{label} [{shown}]" if shown else label), fontsize=8.5 * scale)
+            kind, *parts, column = name.split("/") if "/" in name else ("", name)
+            label = f"{kind} '{'/'.join(parts)}', {column}" if parts else column
+            label = label.replace("_", " ")
+            axes.set_title(literal(f"{label} [{shown}]" if shown else label), fontsize=9.5 * scale)
             canvas.draw()
             self._picture = np.asarray(canvas.buffer_rgba()).copy()
             self._corner = axes.transData.transform(np.stack([self.times * time_factor, self.values * factor], axis=1))

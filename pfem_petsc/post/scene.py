@@ -247,6 +247,6 @@ def _width(count: int, lengths: np.ndarray, shortest: float, unit: float) -> flo
     """Return a width in pixels that shows the bars, and does not merge the chords of a slender truss."""
     least = float(np.clip(3.8 * (300.0 / max(count, 1)) ** 0.25, 1.2, 4.2))
     if count <= TUBE_LIMIT:
-        least = min(least, max(1.8, 0.4 * shortest / unit))
+        least = min(least, max(2.4, 0.75 * shortest / unit))
     wish = min(0.11 * float(lengths.mean()) if count else 1.0, 0.4 * shortest)
     return float(np.clip(wish, least * unit, 6.0 * unit))

@@ -38,7 +38,7 @@ class ColourField:
 
     Attributes
     ----------
-    zero : whether the last range was that of values that are zero, or rounding errors of zero
+    rounded : whether the last range was that of rounding errors of zero
     """
 
     def __init__(self, result: Any, name: str, component: str | int | None = None) -> None:
@@ -53,7 +53,7 @@ class ColourField:
             raise InputError(f"render: field '{name}' has no such component: {why}")
         self._component = _COMPONENTS[component] if component is not None else None
         self._result, self._rounding = result, _rounding_of(result, name)
-        self.zero = False
+        self.rounded = False
         title = name.replace("_", " ")
         self.title = f"{title} {'xyz'[self._component]}" if self._component is not None else title
 
@@ -84,8 +84,8 @@ class ColourField:
             # not for rounding in a field that cannot be negative
             signed = signed or bool((values < -1e-9 * sizes.max()).any())
         limit = largest if largest <= 2.0 * bulk or bulk == 0.0 else bulk
-        self.zero = largest <= self._rounding
-        limit = 1.0 if self.zero else limit
+        self.rounded = 0.0 < largest <= self._rounding
+        limit = 1.0 if self.rounded or limit == 0.0 else limit
         return (-limit, limit) if signed else (0.0, limit)
 
 

@@ -126,7 +126,7 @@ def render(
         shown, chosen = _timed(results, frames, rate, span, tell)
         colours = [ColourField(result, field, component) for result in shown]
         limits = limits_of(clim, symmetric, [colour.limits(chosen) for colour in colours] if clim is None else [])
-        if colours[0].zero and all(colour.zero for colour in colours):
+        if all(colour.rounded for colour in colours):
             tell(f"{colours[0].title} is zero in all frames, to rounding")
         overlays = Overlays(ghost, tuple(marks), tuple(trails))
         motions = [Motion(result, chosen, scale, overlays, tell) for result in shown]

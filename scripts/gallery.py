@@ -2,6 +2,7 @@
 
 python scripts/gallery.py                  # the page alone
 python scripts/gallery.py --run [CASE ...] # runs the cases on one rank, measures and draws them; and the page
+python scripts/gallery.py --draw [CASE ...] # the same without measuring, on a machine with other load
 """
 
 from __future__ import annotations
@@ -84,7 +85,6 @@ def _number(entry: dict[str, Any]) -> str:
 
 def run(name: str, folder: Path) -> dict[str, Any]:
     """Run a case twice, so that nothing is compiled in the second, draw it, and return what it cost."""
-    entry = entries()[name]
     times = []
     for again in ("first", "second"):
         _program(name, "-o", folder / again)
@@ -92,23 +92,32 @@ def run(name: str, folder: Path) -> dict[str, Any]:
         found = re.findall(r"done: .* in ([\d.]+) (s|min)\b", log)
         times.append(float(found[-1][0]) * (60.0 if found[-1][1] == "min" else 1.0) if found else 0.0)
     start = time.perf_counter()
+    _draw(name, folder / "second", folder)
     result = open_result(folder / "second")
-    _draw(name, entry, folder, len(result.times))
     print(f"{name}: {times[1]:.3g} s, drawn in {time.perf_counter() - start:.1f} s", flush=True)
     return {"bars": len(result.bars), "steps": int(result.history["step"][-1]), "seconds": times[1]}
 
 
-def _draw(name: str, entry: dict[str, Any], folder: Path, count: int) -> None:
+def draw(name: str, folder: Path) -> None:
+    """Run a case and draw it."""
+    _program(name, "-o", folder / "run")
+    _draw(name, folder / "run", folder)
+
+
+def _draw(name: str, run: Path, folder: Path) -> None:
+    entry, count = entries()[name], len(open_result(run).times)
     options = ["--size", SIZE, "--video", "none", "--no-poster", *entry["render"]]
     if "modes" in entry:
         options += ["--modes", str(entry["modes"]), "--frames", "4"]
     else:
         options += ["--frames", f"0,{entry['frame'] % count}"]
-    _program("render", folder / "second", "-o", folder / "pictures", *options)
+    _program("render", run, "-o", folder / "pictures", *options)
     frames = sorted((folder / "pictures").rglob("*.png"))
     picture = Image.open(frames[1 if "modes" in entry else -1]).convert("RGB")
     PICTURES.mkdir(parents=True, exist_ok=True)
-    picture.quantize(128, dither=Image.Dither.NONE).save(PICTURES / f"{name}.png", optimize=True)
+    picture.quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(
+        PICTURES / f"{name}.png", optimize=True
+    )
 
 
 def _program(*arguments: Any) -> None:
@@ -129,7 +138,12 @@ def main() -> None:
     """Run what is asked for and write the page."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--run", nargs="*", metavar="CASE", help="run, measure, draw these cases; without names: all")
+    parser.add_argument("--draw", nargs="*", metavar="CASE", help="run and draw these cases; without names: all")
     arguments = parser.parse_args()
+    if arguments.draw is not None:
+        for name in arguments.draw or entries():
+            with tempfile.TemporaryDirectory() as folder:
+                draw(name, Path(folder))
     if arguments.run is not None:
         for name in arguments.run or entries():
             with tempfile.TemporaryDirectory() as folder:

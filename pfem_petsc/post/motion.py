@@ -86,7 +86,7 @@ class Motion:
         self.normals = [normal / np.linalg.norm(normal) for normal in self.normals]
         every = np.asarray(result.times, dtype=float)
         self.time_factor, self.time_unit = prefix_for(float(np.abs(every).max()), result.axis.unit)
-        self._decimals = _decimals(self.time_factor * self.times)
+        self._decimals = _decimals(self.time_factor * every)
 
     def _check_marks(self) -> None:
         for mark in self._overlays.marks:

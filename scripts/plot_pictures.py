@@ -1,0 +1,92 @@
+"""Draws the pictures of docs/plotting.md, and of docs/rendering.md those of rings and of the page for a browser.
+
+python scripts/plot_pictures.py            # a minute; the page needs Chromium
+"""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from PIL import Image
+
+IMAGES = Path(__file__).resolve().parent.parent / "docs" / "images"
+RUNS = {
+    "rod": ["rod_impact"],
+    "rod_newmark": ["rod_impact", "--set", "time.integrator=newmark"],
+    "ring": ["ring_impact"],
+    "30 m per s": ["ring_impact", "--set", "initial.velocity=[30.0,0.0,0.0]"],
+    "path": ["von_mises"],
+    "pendulum": ["pendulum"],
+    "lattice": ["lattice_drop", "--set", "mesh.cells=[8,8,8]", "section.strut.area=2e-6"],
+}
+PLOTS = {
+    "plot_energies": ("energies", ["rod"]),
+    "plot_walls": ("walls", ["ring", "--filter", "cfc:180"]),
+    "plot_path": ("force_displacement", ["path"]),
+    "plot_comparison": ("curves", ["rod", "rod_newmark", "--curves", "kinetic_energy", "wall/wall/force.x"]),
+    "plot_spectrum": ("spectra", ["pendulum", "--spectrum", "probe/tip/position.x", "--highest", "4"]),
+}
+RING = ["--ghost", "--mark", "yielded", "--trails", "opposite", "--inset", "kinetic_energy"]
+FRAMES = {
+    "render_extras": ["ring", *RING, "--frames", "0,50,100,150,200"],
+    "render_side_by_side": ["ring", "30 m per s", "--labels", "20 m/s", "30 m/s", "--frames", "0,20,130"],
+}
+
+
+def main() -> None:
+    """Run the cases, draw them, and write the pictures at the width of a page."""
+    with tempfile.TemporaryDirectory(prefix="pictures-") as name:
+        folder = Path(name)
+        for run, words in RUNS.items():
+            _program(folder, *words, "-o", run, "--quiet")
+        for target, (picture, words) in PLOTS.items():
+            _program(folder, "plot", *words, "-o", target)
+            _write(folder / target / f"{picture}.png", target, 900)
+        for target, words in FRAMES.items():
+            options = ["--size", "1280x720", "--video", "none", "--no-poster"]
+            _program(folder, "render", *words, *options, "-o", target)
+            _write(sorted((folder / target / "frames").glob("*.png"))[-1], target, 960)
+        browser = shutil.which("chromium") or shutil.which("google-chrome")
+        if browser is None:
+            print("render_page.png is left as it is: there is no Chromium")
+            return
+        _program(folder, "render", "lattice", "--html", "-o", "page", "--frames", "20")
+        picture = folder / "page.png"
+        window = [
+            "--headless",
+            "--no-sandbox",
+            "--hide-scrollbars",
+            "--window-size=1280,720",
+            f"--screenshot={picture}",
+        ]
+        page = (folder / "page" / "render.html").as_uri()
+        command = [
+            browser,
+            *window,
+            f"--screenshot={picture}",
+            "--enable-unsafe-swiftshader",
+            "--virtual-time-budget=4000",
+            page,
+        ]
+        subprocess.run(command, check=True, capture_output=True)
+        _write(picture, "render_page", 960)
+
+
+def _program(folder: Path, *words: str) -> None:
+    subprocess.run([sys.executable, "-m", "pfem_petsc", *words], cwd=folder, check=True, stdout=subprocess.DEVNULL)
+
+
+def _write(file: Path, name: str, width: int) -> None:
+    picture = Image.open(file).convert("RGB")
+    picture = picture.resize((width, round(picture.height * width / picture.width)), Image.Resampling.LANCZOS)
+    picture.quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(
+        IMAGES / f"{name}.png", optimize=True
+    )
+
+
+if __name__ == "__main__":
+    main()

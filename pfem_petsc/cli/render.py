@@ -157,7 +157,7 @@ def run(arguments: argparse.Namespace, comm: MPI.Comm) -> int:
         if path not in frames:
             print(path)
     if frames:
-        print(f"{frames[0]} ... {frames[-1].name}: {len(frames)} frames")
+        print(f"{frames[0]} ... {frames[-1].name}: {len(frames)} frames" if len(frames) > 1 else frames[0])
     return 0
 
 

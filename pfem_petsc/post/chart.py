@@ -229,6 +229,7 @@ class Chart:
         for number, (name, values) in enumerate(curves):
             time, thin = thinned(self.time, np.asarray(values, dtype=float) * factor)
             options = {"color": COLOURS[number % len(COLOURS)], **(styles[number] if styles else {})}
+            options |= {"marker": "o"} if len(time) == 1 else {}  # a line needs two points
             axes.plot(time * self.factor, thin, label=literal(name), **options)
             self.record(keys[number] if keys else " ".join(dict.fromkeys([title, name])).strip(), values, unit)
         axes.set_ylabel(f"{label} [{shown}]" if shown else label)

@@ -43,6 +43,8 @@ def draw_forces(
     normals = {wall.name: np.asarray(wall.normal, dtype=float) for wall in walls if hasattr(wall, "normal")}
     counted = [f"{source}/{name}/contacts" in history for name in names]
     smoothing = chosen or _usual_filter(history)
+    if all(not np.any(history[f"{source}/{name}/force"]) for name in names):  # a panel each says so
+        smoothing, counted = make_filter("none"), [False] * len(names)
     plain = smoothing.name == AS_COMPUTED
     heights = [h for c in counted for h in [0.9] * (2 - plain) + [0.5] * c]
     chart = Chart(time, title, len(heights), heights=heights, axis=getattr(history, "axis", TIME))

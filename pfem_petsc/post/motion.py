@@ -58,12 +58,14 @@ class Motion:
     Raises
     ------
     InputError
-        For marks and probes that the result does not have.
+        For marks and probes that the result does not have, and a scale that is not finite.
     """
 
     def __init__(
         self, result: Any, frames: Sequence[int], scale: float, overlays: Overlays, note: Callable[[str], None]
     ) -> None:
+        if not np.isfinite(scale):
+            raise InputError(f"render: scale = {scale:g}, the factor on displacements, must be finite")
         self.result, self.frames, self.scale, self.note, self._overlays = result, list(frames), scale, note, overlays
         self.bars = np.asarray(result.bars)
         self.start = np.asarray(result.positions(0), dtype=float)

@@ -8,8 +8,6 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from ..errors import InputError
 
 __all__ = ["checked_style", "kinds_of_films", "limits_of", "opened"]
@@ -44,20 +42,20 @@ def kinds_of_films(
         raise InputError(
             f"render: size = {size[0]} x {size[1]} pixels is out of range; widths are 160 to 8192, heights 120 to 8192"
         )
-    if not fps > 0:
-        raise InputError(f"render: fps = {fps:g} must be positive")
+    if not 1e-3 <= fps <= 1e3:
+        raise InputError(f"render: fps = {fps:g} must be from 0.001 to 1000 frames per second")
     checked_style(style, radius_scale)
-    if bar_width is not None and not (np.isfinite(bar_width) and bar_width > 0.0):
-        raise InputError(f"render: bar_width = {bar_width:g} must be positive")
+    if bar_width is not None and not 0.0 < bar_width <= 500.0:
+        raise InputError(f"render: bar_width = {bar_width:g} must be positive, and 500 pixels at most")
     return VIDEOS[video]
 
 
 def checked_style(style: str, radius_scale: float) -> None:
-    """Refuse a style that is not known."""
+    """Refuse a style that is not known, and radii that cannot be drawn."""
     if style not in STYLES:
         raise InputError(f"render: style = {style!r} is not known; it is one of {', '.join(STYLES)}")
-    if not (np.isfinite(radius_scale) and radius_scale > 0.0):
-        raise InputError(f"render: radius_scale = {radius_scale:g} must be positive")
+    if not 1e-6 <= radius_scale <= 1e6:
+        raise InputError(f"render: radius_scale = {radius_scale:g} must be from 1e-6 to 1e6")
 
 
 def limits_of(

@@ -51,8 +51,8 @@ class Moves:
         InputError
             For numbers that make no film.
         """
-        if not (np.isfinite(self.zoom) and self.zoom > 0.0):
-            raise InputError(f"render: zoom = {self.zoom:g} must be positive")
+        if not 1e-3 <= self.zoom <= 1e3:
+            raise InputError(f"render: zoom = {self.zoom:g} must be from 0.001 to 1000")
         if not np.isfinite(self.orbit):
             raise InputError(f"render: orbit = {self.orbit:g} is not a number of degrees")
         if self.path is None:

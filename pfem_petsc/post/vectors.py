@@ -101,6 +101,7 @@ def draw_probes(history: History, title: str, exact: ClosedForm | None) -> Chart
         return None
     largest = {each.label: max(other.size for other in every if other.label == each.label) for each in every}
     shown, still = _moving(every, largest)
+    shown, still = (shown, still) if shown else (every, [])  # probes are asked for
     rows, columns, places = _grid([(panel.title, panel.label) for panel in shown])
     chart = make_chart(history, title, rows, columns)
     for label in dict.fromkeys(panel.label for panel in shown):
@@ -139,14 +140,14 @@ def _of_probe(probe: str, quantity: str, values: np.ndarray, exact: ClosedForm |
 
 
 def _moving(panels: Sequence[_Panel], largest: dict[str, float]) -> tuple[list[_Panel], list[_Panel]]:
-    """Return the panels to draw, which change or of which none does, and the others.
+    """Return the panels to draw, which change, or are not zero if none does, and the others.
 
     Rounding is relative to the largest number, by key or label of the panel.
     """
     for panel in panels:
         panel.scale = max(panel.scale, largest.get(panel.key, largest.get(panel.label, 0.0)))
     shown = [panel for panel in panels if panel.changes]
-    shown = shown or [panel for panel in panels if panel.size > 0.0] or list(panels)
+    shown = shown or [panel for panel in panels if panel.size > 0.0]
     return shown, [panel for panel in panels if not any(panel is other for other in shown)]
 
 

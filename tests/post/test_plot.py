@@ -90,10 +90,15 @@ def test_empty_history_is_refused(tmp_path, result):
         plot(result, tmp_path)
 
 
-@pytest.mark.slow
 def test_one_row_is_enough(tmp_path, result):
+    """Its numbers are points, which are seen."""
     result.history = {name: values[:1] for name, values in result.history.items()}
-    assert len(plot(result, tmp_path)) == 5
+    names = [path.stem for path in plot(result, tmp_path, formats=["csv"])]
+    assert names == ["energies", "momentum", "probes", "walls", "solver"]
+    chart = draw_momentum(result.history, "", None)
+    assert [line.get_marker() for line in chart.axes[0, 0].lines] == ["o"]
+    result.history["momentum"] = 0.0 * result.history["momentum"]
+    assert draw_momentum(result.history, "", None) is None
 
 
 def test_folder_that_cannot_be_made_is_refused(tmp_path, result):

@@ -11,6 +11,7 @@ from helpers.synthetic import SyntheticResult, ring
 from PIL import Image
 
 from pfem_petsc.errors import InputError
+from pfem_petsc.output.units import LOAD_FACTOR
 from pfem_petsc.post.frames import Resampled
 from pfem_petsc.post.page import Page
 from pfem_petsc.post.render import render
@@ -61,6 +62,9 @@ def test_results_side_by_side(tmp_path, flying):
     assert heights[1] == pytest.approx(0.5 * heights[0], abs=3)
     with pytest.raises(InputError, match="3 labels for 2 results"):
         draw(tmp_path, [flying, other], labels=["a", "b", "c"])
+    other.axis = LOAD_FACTOR
+    with pytest.raises(InputError, match="different axes \\(t, load factor\\)"):
+        draw(tmp_path, [flying, other])
 
 
 def test_curves_of_results_side_by_side(tmp_path, flying):
@@ -131,7 +135,7 @@ def test_camera_passes_through_the_rows_of_its_path(flying):
         (np.linspace(0.0, 0.2, 201), "t = 1 ms"),
         (np.linspace(0.0, 6e-4, 31), "t = 20 µs"),
         (np.linspace(0.0, 3.0, 4), "t = 1 s"),
-        (np.arange(5) * 1.2345e-3, "t = 1.23 ms"),
+        (np.arange(5) * 1.2345e-3, "t = 1.2 ms"),
     ],
 )
 def test_times_have_the_unit_of_the_film_and_the_digits_that_tell_frames_apart(flying, times, text):

@@ -202,7 +202,7 @@ def test_many_bars_are_drawn_as_lines(tmp_path):
         ({"field": "stres"}, "did you mean 'stress'"),
         ({"field": "velocity", "component": "w"}, "not one of x, y, z"),
         ({"component": "x"}, "one value only"),
-        ({"view": "top"}, "auto, xy, xz, yz, iso"),
+        ({"view": "above"}, "auto, xy, xz, yz, iso"),
         ({"video": "avi"}, "mp4, gif, both, none"),
         ({"frames": [99]}, "snapshots 0 to 12"),
         ({"frames": 0}, "must be positive"),

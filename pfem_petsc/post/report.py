@@ -18,7 +18,7 @@ from ..energies import LOST, STORED, SUPPLIED
 from ..errors import InputError
 from ..output.history import EVENT
 from ..output.modes import NAMES
-from ..output.units import engineering
+from ..output.units import engineering, prefix_for
 from .energies import balance_error
 from .plot import plot
 
@@ -138,6 +138,12 @@ def _span(result: Any) -> str:
     return result.axis.span(float(time[0]), float(time[-1]))
 
 
+def _place(result: Any, time: float) -> str:
+    """Return a time in the unit of the end of the run, so that times of a report can be compared."""
+    factor, unit = prefix_for(float(result.history["time"][-1]), result.axis.unit)
+    return f"{result.axis.symbol} = {time * factor:.4g} {unit}" if unit else result.axis.place(time)
+
+
 def _summary(result: Any) -> dict[str, str]:
     history, case = result.history, result.case
     rows = {"result": str(result.path), "mesh": f"{result.n_nodes:,} nodes, {result.n_bars:,} bars"}
@@ -151,7 +157,7 @@ def _summary(result: Any) -> dict[str, str]:
     for wall in case.every_wall:
         force = np.linalg.norm(np.asarray(history[f"wall/{wall.name}/force"], dtype=float), axis=1)
         peak = int(np.argmax(force))
-        text = f"largest force {engineering(float(force[peak]), 'N')} at {result.axis.place(history['time'][peak])}"
+        text = f"largest force {engineering(float(force[peak]), 'N')} at {_place(result, float(history['time'][peak]))}"
         rows[f"wall '{wall.name}'"] = text if force[peak] > 0.0 else "not touched"
     if "broken_bars" in history and np.asarray(history["broken_bars"])[-1]:
         rows["broken bars"] = f"{int(np.asarray(history['broken_bars'])[-1]):,} of {result.n_bars:,}"

@@ -35,7 +35,7 @@ EVENTS: dict[str, tuple[str, ...]] = {
 }
 """Event to the methods of a simulation that it measures. Nested events are counted in both."""
 
-OF_FORCE, OF_PRODUCT, OF_BALANCE = 28, 24, 5
+OF_FORCE, OF_PRODUCT, OF_BALANCE = 28, 27, 5
 """Operations of the force of a bar with its energy, of its part of a product without matrix, and of the solution of a
 node's balance in an explicit step."""
 

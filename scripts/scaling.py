@@ -49,6 +49,11 @@ def main() -> int:
     parser.add_argument("--again", action="store_true", help="run points that are there already anew")
     parser.add_argument("--latency", type=float, help="of the network, for the model [s]; default: as measured")
     parser.add_argument("--network", type=float, help="bandwidth of a rank's messages, for the model [B/s]")
+    parser.add_argument("--machine-ranks", type=int, default=1, help="that share a memory, for the model")
+    parser.add_argument("--machine-bandwidth", type=float, help="of that memory [B/s]; default: what its ranks need")
+    parser.add_argument("--imbalance", type=float, default=1.0, help="slowest rank over the mean, for the model")
+    parser.add_argument("--fields-every", type=int, default=0, help="steps between snapshots, for the model")
+    parser.add_argument("--disk", type=float, default=1e9, help="bandwidth of the file system, for the model [B/s]")
     arguments = parser.parse_args()
     folder: Path = arguments.results
     folder.mkdir(parents=True, exist_ok=True)
@@ -90,11 +95,30 @@ def _model(points: list[Point], folder: Path, arguments: argparse.Namespace) -> 
     if not known:
         return
     point = max(known, key=lambda p: (p.ranks, p.bars))
-    parts = parts_from(read_point(point, folder), arguments.latency, arguments.network)
+    parts = parts_from(
+        read_point(point, folder),
+        arguments.latency,
+        arguments.network,
+        machine_ranks=arguments.machine_ranks,
+        machine_bandwidth=arguments.machine_bandwidth or float("inf"),
+        imbalance=arguments.imbalance,
+        fields_every=arguments.fields_every,
+        disk=arguments.disk,
+    )
     text = (
         f"From {point.bars:,} bars on {point.ranks} ranks: {1e9 * parts.bar:.2f} ns a bar and rank, "
         f"{1e6 * parts.overhead:.0f} us outside the loops, latency {1e6 * parts.latency:.2f} us, "
         f"{parts.bandwidth / 1e9:.1f} GB/s a rank, sums {1e6 * parts.reduction:.1f} us.\n\n"
+    )
+    text += (
+        f"{parts.machine_ranks} ranks that share a memory need {parts.needed / 1e9:.0f} GB/s of it to run as fast as "
+        f"measured; the model gives them {parts.machine_bandwidth / 1e9:.0f} GB/s. The slowest rank has "
+        f"{parts.imbalance:.2f} times the mean work. "
+    )
+    text += (
+        f"Snapshots every {parts.fields_every} steps, {parts.snapshot:.0f} B a bar at {parts.disk / 1e9:.1f} GB/s.\n\n"
+        if parts.fields_every
+        else "No snapshots.\n\n"
     )
     text += table(parts, MODEL_SIZES)
     rows = rows_of([p for p in known if p.kind == point.kind], folder)

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING
 
 from .bandwidth import Bandwidth
 from .cases import PITCH, WAVE_SPEED, Job, bars_of, make_case
+from .holdings import held_by_parts
 from .memory import PeakMemory
-from .traffic import bytes_per_step
+from .traffic import Work, bytes_per_step, operations_per_step, share_in_runs
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -32,9 +33,12 @@ class Record:
     cpu : processor time of a step, all ranks together
     setup, first : wall clock of the set-up, and from there to the end of the first step (with output opened)
     newton, linear : mean number of iterations of a step
-    traffic : minimum number of bytes that a step moves
+    traffic : number of bytes that a step moves
     share : percent of the bandwidth of all ranks that this traffic needs at the median
     memory : maximum growth of resident memory, all ranks together
+    held : bytes of the arrays that each part of the simulation holds at the end, all ranks together
+    operations : floating-point operations of a step
+    runs : share of the bars that go by runs of constant offset
     ghosts, neighbours : maximum number of ghosts, and of neighbouring ranks, over all ranks
     evaluated : bars evaluated on all ranks together; those between two ranks are evaluated on both
     """
@@ -55,6 +59,9 @@ class Record:
     traffic: float
     share: float
     memory: float
+    held: dict[str, float]
+    operations: float
+    runs: float
     ghosts: int
     neighbours: int
     evaluated: int
@@ -103,6 +110,7 @@ def time_job(
         cpu = (process_time() - cpu_before) / len(times)
         running.close()
         grown = comm.allreduce(memory.growth())
+        held = {part: comm.allreduce(size) for part, size in held_by_parts(simulation).items()}
         plan, mesh = simulation.plan, simulation.mesh
         if hasattr(simulation.stepper, "destroy"):
             simulation.stepper.destroy()
@@ -112,7 +120,7 @@ def time_job(
             shutil.rmtree(folder, ignore_errors=True)
     middle = median(times)
     implicit = plan.linear is not None
-    traffic = bytes_per_step(
+    work = Work(
         mesh.n_bars,
         mesh.n_nodes,
         implicit=implicit,
@@ -120,7 +128,10 @@ def time_job(
         plastic=job.plastic,
         newton=newton / len(times),
         linear=linear / len(times),
+        runs=comm.allreduce(share_in_runs(simulation.model.bars)) / comm.size,
+        rows=1.0 / job.history_every,
     )
+    traffic = bytes_per_step(work)
     return Record(
         job=job.name,
         kind=kind,
@@ -138,6 +149,9 @@ def time_job(
         traffic=traffic,
         share=100.0 * traffic / bandwidth.together / comm.bcast(middle) if bandwidth else 0.0,
         memory=grown,
+        held=held,
+        operations=operations_per_step(work),
+        runs=work.runs,
         ghosts=max(comm.allgather(mesh.n_local - mesh.n_owned)),
         neighbours=max(comm.allgather(mesh.n_neighbours)),
         evaluated=comm.allreduce(len(mesh.bars)),

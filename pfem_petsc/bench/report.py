@@ -12,12 +12,21 @@ from typing import TYPE_CHECKING, Any
 from .bandwidth import BYTES_PER_ELEMENT, Bandwidth
 from .measure import Record
 from .messages import Messages
-from .traffic import ASSUMED
+from .traffic import ASSUMED, OPERATIONS
 
 if TYPE_CHECKING:
     from mpi4py import MPI
 
-__all__ = ["HEADER", "bandwidth_line", "document", "line", "memory_slopes", "messages_line", "processor"]
+__all__ = [
+    "HEADER",
+    "bandwidth_line",
+    "document",
+    "line",
+    "memory_parts",
+    "memory_slopes",
+    "messages_line",
+    "processor",
+]
 
 _FORMAT = "{:18} {:>11} {:>9} {:>9} {:>9} {:>8} {:>6} {:>6} {:>6} {:>7} {:>6} {:>6}"
 _NAMES = (
@@ -84,6 +93,16 @@ def memory_slopes(records: list[Record]) -> dict[str, float]:
     return slopes
 
 
+def memory_parts(record: Record) -> str:
+    """Describe what the parts of a simulation hold, in bytes a bar."""
+    held = {part: size / record.bars for part, size in record.held.items()}
+    texts = ", ".join(f"{part} {size:.1f}" for part, size in held.items() if size >= 0.05)
+    return (
+        f"memory of {record.job}, {record.bars:,} bars: arrays {sum(held.values()):.0f} B a bar ({texts}), "
+        f"growth at most {record.memory / record.bars:.0f}"
+    )
+
+
 def processor() -> str:
     """Return the name of the processor."""
     try:
@@ -96,7 +115,12 @@ def processor() -> str:
 
 
 def document(
-    comm: MPI.Comm, bandwidth: Bandwidth, messages: Messages | None, records: list[Record], tiny: list[Record]
+    comm: MPI.Comm,
+    bandwidth: Bandwidth,
+    messages: Messages | None,
+    records: list[Record],
+    tiny: list[Record],
+    operations: float | None = None,
 ) -> str:
     """Return all measurements as JSON."""
     from ..output.provenance import describe_run
@@ -113,6 +137,8 @@ def document(
         },
         "messages": messages._asdict() if messages is not None else None,
         "bytes_assumed": ASSUMED,
+        "operations_assumed": OPERATIONS,
+        "operations_a_second": operations,
         "runs": [asdict(record) | {"bars_per_second": record.rate} for record in records],
         "memory_slopes": memory_slopes(records),
         "overhead": [asdict(record) for record in tiny],

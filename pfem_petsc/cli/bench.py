@@ -56,6 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--compile", action="store_true", help="only compile the loops of the jobs for later runs; measure nothing"
     )
+    parser.add_argument("--roofline", metavar="FILE.png", type=Path, help="draw what the jobs reach of this machine")
     parser.add_argument("-o", "--output", metavar="FILE", type=Path, help="write all figures as JSON")
 
 
@@ -67,11 +68,21 @@ def run(arguments: argparse.Namespace, comm: MPI.Comm) -> int:
     from ..bench.jobs import jobs, tiny_jobs
     from ..bench.measure import time_job
     from ..bench.messages import measure_messages
-    from ..bench.report import HEADER, bandwidth_line, document, line, memory_slopes, messages_line, processor
+    from ..bench.report import (
+        HEADER,
+        bandwidth_line,
+        document,
+        line,
+        memory_parts,
+        memory_slopes,
+        messages_line,
+        processor,
+    )
 
     if not 0.0 < arguments.seconds < float("inf"):
         raise InputError(f"--seconds {arguments.seconds}: give a positive time")
     _check_output(arguments.output, comm)
+    _check_output(arguments.roofline, comm)
 
     def say(text: str) -> None:
         if comm.rank == 0:
@@ -107,13 +118,23 @@ def run(arguments: argparse.Namespace, comm: MPI.Comm) -> int:
             records.append(record)
             say(line(record))
     say("")
+    for job in chosen:
+        say(memory_parts(max((r for r in records if r.job == job.name), key=lambda r: r.bars)))
     for name, slope in memory_slopes(records).items():
         say(f"memory of {name}: {slope:.0f} B per additional bar")
     tiny = [time_job(job, "cubic", 2, comm, None, arguments.seconds, 3000) for job in tiny_jobs(arguments.explicit)]
     for record in tiny:
         say(f"outside the loops over bars and nodes: {1e6 * record.median:.0f} us a step ({record.job})")
+    operations = None
+    if arguments.roofline is not None:
+        from ..bench.roofline import draw, measure_operations
+
+        operations = measure_operations(comm)
+        if comm.rank == 0:
+            title = f"{processor()}, {comm.size} rank{'s' if comm.size > 1 else ''}, {arguments.kind} lattices"
+            draw(arguments.roofline, bandwidth, operations, records, title)
     if arguments.output is not None and comm.rank == 0:
-        arguments.output.write_text(document(comm, bandwidth, messages, records, tiny), encoding="utf-8")
+        arguments.output.write_text(document(comm, bandwidth, messages, records, tiny, operations), encoding="utf-8")
     return 0
 
 

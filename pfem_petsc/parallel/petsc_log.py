@@ -13,7 +13,7 @@ import functools
 from collections.abc import Callable
 from typing import Any, TypeVar
 
-__all__ = ["EVENTS", "STAGES", "instrument", "staged"]
+__all__ = ["EVENTS", "OF_BALANCE", "OF_FORCE", "OF_PRODUCT", "STAGES", "instrument", "staged"]
 
 SET_UP, STEPS = "pfem set-up", "pfem steps"
 
@@ -35,7 +35,7 @@ EVENTS: dict[str, tuple[str, ...]] = {
 }
 """Event to the methods of a simulation that it measures. Nested events are counted in both."""
 
-_FORCE, _PRODUCT, _BALANCE = 28, 24, 5
+OF_FORCE, OF_PRODUCT, OF_BALANCE = 28, 27, 5
 """Operations of the force of a bar with its energy, of its part of a product without matrix, and of the solution of a
 node's balance in an explicit step."""
 
@@ -45,12 +45,12 @@ def _of_bars(each: int) -> Callable[[Any], float]:
 
 
 def _of_balance(simulation: Any) -> float:
-    return _BALANCE * simulation.mesh.n_owned if simulation.stepper.scheme.explicit else 0.0
+    return OF_BALANCE * simulation.mesh.n_owned if simulation.stepper.scheme.explicit else 0.0
 
 
 FLOPS: dict[str, Callable[[Any], float]] = {
-    "model.bars.forces": _of_bars(_FORCE),
-    "stepper.hessian.mult": lambda simulation: _of_bars(_PRODUCT)(simulation) + 3 * simulation.mesh.n_owned,
+    "model.bars.forces": _of_bars(OF_FORCE),
+    "stepper.hessian.mult": lambda simulation: _of_bars(OF_PRODUCT)(simulation) + 3 * simulation.mesh.n_owned,
     "stepper.solve": _of_balance,
 }
 """Method to the operations of a call of it on this rank."""

@@ -10,7 +10,10 @@ Assumptions
   the latency, and all share a rank's part of the network.
 * One reduction over all ranks per row of history, log2(ranks) stages of one latency each, at least as measured.
 * Python and library calls take the measured time of a step of a tiny model on one rank.
-* No noise of the operating system and no imbalance beyond one layer of nodes.
+* Ranks of a machine share its memory: a bar takes at least its bytes over a rank's part of the machine's bandwidth.
+* The slowest rank has ``imbalance`` times the mean work; the others wait.
+* Fields are written every so many steps at the bandwidth of the file system, while nothing else happens.
+* No noise of the operating system.
 """
 
 from __future__ import annotations
@@ -40,6 +43,13 @@ class Parts:
     bandwidth : of a rank's messages [B/s]
     reduction : of a sum over the measured ranks [s]
     nodes_per_bar : of the lattice
+    bytes_per_bar : that the loops move
+    machine_ranks : that share the memory of a machine
+    machine_bandwidth : of that memory [B/s]; infinite: as many times as there are ranks what they have here
+    imbalance : work of the slowest rank over the mean
+    snapshot : bytes of a snapshot a bar
+    fields_every : steps between snapshots; 0: none
+    disk : bandwidth of the file system [B/s]
     """
 
     bar: float
@@ -48,6 +58,23 @@ class Parts:
     bandwidth: float
     reduction: float
     nodes_per_bar: float
+    bytes_per_bar: float = 0.0
+    machine_ranks: int = 1
+    machine_bandwidth: float = np.inf
+    imbalance: float = 1.0
+    snapshot: float = 0.0
+    fields_every: int = 0
+    disk: float = np.inf
+
+    def bar_on(self, ranks: np.ndarray) -> np.ndarray:
+        """Return the time of the loops [s a bar and rank] where the ranks of a machine share its memory."""
+        sharing = np.minimum(ranks, self.machine_ranks)
+        return np.maximum(self.bar, self.bytes_per_bar * sharing / self.machine_bandwidth)
+
+    @property
+    def needed(self) -> float:
+        """Bandwidth that a machine needs for its ranks to run as fast as measured [B/s]."""
+        return self.machine_ranks * self.bytes_per_bar / self.bar if self.bar > 0.0 else 0.0
 
 
 def step_time(parts: Parts, bars: float, ranks: np.ndarray) -> dict[str, np.ndarray]:
@@ -59,17 +86,22 @@ def step_time(parts: Parts, bars: float, ranks: np.ndarray) -> dict[str, np.ndar
     twice = np.where(alone, 0.0, 0.5 * CROSSING * 6.0 * edge**2)
     neighbours = np.minimum(NEIGHBOURS, ranks - 1)
     found = {
-        "loops": parts.bar * (mine + twice),
+        "loops": parts.bar_on(ranks) * parts.imbalance * (mine + twice),
         "halo": neighbours * parts.latency + 24.0 * ghosts / parts.bandwidth,
         "sums": np.where(alone, 0.0, np.maximum(parts.reduction, parts.latency * np.ceil(np.log2(ranks)))),
         "python": np.full(len(ranks), parts.overhead),
+        "output": np.full(len(ranks), parts.snapshot * bars / parts.disk / max(parts.fields_every, 1))
+        * (parts.fields_every > 0),
     }
     found["step"] = sum(found.values())
     return found
 
 
-def parts_from(found: dict, latency: float | None, bandwidth: float | None) -> Parts:
-    """Parts from what ``bench`` wrote of an explicit run on all cores; a network's figures replace those measured."""
+def parts_from(found: dict, latency: float | None, bandwidth: float | None, **others: float) -> Parts:
+    """Parts from what ``bench`` wrote of an explicit run on all cores; a network's figures replace those measured.
+
+    ``others``: further attributes of :class:`Parts`.
+    """
     run = max((r for r in found["runs"] if r["job"] == "explicit"), key=lambda r: r["bars"])
     # the best steps: on a shared machine the others hold waiting as well
     overhead = next(r["best"] for r in found["overhead"] if r["job"] == "tiny")
@@ -84,6 +116,10 @@ def parts_from(found: dict, latency: float | None, bandwidth: float | None) -> P
         bandwidth=bandwidth if bandwidth is not None else messages["bandwidth"],
         reduction=messages["reduction"],
         nodes_per_bar=run["nodes"] / run["bars"],
+        bytes_per_bar=run["traffic"] / run["bars"],
+        # positions, velocities and contact forces of the nodes; stress, strain and plastic strain of the bars
+        snapshot=72.0 * run["nodes"] / run["bars"] + 24.0,
+        **others,
     )
 
 
@@ -91,8 +127,8 @@ def table(parts: Parts, sizes: list[float], most: int = 10_000) -> str:
     """Markdown: strong scaling of each size, to where the efficiency is a half, and to ``most`` ranks."""
     ranks = np.array([r for r in (1, 2, 8, 32, 128, 512, 1024, 2048, 4096, 10_000) if r <= most])
     lines = [
-        "| bars | ranks | bars a rank | loops ms | halo ms | sums ms | Python ms | step ms | efficiency |",
-        "|---|---|---|---|---|---|---|---|---|",
+        "| bars | ranks | bars a rank | loops ms | halo ms | sums ms | Python ms | output ms | step ms | efficiency |",
+        "|---|---|---|---|---|---|---|---|---|---|",
     ]
     for bars in sizes:
         times = step_time(parts, bars, ranks)
@@ -100,7 +136,9 @@ def table(parts: Parts, sizes: list[float], most: int = 10_000) -> str:
             if bars / r > 2e8 or bars / r < 500:  # does not fit in memory, or is not sensible
                 continue
             efficiency = parts.bar * bars / r / times["step"][k]
-            cells = " | ".join(f"{1e3 * times[name][k]:.3g}" for name in ("loops", "halo", "sums", "python", "step"))
+            cells = " | ".join(
+                f"{1e3 * times[name][k]:.3g}" for name in ("loops", "halo", "sums", "python", "output", "step")
+            )
             lines.append(f"| {bars:.0e} | {r:,} | {bars / r:,.0f} | {cells} | {100 * efficiency:.0f} % |")
     return "\n".join(lines) + "\n"
 

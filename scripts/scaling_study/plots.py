@@ -25,6 +25,15 @@ def plot_study(rows: list[dict], study: str, path: Path) -> None:
         unit = "bars a rank" if study == "weak" else "bars"
         label = f"{kind}, {job} ({integrator}), {size:,} {unit}"
         axes.plot(ranks, [row["step_s"] for row in points], "o-", color=colour, label=label)
+        doubtful = [row for row in points if row["noise"]]
+        axes.plot(
+            [row["ranks"] for row in doubtful],
+            [row["step_s"] for row in doubtful],
+            "o",
+            color=colour,
+            markerfacecolor="white",
+            zorder=3,
+        )
         work = [row["bars"] / first["bars"] for row in points]
         ideal = [first["step_s"] * w * first["ranks"] / r for w, r in zip(work, ranks)]
         axes.plot(ranks, ideal, "--", color=colour, linewidth=0.8)
@@ -33,6 +42,7 @@ def plot_study(rows: list[dict], study: str, path: Path) -> None:
         ]
         axes.plot(ranks, ceiling, ":", color=colour, linewidth=1.2)
     axes.plot([], [], "k--", linewidth=0.8, label="ideal")
+    axes.plot([], [], "ko", markerfacecolor="white", label="noise: see the table")
     axes.plot([], [], "k:", linewidth=1.2, label="as the machine's memory bandwidth grows")
     axes.set(
         xscale="log", yscale="log", xlabel="ranks", ylabel="time of a step [s]", title=f"{study.capitalize()} scaling"

@@ -10,8 +10,15 @@ from .points import Point, read_point
 COLUMNS = (
     *("study", "kind", "job", "integrator", "size", "ranks", "bars", "nodes", "step_s", "best_s", "rate"),
     *("speedup", "ideal", "efficiency", "bandwidth_ratio", "percent_of_bound", "ghosts", "neighbours"),
-    *("evaluated_twice", "memory_B_per_bar", "newton", "linear"),
+    *("evaluated_twice", "memory_B_per_bar", "newton", "linear", "bandwidth_alone", "noise"),
 )
+
+REPEATS = 1.15
+"""Median over best step from which the repeats of a point are noise."""
+
+BANDWIDTH = 0.8
+"""Bandwidth of one process, over the best of the study, below which another program was running; and the lowest ratio
+of the bandwidths of all processes and of one that a machine can have."""
 
 
 def rows_of(points: list[Point], folder: Path) -> list[dict]:
@@ -43,8 +50,11 @@ def rows_of(points: list[Point], folder: Path) -> list[dict]:
                 "memory_B_per_bar": run["memory"] / run["bars"],
                 "newton": run["newton"],
                 "linear": run["linear"],
+                "bandwidth_alone": found["bandwidth"]["alone"],
             }
         )
+    for row in rows:
+        row["noise"] = noise_of(row, max(other["bandwidth_alone"] for other in rows))
     for series in series_of(rows).values():
         first = series[0]
         for row in series:
@@ -52,6 +62,21 @@ def rows_of(points: list[Point], folder: Path) -> list[dict]:
             row["ideal"] = row["ranks"] / first["ranks"]
             row["efficiency"] = row["speedup"] / row["ideal"]
     return rows
+
+
+def noise_of(row: dict, best_bandwidth: float) -> str:
+    """Return why the time of a point is noise, empty if nothing shows that it is.
+
+    ``best_bandwidth``: the largest that one process had in the study [B/s].
+    """
+    reasons = []
+    if row["step_s"] > REPEATS * row["best_s"]:
+        reasons.append(f"repeats differ {row['step_s'] / row['best_s']:.2f} x")
+    if row["bandwidth_alone"] < BANDWIDTH * best_bandwidth:
+        reasons.append(f"one process had {row['bandwidth_alone'] / best_bandwidth:.2f} x the best bandwidth")
+    if not BANDWIDTH <= row["bandwidth_ratio"] <= row["ranks"] / BANDWIDTH:
+        reasons.append(f"bandwidth ratio {row['bandwidth_ratio']:.2f} of {row['ranks']} processes")
+    return "; ".join(reasons)
 
 
 def series_of(rows: list[dict]) -> dict[tuple, list[dict]]:
@@ -77,9 +102,10 @@ def markdown(rows: list[dict]) -> str:
         size = "bars a rank" if study == "weak" else "bars"
         lines += [f"### {study.capitalize()} scaling", ""]
         lines += [
-            f"| lattice | job | {size} | ranks | step ms | bars/s | speed-up | efficiency | machine's bandwidth ratio |"
+            f"| lattice | job | {size} | ranks | step ms | bars/s | speed-up | efficiency | machine's bandwidth ratio "
+            "| noise |"
         ]
-        lines += ["|---|---|---|---|---|---|---|---|---|"]
+        lines += ["|---|---|---|---|---|---|---|---|---|---|"]
         for (name, kind, job, integrator, size), series in series_of(rows).items():
             if name != study:
                 continue
@@ -87,7 +113,7 @@ def markdown(rows: list[dict]) -> str:
                 lines.append(
                     f"| {kind} | {job} ({integrator}) | {size:,} | {row['ranks']} | {1e3 * row['step_s']:.4g} "
                     f"| {row['rate']:.3g} | {row['speedup']:.2f} | {100 * row['efficiency']:.0f} % "
-                    f"| {row['bandwidth_ratio']:.2f} |"
+                    f"| {row['bandwidth_ratio']:.2f} | {row['noise'] or '-'} |"
                 )
         lines.append("")
     return "\n".join(lines)

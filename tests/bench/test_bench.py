@@ -7,9 +7,12 @@ import sys
 import numpy as np
 import pytest
 
+from pfem_petsc import Simulation
 from pfem_petsc.bench.cases import KINDS, PITCH, WAVE_SPEED, Job, bars_of, cells_for, make_case
+from pfem_petsc.bench.holdings import held_by_parts
+from pfem_petsc.bench.jobs import jobs
 from pfem_petsc.bench.memory import PeakMemory
-from pfem_petsc.bench.traffic import bytes_per_step
+from pfem_petsc.bench.traffic import Work, bytes_per_step, share_in_runs
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -29,21 +32,47 @@ def test_nearest_lattice():
 
 
 def test_explicit_bytes_by_hand():
-    # ends 2 x 4 B and rest length 8 B a bar; x, v, f read and written and mass read a node
-    assert bytes_per_step(
-        100, 10, implicit=False, assembled=False, plastic=False, newton=0, linear=0
-    ) == 100 * 16 + 10 * (2 * 3 * 24 + 8)
+    # rest length 8 B a bar, and 4 B of an end where it is in no run; x, v, f read and written and mass read a node; v
+    # and a written in a row
+    nodes = 10 * (2 * 3 * 24 + 8)
+    assert bytes_per_step(Work(100, 10)) == 100 * 12 + nodes
+    assert bytes_per_step(Work(100, 10, runs=0.75, rows=0.1)) == 75 * 8 + 25 * 12 + nodes + 0.1 * 10 * 48
 
 
 def test_a_matrix_moves_more_than_bars():
-    # a product on the cubic lattice: 9 x (1 + 2 x 8.8)/8.8 entries of 12 B a bar against 24 B, and positions
-    counts = {"implicit": True, "plastic": False, "newton": 0.0}
+    # a product on the cubic lattice: 9 x (1 + 2 x 8.8)/8.8 entries of 12 B a bar against 20 B, and positions
     per_product = [
-        bytes_per_step(8800, 1000, assembled=assembled, linear=1.0, **counts)
-        - bytes_per_step(8800, 1000, assembled=assembled, linear=0.0, **counts)
+        bytes_per_step(Work(8800, 1000, implicit=True, assembled=assembled, linear=1.0))
+        - bytes_per_step(Work(8800, 1000, implicit=True, assembled=assembled))
         for assembled in (False, True)
     ]
-    assert per_product[1] - per_product[0] == pytest.approx(9 * (1000 + 2 * 8800) * 12 - 24 * 8800 - 24 * 1000)
+    assert per_product[1] - per_product[0] == pytest.approx(9 * (1000 + 2 * 8800) * 12 - 20 * 8800 - 24 * 1000)
+
+
+def test_bars_of_a_lattice_are_in_runs_and_those_in_random_order_are_not():
+    from types import SimpleNamespace
+
+    from pfem_petsc.mechanics.sweep import make_sweep
+
+    chain = np.column_stack([np.arange(1000), np.arange(1, 1001)]).astype(np.int32)
+    mixed = np.random.default_rng(1).integers(0, 1000, (1000, 2)).astype(np.int32)
+    for ends, share in ((chain, 1.0), (mixed, 0.0)):
+        block = SimpleNamespace(sweep=make_sweep(ends, 0, 1000, 1000), stop=1000)
+        assert share_in_runs(SimpleNamespace(blocks=[block], ends=ends)) == share
+
+
+def test_arrays_are_counted_once_in_the_part_that_holds_them_first(tmp_path):
+    simulation = Simulation(
+        make_case(jobs(["explicit"], "central_differences", "newmark", "lumped", None, 1)[0], "cubic", 3, 10),
+        output=tmp_path,
+    )
+    held = held_by_parts(simulation)
+    mesh, bars = simulation.mesh, simulation.model.bars
+    own = (mesh.points, mesh.bars, mesh.bar_ids, mesh.node_ids)
+    assert sum(array.nbytes for array in own) <= held["mesh"] < 2 * sum(array.nbytes for array in own)
+    assert bars.rest.nbytes <= held["bars"]
+    assert simulation.state.x.nbytes <= held["state"] + held["stepper"] + held["model"]
+    simulation.close()
 
 
 def test_memory_sees_what_was_used_and_freed():
@@ -74,8 +103,11 @@ def bench(*options):
 @pytest.mark.thorough
 def test_the_verb_writes_what_it_measured(tmp_path):
     path = tmp_path / "bench.json"
-    done = bench("--sizes", "100", "1000", "--seconds", "0.05", "-o", str(path))
+    picture = tmp_path / "roofline.png"
+    done = bench("--sizes", "100", "1000", "--seconds", "0.05", "-o", str(path), "--roofline", str(picture))
     assert done.returncode == 0, done.stderr
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert "memory of explicit, " in done.stdout
     found = json.loads(path.read_text())
     assert found["bandwidth"]["alone"] > 1e8
     assert [run["job"] for run in found["runs"]] == 2 * [
@@ -102,6 +134,7 @@ def test_the_verb_writes_what_it_measured(tmp_path):
         (("--seconds", "-1"), "positive"),
         (("--sizes", "10", "--implicit", "newmrk", "--jobs", "assembled"), "newmark"),
         (("-o", "/nowhere/bench.json"), "cannot be written"),
+        (("--roofline", "/nowhere/roofline.png"), "cannot be written"),
     ],
 )
 def test_refusals(options, said):

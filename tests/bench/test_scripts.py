@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scaling_study.model import Parts, step_time
 from scaling_study.points import Point, points_of, run_point
-from scaling_study.tables import rows_of
+from scaling_study.tables import noise_of, rows_of
 
 SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
 
@@ -70,6 +70,38 @@ def test_model_of_one_rank_and_of_many():
     assert many["halo"][0] == pytest.approx(26 * 1e-6 + 24 * 728 / 1e10)
     assert many["sums"][0] == pytest.approx(10e-6)
     assert many["step"][0] == pytest.approx(sum(many[name][0] for name in ("loops", "halo", "sums", "python")))
+
+
+def test_model_of_ranks_that_share_a_memory_with_imbalance_and_output():
+    parts = Parts(
+        bar=4e-9,
+        overhead=0.0,
+        latency=0.0,
+        bandwidth=1e10,
+        reduction=0.0,
+        nodes_per_bar=0.125,
+        bytes_per_bar=32.0,
+        machine_ranks=64,
+        machine_bandwidth=256e9,
+        imbalance=1.1,
+        snapshot=40.0,
+        fields_every=100,
+        disk=1e10,
+    )
+    assert parts.needed == pytest.approx(512e9)  # 64 ranks at 8 GB/s
+    one, many = step_time(parts, 8e6, np.array([1])), step_time(parts, 8e6, np.array([1000]))
+    assert one["loops"][0] == pytest.approx(1.1 * 4e-9 * 8e6)  # alone on the machine
+    assert many["loops"][0] == pytest.approx(1.1 * 8e-9 * (8000 + 0.5 * 5 * 600))  # half of what they need
+    assert many["output"][0] == pytest.approx(40.0 * 8e6 / 1e10 / 100)
+
+
+def test_points_with_other_programs_beside_them_are_marked():
+    quiet = {"step_s": 1.0, "best_s": 0.95, "bandwidth_alone": 1e10, "bandwidth_ratio": 1.3, "ranks": 2}
+    assert noise_of(quiet, 1.1e10) == ""
+    assert noise_of(quiet | {"step_s": 1.5}, 1e10) == "repeats differ 1.58 x"
+    assert noise_of(quiet | {"bandwidth_alone": 6e9}, 1e10) == "one process had 0.60 x the best bandwidth"
+    for ratio in (0.7, 2.6):  # two processes have neither less than one nor more than twice as much
+        assert noise_of(quiet | {"bandwidth_ratio": ratio}, 1e10) == f"bandwidth ratio {ratio:.2f} of 2 processes"
 
 
 def test_points_of_both_studies_share_runs():

@@ -29,6 +29,7 @@ def test_blocks_run(tmp_path):
     assert done.returncode == 0, done.stderr
     assert not done.stderr
     assert "run  time.step  section.legs.area  status" in done.stdout
+    assert int(re.search(r"converged reason (\S+),", done.stdout)[1]) > 0
     difference = re.search(r"difference: (\S+) m", done.stdout)
     assert float(difference[1]) < 1e-12
     assert (tmp_path / "live.png").stat().st_size > 1000 and (tmp_path / "steps.csv").read_text().count("\n") == 5

@@ -230,6 +230,9 @@ def _launcher(bring: dict[str, str], run: Callable[[list[str]], tuple[int, str]]
         return Finding(name, "missing", "there is no mpirun in PATH: runs on one rank work", bring["mpi4py"])
     status, output = run([launcher, "-n", "2", *_python(_TOGETHER)])
     line = re.search(r"^found (.*)$", output, flags=re.MULTILINE)
+    if (status or line is None) and "run as root" in output:
+        text = "Open MPI refuses to run as root: runs on one rank work"
+        return Finding(name, "missing", text, "export OMPI_ALLOW_RUN_AS_ROOT=1 OMPI_ALLOW_RUN_AS_ROOT_CONFIRM=1")
     if status or line is None:
         return Finding(name, "missing", f"mpirun -n 2 fails: {_last(output)}", bring["mpi4py"])
     mpi, petsc, parallel, hdf5, file = json.loads(line[1])

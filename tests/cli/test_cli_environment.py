@@ -98,6 +98,13 @@ def test_what_is_here_is_told():
             "is not the parallel build",
             "-m pip uninstall --yes h5py && apt-get",
         ),
+        (
+            "COMM_WORLD.rank",
+            (1, "mpirun has detected an attempt to run as root.\nWe reiterate our advice against doing so"),
+            "2 ranks",
+            "Open MPI refuses to run as root",
+            "export OMPI_ALLOW_RUN_AS_ROOT=1 OMPI_ALLOW_RUN_AS_ROOT_CONFIRM=1",
+        ),
         ("COMM_WORLD.rank", (1, "ORTE was unable"), "2 ranks", "mpirun -n 2 fails: ORTE was unable", "openmpi-bin"),
         (
             "hasExternalPackage",
@@ -122,6 +129,7 @@ def test_what_is_here_is_told():
         "two MPIs",
         "serial h5py",
         "h5py that hides another",
+        "root",
         "mpirun",
         "complex",
         "old PETSc",

@@ -56,6 +56,7 @@ def write_whole(path: Path | str, mesh: WholeMesh) -> Path:
     from ...errors import InputError
     from ...registry import lookup
 
+    given = path
     path = Path(path).absolute()
     writer = lookup(__name__, writer_name(path), "")
     new = path.with_name(f".{path.name}.{os.getpid()}")
@@ -68,6 +69,8 @@ def write_whole(path: Path | str, mesh: WholeMesh) -> Path:
                 os.replace(file, path.with_name(file.name))
         finally:
             shutil.rmtree(new, ignore_errors=True)
+    except InputError as error:
+        raise InputError(str(error).replace(str(new / path.name), str(given))) from error
     except (OSError, RuntimeError) as error:
         raise InputError(f"{path}: cannot be written: {getattr(error, 'strerror', None) or error}") from error
     return path

@@ -98,7 +98,7 @@ class Flat:
                     found[f"{placed.scope.name}.{table.name}"] = members
         for upper, (name, parts) in common.items():
             if upper not in taken:
-                found[name] = np.unique(np.concatenate(parts))
+                found[name] = _union(parts)
         lost, self._lost = sum(self._lost.values()), {}
         if lost:
             what = {"NSET": "node", "ELSET": "element"}[kind]
@@ -137,7 +137,7 @@ class Flat:
                 found.setdefault(id(block), (block, name, []))[2].append((full, members))
         for block, name, parts in found.values():
             short = names.get(name.upper().replace("/", "_"))
-            together = np.unique(np.concatenate([members for _, members in parts]))
+            together = _union([members for _, members in parts])
             if short is not None and np.array_equal(groups[short], together):
                 yield block, short, together
             else:
@@ -149,7 +149,7 @@ class Flat:
 
     def _members(self, kind: str, key: str, table: SetTable, above: tuple[str, ...] = ()) -> np.ndarray:
         """Return the members of a set in the mesh, ascending."""
-        parts = [np.empty(0, np.int64)]
+        parts: list[np.ndarray] = []
         for entry in table.entries:
             here = entry.instance.upper() or key
             if entry.of_elements:
@@ -159,7 +159,7 @@ class Flat:
                 parts.append(self._named(kind, here, entry, (*above, f"{key}.{table.name.upper()}")))
             elif entry.what.size:
                 parts.append(self._labelled(kind, here, entry.what, entry))
-        return np.unique(np.concatenate(parts))
+        return _union(parts)
 
     def _labelled(self, kind: str, key: str, labels: np.ndarray, entry: Entry) -> np.ndarray:
         placed = self._placed.get(key)
@@ -197,6 +197,13 @@ class Flat:
         if f"{key}.{name.upper()}" in above:
             raise InputError(f"{entry.block.where}: set {name} includes itself")
         return self._members(kind, key, table, above)
+
+
+def _union(parts: list[np.ndarray]) -> np.ndarray:
+    """Return the members (n,) of sets, ascending; files with a set for each bar have very many of one member."""
+    if len(parts) == 1 and len(parts[0]) == 1:
+        return parts[0]
+    return np.unique(np.concatenate([np.empty(0, np.int64), *parts]))
 
 
 def _sets(scope: Scope, kind: str) -> dict[str, SetTable]:

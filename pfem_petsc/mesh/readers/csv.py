@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -65,26 +66,29 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
         Naming file, line and column, for any content that is not a mesh of bars.
     """
     of_nodes, of_bars = pair(path)
-    nodes, bars = _Table(of_nodes), _Table(of_bars)
+    nodes = _Table(of_nodes)
     points = np.stack(
         [nodes.numbers(axis) if nodes.column(axis, axis != "z") else np.zeros(nodes.n) for axis in "xyz"], axis=1
     )
-    labels = nodes.texts("node") if nodes.column("node", False) else [str(i) for i in range(nodes.n)]
+    labels = list(nodes.texts("node")) if nodes.column("node", False) else [str(i) for i in range(nodes.n)]
     number: dict[str, int] = {}
     for i, label in enumerate(labels):
         number.setdefault(label, i)
     if len(number) < nodes.n:
         twice = next(i for i, label in enumerate(labels) if number[label] != i)
         raise InputError(f"{nodes.where(twice)}: node {labels[twice]!r} is listed more than once")
+    of_groups = nodes.groups()
+    del nodes, labels
+    bars = _Table(of_bars)
     ends = np.empty((bars.n, 2), np.int64)
     for side, name in enumerate(("first", "second")):
-        found = [number.get(label, -1) for label in bars.texts(name)]
-        ends[:, side] = found
+        ends[:, side] = np.fromiter((number.get(label, -1) for label in bars.texts(name)), np.int64, bars.n)
         missing = np.flatnonzero(ends[:, side] < 0)
         if len(missing):
             row = int(missing[0])
-            raise InputError(f"{bars.where(row)}: there is no node {bars.texts(name)[row]!r} in {of_nodes.name}")
-    mesh = WholeMesh(points, ends, nodes.groups(), bars.groups())
+            label = next(islice(bars.texts(name), row, None))
+            raise InputError(f"{bars.where(row)}: there is no node {label!r} in {of_nodes.name}")
+    mesh = WholeMesh(points, ends, of_groups, bars.groups())
     for name in bars.others():
         values = bars.maybe_numbers(name)
         if values is None:
@@ -106,28 +110,40 @@ class _Table:
         except (OSError, UnicodeDecodeError) as error:
             raise InputError(f"{path}: cannot be read: {error}; save it as text in UTF-8") from None
         lines = text.splitlines()
+        del text
         kept = [i for i, line in enumerate(lines) if line.strip(" ,;\t") and not line.lstrip().startswith("#")]
         if not kept:
             raise InputError(f"{path}: is empty: the first line has the names of the columns")
         head = lines[kept[0]]
         separator = max(";\t,", key=head.count)
         self._decimal_comma = separator == ";"
-        self._lines = [i + 1 for i in kept[1:]]
+        self._lines = np.array(kept[1:], np.int64) + 1
+        rows = csv.reader((lines[i] for i in kept), delimiter=separator, skipinitialspace=True, strict=True)
+        self.n = len(kept) - 1
+        del kept
         try:
-            rows = list(csv.reader((lines[i] for i in kept), delimiter=separator, skipinitialspace=True, strict=True))
+            self._take(rows)
         except csv.Error as error:
             raise InputError(f"{path}: {error}") from None
-        if len(rows) != len(kept):
-            raise InputError(f"{path}: a text in quotes goes over several lines")
-        self.headings = [_without_unit(name) for name in rows[0]]
+
+    def _take(self, rows: Iterator[list[str]]) -> None:
+        """Put the entries into columns, row by row; a large table has them once in memory, and repeated ones shared."""
+        self.headings = [_without_unit(name) for name in next(rows)]
         self.names = [name.lower().replace(" ", "_") for name in self.headings]
-        self.n = len(rows) - 1
-        width = len(self.names)
-        for i, row in enumerate(rows[1:]):
-            if len(row) < width or any(word.strip() for word in row[width:]):
-                raise InputError(f"{self.where(i)}: {len(row)} entries; expected {width}, as the first line has")
-        self._columns = [list(column) for column in zip(*(row[:width] for row in rows[1:]), strict=True)]
-        self._columns = self._columns or [[] for _ in self.names]
+        width, count = len(self.names), 0
+        self._columns: list[list[str]] = [[] for _ in self.names]
+        add = [column.append for column in self._columns]
+        last = [""] * width
+        for row in rows:
+            if len(row) != width and (len(row) < width or any(word.strip() for word in row[width:])):
+                raise InputError(f"{self.where(count)}: {len(row)} entries; expected {width}, as the first line has")
+            for k in range(width):
+                if row[k] != last[k]:
+                    last[k] = row[k]
+                add[k](last[k])
+            count += 1
+        if count != self.n:
+            raise InputError(f"{self.path}: a text in quotes goes over several lines")
 
     def where(self, row: int) -> str:
         """Return file and line of a row."""
@@ -144,9 +160,9 @@ class _Table:
             )
         return None
 
-    def texts(self, what: str) -> list[str]:
-        """Return the entries of a column; whole numbers written as 3.0 or +3 are 3."""
-        return [_label(word) for word in self._columns[self.column(what) - 1]]  # type: ignore[operator]
+    def texts(self, what: str) -> Iterator[str]:
+        """Yield the entries of a column; whole numbers written as 3.0 or +3 are 3."""
+        return map(_label, self._columns[self.column(what) - 1])  # type: ignore[operator]
 
     def numbers(self, what: str) -> np.ndarray:
         """Return the numbers of a column."""
@@ -181,7 +197,7 @@ class _Table:
         if self._decimal_comma:
             words = [word.replace(",", ".") for word in words]
         try:
-            return np.array([float(word) for word in words], dtype=np.float64)
+            return np.fromiter(map(float, words), np.float64, len(words))
         except ValueError:
             return None
 

@@ -69,6 +69,9 @@ class Film:
     ) -> None:
         self.motions, self.colours, self.scale, self.title, self.look = motions, colours, scale, title, look
         self.count = len(motions[0].frames)
+        for motion, style in zip(motions, look.styles, strict=True):
+            if style.radius is not None and len(style.radius):
+                motion.reach = 1.2 * float(style.radius.max())  # balls of nodes are that much wider than bars
 
     def start(self, size: tuple[int, int]) -> None:
         """Prepare frames of a size."""

@@ -20,6 +20,8 @@ __all__ = ["Motion", "Overlays"]
 
 _STUB = 0.35  # of the initial length: the part of a broken bar that is drawn at each of its nodes
 _MOST_POINTS = 1000  # of a trajectory
+_MOST_NODES = 5000  # of which the outermost are found; of more, the corners of their box are in view
+_WAYS = 200  # directions in which nodes are outermost: a sphere is larger than their hull by 1 %
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,7 @@ class Motion:
     ----------
     bounds : (2, 3) [m], corners of the motion
     boxes : (frames, 2, 3) [m], corners of the structure in each frame
+    reach : [m], how far the picture of a node extends around it
     times : (frames,) [s]
 
     Raises
@@ -73,10 +76,12 @@ class Motion:
         self.n_bars = len(self.bars)
         self._check_marks()
         self._trails = {name: self._trail(name) for name in overlays.trails}
-        boxes = []
+        self.reach, boxes = 0.0, []
+        self._hulls: list[np.ndarray] = []
         for frame in self.frames:
             points = self._held(frame)
             boxes.append([points.min(axis=0), points.max(axis=0)])
+            self._hulls.append(_outermost(points))
         self.boxes = np.array(boxes)
         low, high = self.boxes[:, 0].min(axis=0), self.boxes[:, 1].max(axis=0)
         if overlays.ghost:
@@ -130,9 +135,17 @@ class Motion:
             yield surface.points
 
     @property
+    def hulls(self) -> list[np.ndarray]:
+        """For each frame (n, 3) [m]: outermost nodes, or the corners of a large structure, with what is around them."""
+        if self.reach == 0.0:
+            return list(self._hulls)
+        around = self.reach * (np.array(np.meshgrid(*[[-1.0, 1.0]] * 3)).reshape(3, -1).T)
+        return [(hull[:, None] + around).reshape(-1, 3) for hull in self._hulls]
+
+    @property
     def surroundings(self) -> np.ndarray:
         """Points (n, 3) [m] that the camera has in view: the motion, and walls near it."""
-        near = [np.array(np.meshgrid(*self.bounds.T)).reshape(3, -1).T]
+        near = self.hulls + ([_outermost(self.start)] if self._overlays.ghost else [])
         size = float(np.linalg.norm(self.bounds[1] - self.bounds[0])) or 1.0
         for points in self.places:
             # a distant wall would shrink the structure to a dot: it is drawn but does not affect the view
@@ -239,6 +252,18 @@ class Motion:
         lines = np.stack([numbers, numbers + 2 * count], axis=1)
         stubs = np.concatenate([one, two, one + part, two - part])
         return Layer(stubs, lines, MARKS["broken"].colour, max(2.0, width))
+
+
+def _outermost(points: np.ndarray) -> np.ndarray:
+    """Return the points of (n, 3) that are farthest in evenly spread directions, or the corners of the box of many."""
+    if len(points) > _MOST_NODES:
+        return np.array(np.meshgrid(*np.array([points.min(axis=0), points.max(axis=0)]).T)).reshape(3, -1).T
+    # a spiral of equal areas on the sphere
+    height = 1.0 - (2.0 * np.arange(_WAYS) + 1.0) / _WAYS
+    angle = np.pi * (1.0 + 5.0**0.5) * np.arange(_WAYS)
+    ways = np.stack([np.sqrt(1.0 - height**2) * np.cos(angle), np.sqrt(1.0 - height**2) * np.sin(angle), height])
+    ways = np.concatenate([ways, np.eye(3), -np.eye(3)], axis=1)
+    return points[np.unique(np.argmax(points @ ways, axis=0))]
 
 
 def _decimals(times: np.ndarray) -> int:

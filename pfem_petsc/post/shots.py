@@ -120,9 +120,8 @@ def shots(motion: Motion, moves: Moves, aspect: float) -> list[Camera]:
         boxes = motion.boxes
         centres = boxes.mean(axis=1) if moves.follow == "structure" else motion.probe(moves.follow)
         made = []
-        for way, box, centre in zip(ways, boxes, centres, strict=True):
-            corners = np.array(np.meshgrid(*box.T)).reshape(3, -1).T
-            made.append(fit(corners, *way, parallel, aspect, margin=1.25, centre=centre))
+        for way, hull, centre in zip(ways, motion.hulls, centres, strict=True):
+            made.append(fit(hull, *way, parallel, aspect, margin=1.25, centre=centre))
     (made,) = at_one_scale([made])
     return [camera.zoomed(zoom) for camera, zoom in zip(made, zooms, strict=True)]
 

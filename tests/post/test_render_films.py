@@ -144,6 +144,23 @@ def test_times_have_the_unit_of_the_film_and_the_digits_that_tell_frames_apart(f
     assert motion_of(flying).time(1) == text
 
 
+def test_structures_fill_the_picture_from_any_side(tmp_path):
+    """A dome seen obliquely: all of its nodes are in view, and they span nearly the whole width."""
+    radius, angle = np.meshgrid([0.0, 1.0, 2.0], np.linspace(0.0, 2 * np.pi, 13)[:12])
+    points = np.stack([radius * np.cos(angle), radius * np.sin(angle), 0.3 * (4.0 - radius**2) / 4.0], axis=-1)
+    bars = np.array([[3 * k + j, 3 * k + j + 1] for k in range(12) for j in (0, 1)])
+    motion = motion_of(SyntheticResult(tmp_path / "result.vtkhdf", points.reshape(-1, 3), bars, walls=()))
+    motion.frames, motion.times, motion._hulls = [0], motion.times[:1], motion._hulls[:1]
+    (camera,) = shots(motion, Moves("iso"), 1.5)
+    x, y, _, _ = camera.project(motion.start, (300, 200))
+    assert x.min() > 0 and x.max() < 300 and y.min() > 0 and y.max() < 200
+    assert np.ptp(x) > 250  # by the corners of its box: 190
+    motion.reach = 0.3
+    (camera,) = shots(motion, Moves("iso"), 1.5)
+    x, y, _, scale = camera.project(motion.start, (300, 200))
+    assert (x - 0.3 * scale).min() > 0 and (x + 0.3 * scale).max() < 300  # of stout bars, too
+
+
 def test_followed_structure_stays_in_the_middle(flying):
     motion = motion_of(flying)
     for camera, box in zip(shots(motion, Moves(follow="structure"), 1.5), motion.boxes, strict=True):

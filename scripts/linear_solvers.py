@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 SOLVERS = {
     "CG, Jacobi, matrix-free": ("solver.linear=cg", "solver.operator=matrix_free"),
+    "CG, multigrid on a background grid": ("solver.linear=multigrid",),
     "CG, lagged multigrid, matrix-free": ("solver.linear=gamg", "solver.operator=matrix_free"),
     "CG, lagged MUMPS, matrix-free": ("solver.linear=mumps", "solver.operator=matrix_free"),
     "CG, point-block Jacobi, assembled": ("solver.linear=cg", "solver.operator=assembled"),

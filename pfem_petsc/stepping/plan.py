@@ -215,10 +215,12 @@ def _linear(model: Model, scheme: Scheme, over: float, steps: int) -> LinearChoi
     impact = model.can_touch or not all(law_of(material).smooth for material in case.material.values())
     solver, unknowns = case.solver, 3 * model.mesh.n_nodes
     try:
-        block = fills_block(model.mesh)
+        block = solver.linear == "auto" and fills_block(model.mesh)
         choice = choose_linear(solver.linear, unknowns, over, scheme.symmetric, solver.operator, steps, impact, block)
     except InputError as error:
         raise InputError(f"{case.source}: {error}") from error
+    if choice.preconditioner == "multigrid" and (model.links or not model.contact.symmetric):
+        choice = replace(choice, why=f"{choice.why}; Jacobi where links may close or nodes slip")
     if not model.contact.symmetric and choice.krylov == "cg":
         return replace(choice, why=f"{choice.why}; GMRES near walls with friction")
     return choice

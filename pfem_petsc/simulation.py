@@ -151,6 +151,9 @@ class Simulation(WithEquations):
             self._free_equations()
             self.analysis.close()
 
+    def _usable(self) -> None:
+        self._loop.check_open()
+
     @property
     def analysis(self) -> Analysis:
         """What advances the state, of the present stage."""
@@ -183,12 +186,12 @@ class Simulation(WithEquations):
 
     def summary(self) -> dict[str, str]:
         """Return label and text of a summary for the user before a run. Collective."""
-        self._loop.check_open()
+        self._usable()
         return summarise(self.case, self.model, self.plan)
 
     def inspect(self) -> tuple[dict[str, str], list[str]]:
         """Return label and text of further checks and of a forecast of the run; and warnings. Collective."""
-        self._loop.check_open()
+        self._usable()
         recorder = Recorder(self.stepper, None)
         entries, warnings = inspect(self.model.case, self.model)
         entries |= forecast(self.case, self.model, self.plan, self.outputs.fields, recorder.columns, recorder.types)
@@ -207,7 +210,7 @@ class Simulation(WithEquations):
         InputError
             If ``every`` is not a positive integer.
         """
-        self._loop.check_open()
+        self._usable()
         if not isinstance(every, int | np.integer) or isinstance(every, bool) or every < 1:
             raise InputError(f"on_step: every = {every!r}: give a positive whole number of steps")
         self.outputs.call(function, int(every))
@@ -228,7 +231,7 @@ class Simulation(WithEquations):
         InputError
             If the run has started, or computes no motion.
         """
-        self._loop.check_open()
+        self._usable()
         if not callable(function):
             raise InputError(f"external_force: {function!r:.80} is not a function of time and state")
         if self._loop.started:
@@ -253,7 +256,7 @@ class Simulation(WithEquations):
         return self._iterate(Batches(min_steps))
 
     def _iterate(self, batches: Batches | None) -> Iterator[Step]:
-        self._loop.check_open()
+        self._usable()
         if self.finished:
             return
         with self._compilation:
@@ -277,6 +280,6 @@ class Simulation(WithEquations):
 
     def gather(self, values: np.ndarray) -> np.ndarray | None:
         """Return an owned array (owned, ...) gathered in mesh numbering on rank 0, None elsewhere. Collective."""
-        self._loop.check_open()
+        self._usable()
         parts = self.comm.gather(self.mesh.node_order.to_slab(values))
         return np.concatenate(parts) if parts is not None else None

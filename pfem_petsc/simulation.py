@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import weakref
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, Self
 
@@ -13,7 +14,7 @@ from mpi4py import MPI
 from .analysis import Analysis, Step
 from .case.schema import Case
 from .contact.start import check_start
-from .errors import EarlyStop, InputError, PfemError
+from .errors import InputError, PfemError
 from .integrators.base import State
 from .mechanics.state_forces import ForceState
 from .output.lock import FolderLock
@@ -27,6 +28,7 @@ from .preflight.summary import summarise
 from .recording.recorder import Recorder
 from .restart.folder import Restart, find_restart, finished, finished_message
 from .run.compilation import ReportedCompilation
+from .run.loop import RunLoop
 from .run.outputs import Outputs
 from .run.stages import Stages
 from .run.stop import StopRequest
@@ -85,29 +87,28 @@ class Simulation(WithEquations):
                 f"Simulation: expected a Case, got {case!r:.80}; Case.load reads one from a file, "
                 "Case.from_dict from tables"
             )
-        self._stop = StopRequest(wall_time)
+        stop = StopRequest(wall_time)
         # later changes of the case are those of other simulations
         self.case = case = case.copy(fixed=True)
         self.comm = comm if comm is not None else MPI.COMM_WORLD
         self.folder = Path(output) if output is not None else Path("results") / case.name
         self.quiet = quiet
         self._compilation = ReportedCompilation(self.comm, quiet)
-        self._closed = False
-        self._lock = FolderLock(self.folder)
-        # PETSc objects of a simulation that was dropped without close()
-        for held in (self._stop, self._lock):
+        lock = FolderLock(self.folder)
+        # of a simulation that was dropped without close()
+        for held in (stop, lock):
             weakref.finalize(self, held.release)
         if not check_only:
             # a large model takes minutes to set up
-            on_root(self.comm, self._lock.check)
+            on_root(self.comm, lock.check)
         found = find_restart(case, self.comm, self.folder, None if check_only else restart)
         self.restart = found if isinstance(found, Restart) else None
         self.notes = [found] if isinstance(found, str) else []
         # PETSc and what it is linked to are loaded by now
         with self._compilation, returning_freed_memory():
-            self._prepare()
+            self._prepare(stop, lock)
 
-    def _prepare(self) -> None:
+    def _prepare(self, stop: StopRequest, lock: FolderLock) -> None:
         case, restart = self.case, self.restart
         recorded, number = (restart.attributes["plan"], restart.stage) if restart is not None else (None, 0)
         self._stages = Stages(case, self.comm, recorded, number)
@@ -118,11 +119,11 @@ class Simulation(WithEquations):
         self.mesh = self.model.mesh
         if number == 0:
             check_start(self.model.contact, self.mesh.points[: self.mesh.n_owned], self.model.length)
-        self._started = False
         minutes = case.output.checkpoint_minutes
         interval = 60.0 * minutes if minutes else None
-        self._synchroniser = Synchroniser(self.comm, self.analysis, self._stop, self._lock, interval)
-        self.outputs = Outputs(self._stages, self._synchroniser, self.folder, self.quiet, self._compilation)
+        synchroniser = Synchroniser(self.comm, self.analysis, stop, lock, interval)
+        self.outputs = Outputs(self._stages, synchroniser, self.folder, self.quiet, self._compilation)
+        self._loop = RunLoop(self._stages, synchroniser, self.outputs, self.folder, self.restart, self.notes)
 
     def __enter__(self) -> Self:
         return self
@@ -132,8 +133,8 @@ class Simulation(WithEquations):
         if kind is None or self.comm.size == 1 or issubclass(kind, PfemError):
             self.close()
         else:
-            self._closed = True
-            self._leave("failed")
+            self._loop.closed = True
+            self._loop.leave("failed")
 
     def close(self) -> None:
         """Close the results, free PETSc objects, restore signal handlers and unlock the folder. Collective.
@@ -141,20 +142,17 @@ class Simulation(WithEquations):
         A second call does nothing. State, last row and mesh remain accessible; everything else is refused. A run that
         was not at its end can be continued from its last checkpoint.
         """
-        if self._closed:
+        if self._loop.closed:
             return
-        self._closed = True
+        self._loop.closed = True
         try:
-            self._finish("stopped")
+            self._loop.finish("stopped")
         finally:
             self._free_equations()
             self.analysis.close()
 
     def _usable(self) -> None:
-        if self._closed:
-            raise InputError(
-                f"{self.folder}: this simulation was closed; continue with a new Simulation with restart=True"
-            )
+        self._loop.check_open()
 
     @property
     def analysis(self) -> Analysis:
@@ -236,35 +234,18 @@ class Simulation(WithEquations):
         self._usable()
         if not callable(function):
             raise InputError(f"external_force: {function!r:.80} is not a function of time and state")
-        if self._started:
+        if self._loop.started:
             raise InputError("external_force: the run has started; register forces before the first step")
         self._stages.call(function)
 
     @staged
     def start(self) -> None:
         """Initialise the state and open the output. Collective; called by :meth:`run` and iteration."""
-        self._usable()
-        if self._started:
-            return
-        self._started = True
-        try:
-            on_root(self.comm, self._lock.take)
-            self._stop.watch()
-            with returning_freed_memory():
-                self.outputs.open(self.restart, self.notes)
-                instrument(self)
-                self.outputs.record_start()
-        except PfemError:
-            self._finish("failed")
-            raise
+        self._loop.start(partial(instrument, self))
 
     def __iter__(self) -> Iterator[Step]:
         """Run step by step; the output is closed when the iteration ends."""
-        self._usable()
-        if self.finished:
-            return
-        with self._compilation:
-            yield from self._steps()
+        return self._iterate(None)
 
     def batches(self, min_steps: int = WORTH) -> Iterator[Step]:
         """Run as by iteration, but yield only some of the steps; those in between may be fused into one compiled call.
@@ -272,51 +253,14 @@ class Simulation(WithEquations):
         ``min_steps``: minimum number of steps of a run for which the fused loop is compiled, which takes some seconds
         the first time.
         """
+        return self._iterate(Batches(min_steps))
+
+    def _iterate(self, batches: Batches | None) -> Iterator[Step]:
         self._usable()
         if self.finished:
             return
         with self._compilation:
-            yield from self._steps(Batches(min_steps))
-
-    def _steps(self, batches: Batches | None = None) -> Iterator[Step]:
-        ended = self._stages.at_last and self.state.step >= self.analysis.last_step
-        if self._started and not self.outputs.is_open and not ended:
-            raise InputError(
-                f"{self.folder}: the results of this simulation were closed at step {self.stepper.number}, when its "
-                "iteration ended; continue with a new Simulation with restart=True, from a checkpoint"
-            )
-        try:
-            self.start()
-            self._synchroniser.synchronise()
-            self.outputs.stop_early()
-            while True:
-                while self.state.step < self.analysis.last_step:
-                    if batches is not None:
-                        self.outputs.advance_together(batches)
-                    yield self._advance()
-                    self.outputs.stop_early()
-                if self._stages.at_last:
-                    break
-                self.outputs.begin_stage()
-                batches = None if batches is None else batches.anew()
-            # a run that was killed after its last checkpoint may not have done this
-            self.outputs.complete()
-            self.outputs.record_modes()
-            self.outputs.tell_remarks()
-            self._finish("done")
-        except (GeneratorExit, EarlyStop):
-            self._finish("stopped")
-            raise
-        except PfemError:
-            self._finish("failed")
-            raise
-        except BaseException:
-            # only one rank may be here, so collective operations are not safe
-            if self.comm.size == 1:
-                self._finish("failed")
-            else:
-                self._leave("failed")
-            raise
+            yield from self._loop.steps(self.start, batches)
 
     def run(self) -> int:
         """Run to the end and return the exit status. Collective.
@@ -333,27 +277,6 @@ class Simulation(WithEquations):
         for _ in self.batches():
             pass
         return 0
-
-    def _advance(self) -> Step:
-        self._usable()
-        made = self.analysis.advance()
-        self._stop.stepped = True
-        return self.outputs.after(made)
-
-    def _finish(self, outcome: str) -> None:
-        """Close the results and unlock the folder. Collective."""
-        try:
-            self.outputs.close(outcome)
-        finally:
-            self._leave(outcome)
-            self._lock.release()
-
-    def _leave(self, outcome: str) -> None:
-        """Clean up without communication; the folder stays locked until the process ends, as others may be writing."""
-        self.outputs.leave(outcome)
-        if self.restart is not None:
-            self.restart.file.close()
-        self._stop.release()
 
     def gather(self, values: np.ndarray) -> np.ndarray | None:
         """Return an owned array (owned, ...) gathered in mesh numbering on rank 0, None elsewhere. Collective."""

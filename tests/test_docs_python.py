@@ -8,6 +8,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 PAGE = Path(__file__).parents[1] / "docs" / "python.md"
 
 
@@ -15,6 +17,7 @@ def blocks() -> list[str]:
     return re.findall(r"^```python\n(.*?)^```$", PAGE.read_text(), flags=re.MULTILINE | re.DOTALL)
 
 
+@pytest.mark.slow
 def test_blocks_run(tmp_path):
     """Each on its own would not find what those before have made; warnings are errors."""
     (tmp_path / "page.py").write_text("\n".join(blocks()))

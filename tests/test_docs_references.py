@@ -92,6 +92,7 @@ def test_there_are_messages():
     assert len(quoted()) > 50 and len(set(quoted())) == len(quoted())
 
 
+@pytest.mark.slow
 def test_messages_are_those_of_the_program(messages):
     for message in quoted():
         assert pattern(message).search(messages), message

@@ -25,6 +25,7 @@ def outcome(tmp_path, on_ranks):
     return run
 
 
+@pytest.mark.slow
 def test_failure_on_one_rank_fails_the_run_with_its_report(outcome):
     status, output = outcome("@pytest.mark.parallel", "def test_a():", "    assert rank != 1, 'rank one is unwell'")
     assert status != 0
@@ -33,6 +34,7 @@ def test_failure_on_one_rank_fails_the_run_with_its_report(outcome):
     assert output.count("1 failed in") == 1
 
 
+@pytest.mark.slow
 def test_rank_that_leaves_a_collective_call_early_ends_the_run(outcome):
     status, output = outcome(
         "@pytest.mark.parallel",
@@ -45,6 +47,7 @@ def test_rank_that_leaves_a_collective_call_early_ends_the_run(outcome):
     assert "left early" in output
 
 
+@pytest.mark.slow
 def test_skip_on_one_rank_skips_everywhere(outcome):
     status, output = outcome(
         "@pytest.fixture",
@@ -59,6 +62,7 @@ def test_skip_on_one_rank_skips_everywhere(outcome):
     assert "1 skipped in" in output
 
 
+@pytest.mark.slow
 def test_ranks_that_find_different_tests_end_the_run(outcome):
     status, output = outcome(
         "@pytest.mark.parallel", "@pytest.mark.parametrize('i', range(1 + rank))", "def test_a(i):", "    pass"
@@ -67,6 +71,7 @@ def test_ranks_that_find_different_tests_end_the_run(outcome):
     assert "the ranks found different tests" in output
 
 
+@pytest.mark.slow
 def test_serial_tests_are_left_out_and_folders_agree_as_promised(outcome):
     status, output = outcome(
         "def test_serial():",

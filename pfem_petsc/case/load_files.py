@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..errors import InputError
-from .table_files import file_columns
+from .columns import file_columns
 
 __all__ = ["Forces", "digest_of", "read_forces"]
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
@@ -19,9 +17,8 @@ from .names import nearest_key
 from .problems import Path as KeyPath
 from .problems import Problems, table_list
 from .table_files import TableFiles
-from .toml import cut_rows, put_rows_back
 
-__all__ = ["KEYS", "parse_toml", "read_tables"]
+__all__ = ["KEYS", "read_tables"]
 
 GENERATORS = "pfem_petsc.mesh.generators"
 INTEGRATORS = "pfem_petsc.integrators"
@@ -30,10 +27,6 @@ CONSTRAINTS = "pfem_petsc.contact.constraints"
 STATIC_METHODS = "pfem_petsc.statics.methods"
 
 M = TypeVar("M", bound=StrictModel)
-
-DEEPEST = 100
-"""Maximum number of parts of a dotted key; the parsing time grows with their square."""
-_LONG_KEY = re.compile(r"""(?:(?:[\w-]+|"[^"\n]*"|'[^'\n]*')[ \t]*\.[ \t]*)""" + f"{{{DEEPEST}}}")
 
 KEYS = [
     *("title", "mesh", "node_set", "material", "section", "initial", "support"),
@@ -45,40 +38,6 @@ KEYS = [
 
 VARYING = (("gravity", (t.Gravity, t.VaryingGravity)), ("wind", (t.Wind, t.VaryingWind)))
 """Tables with a vector, constant or over time, and their models."""
-
-
-def parse_toml(text: str, source: str) -> dict[str, Any]:
-    """Parse TOML text to nested tables.
-
-    Raises
-    ------
-    InputError
-        On a syntax error; the message names line and column.
-    """
-    short, rows = cut_rows(text)
-    if rows:
-        try:
-            data = tomllib.loads(_checked_keys(short, source))
-        except ValueError:
-            data = {}  # the whole text is read below, for the message
-        if put_rows_back(data, rows):
-            return data
-    try:
-        return tomllib.loads(_checked_keys(text, source))
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{source}: this is not valid TOML: {error}") from error
-    except ValueError as error:
-        # Python limits the number of digits of integers
-        raise InputError(f"{source}: this is not a case: it has an integer of more than 4,300 digits") from error
-    except RecursionError as error:
-        raise InputError(f"{source}: this is not a case: its lists or tables are nested too deep") from error
-
-
-def _checked_keys(text: str, source: str) -> str:
-    if (found := _LONG_KEY.search(text)) is not None:
-        line = text.count("\n", 0, found.start()) + 1
-        raise InputError(f"{source}: line {line}: this is not a case: a key of more than {DEEPEST} parts")
-    return text
 
 
 def read_tables(data: Mapping[str, Any], folder: Path, problems: Problems) -> dict[str, Any]:

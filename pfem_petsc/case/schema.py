@@ -6,8 +6,6 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Unpack
 
-from pydantic import BaseModel
-
 from ..errors import InputError
 from ..registry import lookup
 from .builtin import built_in_path, read_text
@@ -17,10 +15,12 @@ from .editable import Editable
 from .editing import attribute_of, settle
 from .names import checked_name
 from .overrides import apply_overrides
+from .parsing import parse_toml
 from .problems import Problems
-from .reading import KEYS, parse_toml, read_tables
+from .reading import KEYS, read_tables
 from .stages import stages_of
 from .toml import plain, table_text
+from .writing import tables_of
 
 __all__ = ["Case"]
 
@@ -241,65 +241,11 @@ class Case(Editable):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the case as nested tables with the keys of the case file and all defaults, without absent tables."""
-        data = self._tables()
-        if not self.output.probe:
-            del data["output"]["probe"]
-        data["stage"] = [stage._as_stage() for stage in self.stage]
-        return {key: value for key, value in data.items() if value not in ({}, [])}
-
-    def _as_stage(self) -> dict[str, Any]:
-        """Return name, analysis and given tables of a stage, as its case has them."""
-        tables = self._tables()
-        tables["output"] = {key: tables["output"][key] for key in ("fields_every", "history_every")}
-        named = {name: self.section[name].prestressed for name in self.stressed}
-        tables["section"] = {name: {key: tables["section"][name][key]} for name, key in named.items()}
-        analysis = "time" if self.time is not None else "static"
-        return {"name": self.name, **{key: tables[key] for key in (*self.given, analysis)}}
-
-    def _tables(self) -> dict[str, Any]:
-        """All tables by name, those without content included."""
-        everywhere = [entry for entry in self.initial if entry.node_set is None]
-        initial = _table(everywhere[0]) if everywhere else {}
-        on = [_table(entry) for entry in self.initial if entry.node_set is not None]
-        parameters = self.mesh.parameters
-        mesh = parameters.table() if hasattr(parameters, "table") else _table(parameters)
-        return {
-            "title": self.title,
-            "mesh": {**_table(self.mesh), **mesh},
-            "node_set": {name: _table(entry) for name, entry in self.node_set.items()},
-            "material": {name: _table(entry) for name, entry in self.material.items()},
-            "section": {name: _table(entry) for name, entry in self.section.items()},
-            "initial": {**initial, "on": on} if on else initial,
-            "support": [_table(entry) for entry in self.support],
-            "mass": [_table(entry) for entry in self.point_mass],
-            "spring": [_table(entry) for entry in self.spring],
-            "dashpot": [_table(entry) for entry in self.dashpot],
-            "load": [_table(entry) for entry in self.load],
-            "gravity": _table(self.gravity),
-            "wind": _table(self.wind),
-            "temperature": [_table(entry) for entry in self.temperature],
-            "wall": [_table(entry) for entry in self.wall],
-            "contact_pair": [_table(entry) for entry in self.contact_pair],
-            "constraint": [_table(entry) for entry in self.constraint],
-            "remove": [_table(entry) for entry in self.remove],
-            "contact": _table(self.contact),
-            "time": {**_table(self.time), **_table(self.time.scheme)} if self.time is not None else {},
-            "static": {**_table(self.static), **_table(self.static.parameters)} if self.static is not None else {},
-            "modes": _table(self.modes),
-            "output": _table(self.output),
-            "solver": _table(self.solver),
-        }
+        return tables_of(self)
 
     def to_toml(self) -> str:
         """Return the resolved case, with all defaults, as text from which :meth:`from_toml` reads an equal case."""
         return table_text(self.to_dict())
-
-
-def _table(model: BaseModel | None) -> dict[str, Any]:
-    if model is None:
-        return {}
-    data = model.model_dump(exclude_none=True, exclude={"scheme", "parameters"})
-    return {key: str(value) if isinstance(value, Path) else value for key, value in data.items()}
 
 
 def _with_arrays(table: Any, mesh: Any) -> Any:

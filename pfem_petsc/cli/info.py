@@ -13,7 +13,8 @@ from .parser import PROGRAM, add_result, surviving
 if TYPE_CHECKING:
     import numpy as np
 
-    from ..output.result import Modes, Result
+    from ..output.result import Result
+    from ..output.result_tables import Modes
 
 RANKS = "one"
 

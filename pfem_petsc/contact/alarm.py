@@ -96,24 +96,31 @@ class CarriedNodes:
 
     def __init__(self, contact: Contact) -> None:
         self._contact = contact
+        self._before: dict[int, np.ndarray] = {}
         self.of: dict[int, np.ndarray] = {}
         for k, wall in enumerate(contact.walls):
             if wall.partial:
                 nodes = np.flatnonzero(contact.members[:, k] & held_by_supports(contact.fixed, wall.normal))
                 self.of |= {k: nodes} if len(nodes) else {}
 
-    def places(self, x: np.ndarray, time: float) -> dict[int, np.ndarray]:
+    def start(self, x: np.ndarray, time: float) -> None:
+        """Keep where they are at the start of a step, from all positions (owned, 3) [m] at a time [s]."""
+        if self.of:
+            self._before = self._places(x, time)
+
+    def _places(self, x: np.ndarray, time: float) -> dict[int, np.ndarray]:
         """Return their positions (k, 3) [m] relative to the rectangles, from all positions (owned, 3)."""
         displacements = self._contact.motion.displacements(time)
         return {k: x[nodes] - displacements[k] for k, nodes in self.of.items()}
 
-    def crossing(self, before: dict[int, np.ndarray], after: dict[int, np.ndarray], where: str) -> str | None:
-        """Return the message about nodes that cross a rectangle between two :meth:`places`, None if there are none."""
+    def crossing(self, x: np.ndarray, time: float, where: str) -> str | None:
+        """Return the message about nodes that have crossed a rectangle since :meth:`start`, None if there are none."""
         contact, tolerance = self._contact, BEYOND * self._contact.length
+        after = self._places(x, time)
         for k, nodes in self.of.items():
             wall = contact.walls[k]
             depth = wall.offset - after[k] @ wall.normal
-            crossed = (depth > tolerance) & wall.stops(before[k], after[k], np.full(len(nodes), tolerance))
+            crossed = (depth > tolerance) & wall.stops(self._before[k], after[k], np.full(len(nodes), tolerance))
             if crossed.any():
                 at = int(np.argmax(np.where(crossed, depth, 0.0)))
                 node = int(contact.mesh.node_ids[nodes[at]])

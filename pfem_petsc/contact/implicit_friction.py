@@ -3,8 +3,8 @@
 The law is that of :mod:`~pfem_petsc.contact.friction`. In a solve, the tangential coordinates of a sticking node are
 fixed at their values without slip, and the reaction is the friction force; a slipping node gets a friction force that
 depends on its normal force (:mod:`~pfem_petsc.contact.sliding`). Afterwards the law is verified with a small problem
-per node: with the reaction R at x and any stiffness K, the law holds if x is the explicit solution for the free
-position x - R/K. If it is not, that solution determines the status of the node in the next solve.
+per node (:mod:`~pfem_petsc.contact.local_friction`), whose solution determines the status of a node that violates it in
+the next solve.
 
 The direction of friction of a slipping node is fixed at first; such a problem always has a solution. If the slip turns
 out to be opposite, the node sticks. Once the node is known to slip, its direction is solved for as well.
@@ -16,10 +16,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..tolerances import ON_BOUND, PROJECTED
-from .friction import add_friction
+from ..tolerances import ON_BOUND
 from .jamming import jam
-from .projection import project
+from .local_friction import LocalSolution, solve_locally
 from .sliding import Sliding
 
 if TYPE_CHECKING:
@@ -95,8 +94,8 @@ class StepFriction:
             reaction = self.state.contact[nodes[at]]
             none = np.zeros(len(at), dtype=bool)
             own = self._local(frames, at, x[nodes[at]], reaction, none)
-            self._forces[nodes[at]] = own[2].sum(axis=1)
-            self._decide(frames, at, x[nodes[at]], none, *own)
+            self._forces[nodes[at]] = own.drag.sum(axis=1)
+            self._decide(frames, at, x[nodes[at]], none, own)
             self._guessed[nodes[at]] = True
         self._hold(frames, np.flatnonzero(has_friction & (self._sticks[nodes] >= 0)))
         moving = has_friction & (self._sticks[nodes] < 0) & (self._directions[nodes] != 0.0).any(axis=(1, 2))
@@ -125,7 +124,8 @@ class StepFriction:
         self.drag = np.zeros((*strengths.shape, 3))
         at = np.flatnonzero(self._has_friction(frames))
         slipping = self._sticks[nodes[at]] < 0
-        moved, normal_forces, drag, stiffness = self._local(frames, at, x[at], reaction[at], slipping)
+        own = self._local(frames, at, x[at], reaction[at], slipping)
+        moved, normal_forces, drag, stiffness = own
         self._forces[nodes[at]] = drag.sum(axis=1)
         before = self._sticks.copy(), self._slips.copy()
         apart = stiffness * np.linalg.norm(moved - x[at], axis=1)
@@ -134,8 +134,7 @@ class StepFriction:
         kept = apart <= np.maximum(max(tolerance, 2.0 * noise), floor)
         wrong = np.flatnonzero(~kept)
         if len(wrong):
-            parts = (moved[wrong], normal_forces[wrong], drag[wrong], stiffness[wrong])
-            self._decide(frames, at[wrong], x[at[wrong]], slipping[wrong], *parts)
+            self._decide(frames, at[wrong], x[at[wrong]], slipping[wrong], own.of(wrong))
         may = self._may_stick(nodes[at], slipping & kept, x[at], normal_forces, frames.normals[at])
         trying = may.any(axis=1)
         self._sticks[nodes[at[trying]]] = may[trying].argmax(axis=1)
@@ -179,37 +178,12 @@ class StepFriction:
 
     def _local(
         self, frames: NodalFrames, at: np.ndarray, x: np.ndarray, reaction: np.ndarray, slipping: np.ndarray
-    ) -> tuple[np.ndarray, ...]:
-        """Solve the local problems.
-
-        Returns positions (k, 3), normal (k, w) and friction (k, w, 3) forces, and stiffnesses (k,).
-        Slipping nodes use the dynamic coefficient only; whether they stick is determined by a trial.
-        """
-        contact, nodes = self.contact, frames.nodes[at]
-        stiffness = self._stiffness[nodes]
-        fixed, normals, offsets = contact.fixed[nodes], frames.normals[at], frames.offsets[at]
-        moved = x - np.where(fixed, 0.0, reaction) / stiffness[:, None]
-        normal_forces, drag = np.zeros(offsets.shape), np.zeros(normals.shape)
-        project(moved, fixed, normals, offsets, PROJECTED * contact.length, normal_forces)
-        normal_forces *= stiffness[:, None]
-        for group, static in ((slipping, contact.friction), (~slipping, contact.static_friction)):
-            part = np.flatnonzero(group)
-            place, press, pull = moved[part], normal_forces[part], drag[part]
-            add_friction(
-                place,
-                self.state.position[nodes[part]],
-                self._way,
-                fixed[part],
-                normals[part],
-                offsets[part],
-                contact.friction,
-                static,
-                stiffness[part],
-                press,
-                pull,
-            )
-            moved[part], normal_forces[part], drag[part] = place, press, pull
-        return moved, normal_forces, drag, stiffness
+    ) -> LocalSolution:
+        """Solve the local problems of some nodes of the frames."""
+        nodes = frames.nodes[at]
+        planes = frames.normals[at], frames.offsets[at]
+        start, stiffness = self.state.position[nodes], self._stiffness[nodes]
+        return solve_locally(self.contact, nodes, planes, x, reaction, start, self._way, stiffness, slipping)
 
     def _may_stick(
         self, nodes: np.ndarray, slipping: np.ndarray, x: np.ndarray, normal_forces: np.ndarray, normals: np.ndarray
@@ -228,18 +202,11 @@ class StepFriction:
         return slip - np.einsum("kwi,kwi->kw", slip, normals)[:, :, None] * normals
 
     def _decide(
-        self,
-        frames: NodalFrames,
-        at: np.ndarray,
-        x: np.ndarray,
-        slipping: np.ndarray,
-        moved: np.ndarray,
-        normal_forces: np.ndarray,
-        drag: np.ndarray,
-        stiffness: np.ndarray,
+        self, frames: NodalFrames, at: np.ndarray, x: np.ndarray, slipping: np.ndarray, own: LocalSolution
     ) -> None:
         """Decide which nodes stick or slip in the next solve, from positions x and the solutions of local problems."""
         nodes, contact = frames.nodes[at], self.contact
+        moved, normal_forces, drag, stiffness = own
         slip = self._slip(nodes, moved, frames.normals[at])
         size = np.linalg.norm(drag, axis=2)
         # a normal force within rounding neither sticks nor causes friction

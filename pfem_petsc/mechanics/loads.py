@@ -91,7 +91,8 @@ class ExternalForce:
 
     def at(self, time: float, out: np.ndarray) -> np.ndarray:
         """``out`` (owned, 3) [N] at a time [s], or at a load factor."""
-        np.multiply(self.inertia.mass[:, None], self.gravity_at(time), out=out)
+        for component, gravity in enumerate(self.gravity_at(time)):  # much faster than a product with three columns
+            np.multiply(self.inertia.mass, gravity, out=out[:, component])
         self._add_loads(time, out)
         for force in self.state_forces:
             force.add(time, self._state, out)

@@ -15,28 +15,18 @@ from mpi4py import MPI
 from ..errors import PfemError, SimulationFailure
 from ..parallel.agreement import on_root
 from .connectivity import write_connectivity
-from .digests import snapshot_digests
 from .disk import require_room
-from .hdf5 import (
-    create_new,
-    grow,
-    open_shared,
-    release,
-    require_parallel_hdf5,
-    write_rows,
-    writes_together,
-    writing,
-)
+from .hdf5 import create_new, open_shared, release, require_parallel_hdf5, writing
 from .history import RowTables
-from .layout import create_field, create_result, field_datasets
+from .layout import create_result
 from .modes import prepare_modes, write_modes
 from .provenance import describe_run
 from .repair import reopen
+from .snapshot_data import SnapshotData
 from .snapshot_index import SnapshotIndex
 
 if TYPE_CHECKING:
     from ..mesh.distribution import DistributedMesh
-    from ..parallel.natural import NaturalOrder
 
 __all__ = ["ResultWriter"]
 
@@ -107,14 +97,9 @@ class ResultWriter:
         require_parallel_hdf5(comm)
         self.path, self.comm = Path(path), comm
         self.n_nodes, self.n_bars = int(mesh.n_nodes), int(mesh.n_bars)
-        self._precision = np.dtype(precision)
-        self._together = writes_together(comm)
-        # Bars evaluated on two ranks are written by the rank that counts them.
-        self.counted = mesh.counted
         self.node_order = mesh.node_order
-        self.bar_order = mesh.bar_order
         self._unpublished: Path | None = None  # temporary name until the file has complete data
-        self._fields = {"PointData": sorted(point_fields), "CellData": sorted(cell_fields)}
+        fields = {"PointData": sorted(point_fields), "CellData": sorted(cell_fields)}
         self._file: h5py.File | None = None
         # The failure after which nothing can be written, and whether the open file can still be closed.
         self._failure: SimulationFailure | None = None
@@ -127,16 +112,12 @@ class ResultWriter:
             self._unpublished = create_new(self.path, comm, create_result, *structure, checked=True)
         else:
             last = last or (append_after_step, append_after_step)
-            on_root(
-                comm, reopen, self.path, append_after_step, last, sizes, self._fields, columns, case_text, described
-            )
+            on_root(comm, reopen, self.path, append_after_step, last, sizes, fields, columns, case_text, described)
             on_root(comm, prepare_modes, self.path, modes, self.n_nodes)
         with writing(comm, self.path):
             self._file = open_shared(self._unpublished or self.path, comm)
-        vtk = self._file["VTKHDF"]
-        self.n_snapshots = int(vtk["Steps"].attrs["NSteps"])
-        # Points and fields, created with the first snapshot, which defines the shapes.
-        self._data = field_datasets(vtk) if self.n_snapshots else {}
+        self.n_snapshots = int(self._file["VTKHDF/Steps"].attrs["NSteps"])
+        self._data = SnapshotData(self._file, comm, self.path, mesh, fields, np.dtype(precision))
         self._index = SnapshotIndex(self._file, comm, self.path, mesh)
         self._rows = RowTables(self._file, comm, self.path, columns, events)
         if append_after_step is None:
@@ -171,29 +152,16 @@ class ResultWriter:
             On all ranks, for example if the disk is full or the file is missing.
         """
         file = self._ready()
-        given = {"PointData": point_data, "CellData": cell_data}
-        for kind, names in self._fields.items():
-            if sorted(given[kind]) != names:
-                raise ValueError(f"a snapshot has {kind} {names}, got {sorted(given[kind])}")
-        slabs = {"Points": self.node_order.to_slab(points)}
-        for name in self._fields["PointData"]:
-            slabs[f"PointData/{name}"] = self.node_order.to_slab(np.asarray(point_data[name]))
-        for name in self._fields["CellData"]:
-            slabs[f"CellData/{name}"] = self.bar_order.to_slab(np.asarray(cell_data[name])[self.counted])
-        slabs = {name: slab.astype(self._row_type(name, slab), copy=False) for name, slab in slabs.items()}
-        self._require_room(sum(self._global_bytes(name, slab) for name, slab in slabs.items()))
-        digests = snapshot_digests(self.comm, {name: (slab, self._order(name).first) for name, slab in slabs.items()})
+        slabs = self._data.slabs(points, point_data, cell_data)
+        self._require_room(self._data.n_bytes(slabs))
+        digests = self._data.digests(slabs)
         n = self.n_snapshots
         with self._whole_or_failed():
-            if not self._data:
-                self._create_fields(slabs)
-            for name, slab in slabs.items():
-                order = self._order(name)
+            if not self._data.exists:
                 with writing(self.comm, self.path):
-                    grow(self._data[name], (n + 1) * order.n_global)
-                with writing(self.comm, self.path):
-                    first = n * order.n_global + order.first
-                    write_rows(self._data[name], first, slab, collective=self._together)
+                    self._data.create(slabs)
+                    self._index.create_checks()
+            self._data.append(n, slabs)
             self._index.append(n, step, time, digests)
             self._rows.write()
             with writing(self.comm, self.path):
@@ -307,23 +275,3 @@ class ResultWriter:
         except SimulationFailure as error:
             self._failure = error
             raise
-
-    def _order(self, name: str) -> NaturalOrder:
-        return self.bar_order if name.startswith("CellData") else self.node_order
-
-    def _row_type(self, name: str, slab: np.ndarray) -> np.dtype:
-        return self._precision if slab.dtype.kind == "f" and name != "Points" else slab.dtype
-
-    def _global_bytes(self, name: str, slab: np.ndarray) -> int:
-        n_rows = self.n_bars if name.startswith("CellData") else self.n_nodes
-        return n_rows * self._row_type(name, slab).itemsize * int(np.prod(slab.shape[1:], dtype=np.int64))
-
-    def _create_fields(self, slabs: Mapping[str, np.ndarray]) -> None:
-        vtk = self._file["VTKHDF"]
-        with writing(self.comm, self.path):
-            for name, slab in slabs.items():
-                if name != "Points":
-                    kind, _, field = name.partition("/")
-                    create_field(vtk, kind, field, slab.shape[1:], self._row_type(name, slab))
-            self._data = field_datasets(vtk)
-            self._index.create_checks()

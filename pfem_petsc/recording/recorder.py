@@ -135,6 +135,7 @@ class Recorder:
         """Write this rank's share of a row."""
         stepper, state, ledger = self.stepper, self.stepper.state, self.ledger
         energy, solution = stepper.energy, stepper.solution
+        ledger.complete()
         sums[: HEAD.width] = ledger.sums
         sums[_BARS] = energy.energies
         for term in _STATE:

@@ -24,6 +24,7 @@ from ..stepping.fused_steps import Batches
 from .compilation import ReportedCompilation
 from .modes import record_modes, remove_modes
 from .opening import open_progress, open_result_file
+from .resuming import resume_observers, tell_restart
 from .stages import Stages
 from .synchroniser import Synchroniser
 
@@ -48,12 +49,7 @@ class Outputs:
     """
 
     def __init__(
-        self,
-        stages: Stages,
-        synchroniser: Synchroniser,
-        folder: Path,
-        quiet: bool,
-        compilation: ReportedCompilation,
+        self, stages: Stages, synchroniser: Synchroniser, folder: Path, quiet: bool, compilation: ReportedCompilation
     ) -> None:
         self._stages, self._synchroniser, self._folder, self._quiet = stages, synchroniser, folder, quiet
         self._compilation = compilation
@@ -120,22 +116,9 @@ class Outputs:
         history = self.history
         if restart is not None:
             self._continues = restart.continues
-            sums = history.ledger, history.recorder, history.blow_up
-            history.row = checkpoints.state.load_sums(checkpoint, *sums)
-            self.snapshots.last = restart.last[0]
-            history.contact_watch.start = history.recorder.start_energy
-            if restart.scalars.get("stage") is not None:
-                history.load_stage(restart.scalars["stage"]["history"])
-            changes = f"; changed: {'; '.join(restart.changed)}" if restart.changed else ""
+            resume_observers(restart, checkpoint, checkpoints, history, self.snapshots)
             place = f"step {start[0]}, {plan.axis.place(start[1])}"
-            self.progress.message(f"restart from {restart.path}: {place}{changes}")
-            before, now = int(restart.attributes.get("external_functions", 0)), model.external.functions
-            if before != now:
-                self.progress.warning(
-                    f"{restart.path}: the run had {before} function{'s' * (before != 1)} for forces, and this one has "
-                    f"{now}: functions are not in checkpoints; give them by Simulation.external_force before the run"
-                )
-        if restart is not None:
+            tell_restart(restart, self.progress, place, model.external.functions)
             remove_modes(folder, model.comm)
         events = self._stages.events
         self._writer = open_result_file(case, model, plan, history, self.fields, events, folder, restart, start[0])

@@ -48,7 +48,7 @@ class Synchroniser:
         interval: float | None = None,
     ) -> None:
         self.comm, self.stop, self.interval = comm, stop, interval
-        self._analysis, self._lock = analysis, lock
+        self._analysis, self.lock = analysis, lock
         self.request = 0
         self.checkpoint_due = False
         self._last_checkpoint = time.monotonic()
@@ -83,7 +83,7 @@ class Synchroniser:
         fault, step = self._analysis.fault, self._analysis.stepper.number
         since = self._analysis.stepper.fault_step if fault is not None else step
         try:
-            self._lock.renew()
+            self.lock.renew()
         except SimulationFailure as lost:
             fault = fault or lost
         now = time.monotonic()

@@ -12,10 +12,10 @@ from ..solvers.linear import LinearChoice
 from ..stepping.solution import Solution
 from .bordered import BorderedSystem
 from .controls import ByArc, ByComponent, Control
-from .critical import EVENTS, Event, find_critical
+from .critical import EVENTS, Event
 from .free_motions import free_motions
-from .path_constraints import Along, Direction, Metric
-from .path_limits import end_at_limit
+from .path_constraints import Direction, Metric
+from .path_next import next_point
 from .path_rupture import settle_broken
 from .path_scheme import PathEquilibrium
 from .path_start import check_path, first_point
@@ -29,8 +29,6 @@ if TYPE_CHECKING:
 __all__ = ["PathStepper"]
 
 _FACTORS = 0.5, 1.5  # of the length from point to point
-_UNRESOLVED = 2.0**-6  # of the first length, down to which a step is halved if a critical point is not located
-_TURN = 0.5  # cosine between tangents of successive points, below which the step is halved if possible
 
 
 class PathStepper(StaticStepper):
@@ -164,7 +162,7 @@ class PathStepper(StaticStepper):
         while True:
             self.smallest = size
             try:
-                point, events, reached = self._next(size)
+                point, events, reached = next_point(self, size)
                 break
             except NotConverged as failure:
                 self._restore_bars()
@@ -209,80 +207,6 @@ class PathStepper(StaticStepper):
         else:
             self.keep(point)
         return moved
-
-    def _next(self, size: float) -> tuple[Point, list[Event], str]:
-        """Return the point at a length or at a limit before it, the critical points on the way, and the limit reached.
-
-        Raises
-        ------
-        NotConverged
-            On all ranks.
-        """
-        state = self.state
-        if self.turning:
-            mode = self.turning * self.mode
-            guess, load_factor = size * mode, state.time
-            point = self.points.find(Along(self.metric, mode, size), guess, load_factor)
-        else:
-            tangent = state.memory["tangent"]
-            length = self.control.advance(tangent, size)
-            guess, load_factor = length * tangent, state.time + length * self.slope
-            point = self.points.find(self.control.constraint(size), guess, load_factor)
-        self._suspect(point, guess)
-        if not self.turning:
-            self._refuse_turn(point, size)
-        point, reached = end_at_limit(self, point)
-        if self.turning or self.points.stability is None:
-            return point, [], reached
-        try:
-            events, turn = find_critical(self, point)
-        except NotConverged as failure:
-            # close to an imperfect bifurcation the point may lie on a path that does not pass through it
-            if size > _UNRESOLVED * self.arc and 0.5 * size >= self.keys.smallest:
-                raise
-            self.message(f"a critical point was not located: {failure}")
-            events, turn = [], None
-        if turn is not None:
-            point, reached = turn, ""
-        return point, events, reached
-
-    def _refuse_turn(self, point: Point, size: float) -> None:
-        """Refuse a tangent that has turned too far: it belongs to another path, or the step has cut a corner.
-
-        Raises
-        ------
-        NotConverged
-            On all ranks.
-        """
-        cosine = self.metric.product(point.tangent, point.slope, self.state.memory["tangent"], self.slope)
-        if cosine < _TURN and 0.5 * size >= self.keys.smallest:
-            raise NotConverged(
-                f"{self.points.place}: the path turns by {np.degrees(np.arccos(max(cosine, -1.0))):.3g} degrees"
-            )
-        if self.control.scale and cosine < 0.0:
-            raise NotConverged(
-                f"{self.points.place}: the displacement along static.direction turns back; static.method = "
-                '"arc_length" follows the path'
-            )
-
-    def _suspect(self, point: Point, guess: np.ndarray) -> None:
-        """Refuse a point that is unrelated to the last one.
-
-        Raises
-        ------
-        NotConverged
-            On all ranks.
-        """
-        if self.guard is None:
-            return
-        state, model = self.state, self.model
-        self._after[: model.mesh.n_owned] = state.position + point.u
-        model.mesh.update_ghosts(self._after)
-        forces = np.maximum(np.abs(self.system.external(point.load_factor)), np.abs(self.system.external(state.time)))
-        energy = 0.5 * float(((forces + np.abs(state.support)) * np.abs(point.u)).sum())
-        reason = self.guard.check(state.x, self._after, state.position + guess, energy)
-        if reason is not None:
-            raise NotConverged(f"{self.points.place}: {reason}; {self.remedy}")
 
     def _accept(self, point: Point, size: float) -> tuple[bool, str]:
         """Advance the state to a point; return whether bars broke there, and why the path ends if none carries the

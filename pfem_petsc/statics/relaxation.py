@@ -139,15 +139,14 @@ class RelaxationStepper(StaticStepper):
             return None
         x = balance.predictor + solution.u
         away = np.linalg.norm(x - motion.x[: len(x)], axis=1).max(initial=0.0)
-        self._after[: len(x)] = x
-        model.mesh.update_ghosts(self._after)
-        energy = model.bars.forces(self._after, np.empty_like(self._after), commit=False)
+        after = self.with_ghosts(x)
+        energy = model.bars.forces(after, np.empty_like(after), commit=False)
         here, size = motion.potential(motion.x[: len(x)], motion.energy)
         there, _ = motion.potential(x, energy)
         reached, collapsed = max(model.comm.allgather(float(away))), model.comm.allgather(energy.failed >= 0)
         failed = reached > _NEAR * model.length or there > here + _DOWN * size or sum(collapsed) > 0
         if not failed and self.minimum.refusal is None:
-            failed = self.minimum.falling(self._after, solution.walls, balance.time) > 0
+            failed = self.minimum.falling(after, solution.walls, balance.time) > 0
         if failed:
             state.contact, state.support, self.held = kept
             return None

@@ -6,6 +6,10 @@ from ..mechanics.compiled import kernel
 
 __all__ = ["add_up", "free_residual", "move_freely", "node_stiffness", "shortest_bars"]
 
+RESIDUAL, WEIGHTED, POWER, KINETIC, SUPPORTS, WALLS, BARS, FAILED, WIDTH = range(9)
+"""Sums over all nodes: squares of the residual [N2], the same over masses, power, twice the kinetic energy, squares of
+the forces of supports, of walls, of bars [N2], ranks that failed."""
+
 
 @kernel
 def free_residual(external, f, fixed, r):

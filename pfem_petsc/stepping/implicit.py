@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import atexit
 import gc
-from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -25,9 +24,9 @@ from ..solvers.newton import NewtonSolver, zero_tolerance
 from ..tolerances import ON_BOUND
 from .convergence import failure_message, residual_tolerance
 from .guard import StepGuard
+from .halving import HalvedSteps
 from .problem import StepProblem
 from .solution import Solution
-from .stepper import Stepper
 
 if TYPE_CHECKING:
     from ..integrators.base import Scheme
@@ -39,14 +38,12 @@ atexit.register(gc.collect)
 
 __all__ = ["ImplicitStepper"]
 
-_HALVINGS = 10  # most halvings of a step: to 1/1024
 
-
-class ImplicitStepper(Stepper):
+class ImplicitStepper(HalvedSteps):
     """Solves steps by Newton's method, or as a variational inequality if contact is possible."""
 
-    kept_numbers = (*Stepper.kept_numbers, "level", "lagged_count")
-    kept_arrays = (*Stepper.kept_arrays, "held", "lagged_place")
+    kept_numbers = (*HalvedSteps.kept_numbers, "lagged_count")
+    kept_arrays = (*HalvedSteps.kept_arrays, "held", "lagged_place")
     kept_bars = ("lagged_history",)
 
     def __init__(self, model: Model, scheme: Scheme, h: float, choice: LinearChoice) -> None:
@@ -56,8 +53,6 @@ class ImplicitStepper(Stepper):
         self._make_solvers()
         self.guard = StepGuard(model) if model.case.solver.guard else None
         self._after = np.zeros_like(self.state.x)
-        self.level = 0  # the next step is made in 2**level parts
-        self.message: Callable[[str], None] = lambda text: None
         self.held = np.zeros(model.mesh.n_owned, dtype=bool)  # nodes in contact with walls in the last step
         self.accuracy = 1.0  # of a solve, as a factor on the tolerance of steps; zero: to rounding
 
@@ -85,56 +80,16 @@ class ImplicitStepper(Stepper):
         self._mass: MassSolver | None = None
 
     def supports_changed(self) -> None:
-        """See :class:`Stepper`. Collective."""
+        """See :class:`~pfem_petsc.stepping.stepper.Stepper`. Collective."""
         super().supports_changed()
         self._free_solvers()
         self._make_solvers()
 
     def resume(self) -> None:
-        """See :class:`Stepper`. Collective."""
+        """See :class:`~pfem_petsc.stepping.stepper.Stepper`. Collective."""
         kept = self.lagged_count, self.lagged_place, self.lagged_history
         super().resume()
         self.lagged_count, self.lagged_place, self.lagged_history = kept
-
-    def step(self) -> None:
-        """Advance by one step; a part that does not converge is bisected, and parts grow again from step to step.
-
-        Raises
-        ------
-        NotConverged
-            On all ranks, if the smallest part does not converge.
-        """
-        state, ticks = self.state, 2**_HALVINGS
-        start, done = state.time, 0
-        end = (state.step + 1) * self.h
-        size = ticks >> self.level
-        self.smallest = self.h
-        while done < ticks:
-            self._set_part(self.h * (size / ticks))
-            try:
-                self._make_part(end if done + size == ticks else start + self.h * ((done + size) / ticks))
-            except NotConverged as failure:
-                if size == 1:
-                    raise NotConverged(f"{failure} (the step was bisected {_HALVINGS} times)") from failure
-                if self.model.bars_vary:
-                    # the failed solve has applied the temperatures and rest lengths of its end
-                    self.model.change_bars(self.state.time)
-                size //= 2
-                self.level += 1
-                self.message(f"{failure}; bisecting the step, to {self.h * size / ticks:.4g} s")
-                continue
-            done += size
-        self.level = max(self.level - 1, 0)
-        self.leave()
-        state.step += 1
-
-    def _set_part(self, part: float) -> None:
-        if part != self.part:
-            self.scheme.step_changed(self.state)
-            self.model.contact.motion.step_changed(self.scheme)
-            self.step_changed = True
-            self.part = part
-        self.smallest = min(self.smallest, part)
 
     def destroy(self) -> None:
         self._free_solvers()
@@ -206,17 +161,22 @@ class ImplicitStepper(Stepper):
             raise
         return solution
 
+    def with_ghosts(self, x: np.ndarray) -> np.ndarray:
+        """Return positions (owned, 3) with those of ghosts (local, 3), valid until the next call. Collective."""
+        self._after[: len(x)] = x
+        self.model.mesh.update_ghosts(self._after)
+        return self._after
+
     def _suspicion(self, balance: Balance, solution: Solution) -> str | None:
         """Return why the guard rejects a solution, None if it accepts it. Collective."""
         state, model = self.state, self.model
         owned, h = model.mesh.n_owned, balance.time - state.time
-        self._after[:owned] = balance.predictor + solution.u
-        model.mesh.update_ghosts(self._after)
-        move = self._after[:owned] - state.position
+        after = self.with_ghosts(balance.predictor + solution.u)
+        move = after[:owned] - state.position
         momentum = model.inertia.mass_times(state.v, np.empty_like(state.v))
         work = state.external + state.contact + state.support
         energy = 0.5 * float((momentum * state.v).sum()) + 0.5 * float(np.abs(work * move).sum())
-        return self.guard.check(state.x, self._after, state.position + self.scheme.expected_move(state, h), energy)
+        return self.guard.check(state.x, after, state.position + self.scheme.expected_move(state, h), energy)
 
     def _with_walls(self, balance: Balance) -> Solution:
         """Solve a balance together with the motion of walls with mass. Collective."""

@@ -9,7 +9,7 @@ of h^2/8 m a . a. So the numerical dissipation of steps 0 to n is
         - change of h^2/8 m a . a - works of contact in excess of its losses,
 
 the terms of :mod:`~pfem_petsc.stepping.ledger` in another order. The fused loop, which makes many steps in one call,
-computes the same sums in the same order. It applies where the scheme alone moves the nodes.
+computes the same sums in the same order. It applies where scheme and contact alone move the nodes.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _NOTHING = np.empty((0, 3))
 def make_ledger(stepper: Stepper) -> Ledger:
     """Return the ledger for the steps of a run or stage, after the start of the stepper. Collective."""
     leapfrog = stepper.scheme.leapfrog and stepper.steady and stepper.treatment is None
-    same = stepper.model.comm.allreduce(leapfrog and stepper.model.steady, op=MPI.LAND)
+    same = stepper.model.comm.allreduce(leapfrog and stepper.model.constant, op=MPI.LAND)
     return (LeapfrogLedger if same else Ledger)(stepper)
 
 
@@ -59,6 +59,9 @@ class LeapfrogLedger(Ledger):
         super().__init__(stepper)
         self._ends = np.zeros(len(WORKS))
         self._lanes, self._room = new_sums(), new_lanes()
+        self._complete = True
+        # bars that are removed after a step change the forces of its end
+        self._at_once = bool(stepper.model.case.remove)
 
     def update(self) -> None:
         """Add the last step."""
@@ -69,18 +72,25 @@ class LeapfrogLedger(Ledger):
             self._begin()
             self._sum_balance(self._before)
             return
-        before, present = self._before, moment_of(stepper)
-        self._before = present
-        kinetic = present.kinetic = self._sum_row(present)
-        powers = self.powers.copy()
-        self._sum_balance(present)
-        add_totals(self.sums, self._totals)
+        before, self._before = self._before, moment_of(stepper)
+        self._works[:] = self.powers
+        self._sum_balance(self._before)
         self.impulses.step(self._totals[3:])
-        self.impulses.fill(self.sums)
         impact, _ = self._dissipated(before)
         self.sums[_IMPACT] += impact
-        self.sums[_KINETIC] = kinetic
-        fill_works(self.sums, powers, self._ends, stepper.energy.total)
+        self._complete = False
+        if self._at_once:
+            self.complete()
+
+    def complete(self) -> None:
+        """Compute what only rows and checkpoints need of the last step."""
+        if self._complete:
+            return
+        present, self._complete = self._before, True
+        self.sums[_KINETIC] = present.kinetic = self._sum_row(present)
+        add_totals(self.sums, self._totals)
+        self.impulses.fill(self.sums)
+        fill_works(self.sums, self._works, self._ends, present.energy.total)
 
     def _sum_row(self, present: Moment) -> float:
         """Return the kinetic energy [J]; compute totals and the works of half a step."""
@@ -114,8 +124,14 @@ class LeapfrogLedger(Ledger):
         self.powers[INERTIAL] += self.stepper.energy.total - self._before.energy.total
         super().follow_removal()
 
+    def resume(self, kinetic: float) -> None:
+        """See :class:`~pfem_petsc.stepping.ledger.Ledger`."""
+        super().resume(kinetic)
+        self._complete = True
+
     def kept(self) -> dict[str, Any]:
         """Return this rank's share for a checkpoint: numbers that can be summed over ranks."""
+        self.complete()
         return super().kept() | ({"powers": self.powers.tolist()} if self.begun else {})
 
     def load_state(self, kept: dict[str, Any]) -> None:

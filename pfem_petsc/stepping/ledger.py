@@ -49,7 +49,7 @@ class Ledger:
     Attributes
     ----------
     sums : of a row, in the layout of :data:`~pfem_petsc.output.sums.HEAD`: works and dissipations since the start [J],
-        and totals of this rank's nodes at the present state
+        and totals of this rank's nodes at the present state; valid after :meth:`complete`
     impulses : Impulses
     impacts : Impacts
     begun : whether the works of the steps before are continued; false until the first step, and after a restart from a
@@ -120,6 +120,9 @@ class Ledger:
         add_works(self.sums, self._works, stored, heating, impact, friction, work, given, weight, lost, jumped)
         self.sums[_AT["prestress_work"]] += stressing
         self.sums[_AT["numerical_dissipation"]] += stressing
+
+    def complete(self) -> None:
+        """Complete :attr:`sums` for a row; nothing is left to do where each step does it."""
 
     def _damped(self) -> float:
         """Return the damping dissipation of the last step, C dx . dx / h [J]; never negative.

@@ -20,12 +20,14 @@ def load_of(stepper: Stepper, balance: Balance) -> np.ndarray:
     external = stepper.model.external
     if not external.active:
         return stepper.zero
-    total = np.zeros_like(stepper.state.v)
-    part = np.empty_like(total)
+    total: np.ndarray | None = None
     for weight, time in balance.loads:
         if external.state_forces:
             external.follow(*_expected(stepper, balance, time))
-        total += weight * external.at(time, part)
+        part = external.at(time, np.empty_like(stepper.state.v))
+        if weight != 1.0:
+            part *= weight
+        total = part if total is None else np.add(total, part, out=total)
     if external.failure is not None:
         _fail(stepper, stepper.when(balance))
     return total

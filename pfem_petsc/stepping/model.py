@@ -164,16 +164,15 @@ class Model:
             self.rest_lengths.apply(time)
 
     @property
+    def constant(self) -> bool:
+        """Whether supports, loads and bars are constant in time, bars of one section, and walls flat and at rest."""
+        changing = self.supports.moving or self.bars_vary or self.bars.springs is not None or self.inertia.varies
+        return not changing and len(self.bars.blocks) == 1 and self.external.steady and self.contact.steady
+
+    @property
     def steady(self) -> bool:
         """Whether the model is constant in time, and the fused loop supports its bars and contact."""
-        moving = (
-            self.supports.moving
-            or self.bars_vary
-            or bool(self.links)
-            or self.bars.springs is not None
-            or self.inertia.varies
-        )
-        return not moving and len(self.bars.blocks) == 1 and self.external.steady and self.contact.steady
+        return self.constant and not self.links
 
     def initial_velocity(self) -> np.ndarray:
         """Return initial velocities (owned, 3) [m/s]; later ``[initial]`` tables override earlier ones. Collective."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,6 +11,7 @@ from ..contact.initial_equilibrium import start_at_rest
 from ..errors import SimulationFailure
 from ..tolerances import BEYOND
 from .loading import load_now
+from .phases import solve_and_finish
 
 if TYPE_CHECKING:
     from .stepper import Stepper
@@ -38,9 +40,9 @@ def start_in_motion(stepper: Stepper) -> None:
     load = state.external - state.f[: model.mesh.n_owned]
     if model.inertia.damped:
         load -= model.inertia.damping_times(state.v, np.zeros_like(load))
-    state.a = stepper.initial_acceleration(load)
+    state.a = _acceleration(stepper, load)
     if model.can_touch and model.inertia.redistribution is None:
-        walls = start_at_rest(model, state, stepper.initial_acceleration, load)
+        walls = start_at_rest(model, state, partial(_acceleration, stepper), load)
         if walls is not None:
             held = model.links.count_held(walls.nodes[walls.touching.any(axis=1)], len(state.v))
             stepper.solution.walls, stepper.solution.contacts = walls, held
@@ -58,7 +60,7 @@ def start_in_motion(stepper: Stepper) -> None:
     motion.start(stepper.h)
     if stepper.scheme.solves_next_position:
         v, speeds = state.v, motion.speeds
-        stepper.solve_and_finish(stepper.state.time)
+        solve_and_finish(stepper, state.time)
         stepper.totals_solved = stepper.totals()
         stepper.velocity_solved = state.v
         # nodes on a wall have not lost their velocity yet; the scheme continues from its own memory
@@ -76,3 +78,15 @@ def start_at_zero(stepper: Stepper) -> None:
     stepper.evaluate(commit=True)
     if model.external.active:
         state.external = model.external.at(0.0, np.empty_like(state.v))
+
+
+def _acceleration(stepper: Stepper, load: np.ndarray) -> np.ndarray:
+    """Return the acceleration (owned, 3) with M a = load [N], prescribed values included. Collective."""
+    supports = stepper.model.supports
+    if not supports.moving:
+        return stepper.accelerate(load)
+    carried = np.zeros_like(load)
+    supports.put(carried, supports.rates(stepper.state.time, 0.0)[1])
+    a = stepper.accelerate(load - stepper.model.inertia.mass_times(carried, np.empty_like(load)))
+    supports.put(a, supports.get(carried))
+    return a

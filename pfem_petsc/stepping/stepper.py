@@ -14,8 +14,9 @@ from ..integrators.base import Balance, Scheme, State
 from ..mechanics.bars import StrainEnergy
 from ..tolerances import TIME
 from .collapse import tell_collapse
-from .loading import load_now, load_of
+from .loading import load_now
 from .massless import MasslessNodes
+from .phases import phases_of
 from .prescribed import PrescribedMotion
 from .removals import Removals
 from .ruptures import Ruptures
@@ -48,6 +49,7 @@ class Stepper(ABC):
     prescribed : PrescribedMotion of supports
     ruptures : Ruptures, which counts broken bars
     removals : Removals of bars and supports
+    carried : CarriedNodes, which supports may carry through rectangles
     support_changes : how often components have ceased or begun to be prescribed
     step_changed : whether the scheme was notified of another step size since the last booking
     totals_at_start, totals_solved : (3, 3) this rank's sums of support, external and damping force [N] at the start,
@@ -107,7 +109,7 @@ class Stepper(ABC):
         self.ruptures = Ruptures(self)
         self.removals = Removals(self)
         self.support_changes = 0
-        self._carried = CarriedNodes(model.contact)
+        self.carried = CarriedNodes(model.contact)
         self.totals_at_start: np.ndarray | None = None
         self.totals_solved: np.ndarray | None = None
         self.velocity_solved = self.zero
@@ -237,72 +239,8 @@ class Stepper(ABC):
 
     def _make_part(self, end: float) -> None:
         """Advance by ``part`` to the time ``end`` [s]."""
-        state, carried = self.state, self._carried
-        if self.model.bars_vary:
-            self.model.bars.keep_start()
-        places = carried.places(state.position, state.time) if carried.of else {}
-        if self.treatment is not None:
-            self.treatment.before()
-        if self.scheme.solves_next_position:
-            self.before[:] = self.state.x
-            self.scheme.advance(self.state, self.part)
-            self.prescribed.place(end)
-            self._arrive(end)
-            self.solve_and_finish(end)
-        else:
-            self.solve_and_finish(end)
-            if self.prescribed.moving:
-                self.prescribed.place(end)
-                self.prescribed.take_rates(end)
-            self._arrive(end)
-        if self.treatment is not None:
-            self.treatment.after()
-        self.booking()
-        if carried.of and self.fault is None:
-            where = self.at(state.step + 1, end)
-            crossing = carried.crossing(places, carried.places(state.position, end), where)
-            self.fault = SimulationFailure(crossing) if crossing else None
-
-    def _arrive(self, end: float) -> None:
-        if self.scheme.inertial:  # static steps are infinitely long for material laws
-            self.model.bars.step = self.part
-        self.state.time = end
-        if self.model.bars_vary:
-            self.model.change_bars(end)
-        self.evaluate(commit=True)
-
-    def solve_and_finish(self, end: float) -> None:
-        """Solve the balance of the part to a time [s] and update the state. Collective if the solve is."""
-        state = self.state
-        self.balance = self.scheme.balance(state, self.part)
-        if self.prescribed.moving:
-            self.prescribed.prescribe(self.balance)
-        self.model.inertia.change(sum(weight * time for weight, time in self.balance.loads))
-        self.model.contact.motion.begin(state.time, self.part)
-        state.external = load_of(self, self.balance)
-        if self.scheme.inertial:
-            self.model.bars.step = self.balance.time - state.time
-        self.solution = self.solve(self.balance)
-        fresh = self.model.contact.record(self.solution.walls, self.balance.time, self.part)
-        if not self.scheme.solves_next_position:
-            self.before[:] = state.x
-        self.scheme.finish(state, self.balance, self.solution.u, self.part)
-        if self.scheme.solves_next_position and self.prescribed.moving:
-            self.prescribed.take_rates(state.time)
-        self.model.contact.motion.finish(self.part, end)
-        if self.scheme.turns_held and self.treatment is None:
-            self.model.contact.calm(fresh, state.v, self.balance.time, self.part)
-
-    def initial_acceleration(self, load: np.ndarray) -> np.ndarray:
-        """Return the acceleration (owned, 3) with M a = load [N], prescribed values included. Collective."""
-        supports = self.model.supports
-        if not supports.moving:
-            return self.accelerate(load)
-        carried = np.zeros_like(load)
-        supports.put(carried, supports.rates(self.state.time, 0.0)[1])
-        a = self.accelerate(load - self.model.inertia.mass_times(carried, np.empty_like(load)))
-        supports.put(a, supports.get(carried))
-        return a
+        for phase in phases_of(self.scheme):
+            phase(self, end)
 
     def remarks(self) -> list[str]:
         """What users should know at the end of a run."""

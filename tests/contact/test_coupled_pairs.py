@@ -65,6 +65,7 @@ def crowded(walls, file, integrator="central_differences", **options):
     return case
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("supported", [False, True], ids=["free", "supported"])
 @pytest.mark.parametrize("name", WALLS)
 def test_every_step_is_optimal(name, supported, comm, shared_tmp_path):

@@ -71,25 +71,26 @@ CASES = {
 }
 
 
-class Stopped(Simulation):
-    """A run that is asked to stop after a step, as by a signal."""
+def request_stop(simulation, last):
+    """Let a run be asked to stop after a step, as by a signal."""
+    loop, advance = simulation._loop, simulation._loop.advance
 
-    last = -1
+    def advance_and_stop():
+        made = advance()
+        if made.step == last and loop.comm.rank == loop.comm.size - 1:
+            loop.stop._signal = 15
+        return made
 
-    def _advance(self):
-        result = super()._advance()
-        if result.step == self.last and self.comm.rank == self.comm.size - 1:
-            self._stop._signal = 15
-        return result
+    loop.advance = advance_and_stop
 
 
 def simulate(case, overrides, folder, comm, stop_after=None, **options):
     """Run, to the end or to a stop; gives the number of the last step."""
-    simulation = Stopped(Case.load(case, overrides), comm, output=folder, quiet=True, **options)
+    simulation = Simulation(Case.load(case, overrides), comm, output=folder, quiet=True, **options)
     if stop_after is None:
         assert simulation.run() == 0
     else:
-        simulation.last = stop_after
+        request_stop(simulation, stop_after)
         with pytest.raises(EarlyStop, match="SIGTERM"):
             simulation.run()
     return simulation.state.step

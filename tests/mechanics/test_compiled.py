@@ -221,6 +221,7 @@ print(*(energies(*PARAMETERS[name]) for name in sys.argv[1:]))
 """
 
 
+@pytest.mark.slow
 def test_machine_code_of_two_processes_does_not_mix_laws(tmp_path):
     """Each law is compiled by a process of its own, then a third one loads both."""
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}

@@ -182,6 +182,7 @@ def test_overstress_relaxes_in_a_static_stage(tmp_path):
     assert reaction[-1] == pytest.approx(static, rel=1e-2)  # a is larger by the plastic strain of the overstress
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 def test_softened_elastic_bar_keeps_its_energy_while_heated(comm, shared_tmp_path):
     """Heat supplies what softening and expansion take; nothing is lost, in steps of a tenth of a period."""
@@ -207,6 +208,7 @@ def test_heated_bar_with_a_rate_keeps_its_balance(tmp_path):
     assert abs(history["numerical_dissipation"]).max() < 1e-11 * start
 
 
+@pytest.mark.slow
 def test_restrained_bar_that_softens(tmp_path):
     """Held at both ends: the stress follows -E(T) alpha T until it yields at s_Y(T)."""
     for law, keys in (("elastic", {}), ("elastoplastic", {"yield_stress": 250e6})):

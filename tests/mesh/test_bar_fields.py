@@ -72,6 +72,7 @@ def test_field_is_a_section_for_each_bar(name, shared_tmp_path, comm):
         np.testing.assert_allclose(*(h[column] for h in histories), rtol=1e-9, atol=1e-9 * scale, err_msg=column)
 
 
+@pytest.mark.slow
 def test_fused_steps_are_single_steps(tmp_path):
     from mpi4py import MPI
 

@@ -172,6 +172,7 @@ def test_struts_across_a_gap_are_cut(tmp_path):
     assert faces[0] == faces[1] > 3  # a strut that passes the gap is divided into two
 
 
+@pytest.mark.slow
 def test_bracket_has_the_struts_inside_it():
     """The surface of the built-in case: its volume, and the struts that lie in the angle and not in a hole."""
     path = Path(cases.__file__).parent / "bracket.stl"

@@ -70,6 +70,7 @@ def test_a_reader_of_paraview_sees_a_step_a_mode(tmp_path):
     assert (vtk_to_numpy(data.GetArray("displacement")) == open_result(tmp_path).modes.shape[7]).all()
 
 
+@pytest.mark.slow
 def test_damage_is_found(tmp_path):
     run(block(), tmp_path)
     path = open_result(tmp_path).path
@@ -96,6 +97,7 @@ def test_buckling_has_no_frequency(tmp_path):
         _ = modes.frequency
 
 
+@pytest.mark.slow
 def test_restart_of_a_finished_run(tmp_path):
     """With its modes: nothing; with others: these alone, from the checkpoint at the end; to a later end: new ones."""
     tables = press(0.5) | {"output": {"checkpoint_every": 1}}
@@ -116,6 +118,7 @@ def test_restart_of_a_finished_run(tmp_path):
     run(arch_of(tmp_path, MPI.COMM_SELF, tables), out, restart=True)
 
 
+@pytest.mark.slow
 def test_restart_after_modes_were_not_reached(tmp_path, monkeypatch):
     """A run that ended between its last step and its modes gets them by a restart."""
     from pfem_petsc.run import outputs
@@ -135,6 +138,7 @@ def test_restart_after_modes_were_not_reached(tmp_path, monkeypatch):
     assert open_result(tmp_path / "out").n_modes == 1
 
 
+@pytest.mark.slow
 def test_a_request_to_stop_before_the_modes(tmp_path):
     """The wall time is over after the only step: a checkpoint, from which a restart computes the modes."""
     tables = press(0.5) | {"static": {"step": 1.0}}

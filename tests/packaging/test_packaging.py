@@ -51,6 +51,7 @@ def queue(tmp_path):
     return submit
 
 
+@pytest.mark.slow
 def test_a_job_that_is_stopped_is_queued_again_and_continues(queue, tmp_path):
     job = ("rod_impact", "out", "--set", "time.end=0.5")
     stopped, told = queue(*job, "--wall-time", "0.001")

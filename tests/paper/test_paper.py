@@ -87,6 +87,7 @@ def test_rod_with_lumped_mass(measures, scheme, end, peak, releases, rebound, en
     assert (-rod.whole_rebound, rod.energy) == pytest.approx((rebound, energy), abs=2e-3)
 
 
+@pytest.mark.slow
 def test_rod_with_consistent_mass(measures):
     """Independent values: excess 6.6 and 3.8, energy 0.973 (Wilson) and 0.957 (Houbolt)."""
     wilson, houbolt = (measures[LIKELY].rod[scheme] for scheme in ("wilson", "houbolt"))

@@ -5,9 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from helpers.balances import GRAVITY, SCHEMES, case, floor, unexplained
+from helpers.bodies import two_lattices
 from helpers.runs import run
 
+from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.energies import LOST, STORED, SUPPLIED
+from pfem_petsc.recording import history as recording
+from pfem_petsc.stepping.leapfrog_ledger import LeapfrogLedger
+from pfem_petsc.stepping.ledger import Ledger
 
 
 @pytest.mark.parametrize("integrator", SCHEMES)
@@ -181,3 +186,33 @@ def test_damping_of_backward_differences_only_takes(shared_tmp_path):
     history = run(table, shared_tmp_path)
     assert (np.diff(history["damping_dissipation"]) > 0.0).all()
     assert np.abs(history["energy_imbalance"]).max() < 1e-10 * history["kinetic_energy"][0]
+
+
+def test_both_ledgers_of_central_differences_agree_at_pairs(tmp_path, monkeypatch):
+    """Works as sums over balances and over steps, of bodies that collide; rows at some steps or at all."""
+    tables = two_lattices(
+        tmp_path / "mesh.vtu",
+        "central_differences",
+        gravity=(0.0, 0.0, -50.0),
+        load=[{"node_set": "second", "force": [-1.0, 0.0, 0.0]}],
+        wall=[{"name": "floor", "type": "plane", "point": [0.0, 0.0, -0.004], "normal": [0.0, 0.0, 1.0]}],
+    )
+    found = {}
+    for name, kind, every in (("leapfrog", LeapfrogLedger, 1), ("some rows", LeapfrogLedger, 10), ("steps", Ledger, 1)):
+        with monkeypatch.context() as patch:
+            if kind is Ledger:
+                patch.setattr(recording, "make_ledger", Ledger)
+            case = Case.from_dict(tables | {"output": {"fields_every": 0, "history_every": every}})
+            simulation = Simulation(case, output=tmp_path / name, quiet=True)
+            simulation.run()
+        assert type(simulation.outputs.history.ledger) is kind
+        history = open_result(tmp_path / name).history
+        found[name] = {column: history[column] for column in history}
+    one, some, other = found.values()
+    assert one["pair/faces/force"].any() and one["wall/floor/force"].any() and one["impact_dissipation"][-1] > 0.0
+    scale = one["kinetic_energy"].max()
+    for column in one:
+        if column.endswith(("energy", "work", "dissipation", "imbalance", "momentum", "impulse", "force")):
+            np.testing.assert_array_equal(one[column][::10], some[column], err_msg=column)
+        if column.endswith(("energy", "work", "dissipation", "imbalance")):
+            np.testing.assert_allclose(one[column], other[column], rtol=0, atol=1e-12 * scale, err_msg=column)

@@ -217,6 +217,7 @@ def test_balance_with_other_laws(law, tmp_path):
     assert open_result(tmp_path / "held").field("axial_force", -1) == pytest.approx([1500.0] * 2, rel=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 def test_restart_while_stressing_is_bitwise(shared_tmp_path, comm):
     """The table comes back to the value of its start, and the rest lengths are those of the checkpoint."""
@@ -232,6 +233,7 @@ def test_restart_while_stressing_is_bitwise(shared_tmp_path, comm):
         assert everywhere(comm, differences, *(folder / "result.vtkhdf" for folder in folders)) == {}
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 def test_stages_keep_what_is_stressed(shared_tmp_path, comm):
     """Stressed in the first stage, a bar stays so; let go in the second, it moves from there."""

@@ -110,6 +110,7 @@ def test_a_support_is_taken_away_in_equilibrium(method, comm, tmp_path):
     assert np.abs(history["energy_imbalance"]).max() < 1e-7 * history["external_work"][-1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["central_differences", "newmark"])
 @pytest.mark.parametrize("what", [{"bars": "leg"}, {"supports": "foot"}, {"supports": "foot", "duration": 0.0}])
 def test_restarts_are_bitwise_while_something_is_removed(what, scheme, comm, tmp_path):

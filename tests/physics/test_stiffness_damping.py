@@ -37,6 +37,7 @@ def rod(ratio, integrator, step, end, material=(), elements=1, ends=("start",), 
     return Case.from_dict(data | tables)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", [*EXPLICIT[:3], "newmark", "generalized_alpha", "energy_momentum"])
 @pytest.mark.parametrize("ratio", [0.02, 0.1])
 def test_damping_ratio(integrator, ratio, tmp_path):
@@ -140,6 +141,7 @@ def test_stable_step(integrator, ratio, tmp_path):
         Simulation(rod(ratio, integrator, 1.02 * critical, 1.0), output=tmp_path / "above", quiet=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 def test_restart_and_statics(shared_tmp_path, comm):
     """Bitwise; a static stage before has neither rate nor viscous stress."""

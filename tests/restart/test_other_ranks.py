@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from helpers.stopped import CASES, Stopped, everywhere, simulate
+from helpers.stopped import CASES, everywhere, request_stop, simulate
 from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation, open_result
@@ -59,8 +59,8 @@ def test_state_comes_back_to_the_last_bit_with_nodes_elsewhere(comm, shared_tmp_
     folder = shared_tmp_path / "lattice"
     before = {}
     if comm.rank == 0:
-        first = Stopped(Case.load(case, overrides), MPI.COMM_SELF, output=folder, quiet=True)
-        first.last = 60
+        first = Simulation(Case.load(case, overrides), MPI.COMM_SELF, output=folder, quiet=True)
+        request_stop(first, 60)
         with pytest.raises(EarlyStop):
             first.run()
         before = _by_number(first, MPI.COMM_SELF)
@@ -69,7 +69,7 @@ def test_state_comes_back_to_the_last_bit_with_nodes_elsewhere(comm, shared_tmp_
     again = Simulation(Case.load(case, overrides), comm, output=folder, quiet=True, restart=True)
     again.start()
     after = _by_number(again, comm)
-    again._finish("stopped")
+    again._loop.finish("stopped")
     assert before.keys() == after.keys()
     for name in before:
         assert before[name].tobytes() == after[name].tobytes(), name

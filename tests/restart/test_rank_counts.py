@@ -55,15 +55,15 @@ KILLED = """
 import os, signal, sys
 from mpi4py import MPI
 from pfem_petsc.cli.main import main
-from pfem_petsc.simulation import Simulation
-advance = Simulation._advance
+from pfem_petsc.run.loop import RunLoop
+advance = RunLoop.advance
 main([*sys.argv[1:], "-o", "whole"])
 
 def killed(self):
-    if self.state.step == 27 and MPI.COMM_WORLD.rank == MPI.COMM_WORLD.size - 1:
+    if self._stages.analysis.state.step == 27 and MPI.COMM_WORLD.rank == MPI.COMM_WORLD.size - 1:
         os.kill(os.getpid(), signal.SIGKILL)
     return advance(self)
-Simulation._advance = killed
+RunLoop.advance = killed
 main([*sys.argv[1:], "-o", "killed"])
 """
 

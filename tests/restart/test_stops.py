@@ -131,6 +131,7 @@ def signalled(line, ranks, folder, number, whom):
     return process.returncode, said
 
 
+@pytest.mark.slow
 def test_third_interrupt_ends_at_once(tmp_path):
     """Also where the others are not looked at any more: here in a step that never ends."""
     script = tmp_path / "stuck.py"

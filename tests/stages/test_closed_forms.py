@@ -54,6 +54,7 @@ def pull(force, **more):
     return {"node_set": "tip", "force": [force, 0.0, 0.0], **more}
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 def test_press_and_release_beyond_yield(run):
     """Pulled beyond yield, let go in equilibrium, and free to move: the plastic strain stays."""
@@ -73,6 +74,7 @@ def test_press_and_release_beyond_yield(run):
     np.testing.assert_allclose(history["plastic_dissipation"][4:], plastic * (limit + force) / 2.0, rtol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 def test_loads_stay_or_are_replaced(run):
     stages = [
@@ -95,6 +97,7 @@ def test_loads_stay_or_are_replaced(run):
     np.testing.assert_array_equal(history["load_factor"][[9, 12, -1]], [1.0, 1.0, 1.0])
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 def test_gravity_stays_and_a_bar_that_is_let_go_falls(run):
     weight, h = DENSITY * AREA * 10.0, 1e-4
@@ -113,6 +116,7 @@ def test_gravity_stays_and_a_bar_that_is_let_go_falls(run):
     np.testing.assert_allclose(history["momentum"][203:, 0], -weight * 200 * h, rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 def test_supports_hold_where_they_are_and_move_from_there(run):
     moved = {"node_set": "base", "fix": "x", "motion": [[0.0, 0.0, 0.0, 0.0], [1.0, 0.1, 0.0, 0.0]]}
@@ -131,6 +135,7 @@ def test_supports_hold_where_they_are_and_move_from_there(run):
     assert history["probe/tip/position"][-1, 0, 0] == pytest.approx(1.4, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_preload_flight_and_rest_on_a_floor(run):
     """Pressed between two walls, let go by one of them, and fallen back onto the other."""
     press, mass, stiffness = 0.01, 0.5, YOUNG * AREA
@@ -159,6 +164,7 @@ def test_preload_flight_and_rest_on_a_floor(run):
     assert history["kinetic_energy"][-1] < 1e-9
 
 
+@pytest.mark.slow
 def test_velocities_are_added_at_the_start_of_their_stage(run):
     kick = {"name": "kick", "time": FLY, "initial": {"velocity": [0.3, 0.0, 0.0]}}
     stages = [{"name": "flies", "time": FLY, "support": [LINE], "initial": {"velocity": [0.2, 0.0, 0.0]}}, kick]
@@ -182,6 +188,7 @@ def test_a_wall_that_nodes_are_beyond_when_its_stage_begins_is_refused(run):
         run(bar(stages))
 
 
+@pytest.mark.slow
 def test_temperatures_stay_and_change(run):
     stages = [
         {"name": "heat", "static": {"step": 0.5}, "temperature": [{"table": [[0.0, 0.0], [1.0, 100.0]]}]},

@@ -23,6 +23,7 @@ def run(data, comm, folder, stop_after=-1, **options):
         return simulation.stepper.number
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 def test_four_stages_on_one_state(comm, shared_tmp_path):
     run(BLOCK, comm, shared_tmp_path / "out")

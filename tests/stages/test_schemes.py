@@ -65,6 +65,7 @@ def drawn(seed):
     return Case.from_dict({**BLOCK, "support": HELD, "stage": stages}, name=f"drawn {seed}")
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("seed", range(6))
 def test_balances_of_stages_drawn_by_chance(seed, comm, shared_tmp_path):

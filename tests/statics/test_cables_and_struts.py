@@ -246,6 +246,7 @@ def test_prestress(law, comm, shared_tmp_path):
     assert fields["axial_force"] == pytest.approx([force, force], rel=1e-9)
 
 
+@pytest.mark.slow
 def test_each_strut_buckles_at_the_load_of_its_own_area_and_length(comm, shared_tmp_path):
     fields = {"a": np.array([1e-4, 3e-4])}
     points = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.5, 0.0, 0.0]]

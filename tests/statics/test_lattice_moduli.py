@@ -76,6 +76,7 @@ def modulus(folder, comm, points, base):
     return float(force) / base / SHORTENED / (DENSITY * YOUNG)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("block", "sizes", "expected"),
     [(along_cube_edge, (2, 3, 4, 5), 1.0 / 9.0), (along_space_diagonal, (2, 3, 4), 1.0 / 5.0)],

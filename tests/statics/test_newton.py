@@ -159,6 +159,7 @@ def test_a_wall_presses_a_truss(shared_tmp_path, comm):
     assert abs(history["energy_imbalance"]).max() < 1e-9 * history["elastic_energy"].max()
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 def test_a_restart_goes_on_to_the_last_bit(shared_tmp_path, comm):
     tables = {

@@ -127,6 +127,7 @@ def test_a_cascade(comm, tmp_path):
     assert history["broken_bars"][-1] == 3 and history["load_factor"][-1] == pytest.approx(0.0, abs=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 def test_restart_is_bitwise(comm, shared_tmp_path):
     """Before and after the break; on several ranks MUMPS repeats to rounding only."""
@@ -181,6 +182,7 @@ def test_removals_are_refused(comm, tmp_path):
         Simulation(case, comm, output=tmp_path / "out", quiet=True)
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("operator", ["assembled", "matrix_free"])
 @pytest.mark.parametrize("method", ["displacement", "arc_length"])

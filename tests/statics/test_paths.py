@@ -195,6 +195,7 @@ class TestDomeOf16:
         ]
         np.testing.assert_allclose(found, [(0.30961, 1), (0.32034, 2), (-0.32034, 2), (-0.30961, 1)], atol=1e-5)
 
+    @pytest.mark.slow
     @pytest.mark.parametrize(
         ("at", "mode", "limits"),
         [
@@ -250,6 +251,7 @@ class TestCoarseSteps:
         assert "bifurcation" in guarded["event/kind"]
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("branch", ["[]", "[2]"])
 def test_same_path_on_any_number_of_ranks(branch, tmp_path):
@@ -265,6 +267,7 @@ def test_same_path_on_any_number_of_ranks(branch, tmp_path):
     np.testing.assert_allclose(together["event/load_factor"], alone["event/load_factor"], rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_imperfect_column_is_followed_into_its_bend(tmp_path):
     """A lattice column with a hundred-thousandth of its load across: large steps do not stay on the straight column.
 

@@ -30,6 +30,7 @@ def test_straight_cable_hangs_as_the_chain_that_it_is(comm, shared_tmp_path, dam
     assert row["kinetic_energy"] == 0.0 and not row["momentum"].any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("heat", "sag"), [(0.0, 6.352161), (39.26, 8.192650)])
 def test_heavy_cable(comm, shared_tmp_path, heat, sag):
     """The elastic catenary, and code_aster's SSNL114: 6.352 m, and 8.195 m once the cable is 39.26 K warmer.
@@ -112,6 +113,7 @@ def test_a_free_mode_is_left_alone(comm, shared_tmp_path):
     assert np.linalg.norm(row["probe/ends/reaction"][0]) == pytest.approx(tension[0], rel=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sides", [3, 4, 5])
 def test_tensegrity_prism_turns_to_its_angle(comm, shared_tmp_path, sides):
     """90 degrees and 180/sides from the foot of a strut to its head (Connelly & Back 1998), 150 for three struts."""
@@ -133,6 +135,7 @@ def potential(points, rest, bars, stiffness, weights):
     return (0.5 * stiffness * (lengths - rest) ** 2 / rest).sum() + weights @ points[:, 2]
 
 
+@pytest.mark.slow
 def test_hanging_net_is_a_minimum_of_its_potential(comm, shared_tmp_path):
     """Corners bear a quarter of the weight each, and no small displacement of a node lowers the potential."""
     case = Case.load("hanging_net", ["mesh.cells=[4, 4]"])
@@ -154,6 +157,7 @@ def test_hanging_net_is_a_minimum_of_its_potential(comm, shared_tmp_path):
             assert potential(moved, rest, bars, 1e5, weights) > least
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("newton", [True, False])
 def test_a_net_lies_down_on_a_floor(comm, shared_tmp_path, newton):
     """The floor and the corners bear the weight; nodes are on the floor or above it."""
@@ -172,6 +176,7 @@ def test_a_net_lies_down_on_a_floor(comm, shared_tmp_path, newton):
     assert np.abs(floor[:2]).max() < 1e-9
 
 
+@pytest.mark.slow
 def test_chain_that_rests_on_a_floor(comm, shared_tmp_path):
     """A mooring line, anchor and part of it on the floor, beside pycatenary 1.0.0 (scripts/peers/run_pycatenary.py).
 
@@ -203,6 +208,7 @@ def test_chain_that_rests_on_a_floor(comm, shared_tmp_path):
     assert fairlead[:2] / np.hypot(*fairlead[:2]) == pytest.approx(top[:2] / np.hypot(*top[:2]), abs=1e-6)
 
 
+@pytest.mark.slow
 def test_a_shallow_truss_snaps_through(comm, shared_tmp_path):
     """Beyond its limit load the crown goes to where bars pull: the equilibrium of the closed form below."""
     stiffness, rest, push = 1e5, np.hypot(1.0, 0.2), 600.0
@@ -245,6 +251,7 @@ def column(folder, comm, bend, **static):
     )
 
 
+@pytest.mark.slow
 def test_a_column_that_is_hardly_bent_buckles(comm, shared_tmp_path):
     """It passes the unstable equilibrium, where Newton's method would stay, with a small residual; its top falls
     through, as the load that it bears decreases, and it hangs."""
@@ -256,6 +263,7 @@ def test_a_column_that_is_hardly_bent_buckles(comm, shared_tmp_path):
     assert results[0][1][2] == pytest.approx([0.0, 0.0, -2.012], abs=1e-4)
 
 
+@pytest.mark.slow
 def test_an_unstable_equilibrium_is_told(comm, shared_tmp_path, capsys):
     case = chain(
         shared_tmp_path,
@@ -270,6 +278,7 @@ def test_an_unstable_equilibrium_is_told(comm, shared_tmp_path, capsys):
     assert "load factor 1: the equilibrium is unstable, with 2 negative eigenvalues" in told
 
 
+@pytest.mark.slow
 def test_bars_that_yield_remember_equilibria_alone(comm, shared_tmp_path):
     """Two bars pushed and let go: what Newton's method gives, although the pseudo-motion swings beyond."""
     histories = []

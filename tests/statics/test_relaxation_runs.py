@@ -20,6 +20,7 @@ INCREMENTS = [
 FLOOR = "wall=[{name='floor', type='plane', point=[0.0, 0.0, -2.3], normal=[0.0, 0.0, 1.0]}]"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("newton", [True, False])
 def test_restart_between_increments_is_bitwise(comm, shared_tmp_path, newton):
     keys = [FLOOR, "material.rope.young_modulus=1e7", f"static.newton={str(newton).lower()}"]

@@ -176,6 +176,7 @@ def test_a_block_that_friction_alone_holds_sticks(shared_tmp_path, comm):
     assert abs(history["energy_imbalance"]).max() < 1e-10 * history["elastic_energy"][-1]
 
 
+@pytest.mark.slow
 def test_a_block_that_slips_has_no_equilibrium(shared_tmp_path, comm):
     """It is refused beyond mu N and told why; a viscous force carries it on, against friction of mu N."""
     push = 2.0 * FRICTION * WEIGHT
@@ -192,6 +193,7 @@ def test_a_block_that_slips_has_no_equilibrium(shared_tmp_path, comm):
     np.testing.assert_allclose(force[:, 0], -FRICTION * force[:, 2], rtol=0.01)
 
 
+@pytest.mark.slow
 def test_a_block_between_a_plate_and_a_rough_floor(shared_tmp_path, comm):
     """Pressed, moved aside and back: nodes begin to slip one after the other, until mu N acts against the way."""
     motion = [[0.0, 0.0, 0.0, 0.0], [0.2, 0.0, 0.0, -1e-3], [0.7, 4e-3, 0.0, -1e-3], [1.0, 1e-3, 0.0, -1e-3]]
@@ -209,6 +211,7 @@ def test_a_block_between_a_plate_and_a_rough_floor(shared_tmp_path, comm):
     assert abs(history["energy_imbalance"]).max() < 1e-10 * history["elastic_energy"].max()
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 def test_a_restart_amid_slip_goes_on_to_the_last_bit(shared_tmp_path, comm):
     tables = {"output": {"fields_every": 0, "checkpoint_every": 7, "probe": [{"name": "all", "node_set": "all"}]}}

@@ -47,6 +47,7 @@ def last_of(simulation):
     return [step.row for step in simulation][-1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step", [0.1, 1.0, 10.0])
 def test_a_dome_is_not_turned_inside_out(step, comm, shared_tmp_path):
     """Its own weight moves the apex by 0.16 mm; one large step turns it inside out otherwise."""
@@ -63,12 +64,14 @@ def test_a_dome_is_not_turned_inside_out(step, comm, shared_tmp_path):
     assert any("energy without a source" in text or "too far from the previous state" in text for text in told)
 
 
+@pytest.mark.slow
 def test_without_the_guard_the_dome_turns(comm, shared_tmp_path):
     """What the guard is for: no message, and a state far from the exact one."""
     row = last_of(dome(comm, shared_tmp_path, 10.0, 10.0, guard=False))
     assert row["probe/apex/position"][0, 2] < 0.0
 
 
+@pytest.mark.slow
 def test_a_step_that_is_refused_leaves_the_state_as_it_was(comm, shared_tmp_path, monkeypatch):
     """Halved to the end: status 3 with reason and way out, and nothing of the state has changed."""
     simulation = dome(comm, shared_tmp_path, 0.01, 1.0)

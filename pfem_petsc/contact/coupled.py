@@ -72,7 +72,8 @@ class CoupledPairs:
         self._gather_groups()
 
     def _lowest(self, which: np.ndarray) -> int | None:
-        lowest = self.pairs.mesh.comm.allreduce(int(self.numbers[which].min(initial=2**62)), op=MPI.MIN)
+        own = self.numbers[which]
+        lowest = self.pairs.mesh.comm.allreduce(int(own.min()) if len(own) else 2**62, op=MPI.MIN)
         return lowest if lowest < 2**62 else None
 
     def _gather_groups(self) -> None:

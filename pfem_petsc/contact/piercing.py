@@ -107,7 +107,7 @@ class Piercing:
         else:
             across = distances(starts, ends, wall.centre, getattr(wall, "axis", None)) < (1.0 - DEEP) * wall.radius
         ids = mesh.bar_ids[mesh.counted][rows[across]]
-        return len(ids), int(ids.min(initial=np.iinfo(np.int64).max))
+        return len(ids), int(ids.min()) if len(ids) else int(np.iinfo(np.int64).max)
 
     def summary(self) -> list[str]:
         """Return messages for the end of the run."""

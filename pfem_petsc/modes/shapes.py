@@ -95,7 +95,7 @@ class Basis:
         largest = self._comm.allreduce(float(sizes.max(initial=0.0)), op=MPI.MAX)
         near = np.flatnonzero(sizes >= (1.0 - _TIE) * largest)
         none = np.iinfo(np.int64).max
-        first = int(self._places[near].min(initial=none))
+        first = int(self._places[near].min()) if len(near) else none
         winner = self._comm.allreduce(first, op=MPI.MIN)
         if first != winner or not len(near):
             return -1

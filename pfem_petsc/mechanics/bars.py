@@ -11,7 +11,6 @@ from ..energies import BAR_ENERGIES
 from ..fields import STATUS
 from .bar_blocks import BarBlock, laws_of, make_blocks
 from .bar_geometry import bar_lengths, first_inverted
-from .planes import new_planes
 
 if TYPE_CHECKING:
     from ..case.schema import Case
@@ -61,7 +60,6 @@ class Bars:
         analyses
     internal : name and unit of the internal variables of all laws of the case
     kept_names : names of all data that laws keep from step to step, the same on all ranks
-    planes : workspace for positions and forces by components, see :mod:`~pfem_petsc.mechanics.planes`
     blocks : bars by section
     springs : from nodes to the ground, whose forces and stiffness are added to those of the bars; None without
     """
@@ -80,8 +78,6 @@ class Bars:
         self.step = 0.0
         self.internal = internal_variables(case.material)
         self.blocks = make_blocks(mesh, case, self.mesh_lengths)
-        by_planes = any(block.sweep.diagonal.any() for block in self.blocks)
-        self.planes = new_planes(len(mesh.points) if by_planes else 0)
         laws = laws_of(case).values()
         self.can_break = any(law.rupture >= 0 for law in laws)
         self._watched = np.empty(len(mesh.bars) if self.can_break else 0)
@@ -130,7 +126,7 @@ class Bars:
             law = (block.parameters, block.area, self.step, block.history)
             part = np.zeros(len(BAR_ENERGIES))
             at, short, broke = block.kernels.forces(
-                x, *self.planes, block.sweep, self.far, self.rest, self.heat, *law, commit, f, part
+                x, block.sweep, self.far, self.rest, self.heat, *law, commit, f, part
             )
             energies += part
             shortened |= short

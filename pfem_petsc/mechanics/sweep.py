@@ -15,14 +15,8 @@ import numpy as np
 from ..mesh.ordering import LEAST_RUN, NODE_BLOCK
 from .compiled import kernel
 from .rows import CHUNK
-from .strips import LANES
 
-__all__ = ["OWN_CHUNK", "Sweep", "make_sweep"]
-
-OWN_CHUNK = 64
-"""This many bars of one offset are a chunk of their own."""
-
-_WIDEST_GAP = 16  # nodes between runs; a new run costs about as much as the evaluation of as many bars
+__all__ = ["Sweep", "make_sweep"]
 
 
 class Sweep(NamedTuple):
@@ -33,11 +27,8 @@ class Sweep(NamedTuple):
     ----------
     heads : (runs,) uint32, lower end of the first bar of each run
     fars : (runs,) uint32, its upper end
-    starts : (runs + 1,) uint32, first bar of each run, and the end; columns in a
-        :class:`~pfem_petsc.mechanics.padding.Padding`
-    lanes : (runs,) uint32, place of the first bar of each run among the sums of its chunk: that of a padded chunk
+    starts : (runs + 1,) uint32, first bar of each run, and the end
     chunks : (chunks + 1,) uint32, first run of each chunk, and the end
-    bars : (chunks,) uint32, first bar of each chunk
     diagonal : (chunks,) bool, whether the runs of a chunk are diagonal, else stars
     counted : number of leading chunks whose bars are counted on this rank
     parts : (parts + 1,) int64, first chunk of each part, and the end: the counted bars by their lower ends, part k with
@@ -47,9 +38,7 @@ class Sweep(NamedTuple):
     heads: np.ndarray
     fars: np.ndarray
     starts: np.ndarray
-    lanes: np.ndarray
     chunks: np.ndarray
-    bars: np.ndarray
     diagonal: np.ndarray
     counted: int
     parts: np.ndarray
@@ -58,8 +47,7 @@ class Sweep(NamedTuple):
 def make_sweep(bars: np.ndarray, start: int, counted: int, stop: int, chunk: int = CHUNK) -> Sweep:
     """Make the sweep over ``bars`` (b, 2) [start, stop), of which [start, counted) are counted.
 
-    Chunks end after ``chunk`` bars, at ``counted``, where the lower end passes to another block of nodes, and before
-    and after many bars of one offset.
+    Chunks end after ``chunk`` bars, at ``counted``, and where the lower end passes to another block of nodes.
     """
     firsts = np.empty(_cut(bars, start, counted, stop, chunk, np.empty(0, dtype=np.uint32)) + 1, dtype=np.uint32)
     _cut(bars, start, counted, stop, chunk, firsts)
@@ -68,14 +56,13 @@ def make_sweep(bars: np.ndarray, start: int, counted: int, stop: int, chunk: int
     chunks = np.empty(len(firsts), dtype=np.uint32)
     none = np.empty(0, dtype=np.uint32)
     runs = _find_runs(bars, firsts, diagonal, chunks, none, none, none)
-    heads, fars, starts, lanes = (np.empty(n, dtype=np.uint32) for n in (runs, runs, runs + 1, runs))
+    heads, fars, starts = (np.empty(n, dtype=np.uint32) for n in (runs, runs, runs + 1))
     _find_runs(bars, firsts, diagonal, chunks, heads, fars, starts)
     starts[runs] = stop
-    _place_runs(heads, fars, starts, chunks, diagonal, chunk, lanes)
     chunks_counted = int(np.searchsorted(firsts[:-1], counted))
     lower = bars[firsts[:chunks_counted]].min(axis=1) // NODE_BLOCK
-    parts = np.searchsorted(lower, np.arange((int(lower[-1]) if len(lower) else -1) + 2)).astype(np.int64)
-    return Sweep(heads, fars, starts, lanes, chunks, firsts[:-1], diagonal, chunks_counted, parts)
+    parts = np.searchsorted(lower, np.arange((int(lower[-1]) if len(lower) else -1) + 2))
+    return Sweep(heads, fars, starts, chunks, diagonal, chunks_counted, parts.astype(np.int64))
 
 
 @kernel
@@ -83,26 +70,10 @@ def _cut(bars, start, counted, stop, chunk, firsts):
     """Return the number of chunks; write their first bars unless ``firsts`` is empty."""
     count = 0
     first = start
-    ended = start  # of the bars of one offset
-    many = False
     block = -1
     for k in range(start, stop):
         here = min(bars[k, 0], bars[k, 1]) // NODE_BLOCK
-        fresh = False
-        if k == ended:
-            fresh = many
-            offset = abs(bars[k, 1] - bars[k, 0])
-            ended += 1
-            while (
-                ended < stop
-                and ended != counted
-                and abs(bars[ended, 1] - bars[ended, 0]) == offset
-                and min(bars[ended, 0], bars[ended, 1]) // NODE_BLOCK == here
-            ):
-                ended += 1
-            many = ended - k >= OWN_CHUNK
-            fresh = fresh or many
-        if fresh or k in (start, counted) or here != block or k - first == chunk:
+        if k in (start, counted) or here != block or k - first == chunk:
             if len(firsts) > 0:
                 firsts[count] = k
             count += 1
@@ -136,37 +107,6 @@ def _find_runs(bars, firsts, diagonal, chunks, heads, fars, starts):
             count += 1
     chunks[len(firsts) - 1] = count
     return count
-
-
-@kernel
-def _place_runs(heads, fars, starts, chunks, diagonal, chunk, lanes):
-    """Write the place of each run in its chunk, after gaps of as many places as nodes where these are few.
-
-    If all runs follow each other so, places begin at a node whose number is a multiple of :data:`LANES`.
-    """
-    for c in range(len(diagonal)):
-        origin = np.int64(starts[chunks[c]])
-        bars = np.int64(starts[chunks[c + 1]]) - origin
-        single = diagonal[c] and bars >= OWN_CHUNK
-        shift = np.int64(0)
-        for run in range(chunks[c], chunks[c + 1]):
-            if diagonal[c] and run > chunks[c]:
-                count = np.int64(starts[run]) - np.int64(starts[run - 1])
-                gap = np.int64(heads[run]) - np.int64(heads[run - 1]) - count
-                alike = gap == np.int64(fars[run]) - np.int64(fars[run - 1]) - count
-                if alike and 0 < gap <= _WIDEST_GAP:
-                    shift += gap
-                else:
-                    single = False
-            lanes[run] = np.int64(starts[run]) - origin + shift
-        lead = np.int64(heads[chunks[c]]) % LANES if single else 0
-        if bars + shift + lead > chunk:
-            shift = 0
-            for run in range(chunks[c], chunks[c + 1]):
-                lanes[run] = np.int64(starts[run]) - origin
-        elif lead > 0:
-            for run in range(chunks[c], chunks[c + 1]):
-                lanes[run] = np.int64(lanes[run]) + lead
 
 
 @kernel

@@ -12,14 +12,11 @@ __all__ = ["BarArrays", "ImpulseArrays", "NodeArrays", "ProbeArrays", "StateArra
 
 
 class BarArrays(NamedTuple):
-    """Arguments of the bar loop of a law by columns of a :class:`~pfem_petsc.mechanics.padding.Padding`, except
-    ``ends``, ``far`` and ``watched``; see :mod:`~pfem_petsc.mechanics.kernels`. ``slack``: row of the history with the
-    variable of this name, or -1; ``counted``: columns of the history that belong to counted bars; ``reach``: how many
-    blocks of nodes beyond its own the bars of a block reach."""
+    """Arguments of the bar loop of a law; see :mod:`~pfem_petsc.mechanics.kernels`. ``slack``: row of the history with
+    the variable of this name, or -1; ``counted``: columns of the history that belong to counted bars; ``reach``: how
+    many blocks of nodes beyond its own the bars of a block reach."""
 
     ends: np.ndarray
-    planes: np.ndarray
-    pulls: np.ndarray
     sweep: Sweep
     far: np.ndarray
     rest: np.ndarray

@@ -20,7 +20,7 @@ from ..contact.log import compare_contacts
 from ..integrators._leapfrog import centre
 from ..mechanics.bar_geometry import first_inverted
 from ..mechanics.compiled import inlined, kernel
-from ..mechanics.planes import slide_planes
+from ..mechanics.rows import CHUNK
 from ..mesh.ordering import NODE_BLOCK
 from ..output.sums import HEAD
 from .balance_loops import (
@@ -34,7 +34,7 @@ from .balance_loops import (
     sum_balance,
 )
 from .book_loops import WORKS, new_lanes
-from .fused_blocks import advance_block, finish_block, join_block, move_block, solve_block, split_block
+from .fused_blocks import advance_block, finish_block, move_block, solve_block
 from .fused_rows import complete, fill_row, push_particles, stop_at_walls
 from .ghost_loops import trade_positions
 from .sum_loops import fill_walls
@@ -51,12 +51,12 @@ def make_fused_loop(
     forces: Callable,
     sum_energies: Callable,
     clear_energies: Callable,
-    new_work: Callable,
+    work_rows: int,
 ) -> Callable:
     """Return the fused loop for a law and strain measure.
 
-    ``forces`` is the bar loop over a part of a sweep, with the functions for its energies and its workspace, see
-    :func:`~pfem_petsc.mechanics.kernels.make_kernels`.
+    ``forces`` is the bar loop over a part of a sweep, with the functions for its energies and the number of its working
+    arrays, see :func:`~pfem_petsc.mechanics.kernels.make_kernels`.
 
     Its arguments are the maximum number of steps; the step [s]; positions, positions of the previous step, which are
     computed for the last step alone, and velocities at half steps (n, 3); arrays of bars, nodes, walls, probes,
@@ -74,11 +74,10 @@ def make_fused_loop(
     """
 
     @inlined
-    def pull(x, bars, base, begun, ended, h, tally, f, work):
+    def pull(x, bars, begun, ended, h, f, work):
         """Add the forces of some chunks of bars."""
         law = (bars.parameters, bars.area, h, bars.history)
-        planes = (bars.planes, bars.pulls, base)
-        return forces(x, *planes, bars.sweep, begun, ended, bars.far, bars.rest, bars.heat, *law, True, tally, f, work)
+        return forces(x, bars.sweep, begun, ended, bars.far, bars.rest, bars.heat, *law, True, f, work)
 
     @kernel
     def fused_loop(
@@ -121,7 +120,7 @@ def make_fused_loop(
         speeds, drag = np.empty(3 * NODE_BLOCK), np.empty(3 * NODE_BLOCK if damped else 0)
         ends, totals, lanes, room = np.empty(len(WORKS)), np.zeros((6, 3)), new_sums(), new_lanes()
         row_lanes, after = new_sums(), np.empty(len(WORKS))
-        work = new_work()
+        work = np.empty(work_rows * CHUNK)
         push_u = np.empty(impulses.v.shape)
         near = np.empty(0, dtype=np.int64)
         stuck_offsets = np.empty((0, n_walls))
@@ -130,7 +129,6 @@ def make_fused_loop(
         touching, places = np.empty((0, n_walls), dtype=np.bool_), np.empty((0, 3))
         pressed = touched  # nodes with entries in the array of wall forces
         n_blocks = (n + NODE_BLOCK - 1) // NODE_BLOCK
-        room_for = len(bars.planes) // 3
         failed = -1
         turned = -1
         infeasible = -1
@@ -153,24 +151,17 @@ def make_fused_loop(
             shortened, changed = False, 0
             changes = 0
             moved = 0
-            base = 0  # first node of the planes
             if several:
                 while moved < n_blocks:
-                    move_block(moved, n, x, h, half, f, bars.planes, bars.pulls, base)
+                    move_block(moved, n, x, h, half, f)
                     moved += 1
                 for i in range(n, len(x)):
                     f[i, 0] = f[i, 1] = f[i, 2] = 0.0
                 lost = trade_positions(messages, x, before, True)
                 if lost != 0:
                     break
-                split_block(n, len(x), x, bars.planes, bars.pulls, base)
-                failed, shortened, changed = pull(
-                    x, bars, base, bars.sweep.counted, len(bars.sweep.diagonal), h, False, f, work
-                )
-            # nothing reads the energies of other steps: a failure ends the run
-            tally = due[step] or step == count - 1 or bars.can_break
-            if tally:
-                clear_energies(work)
+                failed, shortened, changed = pull(x, bars, bars.sweep.counted, len(bars.sweep.diagonal), h, f, work)
+            clear_energies(work)
             # Blocks of nodes pass once through the cache: each moves shortly before its first bar, and is finished
             # after its last one, which belongs to its own block or to one before. Walls take all nodes in between.
             for stage in range(2):
@@ -199,20 +190,15 @@ def make_fused_loop(
                 for block in range(n_blocks):
                     if stage == 0:
                         while moved < min(block + 1 + bars.reach, n_blocks):
-                            if room_for < NODE_BLOCK * (moved + 1) - base and len(bars.planes) > 0:
-                                slide_planes(bars.planes, NODE_BLOCK * block - base, NODE_BLOCK * (moved - block))
-                                slide_planes(bars.pulls, NODE_BLOCK * block - base, NODE_BLOCK * (moved - block))
-                                base = NODE_BLOCK * block
-                            move_block(moved, n, x, h, half, f, bars.planes, bars.pulls, base)
+                            move_block(moved, n, x, h, half, f)
                             moved += 1
                         if block < len(bars.sweep.parts) - 1:
                             at, short, broke = pull(
-                                x, bars, base, bars.sweep.parts[block], bars.sweep.parts[block + 1], h, tally, f, work
+                                x, bars, bars.sweep.parts[block], bars.sweep.parts[block + 1], h, f, work
                             )
                             failed = at if failed < 0 else failed
                             shortened = shortened or short
                             changed += broke
-                        join_block(block, n, bars.pulls, base, f)
                         if not kept:
                             advance_block(
                                 block,
@@ -277,10 +263,9 @@ def make_fused_loop(
                     turned = first_inverted(x, before, bars.ends, bars.watched)
                 wrong = wrong or turned >= 0
             if due[step] or wrong or step == count - 1:
-                for k in range(len(energies) if tally else 0):
+                for k in range(len(energies)):
                     energies[k] = 0.0
-                if tally:
-                    sum_energies(work, energies)
+                sum_energies(work, energies)
                 kinetic = fill_row(
                     x,
                     h,

@@ -148,7 +148,7 @@ def fill_row(
     if bars.slack >= 0:
         slack = 0.0
         for k in range(bars.counted):
-            slack += bars.history[bars.slack, k] if bars.rest[k] > 0.0 else 0.0
+            slack += bars.history[bars.slack, k]
         row[_SLACK] = slack
     at = _HEAD
     force, moment, contacts, releases = wall_sums

@@ -11,8 +11,6 @@ from ..contact.forces import WallForces
 from ..energies import ENERGIES
 from ..errors import SimulationFailure
 from ..mechanics.bars import StrainEnergy
-from ..mechanics.padding import NO_BAR, Padding
-from ..mechanics.planes import new_planes
 from ..mesh.ordering import NODE_BLOCK
 from ..output.sums import HEAD, WALL
 from ..tolerances import PROJECTED
@@ -37,7 +35,6 @@ WORTH = 1000
 """Minimum number of steps of a run for which the fused loop is compiled, which takes some seconds once."""
 
 _BROKEN, _ALARM = HEAD.first("broken_bars"), HEAD.first("alarm")
-_WINDOW = 4  # times the blocks of nodes that bars of one block belong to
 _FEWEST = 8  # minimum number of steps for one call
 
 
@@ -58,33 +55,13 @@ class Batch:
             block.kernels.sweep_part,
             block.kernels.sum_energies,
             block.kernels.clear_energies,
-            block.kernels.new_work,
+            block.kernels.work_rows,
         )
         bars = model.bars
-        columns = self._columns = Padding(block.sweep)
-        self._kept = block.history
-        self._history = columns.spread(block.history)
-        reach = self._reach()
-        planes, pulls = bars.planes
-        if model.comm.size == 1 and len(planes):  # a window of the nodes, which stays in the cache
-            blocks = min(_WINDOW * (reach + 1), -(-len(bars.mesh.points) // NODE_BLOCK))
-            planes, pulls = new_planes(blocks * NODE_BLOCK)
+        law = (bars.far, bars.rest, bars.watched, bars.heat, block.parameters, block.area, block.history)
+        counted = block.counted - block.start
         self._bars = BarArrays(
-            ends=bars.ends,
-            planes=planes,
-            pulls=pulls,
-            sweep=columns.sweep,
-            far=bars.far,
-            rest=columns.spread(bars.rest, NO_BAR),
-            watched=bars.watched,
-            heat=columns.spread(bars.heat),
-            parameters=block.parameters,
-            area=columns.spread(block.area) if isinstance(block.area, np.ndarray) else block.area,
-            history=self._history,
-            slack=block.law.slack_row,
-            counted=columns.counted,
-            reach=reach,
-            can_break=bars.can_break,
+            bars.ends, block.sweep, *law, block.law.slack_row, counted, self._reach(), bars.can_break
         )
         supports, inertia, contact = model.supports, model.inertia, model.contact
         nothing = np.empty((0, 3))
@@ -150,7 +127,6 @@ class Batch:
         pushed = ledger.impulses.state
         impulses = ImpulseArrays(pushed.memory["half_velocity"], pushed.a, pushed.v)
         ledger.sums[_BROKEN] = stepper.ruptures.count
-        self._columns.renew(self._kept, self._history)
         done, lost, changed, failed, turned, infeasible, offsets, kinetic, u, touched, log.last, met = self._fused_loop(
             len(due),
             stepper.h,
@@ -173,8 +149,6 @@ class Batch:
         )
         if lost:
             raise MPI.Exception(lost)
-        self._columns.collect(self._history, self._kept)
-        failed = self._columns.bar(failed) if failed >= 0 else failed
         state.support = support if self.model.supports.any else stepper.zero
         state.contact = contact if len(touched[3]) else stepper.zero
         stepper.energy = StrainEnergy(tuple(energies.tolist()), failed)

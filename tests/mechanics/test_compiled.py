@@ -126,7 +126,7 @@ def test_machine_code_is_never_older_than_what_a_loop_inlines(tmp_path, monkeypa
 def test_code_that_a_class_generates_is_part_of_the_digest(monkeypatch):
     before = code_digest(make_kernels(elastic.LAW, engineering).forces.py_func)
     assert before == code_digest(make_kernels(elastic.LAW, engineering).forces.py_func)
-    monkeypatch.setattr(strips.Strip, "store_nodes", lambda self, vectors, pointer, node: None)
+    monkeypatch.setattr(strips._Strip, "store_nodes", lambda self, vectors, pointer, node: None)
     assert code_digest(make_kernels(elastic.LAW, engineering).forces.py_func) != before
 
 
@@ -163,7 +163,7 @@ def test_every_process_finds_the_fused_loop_of_another():
         "from pfem_petsc.mechanics.strain import engineering\n"
         "from pfem_petsc.stepping.fused_loop import make_fused_loop\n"
         "kernels = make_kernels(LAW, engineering)\n"
-        "parts = kernels.sweep_part, kernels.sum_energies, kernels.clear_energies, kernels.new_work\n"
+        "parts = kernels.sweep_part, kernels.sum_energies, kernels.clear_energies, kernels.work_rows\n"
         "loop = make_fused_loop(*parts)\n"
         "print(loop._cache._index_key((), loop.targetctx.codegen()), loop._cache._cache_file._source_stamp)"
     )
@@ -185,7 +185,7 @@ def test_loops_of_all_laws_have_names_of_their_own():
                 kernels = make_kernels(variant, measure)
                 names.append(_variant(kernels.forces.py_func))
                 fused = make_fused_loop(
-                    kernels.sweep_part, kernels.sum_energies, kernels.clear_energies, kernels.new_work
+                    kernels.sweep_part, kernels.sum_energies, kernels.clear_energies, kernels.work_rows
                 )
                 longest = fused._cache._cache_file._data_path("x")
                 assert len(Path(longest).name) < 220
@@ -204,7 +204,6 @@ import sys
 import numpy as np
 from pfem_petsc.mechanics.kernels import make_kernels
 from pfem_petsc.mechanics.materials import elastic, elastoplastic
-from pfem_petsc.mechanics.planes import new_planes
 from pfem_petsc.mechanics.strain import engineering
 from pfem_petsc.mechanics.sweep import make_sweep
 
@@ -213,7 +212,7 @@ def energies(law, p):
     x, far = np.array([[0.0, 0, 0], [1.5, 0, 0]]), np.array([1], dtype=np.uint32)
     sums = np.zeros(16)
     given = (np.ones(1), np.empty((2, 0)), p, 1.0, 0.0, np.zeros((len(law.rows), 1)), True, np.zeros((2, 3)), sums)
-    make_kernels(law, engineering).forces(x, *new_planes(0), make_sweep(bars, 0, 1, 1), far, *given)
+    make_kernels(law, engineering).forces(x, make_sweep(bars, 0, 1, 1), far, *given)
     return float(sums.sum())
 
 PARAMETERS = {"elastic": (elastic.LAW, (2.0,)), "elastoplastic": (elastoplastic.LAW, (2.0, 0.5, 0.0, 0.0, 0.5))}
@@ -253,7 +252,7 @@ def test_functions_of_one_name_have_the_same_code():
     for law in (elastic.LAW, elastoplastic.LAW, softened(elastic.LAW), softened(elastoplastic.LAW)):
         for measure in MEASURES.values():
             kernels = make_kernels(law, measure)
-            parts = kernels.sweep_part, kernels.sum_energies, kernels.clear_energies, kernels.new_work
+            parts = kernels.sweep_part, kernels.sum_energies, kernels.clear_energies, kernels.work_rows
             loops = [value for value in vars(kernels).values() if not isinstance(value, int)]
             for loop in (*loops, make_fused_loop(*parts)):
                 closures(loop, found)

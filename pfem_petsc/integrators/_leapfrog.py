@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from ..mechanics.compiled import kernel
 
-__all__ = ["advance", "advance_loaded", "centre", "drift", "kick"]
+__all__ = ["advance", "advance_loaded", "centre", "drift", "kick", "move"]
 
 
 @kernel
@@ -16,6 +16,13 @@ def drift(x, h, half, moved):
     """Compute ``moved`` = x + h half."""
     for i in range(len(half)):
         moved[i] = x[i] + h * half[i]
+
+
+@kernel
+def move(x, h, half):
+    """Add h half to ``x``: :func:`drift` in place, which needs a loop of its own to be vectorised."""
+    for i in range(len(half)):
+        x[i] += h * half[i]
 
 
 @kernel

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from functools import cache
 from types import SimpleNamespace
 
+from .column_kernels import make_column_kernels
 from .field_kernels import make_field_kernels
 from .force_kernels import make_force_kernels
 from .materials.base import Law
@@ -31,5 +32,8 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
     array is passed to an inner function: reference counting would cost more than the bar.
     """
     return SimpleNamespace(
-        **make_force_kernels(law, measure), **make_tangent_kernels(law, measure), **make_field_kernels(law, measure)
+        **make_force_kernels(law, measure),
+        **make_column_kernels(law, measure),
+        **make_tangent_kernels(law, measure),
+        **make_field_kernels(law, measure),
     )

@@ -12,16 +12,16 @@ from llvmlite import ir
 from numba.core import types
 from numba.extending import intrinsic
 
-from .strips import _LANES, _NUMBERS, _add_to_both, _Arguments, _places, _separate, _Strip
+from .strips import LANES, NUMBERS, Arguments, Strip, add_to_both, chosen, separate
 
 __all__ = ["add_stiffness_diagonals", "add_stiffness_products"]
 
 
 def _spread(builder: Any, values: Any) -> list[Any]:
     """Return numbers of eight nodes for each of their components: a a a b b b ..."""
-    nothing = ir.Constant(_NUMBERS, ir.Undefined)
-    places = [[(_LANES * part + j) // 3 for j in range(_LANES)] for part in range(3)]
-    return [builder.shuffle_vector(values, nothing, _places(*some)) for some in places]
+    nothing = ir.Constant(NUMBERS, ir.Undefined)
+    places = [[(LANES * part + j) // 3 for j in range(LANES)] for part in range(3)]
+    return [builder.shuffle_vector(values, nothing, chosen(*some)) for some in places]
 
 
 @intrinsic
@@ -31,24 +31,24 @@ def add_stiffness_products(typingctx, x, u, out, low, high, count, along, across
     ``first`` on."""
 
     def generate(context, builder, signature, values):  # noqa: ANN001, ANN202
-        given = _Arguments(context, builder, signature, values)
+        given = Arguments(context, builder, signature, values)
         low, high, first = given.index(3), given.index(4), given.index(8)
         ends = [[given.numbers(k, node, 3) for node in (low, high)] for k in range(3)]
         factors = [given.numbers(k, first) for k in (6, 7)]
 
-        def difference(of: list[Any], at: Any, strip: _Strip) -> list[Any]:
+        def difference(of: list[Any], at: Any, strip: Strip) -> list[Any]:
             one, other = (strip.load_nodes(end, at) for end in of)
             return [builder.fsub(b, a) for a, b in zip(one, other, strict=True)]
 
-        def pull(at: Any, strip: _Strip) -> list[Any]:
+        def pull(at: Any, strip: Strip) -> list[Any]:
             d, w = difference(ends[0], at, strip), difference(ends[1], at, strip)
-            px, py, pz = _separate(builder, [builder.fmul(a, b) for a, b in zip(d, w, strict=True)])
+            px, py, pz = separate(builder, [builder.fmul(a, b) for a, b in zip(d, w, strict=True)])
             c, g = (strip.load(factor, at) for factor in factors)
             c = builder.fmul(c, builder.fadd(builder.fadd(px, py), pz))
             parts = zip(_spread(builder, c), d, _spread(builder, g), w, strict=True)
             return [builder.fadd(builder.fmul(a, b), builder.fmul(e, f)) for a, b, e, f in parts]
 
-        _add_to_both(builder, ends[2], builder.sub(high, low), given.index(5), pull)
+        add_to_both(builder, ends[2], builder.sub(high, low), given.index(5), pull)
         return context.get_dummy_value()
 
     return types.void(x, u, out, low, high, count, along, across, first), generate
@@ -60,19 +60,19 @@ def add_stiffness_diagonals(typingctx, x, minus, plus, low, high, count, along, 
     subtract them from those of ``minus`` (n, 3) from ``low`` on; see :func:`add_stiffness_products`."""
 
     def generate(context, builder, signature, values):  # noqa: ANN001, ANN202
-        given = _Arguments(context, builder, signature, values)
+        given = Arguments(context, builder, signature, values)
         low, high, first = given.index(3), given.index(4), given.index(8)
         strips = [given.numbers(0, node, 3) for node in (low, high)]
         ends = [given.numbers(1, low, 3), given.numbers(2, high, 3)]
         factors = [given.numbers(k, first) for k in (6, 7)]
 
-        def pull(at: Any, strip: _Strip) -> list[Any]:
+        def pull(at: Any, strip: Strip) -> list[Any]:
             one, other = (strip.load_nodes(end, at) for end in strips)
             d = [builder.fsub(b, a) for a, b in zip(one, other, strict=True)]
             c, g = (_spread(builder, strip.load(factor, at)) for factor in factors)
             return [builder.fadd(builder.fmul(b, builder.fmul(a, a)), e) for a, b, e in zip(d, c, g, strict=True)]
 
-        _add_to_both(builder, ends, builder.sub(high, low), given.index(5), pull)
+        add_to_both(builder, ends, builder.sub(high, low), given.index(5), pull)
         return context.get_dummy_value()
 
     return types.void(x, minus, plus, low, high, count, along, across, first), generate

@@ -9,10 +9,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+import numpy as np
 from llvmlite import ir
 from numba.core import cgutils, types
 from numba.core.imputils import impl_ret_borrowed
 from numba.extending import intrinsic
+
+from .compiled import inlined
 
 __all__ = [
     "CHUNK",
@@ -22,7 +25,10 @@ __all__ = [
     "differ",
     "extend",
     "keep_where",
+    "known_ends",
+    "new_rows",
     "put",
+    "put_apart",
     "sum_where",
     "sum_with",
     "take",
@@ -30,6 +36,20 @@ __all__ = [
 
 CHUNK = 512
 """Bars whose working arrays fit into the fastest cache."""
+
+
+@inlined
+def new_rows(count):
+    """Return ``count`` rows of :data:`CHUNK` numbers in one array, aligned to lines of the cache; not initialised."""
+    room = np.empty(count * CHUNK + 8)
+    return room[-(room.ctypes.data // 8) % 8 :]
+
+
+def known_ends(builder: Any) -> Any:
+    """Return the metadata of loads of the ends of bars, and of stores that do not overlap with them: without it
+    compilers would have to compare all places before each loop."""
+    module = builder.module
+    return module.add_metadata([module.add_metadata(["pfem_petsc: ends of bars", module.add_metadata(["pfem_petsc"])])])
 
 
 def _places(context: Any, builder: Any, signature: Any, args: Any, first: int, column: int, count: int) -> list[Any]:
@@ -118,6 +138,23 @@ def accumulate(typingctx, rows, first, column, factor, values):  # noqa: ANN001,
         for j, place in enumerate(_places(context, builder, signature, args, 1, 2, count)):
             more = builder.fmul(args[3], builder.extract_value(args[4], j))
             builder.store(builder.fadd(builder.load(place), more), place)
+        return context.get_dummy_value()
+
+    return types.void(rows, first, column, factor, values), generate
+
+
+@intrinsic
+def put_apart(typingctx, rows, first, column, factor, values):  # noqa: ANN001, ANN201
+    """Write ``factor`` times a tuple to ``rows[first, column]`` and the following rows, which do not overlap with what
+    the functions of :mod:`~pfem_petsc.mechanics.planes` load."""
+    count = len(values)
+
+    def generate(context, builder, signature, args):  # noqa: ANN001, ANN202
+        known = known_ends(builder)
+        for j, place in enumerate(_places(context, builder, signature, args, 1, 2, count)):
+            builder.store(builder.fmul(args[3], builder.extract_value(args[4], j)), place).set_metadata(
+                "noalias", known
+            )
         return context.get_dummy_value()
 
     return types.void(rows, first, column, factor, values), generate

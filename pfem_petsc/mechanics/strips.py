@@ -15,29 +15,48 @@ from llvmlite import ir
 from numba.core import cgutils, types
 from numba.extending import intrinsic
 
-__all__ = ["add_strips", "differences"]
+from .rows import CHUNK
 
-_LANES = 8
+__all__ = [
+    "APART",
+    "LANES",
+    "NUMBERS",
+    "Arguments",
+    "Strip",
+    "add_strips",
+    "add_to_both",
+    "chosen",
+    "differences",
+    "for_strips",
+    "separate",
+    "weave",
+]
+
+LANES = 8
+"""Numbers of a vector."""
+
 _INT, _SHORT = ir.IntType(64), ir.IntType(32)
-_NUMBERS = ir.VectorType(ir.DoubleType(), _LANES)
-_INTS = ir.VectorType(_INT, _LANES)
-_MASK = ir.VectorType(ir.IntType(1), _LANES)
-_POINTER = _NUMBERS.as_pointer()
-_ZEROS = ir.Constant(_NUMBERS, [0.0] * _LANES)
+NUMBERS = ir.VectorType(ir.DoubleType(), LANES)
+_INTS = ir.VectorType(_INT, LANES)
+_MASK = ir.VectorType(ir.IntType(1), LANES)
+_POINTER = NUMBERS.as_pointer()
+_ZEROS = ir.Constant(NUMBERS, [0.0] * LANES)
 _ALIGNED = ir.Constant(_SHORT, 8)  # bytes: the arrays are aligned to numbers, not to vectors
+_LONG = 8 * LANES  # run for which a beginning apart pays
 # below this distance of the ends [nodes] the vectors of both overlap
-_APART = 2 * _LANES
+APART = 2 * LANES
 
 
 def _number(value: int) -> ir.Constant:
     return ir.Constant(_INT, value)
 
 
-def _places(*values: int) -> ir.Constant:
-    return ir.Constant(ir.VectorType(_SHORT, _LANES), list(values))
+def chosen(*values: int) -> ir.Constant:
+    """Return the mask of a shuffle: the places of the numbers it takes."""
+    return ir.Constant(ir.VectorType(_SHORT, LANES), list(values))
 
 
-class _Strip:
+class Strip:
     """Loads and stores of eight numbers, or of the first ``left`` ones."""
 
     def __init__(self, builder: Any, left: Any = None) -> None:
@@ -50,8 +69,8 @@ class _Strip:
         """Return the mask of numbers ``first``, ``first`` + 1, ... that are below ``limit``."""
         builder, undefined = self.builder, ir.Constant(_INTS, ir.Undefined)
         one = builder.insert_element(undefined, limit, ir.Constant(_SHORT, 0))
-        every = builder.shuffle_vector(one, undefined, _places(*[0] * _LANES))
-        return builder.icmp_signed("<", ir.Constant(_INTS, [_number(first + j) for j in range(_LANES)]), every)
+        every = builder.shuffle_vector(one, undefined, chosen(*[0] * LANES))
+        return builder.icmp_signed("<", ir.Constant(_INTS, [_number(first + j) for j in range(LANES)]), every)
 
     def _masked(self, name: str, result: Any, *arguments: Any) -> Any:
         kind = ir.FunctionType(result, [argument.type for argument in arguments])
@@ -60,21 +79,21 @@ class _Strip:
 
     def load(self, pointer: Any, index: Any, width: int = 1, part: int = 0) -> Any:
         """Return eight numbers from ``index``, the vector ``part`` of those with ``width`` numbers for each node."""
-        at = self._at(pointer, self.builder.add(index, _number(_LANES * part)))
+        at = self._at(pointer, self.builder.add(index, _number(LANES * part)))
         if self.left is None:
             loaded = self.builder.load(at)
             loaded.align = 8
             return loaded
-        mask = self._mask(self.builder.mul(self.left, _number(width)), _LANES * part)
-        return self._masked("load", _NUMBERS, at, _ALIGNED, mask, _ZEROS)
+        mask = self._mask(self.builder.mul(self.left, _number(width)), LANES * part)
+        return self._masked("load", NUMBERS, at, _ALIGNED, mask, _ZEROS)
 
     def store(self, values: Any, pointer: Any, index: Any, width: int = 1, part: int = 0) -> None:
         """Store eight numbers, see :meth:`load`."""
-        at = self._at(pointer, self.builder.add(index, _number(_LANES * part)))
+        at = self._at(pointer, self.builder.add(index, _number(LANES * part)))
         if self.left is None:
             self.builder.store(values, at).align = 8
             return
-        mask = self._mask(self.builder.mul(self.left, _number(width)), _LANES * part)
+        mask = self._mask(self.builder.mul(self.left, _number(width)), LANES * part)
         self._masked("store", ir.VoidType(), values, at, _ALIGNED, mask)
 
     def load_nodes(self, pointer: Any, node: Any) -> list[Any]:
@@ -89,41 +108,52 @@ class _Strip:
             self.store(vectors[part], pointer, index, 3, part)
 
 
-def _separate(builder: Any, woven: list[Any]) -> list[Any]:
+def separate(builder: Any, woven: list[Any]) -> list[Any]:
     """Return the components of eight nodes: x x x ..., y y y ..., z z z ..."""
     found = []
     for c in range(3):
-        places = [3 * i + c for i in range(_LANES)]
-        both = [at if at < 2 * _LANES else 0 for at in places]
-        rest = [i if at < 2 * _LANES else at - _LANES for i, at in enumerate(places)]
-        first = builder.shuffle_vector(woven[0], woven[1], _places(*both))
-        found.append(builder.shuffle_vector(first, woven[2], _places(*rest)))
+        places = [3 * i + c for i in range(LANES)]
+        both = [at if at < 2 * LANES else 0 for at in places]
+        rest = [i if at < 2 * LANES else at - LANES for i, at in enumerate(places)]
+        first = builder.shuffle_vector(woven[0], woven[1], chosen(*both))
+        found.append(builder.shuffle_vector(first, woven[2], chosen(*rest)))
     return found
 
 
-def _weave(builder: Any, components: list[Any]) -> list[Any]:
-    """Return the reverse of :func:`_separate`."""
+def weave(builder: Any, components: list[Any]) -> list[Any]:
+    """Return the reverse of :func:`separate`."""
     woven = []
     for part in range(3):
-        places = [divmod(_LANES * part + j, 3) for j in range(_LANES)]
-        both = [node if c == 0 else _LANES + node if c == 1 else 0 for node, c in places]
-        rest = [_LANES + node if c == 2 else j for j, (node, c) in enumerate(places)]
-        first = builder.shuffle_vector(components[0], components[1], _places(*both))
-        woven.append(builder.shuffle_vector(first, components[2], _places(*rest)))
+        places = [divmod(LANES * part + j, 3) for j in range(LANES)]
+        both = [node if c == 0 else LANES + node if c == 1 else 0 for node, c in places]
+        rest = [LANES + node if c == 2 else j for j, (node, c) in enumerate(places)]
+        first = builder.shuffle_vector(components[0], components[1], chosen(*both))
+        woven.append(builder.shuffle_vector(first, components[2], chosen(*rest)))
     return woven
 
 
-def _for_strips(builder: Any, count: Any, body: Callable[[Any, _Strip], None]) -> None:
-    """Generate a loop over ``count`` bars, eight at a time; ``body`` gets the first one of each."""
-    whole = builder.and_(count, _number(-_LANES))
-    with cgutils.for_range_slice(builder, _number(0), whole, _number(_LANES), _INT) as (at, _):
-        body(at, _Strip(builder))
+def for_strips(builder: Any, count: Any, body: Callable[[Any, Strip], None], stored: Any = None) -> None:
+    """Generate a loop over ``count`` bars, eight at a time; ``body`` gets the first one of each.
+
+    If ``count`` is large, the loop begins with fewer, so that it then stores at multiples of the vectors' size, from
+    the pointer ``stored`` on.
+    """
+    begin = _number(0)
+    if stored is not None:
+        address = builder.lshr(builder.ptrtoint(stored, _INT), _number(3))
+        ahead = builder.and_(builder.neg(address), _number(LANES - 1))
+        begin = builder.select(builder.icmp_signed(">=", count, _number(_LONG)), ahead, begin)
+        with builder.if_then(builder.icmp_signed(">", begin, _number(0))):
+            body(_number(0), Strip(builder, begin))
+    whole = builder.add(begin, builder.and_(builder.sub(count, begin), _number(-LANES)))
+    with cgutils.for_range_slice(builder, begin, whole, _number(LANES), _INT) as (at, _):
+        body(at, Strip(builder))
     left = builder.sub(count, whole)
     with builder.if_then(builder.icmp_signed(">", left, _number(0))):
-        body(whole, _Strip(builder, left))
+        body(whole, Strip(builder, left))
 
 
-class _Arguments:
+class Arguments:
     """The arguments of an intrinsic."""
 
     def __init__(self, context: Any, builder: Any, signature: Any, values: Any) -> None:
@@ -138,48 +168,56 @@ class _Arguments:
         data = self.context.make_array(self.types[k])(self.context, self.builder, self.values[k]).data
         return self.builder.gep(data, [self.builder.mul(first, _number(width))])
 
+    def plane(self, k: int, node: Any, stride: Any, component: int) -> Any:
+        """Return a pointer to a component of a node in array k (3 stride,), which holds all x, then all y, all z."""
+        return self.numbers(k, self.builder.add(node, self.builder.mul(stride, _number(component))))
+
+    def row(self, k: int, column: Any, number: int) -> Any:
+        """Return a pointer into a row of array k, whose rows have :data:`~pfem_petsc.mechanics.rows.CHUNK` numbers."""
+        return self.numbers(k, self.builder.add(column, _number(number * CHUNK)))
+
 
 @intrinsic
 def differences(typingctx, x, low, high, count, dx, dy, dz, first):  # noqa: ANN001, ANN201 - Numba's types
     """Write x[high + i] - x[low + i] for ``count`` nodes of ``x`` (n, 3) to ``dx``, ``dy``, ``dz`` from ``first``."""
 
     def generate(context, builder, signature, values):  # noqa: ANN001, ANN202
-        given = _Arguments(context, builder, signature, values)
+        given = Arguments(context, builder, signature, values)
         ends = [given.numbers(0, given.index(k), 3) for k in (1, 2)]
         rows = [given.numbers(k, given.index(7)) for k in (4, 5, 6)]
 
-        def body(at: Any, strip: _Strip) -> None:
+        def body(at: Any, strip: Strip) -> None:
             one, other = (strip.load_nodes(end, at) for end in ends)
             for row, values in zip(
-                rows, _separate(builder, [builder.fsub(b, a) for a, b in zip(one, other, strict=True)]), strict=True
+                rows, separate(builder, [builder.fsub(b, a) for a, b in zip(one, other, strict=True)]), strict=True
             ):
                 strip.store(values, row, at)
 
-        _for_strips(builder, given.index(3), body)
+        for_strips(builder, given.index(3), body)
         return context.get_dummy_value()
 
     return types.void(x, low, high, count, dx, dy, dz, first), generate
 
 
-def _add_to_both(builder: Any, ends: list[Any], distance: Any, count: Any, pull: Callable[[Any, _Strip], Any]) -> None:
+def add_to_both(builder: Any, ends: list[Any], distance: Any, count: Any, pull: Callable[[Any, Strip], Any]) -> None:
     """Generate the subtraction of what ``pull`` returns from the nodes of a strip, and the addition to the other."""
 
-    def add(strip: _Strip, at: Any, which: int, pulls: list[Any]) -> None:
+    def add(strip: Strip, at: Any, which: int, pulls: list[Any]) -> None:
         combine = builder.fadd if which else builder.fsub
         old = strip.load_nodes(ends[which], at)
         strip.store_nodes([combine(a, b) for a, b in zip(old, pulls, strict=True)], ends[which], at)
 
-    def both(at: Any, strip: _Strip) -> None:
+    def both(at: Any, strip: Strip) -> None:
         pulls = pull(at, strip)
         add(strip, at, 0, pulls)
         add(strip, at, 1, pulls)
 
-    with builder.if_else(builder.icmp_signed(">=", distance, _number(_APART))) as (apart, close):
+    with builder.if_else(builder.icmp_signed(">=", distance, _number(APART))) as (apart, close):
         with apart:
-            _for_strips(builder, count, both)
+            for_strips(builder, count, both)
         with close:  # a load of what has just been stored at another place would have to wait
             for which in range(2):
-                _for_strips(builder, count, lambda at, strip, which=which: add(strip, at, which, pull(at, strip)))
+                for_strips(builder, count, lambda at, strip, which=which: add(strip, at, which, pull(at, strip)))
 
 
 @intrinsic
@@ -188,16 +226,16 @@ def add_strips(typingctx, f, low, high, count, dx, dy, dz, c, first):  # noqa: A
     add it to those from ``high`` on."""
 
     def generate(context, builder, signature, values):  # noqa: ANN001, ANN202
-        given = _Arguments(context, builder, signature, values)
+        given = Arguments(context, builder, signature, values)
         low, high, first = given.index(1), given.index(2), given.index(8)
         rows = [given.numbers(k, first) for k in (4, 5, 6, 7)]
 
-        def pull(at: Any, strip: _Strip) -> list[Any]:
+        def pull(at: Any, strip: Strip) -> list[Any]:
             *components, factor = (strip.load(row, at) for row in rows)
-            return _weave(builder, [builder.fmul(factor, component) for component in components])
+            return weave(builder, [builder.fmul(factor, component) for component in components])
 
         ends = [given.numbers(0, node, 3) for node in (low, high)]
-        _add_to_both(builder, ends, builder.sub(high, low), given.index(3), pull)
+        add_to_both(builder, ends, builder.sub(high, low), given.index(3), pull)
         return context.get_dummy_value()
 
     return types.void(f, low, high, count, dx, dy, dz, c, first), generate

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..mechanics.columns import Columns
 from ..mechanics.sweep import Sweep
 
 __all__ = ["BarArrays", "ImpulseArrays", "NodeArrays", "ProbeArrays", "StateArrays", "WallArrays"]
@@ -14,7 +15,8 @@ __all__ = ["BarArrays", "ImpulseArrays", "NodeArrays", "ProbeArrays", "StateArra
 class BarArrays(NamedTuple):
     """Arguments of the bar loop of a law; see :mod:`~pfem_petsc.mechanics.kernels`. ``slack``: row of the history with
     the variable of this name, or -1; ``counted``: columns of the history that belong to counted bars; ``reach``: how
-    many blocks of nodes beyond its own the bars of a block reach."""
+    many blocks of nodes beyond its own the bars of a block reach; ``columns`` of the bars, or none; ``planes`` and
+    ``pulls`` (3 stride,): positions and forces by components, of a window of the nodes."""
 
     ends: np.ndarray
     sweep: Sweep
@@ -29,6 +31,9 @@ class BarArrays(NamedTuple):
     counted: int
     reach: int
     can_break: bool
+    columns: Columns
+    planes: np.ndarray
+    pulls: np.ndarray
 
 
 class NodeArrays(NamedTuple):

@@ -9,25 +9,49 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..integrators._leapfrog import advance, advance_loaded, centre, drift, kick
+from ..integrators._leapfrog import advance, advance_loaded, centre, drift, kick, move
 from ..mechanics.compiled import kernel
+from ..mechanics.planes import join_planes, split_planes
 from ..mesh.ordering import NODE_BLOCK
 from .balance_loops import INTERNAL, REACTIONS, add_drags, add_loads, add_powers, add_sparse_forces
 from .book_loops import spread
 from .node_loops import explicit_increments, hold, hold_still, react
 
-__all__ = ["advance_block", "finish_block", "move_block", "solve_block"]
+__all__ = ["advance_block", "finish_block", "join_block", "move_block", "solve_block", "split_block"]
 
 
 @kernel
-def move_block(block, n, x, h, half, f):
-    """Move the nodes of a block, and set their forces to zero."""
+def move_block(block, n, x, h, half, f, light, planes, pulls, base):
+    """Move the nodes of a block, and set their forces to zero; in ``light`` steps those of :func:`split_block`."""
     first = NODE_BLOCK * block
     last = min(first + NODE_BLOCK, n)
-    where, sums = x[first:last].reshape(-1), f[first:last].reshape(-1)
-    drift(where, h, half[first:last].reshape(-1), where)
+    where = x[first:last].reshape(-1)
+    move(where, h, half[first:last].reshape(-1))
+    if light:
+        split_block(first, last, x, planes, pulls, base)
+        return
+    sums = f[first:last].reshape(-1)
     for j in range(len(sums)):
         sums[j] = 0.0
+
+
+@kernel
+def split_block(first, last, x, planes, pulls, base):
+    """Write the positions of nodes [first, last) to ``planes`` (3 stride,), which begin at node ``base``, and set their
+    forces in ``pulls`` (3 stride,) to zero."""
+    stride = len(planes) // 3
+    split_planes(x, first, last - first, planes, stride, base)
+    for c in range(3):
+        part = pulls[c * stride + first - base : c * stride + last - base]
+        for i in range(len(part)):
+            part[i] = 0.0
+
+
+@kernel
+def join_block(block, n, pulls, base, f):
+    """Write the forces of the nodes of a block from ``pulls``."""
+    first = NODE_BLOCK * block
+    join_planes(pulls, len(pulls) // 3, base, first, min(NODE_BLOCK, n - first), f)
 
 
 @kernel

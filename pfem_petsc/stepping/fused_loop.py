@@ -20,6 +20,7 @@ from ..contact.log import compare_contacts
 from ..integrators._leapfrog import centre
 from ..mechanics.bar_geometry import first_inverted
 from ..mechanics.compiled import inlined, kernel
+from ..mechanics.planes import slide_planes
 from ..mechanics.rows import CHUNK
 from ..mesh.ordering import NODE_BLOCK
 from ..output.sums import HEAD
@@ -34,7 +35,7 @@ from .balance_loops import (
     sum_balance,
 )
 from .book_loops import WORKS, new_lanes
-from .fused_blocks import advance_block, finish_block, move_block, solve_block
+from .fused_blocks import advance_block, finish_block, join_block, move_block, solve_block, split_block
 from .fused_rows import complete, fill_row, push_particles, stop_at_walls
 from .ghost_loops import trade_positions
 from .sum_loops import fill_walls
@@ -52,11 +53,14 @@ def make_fused_loop(
     sum_energies: Callable,
     clear_energies: Callable,
     work_rows: int,
+    pull_columns: Callable,
+    new_columns_work: Callable,
 ) -> Callable:
     """Return the fused loop for a law and strain measure.
 
     ``forces`` is the bar loop over a part of a sweep, with the functions for its energies and the number of its working
-    arrays, see :func:`~pfem_petsc.mechanics.kernels.make_kernels`.
+    arrays; ``pull_columns``, with its workspace, is the loop over columns, for steps whose energies nothing reads; see
+    :func:`~pfem_petsc.mechanics.kernels.make_kernels`.
 
     Its arguments are the maximum number of steps; the step [s]; positions, positions of the previous step, which are
     computed for the last step alone, and velocities at half steps (n, 3); arrays of bars, nodes, walls, probes,
@@ -78,6 +82,12 @@ def make_fused_loop(
         """Add the forces of some chunks of bars."""
         law = (bars.parameters, bars.area, h, bars.history)
         return forces(x, bars.sweep, begun, ended, bars.far, bars.rest, bars.heat, *law, True, f, work)
+
+    @inlined
+    def pull_light(x, bars, base, begun, ended, h, work):
+        """Add the forces of some groups of columns to the planes."""
+        law = (bars.parameters, h, bars.history)
+        return pull_columns(x, bars.planes, bars.pulls, base, bars.sweep, bars.columns, begun, ended, *law, work)
 
     @kernel
     def fused_loop(
@@ -120,7 +130,7 @@ def make_fused_loop(
         speeds, drag = np.empty(3 * NODE_BLOCK), np.empty(3 * NODE_BLOCK if damped else 0)
         ends, totals, lanes, room = np.empty(len(WORKS)), np.zeros((6, 3)), new_sums(), new_lanes()
         row_lanes, after = new_sums(), np.empty(len(WORKS))
-        work = np.empty(work_rows * CHUNK)
+        work, columns_work = np.empty(work_rows * CHUNK), new_columns_work()
         push_u = np.empty(impulses.v.shape)
         near = np.empty(0, dtype=np.int64)
         stuck_offsets = np.empty((0, n_walls))
@@ -129,6 +139,7 @@ def make_fused_loop(
         touching, places = np.empty((0, n_walls), dtype=np.bool_), np.empty((0, 3))
         pressed = touched  # nodes with entries in the array of wall forces
         n_blocks = (n + NODE_BLOCK - 1) // NODE_BLOCK
+        room_for, parts = len(bars.planes) // 3, bars.columns.parts
         failed = -1
         turned = -1
         infeasible = -1
@@ -151,16 +162,24 @@ def make_fused_loop(
             shortened, changed = False, 0
             changes = 0
             moved = 0
+            base = 0  # first node of the planes
+            # nothing reads the energies of other steps: a failure ends the run
+            light = len(parts) > 0 and not (due[step] or step == count - 1)
             if several:
                 while moved < n_blocks:
-                    move_block(moved, n, x, h, half, f)
+                    move_block(moved, n, x, h, half, f, light, bars.planes, bars.pulls, base)
                     moved += 1
                 for i in range(n, len(x)):
                     f[i, 0] = f[i, 1] = f[i, 2] = 0.0
                 lost = trade_positions(messages, x, before, True)
                 if lost != 0:
                     break
-                failed, shortened, changed = pull(x, bars, bars.sweep.counted, len(bars.sweep.diagonal), h, f, work)
+                if light:
+                    split_block(n, len(x), x, bars.planes, bars.pulls, base)
+                    groups = (bars.columns.counted, len(bars.columns.heads))
+                    failed, shortened = pull_light(x, bars, base, *groups, h, columns_work)
+                else:
+                    failed, shortened, changed = pull(x, bars, bars.sweep.counted, len(bars.sweep.diagonal), h, f, work)
             clear_energies(work)
             # Blocks of nodes pass once through the cache: each moves shortly before its first bar, and is finished
             # after its last one, which belongs to its own block or to one before. Walls take all nodes in between.
@@ -190,9 +209,20 @@ def make_fused_loop(
                 for block in range(n_blocks):
                     if stage == 0:
                         while moved < min(block + 1 + bars.reach, n_blocks):
-                            move_block(moved, n, x, h, half, f)
+                            if light and room_for < NODE_BLOCK * (moved + 1) - base:
+                                live = NODE_BLOCK * block
+                                slide_planes(bars.planes, live - base, NODE_BLOCK * moved - live)
+                                slide_planes(bars.pulls, live - base, NODE_BLOCK * moved - live)
+                                base = live
+                            move_block(moved, n, x, h, half, f, light, bars.planes, bars.pulls, base)
                             moved += 1
-                        if block < len(bars.sweep.parts) - 1:
+                        if light:
+                            if block < len(parts) - 1:
+                                at, short = pull_light(x, bars, base, parts[block], parts[block + 1], h, columns_work)
+                                failed = at if failed < 0 else failed
+                                shortened = shortened or short
+                            join_block(block, n, bars.pulls, base, f)
+                        elif block < len(bars.sweep.parts) - 1:
                             at, short, broke = pull(
                                 x, bars, bars.sweep.parts[block], bars.sweep.parts[block + 1], h, f, work
                             )
@@ -263,9 +293,10 @@ def make_fused_loop(
                     turned = first_inverted(x, before, bars.ends, bars.watched)
                 wrong = wrong or turned >= 0
             if due[step] or wrong or step == count - 1:
-                for k in range(len(energies)):
+                for k in range(0 if light else len(energies)):
                     energies[k] = 0.0
-                sum_energies(work, energies)
+                if not light:
+                    sum_energies(work, energies)
                 kinetic = fill_row(
                     x,
                     h,

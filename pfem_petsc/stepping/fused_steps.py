@@ -11,6 +11,8 @@ from ..contact.forces import WallForces
 from ..energies import ENERGIES
 from ..errors import SimulationFailure
 from ..mechanics.bars import StrainEnergy
+from ..mechanics.columns import Columns, make_columns, no_columns
+from ..mechanics.planes import new_planes
 from ..mesh.ordering import NODE_BLOCK
 from ..output.sums import HEAD, WALL
 from ..tolerances import PROJECTED
@@ -35,6 +37,7 @@ WORTH = 1000
 """Minimum number of steps of a run for which the fused loop is compiled, which takes some seconds once."""
 
 _BROKEN, _ALARM = HEAD.first("broken_bars"), HEAD.first("alarm")
+_WINDOW = 4  # times the nodes of the blocks that bars of one block belong to
 _FEWEST = 8  # minimum number of steps for one call
 
 
@@ -56,12 +59,23 @@ class Batch:
             block.kernels.sum_energies,
             block.kernels.clear_energies,
             block.kernels.work_rows,
+            block.kernels.pull_columns,
+            block.kernels.new_columns_work,
         )
         bars = model.bars
         law = (bars.far, bars.rest, bars.watched, bars.heat, block.parameters, block.area, block.history)
         counted = block.counted - block.start
+        reach, columns = self._reach(), self._columns()
         self._bars = BarArrays(
-            bars.ends, block.sweep, *law, block.law.slack_row, counted, self._reach(), bars.can_break
+            bars.ends,
+            block.sweep,
+            *law,
+            block.law.slack_row,
+            counted,
+            reach,
+            bars.can_break,
+            columns,
+            *self._planes(reach, columns),
         )
         supports, inertia, contact = model.supports, model.inertia, model.contact
         nothing = np.empty((0, 3))
@@ -82,6 +96,21 @@ class Batch:
         self._probes = ProbeArrays(*recorder.probed())
         self._messages = model.mesh.messages()
         self.sums = np.zeros((MOST, recorder.width))
+
+    def _columns(self) -> Columns:
+        """Return the columns of the bars, or none if their law keeps data or they are not in diagonal runs."""
+        bars = self.model.bars
+        block = bars.blocks[0]
+        if len(block.history) or bars.heat.size or not len(bars.rest) or not block.sweep.diagonal.all():
+            return no_columns(block.area)
+        return make_columns(block.sweep, bars.rest, block.area)
+
+    def _planes(self, reach: int, columns: Columns) -> tuple[np.ndarray, np.ndarray]:
+        """Return planes for all nodes; on one rank for a window of them, which stays in the cache."""
+        nodes = len(self.model.mesh.points) if len(columns.parts) else 0
+        if self.model.comm.size == 1:
+            nodes = min(nodes, _WINDOW * (reach + 1) * NODE_BLOCK)
+        return new_planes(nodes)
 
     def _reach(self) -> int:
         """Return how many blocks of nodes beyond its own the bars of a block reach."""

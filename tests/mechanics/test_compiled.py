@@ -126,7 +126,7 @@ def test_machine_code_is_never_older_than_what_a_loop_inlines(tmp_path, monkeypa
 def test_code_that_a_class_generates_is_part_of_the_digest(monkeypatch):
     before = code_digest(make_kernels(elastic.LAW, engineering).forces.py_func)
     assert before == code_digest(make_kernels(elastic.LAW, engineering).forces.py_func)
-    monkeypatch.setattr(strips._Strip, "store_nodes", lambda self, vectors, pointer, node: None)
+    monkeypatch.setattr(strips.Strip, "store_nodes", lambda self, vectors, pointer, node: None)
     assert code_digest(make_kernels(elastic.LAW, engineering).forces.py_func) != before
 
 
@@ -164,6 +164,7 @@ def test_every_process_finds_the_fused_loop_of_another():
         "from pfem_petsc.stepping.fused_loop import make_fused_loop\n"
         "kernels = make_kernels(LAW, engineering)\n"
         "parts = kernels.sweep_part, kernels.sum_energies, kernels.clear_energies, kernels.work_rows\n"
+        "parts += kernels.pull_columns, kernels.new_columns_work\n"
         "loop = make_fused_loop(*parts)\n"
         "print(loop._cache._index_key((), loop.targetctx.codegen()), loop._cache._cache_file._source_stamp)"
     )
@@ -185,7 +186,12 @@ def test_loops_of_all_laws_have_names_of_their_own():
                 kernels = make_kernels(variant, measure)
                 names.append(_variant(kernels.forces.py_func))
                 fused = make_fused_loop(
-                    kernels.sweep_part, kernels.sum_energies, kernels.clear_energies, kernels.work_rows
+                    kernels.sweep_part,
+                    kernels.sum_energies,
+                    kernels.clear_energies,
+                    kernels.work_rows,
+                    kernels.pull_columns,
+                    kernels.new_columns_work,
                 )
                 longest = fused._cache._cache_file._data_path("x")
                 assert len(Path(longest).name) < 220
@@ -252,7 +258,14 @@ def test_functions_of_one_name_have_the_same_code():
     for law in (elastic.LAW, elastoplastic.LAW, softened(elastic.LAW), softened(elastoplastic.LAW)):
         for measure in MEASURES.values():
             kernels = make_kernels(law, measure)
-            parts = kernels.sweep_part, kernels.sum_energies, kernels.clear_energies, kernels.work_rows
+            parts = (
+                kernels.sweep_part,
+                kernels.sum_energies,
+                kernels.clear_energies,
+                kernels.work_rows,
+                kernels.pull_columns,
+                kernels.new_columns_work,
+            )
             loops = [value for value in vars(kernels).values() if not isinstance(value, int)]
             for loop in (*loops, make_fused_loop(*parts)):
                 closures(loop, found)

@@ -44,6 +44,7 @@ class MasslessNodes:
             model.external.at(time, external)
         if model.bars_vary:
             model.change_bars(time)
+        model.mesh.update_ghosts(x)  # a scheme predicts owned nodes alone
         elastic, farthest = self._stiffness(x)
         stiffness, force, step = elastic, np.full(len(nodes), np.nan), np.zeros(len(nodes))
         part, largest = np.ones(len(nodes)), 0.0

@@ -75,6 +75,23 @@ def test_no_mass_where_supports_hold_the_normal(comm, shared_tmp_path):
     assert comm.allreduce(len(run.model.inertia.redistribution.nodes)) == 0
 
 
+@pytest.mark.parallel
+def test_no_mass_beside_ghosts(comm, shared_tmp_path):
+    """Bars of massless nodes that end at nodes of another rank have the lengths of the new positions."""
+    case = {
+        "mesh": {"generator": "lattice", "kind": "cubic", "cells": [1, 2, 2], "pitch": 0.4},
+        "node_set": {"front": {"group": "front"}},
+        "material": {"it": {"young_modulus": 2e5, "density": 6500.0}},
+        "section": {"it": {"area": 9e-4, "material": "it"}},
+        "wall": [{"name": "wall", "type": "plane", "point": [0, -0.02, 0], "normal": [0, 1, 0], "node_set": "front"}],
+        "contact": {"treatment": "mass_redistribution"},
+        "time": {"integrator": "central_differences", "step": 0.05, "end": 0.25},
+        "output": {"fields_every": 0},
+    }
+    run = Simulation(Case.from_dict(case), comm, output=shared_tmp_path / "lattice", quiet=True)
+    assert len(list(run)) == 5 and np.abs(run.state.v).max(initial=0.0) < 1e-12
+
+
 @pytest.mark.parametrize("step", [0.01, 0.05])
 @pytest.mark.parametrize("integrator, parameters", [("newmark", TRAPEZOID), ("energy_momentum", {})])
 def test_no_mass_no_spike_implicit(integrator, parameters, step, comm, shared_tmp_path):

@@ -10,7 +10,7 @@ from petsc4py import PETSc
 
 from pfem_petsc import Case, Simulation
 from pfem_petsc.errors import SimulationFailure
-from pfem_petsc.solvers import matrix_free
+from pfem_petsc.solvers import restricted
 
 pytestmark = pytest.mark.parallel
 
@@ -41,7 +41,7 @@ def test_restrictions_to_inactive_unknowns_are_freed(comm, shared_tmp_path):
     def restrictions():
         gc.collect()
         # by type: isinstance would ask for what weak proxies stand for
-        return sum(type(thing) is matrix_free._Restriction for thing in gc.get_objects())
+        return sum(type(thing) is restricted.Restriction for thing in gc.get_objects())
 
     before = restrictions()  # of other tests' runs
     run = simulation(resting(25, solver={"operator": "matrix_free", "linear": "cg"}), comm, shared_tmp_path)

@@ -14,39 +14,33 @@ import numpy as np
 
 from .compiled import inlined
 from .force_kernels import COLLAPSED_STRETCH, SHORTENED_STRETCH
-from .law_rows import no_bar_data, no_variables
 from .materials.base import Law
 from .planes import add_rows, address, difference_of_ends, number_at, subtract_rows
-from .rows import CHUNK, bar_value, extend, new_rows, put_apart, take
+from .rows import CHUNK, bar_value, put_apart
 
 __all__ = ["make_column_kernels"]
 
 
 def make_column_kernels(law: Law, measure: Callable) -> dict[str, Any]:
-    """Make ``pull_columns``, which adds internal forces, and ``new_columns_work``, which returns its workspace.
+    """Make ``pull_columns``, which adds internal forces.
 
     Laws that have a history or data of each bar have no such loop: it is replaced by a function that does nothing.
     """
-    response, like, of_bar = law.response, no_variables(law), no_bar_data(law)
+    response = law.response
     serves = not law.rows and not law.bar_data
 
     @inlined
-    def new_columns_work():
-        """Return the workspace: forces of a group of columns, by components."""
-        return new_rows(3)
-
-    @inlined
-    def pull_none(x, planes, sums, base, sweep, columns, begun, ended, p, step, history, work):
+    def pull_none(x, planes, sums, base, sweep, columns, begun, ended, p, step, work):
         """Replace :func:`pull_columns` where it does not apply."""
         return -1, False
 
     @inlined
-    def pull_columns(x, planes, sums, base, sweep, columns, begun, ended, p, step, history, work):
+    def pull_columns(x, planes, sums, base, sweep, columns, begun, ended, p, step, work):
         """Add the internal forces of the groups [begun, ended) of ``columns`` to ``sums`` (3 stride,); return the first
         failed bar, or -1, and whether any bar is so short that it may be inverted.
 
         ``x`` (n, 3) positions, which are also in ``planes`` (3 stride,) from node ``base`` on; ``sweep``: of the bars;
-        ``history``: without rows; see :func:`~pfem_petsc.mechanics.kernels.make_kernels`.
+        ``work``: three rows; see :func:`~pfem_petsc.mechanics.kernels.make_kernels`.
         """
         failed = -1
         shortened = False
@@ -67,8 +61,7 @@ def make_column_kernels(law: Law, measure: Callable) -> dict[str, Any]:
                 stretch = length / (rest if real else 1.0)
                 short += 0 if stretch >= SHORTENED_STRETCH else 1  # NaN counts
                 strain, slope, _ = measure(stretch)
-                given = extend(p, history, 0, i, of_bar)
-                stress, _, _, _ = response(strain, 0.0, step, 0.0, given, take(history, i, like))
+                stress, _, _, _ = response(strain, 0.0, step, 0.0, p, ())
                 section = bar_value(columns.area, first + i) if real else 0.0
                 put_apart(work, 0, i, section * stress * slope / length, (dx, dy, dz))
             if short > 0:
@@ -96,4 +89,4 @@ def make_column_kernels(law: Law, measure: Callable) -> dict[str, Any]:
                 subtract_rows(sums, stride, head, n, work, 0)
         return failed, shortened
 
-    return {"pull_columns": pull_columns if serves else pull_none, "new_columns_work": new_columns_work}
+    return {"pull_columns": pull_columns if serves else pull_none}

@@ -17,7 +17,7 @@ from .force_kernels import make_force_kernels
 from .materials.base import Law
 from .tangent_kernels import make_tangent_kernels
 
-__all__ = ["make_kernels"]
+__all__ = ["fused_parts", "make_kernels"]
 
 
 @cache
@@ -36,4 +36,15 @@ def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
         **make_column_kernels(law, measure),
         **make_tangent_kernels(law, measure),
         **make_field_kernels(law, measure),
+    )
+
+
+def fused_parts(kernels: SimpleNamespace) -> tuple:
+    """Return the kernels of which :func:`~pfem_petsc.stepping.fused_loop.make_fused_loop` makes its loop."""
+    return (
+        kernels.sweep_part,
+        kernels.sum_energies,
+        kernels.clear_energies,
+        kernels.work_rows,
+        kernels.pull_columns,
     )

@@ -21,7 +21,7 @@ from ..integrators._leapfrog import centre
 from ..mechanics.bar_geometry import first_inverted
 from ..mechanics.compiled import inlined, kernel
 from ..mechanics.planes import slide_planes
-from ..mechanics.rows import CHUNK
+from ..mechanics.rows import CHUNK, new_rows
 from ..mesh.ordering import NODE_BLOCK
 from ..output.sums import HEAD
 from .balance_loops import (
@@ -54,12 +54,11 @@ def make_fused_loop(
     clear_energies: Callable,
     work_rows: int,
     pull_columns: Callable,
-    new_columns_work: Callable,
 ) -> Callable:
     """Return the fused loop for a law and strain measure.
 
     ``forces`` is the bar loop over a part of a sweep, with the functions for its energies and the number of its working
-    arrays; ``pull_columns``, with its workspace, is the loop over columns, for steps whose energies nothing reads; see
+    arrays; ``pull_columns`` is the loop over columns, for steps whose energies nothing reads; see
     :func:`~pfem_petsc.mechanics.kernels.make_kernels`.
 
     Its arguments are the maximum number of steps; the step [s]; positions, positions of the previous step, which are
@@ -86,7 +85,7 @@ def make_fused_loop(
     @inlined
     def pull_light(x, bars, base, begun, ended, h, work):
         """Add the forces of some groups of columns to the planes."""
-        law = (bars.parameters, h, bars.history)
+        law = (bars.parameters, h)
         return pull_columns(x, bars.planes, bars.pulls, base, bars.sweep, bars.columns, begun, ended, *law, work)
 
     @kernel
@@ -130,7 +129,7 @@ def make_fused_loop(
         speeds, drag = np.empty(3 * NODE_BLOCK), np.empty(3 * NODE_BLOCK if damped else 0)
         ends, totals, lanes, room = np.empty(len(WORKS)), np.zeros((6, 3)), new_sums(), new_lanes()
         row_lanes, after = new_sums(), np.empty(len(WORKS))
-        work, columns_work = np.empty(work_rows * CHUNK), new_columns_work()
+        work, columns_work = np.empty(work_rows * CHUNK), new_rows(3)
         push_u = np.empty(impulses.v.shape)
         near = np.empty(0, dtype=np.int64)
         stuck_offsets = np.empty((0, n_walls))
@@ -293,9 +292,9 @@ def make_fused_loop(
                     turned = first_inverted(x, before, bars.ends, bars.watched)
                 wrong = wrong or turned >= 0
             if due[step] or wrong or step == count - 1:
-                for k in range(0 if light else len(energies)):
-                    energies[k] = 0.0
                 if not light:
+                    for k in range(len(energies)):
+                        energies[k] = 0.0
                     sum_energies(work, energies)
                 kinetic = fill_row(
                     x,

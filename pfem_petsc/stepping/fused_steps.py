@@ -12,6 +12,7 @@ from ..energies import ENERGIES
 from ..errors import SimulationFailure
 from ..mechanics.bars import StrainEnergy
 from ..mechanics.columns import Columns, make_columns, no_columns
+from ..mechanics.kernels import fused_parts
 from ..mechanics.planes import new_planes
 from ..mesh.ordering import NODE_BLOCK
 from ..output.sums import HEAD, WALL
@@ -54,14 +55,7 @@ class Batch:
         model = stepper.model
         self.model = model
         block = model.bars.blocks[0]
-        self._fused_loop = make_fused_loop(
-            block.kernels.sweep_part,
-            block.kernels.sum_energies,
-            block.kernels.clear_energies,
-            block.kernels.work_rows,
-            block.kernels.pull_columns,
-            block.kernels.new_columns_work,
-        )
+        self._fused_loop = make_fused_loop(*fused_parts(block.kernels))
         bars = model.bars
         law = (bars.far, bars.rest, bars.watched, bars.heat, block.parameters, block.area, block.history)
         counted = block.counted - block.start

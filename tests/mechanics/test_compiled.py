@@ -15,7 +15,7 @@ from pfem_petsc import Case, Simulation
 from pfem_petsc.case.materials import LAWS
 from pfem_petsc.mechanics import strips
 from pfem_petsc.mechanics.compiled import Compilation, _variant, code_digest
-from pfem_petsc.mechanics.kernels import make_kernels
+from pfem_petsc.mechanics.kernels import fused_parts, make_kernels
 from pfem_petsc.mechanics.materials import elastic, elastoplastic
 from pfem_petsc.mechanics.materials._softening import softened
 from pfem_petsc.mechanics.materials._stiffness_damping import damped
@@ -158,14 +158,12 @@ def test_every_process_finds_the_machine_code_of_another():
 def test_every_process_finds_the_fused_loop_of_another():
     """Keys of loops that are made of other loops are the same in all processes: a start must not compile them anew."""
     program = (
-        "from pfem_petsc.mechanics.kernels import make_kernels\n"
+        "from pfem_petsc.mechanics.kernels import fused_parts, make_kernels\n"
         "from pfem_petsc.mechanics.materials.elastic import LAW\n"
         "from pfem_petsc.mechanics.strain import engineering\n"
         "from pfem_petsc.stepping.fused_loop import make_fused_loop\n"
         "kernels = make_kernels(LAW, engineering)\n"
-        "parts = kernels.sweep_part, kernels.sum_energies, kernels.clear_energies, kernels.work_rows\n"
-        "parts += kernels.pull_columns, kernels.new_columns_work\n"
-        "loop = make_fused_loop(*parts)\n"
+        "loop = make_fused_loop(*fused_parts(kernels))\n"
         "print(loop._cache._index_key((), loop.targetctx.codegen()), loop._cache._cache_file._source_stamp)"
     )
     keys = set()
@@ -185,14 +183,7 @@ def test_loops_of_all_laws_have_names_of_their_own():
             for measure in MEASURES.values():
                 kernels = make_kernels(variant, measure)
                 names.append(_variant(kernels.forces.py_func))
-                fused = make_fused_loop(
-                    kernels.sweep_part,
-                    kernels.sum_energies,
-                    kernels.clear_energies,
-                    kernels.work_rows,
-                    kernels.pull_columns,
-                    kernels.new_columns_work,
-                )
+                fused = make_fused_loop(*fused_parts(kernels))
                 longest = fused._cache._cache_file._data_path("x")
                 assert len(Path(longest).name) < 220
     assert len(names) > 40 and len(set(names)) == len(names)
@@ -258,16 +249,8 @@ def test_functions_of_one_name_have_the_same_code():
     for law in (elastic.LAW, elastoplastic.LAW, softened(elastic.LAW), softened(elastoplastic.LAW)):
         for measure in MEASURES.values():
             kernels = make_kernels(law, measure)
-            parts = (
-                kernels.sweep_part,
-                kernels.sum_energies,
-                kernels.clear_energies,
-                kernels.work_rows,
-                kernels.pull_columns,
-                kernels.new_columns_work,
-            )
             loops = [value for value in vars(kernels).values() if not isinstance(value, int)]
-            for loop in (*loops, make_fused_loop(*parts)):
+            for loop in (*loops, make_fused_loop(*fused_parts(kernels))):
                 closures(loop, found)
     digests = {}
     for function in found:

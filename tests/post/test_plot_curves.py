@@ -6,8 +6,8 @@ import csv
 
 import numpy as np
 import pytest
+from helpers.charts import saturated, table_columns
 from helpers.synthetic import SyntheticResult, ring
-from PIL import Image
 
 from pfem_petsc.errors import InputError
 from pfem_petsc.post.chart import thinned
@@ -18,17 +18,6 @@ from pfem_petsc.post.plot import plot
 @pytest.fixture
 def result(tmp_path):
     return SyntheticResult(tmp_path / "result.vtkhdf", *ring())
-
-
-def saturated(file) -> np.ndarray:
-    """Pixels (n, 3) with a colour: curves, not axes and text."""
-    picture = np.asarray(Image.open(file).convert("RGB")).reshape(-1, 3).astype(int)
-    return picture[np.ptp(picture, axis=1) > 60]
-
-
-def _columns(path):
-    head, *rows = csv.reader(path.open())
-    return head, np.array(rows, dtype=float).T
 
 
 def test_named_curves(tmp_path, result):
@@ -100,7 +89,7 @@ def test_formats_and_tables(tmp_path, result):
 
 def test_forces_over_displacements(tmp_path, result):
     (file,) = plot(result, tmp_path, curves=["wall/wall/force.x"], against="centre_of_mass.x", formats=["csv"])
-    head, (place, force) = _columns(file)
+    head, (place, force) = table_columns(file)
     assert head == ["centre_of_mass.x [m]", "wall/wall/force.x [N]"]
     assert np.array_equal(place, result.history["centre_of_mass"][:, 0])
     assert np.array_equal(force, result.history["wall/wall/force"][:, 0])
@@ -130,7 +119,7 @@ def test_spectra_have_the_amplitude(tmp_path, result):
     result.history["probe/tip/velocity"][:, 0, 1] = 3.0 * np.sin(2 * np.pi * frequency * time)
     (file,) = plot(result, tmp_path, spectrum=["probe/tip/velocity"], formats=["csv"])
     assert file.name == "spectra.csv"
-    head, (places, amplitude) = _columns(file)
+    head, (places, amplitude) = table_columns(file)
     assert head == ["frequency [Hz]", "probe/tip/velocity.y [m/s]"]
     assert places[20] == pytest.approx(frequency) and amplitude.argmax() == 20 and amplitude[20] == pytest.approx(3.0)
     assert len(saturated(plot(result, tmp_path, spectrum=["probe/tip/velocity"])[0])) > 300

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.charts import saturated, table_columns
 from helpers.synthetic import SyntheticResult, ring
 from PIL import Image
 
@@ -22,17 +23,6 @@ from pfem_petsc.post.plot import plot
 @pytest.fixture
 def result(tmp_path):
     return SyntheticResult(tmp_path / "result.vtkhdf", *ring())
-
-
-def saturated(file) -> np.ndarray:
-    """Pixels (n, 3) with a colour: curves, not axes and text."""
-    picture = np.asarray(Image.open(file).convert("RGB")).reshape(-1, 3).astype(int)
-    return picture[np.ptp(picture, axis=1) > 60]
-
-
-def _columns(path):
-    head, *rows = csv.reader(path.open())
-    return head, np.array(rows, dtype=float).T
 
 
 def test_pairs_and_constraints_have_pictures(tmp_path, result):
@@ -60,7 +50,7 @@ def test_walls_without_a_force_take_no_panels(tmp_path, result):
 
 def test_filter_of_forces_is_named(tmp_path, result):
     plot(result, tmp_path, force_filter="cfc:60", formats=["csv"])
-    head, columns = _columns(tmp_path / "walls.csv")
+    head, columns = table_columns(tmp_path / "walls.csv")
     (k,) = (k for k, name in enumerate(head) if "CFC 60 of SAE J211-1 (two passes, −3 dB at 100 Hz)" in name)
     raw = result.history["wall/wall/force"] @ np.array([-1.0, 0.0, 0.0])
     assert columns[k] == pytest.approx(cfc(result.history["time"], raw, 60.0))
@@ -71,7 +61,7 @@ def test_results_over_load_factors_are_not_over_time(tmp_path):
     with Simulation(Case.load("von_mises"), output=tmp_path / "r", quiet=True) as simulation:
         simulation.run()
     written = {path.name: path for path in plot(tmp_path / "r", formats=["csv"])}
-    assert _columns(written["energies.csv"])[0][0] == "point"
+    assert table_columns(written["energies.csv"])[0][0] == "point"
     head, *rows = csv.reader(written["force_displacement.csv"].open())
     assert head[0] == "displacement along −z [m]" and head[3].endswith("closed form")
     exact = np.array([row[2:] for row in rows], dtype=float)
@@ -119,7 +109,7 @@ def test_forces_over_displacements_begin_at_the_contact(tmp_path, result):
     """Not the flight to the wall and back: the displacement is that since the contact."""
     result.history["centre_of_mass"] = result.history["centre_of_mass"] + 5.0
     plot(result, tmp_path, formats=["csv"], force_filter="none")
-    head, (place, force) = _columns(tmp_path / "force_displacement.csv")
+    head, (place, force) = table_columns(tmp_path / "force_displacement.csv")
     assert head[0] == "displacement of the centre of mass since contact [m]"
     time = result.history["time"]
     touching = np.flatnonzero(result.history["wall/wall/force"].any(axis=1))

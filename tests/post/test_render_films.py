@@ -7,6 +7,7 @@ import math
 import imageio_ffmpeg
 import numpy as np
 import pytest
+from helpers.frames import TINY, box, draw, drawing, near, pixels
 from helpers.synthetic import SyntheticResult, ring
 from PIL import Image
 
@@ -16,32 +17,6 @@ from pfem_petsc.post.frames import Resampled
 from pfem_petsc.post.page import Page
 from pfem_petsc.post.render import render
 from pfem_petsc.post.shots import Moves, camera_path, shots
-
-TINY = (240, 160)
-
-
-def draw(folder, result, **options):
-    options = {"size": TINY, "video": "none", "poster": False, "note": lambda text: None, **options}
-    return render(result, folder, **options)
-
-
-def pixels(file) -> np.ndarray:
-    return np.asarray(Image.open(file).convert("RGBA")).astype(int)
-
-
-def drawing(file) -> np.ndarray:
-    picture = pixels(file)
-    left, top, width, height = Page.region_of((picture.shape[1], picture.shape[0]))
-    return picture[top : top + height, left : left + width]
-
-
-def near(picture: np.ndarray, colour, within: int = 40) -> np.ndarray:
-    return (np.abs(picture[..., :3] - np.array(colour)).max(axis=2) < within).nonzero()
-
-
-def box(picture: np.ndarray) -> tuple[int, int, int, int]:
-    rows, columns = (picture[..., :3].min(axis=2) < 200).nonzero()
-    return rows.min(), rows.max(), columns.min(), columns.max()
 
 
 @pytest.fixture
@@ -163,8 +138,8 @@ def test_structures_fill_the_picture_from_any_side(tmp_path):
 
 def test_followed_structure_stays_in_the_middle(flying):
     motion = motion_of(flying)
-    for camera, box in zip(shots(motion, Moves(follow="structure"), 1.5), motion.boxes, strict=True):
-        x, y, _, _ = camera.project(box.mean(axis=0)[None, :], (300, 200))
+    for camera, bounds in zip(shots(motion, Moves(follow="structure"), 1.5), motion.boxes, strict=True):
+        x, y, _, _ = camera.project(bounds.mean(axis=0)[None, :], (300, 200))
         assert (x[0], y[0]) == pytest.approx((150.0, 100.0))
     assert len(shots(motion, Moves(follow="tip"), 1.5)) == 13
 

@@ -7,44 +7,16 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from helpers.frames import TINY, box, draw, drawing, near
 from helpers.synthetic import SyntheticResult, lattice, ring
-from PIL import Image
 
 from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.cli.main import main
 from pfem_petsc.errors import InputError
 from pfem_petsc.post.camera import aim
 from pfem_petsc.post.contrast import GHOST, MARKS, TRAILS
-from pfem_petsc.post.page import Page
 from pfem_petsc.post.radii import drawn_radii, radii_of
-from pfem_petsc.post.render import render
 from pfem_petsc.post.scene import Layer, Scene, Style
-
-TINY = (240, 160)
-
-
-def draw(folder, result, **options):
-    options = {"size": TINY, "video": "none", "poster": False, "note": lambda text: None, **options}
-    return render(result, folder, **options)
-
-
-def pixels(file) -> np.ndarray:
-    return np.asarray(Image.open(file).convert("RGBA")).astype(int)
-
-
-def drawing(file) -> np.ndarray:
-    picture = pixels(file)
-    left, top, width, height = Page.region_of((picture.shape[1], picture.shape[0]))
-    return picture[top : top + height, left : left + width]
-
-
-def near(picture: np.ndarray, colour, within: int = 40) -> np.ndarray:
-    return (np.abs(picture[..., :3] - np.array(colour)).max(axis=2) < within).nonzero()
-
-
-def box(picture: np.ndarray) -> tuple[int, int, int, int]:
-    rows, columns = (picture[..., :3].min(axis=2) < 200).nonzero()
-    return rows.min(), rows.max(), columns.min(), columns.max()
 
 
 @pytest.fixture

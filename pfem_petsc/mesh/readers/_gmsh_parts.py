@@ -14,7 +14,7 @@ import numpy as np
 from mpi4py import MPI
 
 from ...errors import InputError
-from ._gmsh_sections import Format, Numbers, find_sections
+from ._gmsh_sections import Format, Numbers, find_sections, read_entities
 from ._gmsh_stream import END, FAILED, LINES, MARKED, POINTS, TAGS, Sender, Stream, receive, steps
 
 __all__ = ["Parsed", "parse"]
@@ -97,23 +97,10 @@ def _send_all(path: Path, comm: MPI.Comm, held: dict[int, list], line: int, poin
         def stream(name: str) -> Stream:
             return Stream(f"{path}: section ${name}", file, *places[name][0], layout)
 
-        groups = _entities(stream("Entities")) if "Entities" in places else {}
+        entities = read_entities(stream("Entities")) if "Entities" in places else {}
+        groups = {entity: tuple(abs(tags).tolist()) for entity, tags in entities.items()}
         n_nodes = _nodes(stream("Nodes"), comm, held, places["Nodes"][0])
         return (n_nodes, *_elements(path, stream("Elements"), comm, held, groups, line, point, nodes_of), texts)
-
-
-def _entities(numbers: Numbers) -> dict[tuple[int, int], tuple[int, ...]]:
-    """Return the tags of physical groups of every point and curve."""
-    groups = {}
-    counts = numbers.sizes(4)
-    for dimension in (0, 1):
-        for _ in range(counts[dimension]):
-            tag = int(numbers.ints(1)[0])
-            numbers.reals(3 if dimension == 0 else 6)
-            groups[dimension, tag] = tuple(abs(numbers.ints(int(numbers.sizes(1)[0]))).tolist())
-            if dimension == 1:
-                numbers.ints(int(numbers.sizes(1)[0]))
-    return groups
 
 
 def _nodes(numbers: Numbers, comm: MPI.Comm, held: dict[int, list], place: tuple[int, int]) -> int:

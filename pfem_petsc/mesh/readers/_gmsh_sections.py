@@ -10,7 +10,7 @@ import numpy as np
 from ...errors import InputError
 from ._text import numbers_of
 
-__all__ = ["Format", "Numbers", "find_sections", "sections"]
+__all__ = ["Format", "Numbers", "find_sections", "read_entities", "sections"]
 
 
 class Format:
@@ -215,3 +215,18 @@ def _parse(where: str, text: bytes) -> np.ndarray:
 
 def _shown(text: bytes) -> str:
     return text[:60].decode("utf-8", "replace")
+
+
+def read_entities(numbers: Numbers) -> dict[tuple[int, int], np.ndarray]:
+    """Return the tags of physical groups of every point and curve."""
+    groups = {}
+    counts = numbers.sizes(4)
+    for dimension in (0, 1):
+        for _ in range(counts[dimension]):
+            tag = int(numbers.ints(1)[0])
+            numbers.reals(3 if dimension == 0 else 6)
+            groups[dimension, tag] = numbers.ints(int(numbers.sizes(1)[0]))
+            if dimension == 1:
+                numbers.ints(int(numbers.sizes(1)[0]))
+    # Surfaces and volumes follow, which have no bars.
+    return groups

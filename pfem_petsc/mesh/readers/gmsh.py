@@ -18,7 +18,7 @@ from ...errors import InputError
 from ..whole import WholeMesh
 from ._gmsh_lines import element_data, in_order, once
 from ._gmsh_parts import parse
-from ._gmsh_sections import Format, Numbers, sections
+from ._gmsh_sections import Format, Numbers, read_entities, sections
 from ._gmsh_slab import assemble
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
         elements = _elements_2(path, numbers("Elements"), layout.binary)
     else:
         tags, points = _nodes_4(path, numbers("Nodes"))
-        groups = _entities_4(numbers("Entities")) if "Entities" in parts else {}
+        groups = read_entities(numbers("Entities")) if "Entities" in parts else {}
         elements = _elements_4(path, numbers("Elements"), groups)
     mesh = _assemble(path, tags, points, elements, names)
     lines = [own for kind, own, _, _ in elements if kind == _LINE]
@@ -147,21 +147,6 @@ def _nodes_4(path: Path, numbers: Numbers) -> tuple[np.ndarray, np.ndarray]:
     if len(result[0]) != n_nodes:
         raise InputError(f"{path}: section $Nodes declares {n_nodes} nodes, its blocks hold {len(result[0])}")
     return result
-
-
-def _entities_4(numbers: Numbers) -> dict[tuple[int, int], np.ndarray]:
-    """Return the tags of physical groups of every point and curve."""
-    groups = {}
-    counts = numbers.sizes(4)
-    for dimension in (0, 1):
-        for _ in range(counts[dimension]):
-            tag = int(numbers.ints(1)[0])
-            numbers.reals(3 if dimension == 0 else 6)
-            groups[dimension, tag] = numbers.ints(int(numbers.sizes(1)[0]))
-            if dimension == 1:
-                numbers.ints(int(numbers.sizes(1)[0]))
-    # Surfaces and volumes follow, which have no bars.
-    return groups
 
 
 def _elements_2(path: Path, numbers: Numbers, binary: bool) -> Elements:

@@ -1,4 +1,4 @@
-"""Compiled loop over columns of bars: internal forces alone, of laws without history.
+"""Compiled loop over columns of bars: internal forces, and the history of laws that have one, but no energies.
 
 It computes the same forces as :mod:`~pfem_petsc.mechanics.force_kernels`, and adds them to each node in the same order,
 so the results are bitwise identical.
@@ -12,46 +12,55 @@ from typing import Any
 
 import numpy as np
 
-from .compiled import inlined
+from .compiled import borrowing
 from .force_kernels import COLLAPSED_STRETCH, SHORTENED_STRETCH
+from .law_rows import last_row, no_bar_data, no_variables
 from .materials.base import Law
-from .planes import add_rows, address, difference_of_ends, number_at, subtract_rows
-from .rows import CHUNK, bar_value, put_apart
+from .planes import add_rows, address, copy_run, difference_of_ends, number_at, subtract_rows
+from .rows import CHUNK, bar_value, differ, extend, put_apart, take
 
 __all__ = ["make_column_kernels"]
 
 
 def make_column_kernels(law: Law, measure: Callable) -> dict[str, Any]:
-    """Make ``pull_columns``, which adds internal forces.
+    """Make ``pull_columns``, which adds internal forces, and the number ``column_rows`` of rows of CHUNK numbers in its
+    workspace.
 
-    Laws that have a history or data of each bar have no such loop: it is replaced by a function that does nothing.
+    Laws of bars that can break have no such loop, since a step in which a bar breaks needs the energies: it is replaced
+    by a function that does nothing.
     """
-    response = law.response
-    serves = not law.rows and not law.bar_data
+    response, like, of_bar, by_rate = law.response, no_variables(law), no_bar_data(law), law.rate
+    n_rows, last = len(law.rows), last_row(law)
+    keeps = n_rows + len(law.bar_data) > 0
 
-    @inlined
+    @borrowing
     def pull_none(x, planes, sums, base, sweep, columns, begun, ended, p, step, work):
         """Replace :func:`pull_columns` where it does not apply."""
         return -1, False
 
-    @inlined
+    @borrowing
     def pull_columns(x, planes, sums, base, sweep, columns, begun, ended, p, step, work):
-        """Add the internal forces of the groups [begun, ended) of ``columns`` to ``sums`` (3 stride,); return the first
-        failed bar, or -1, and whether any bar is so short that it may be inverted.
+        """Add the internal forces of the groups [begun, ended) of ``columns`` to ``sums`` (3 stride,), and update the
+        history in ``columns.kept``; return the first failed bar, or -1, and whether any bar is so short that it may be
+        inverted.
 
         ``x`` (n, 3) positions, which are also in ``planes`` (3 stride,) from node ``base`` on; ``sweep``: of the bars;
-        ``work``: three rows; see :func:`~pfem_petsc.mechanics.kernels.make_kernels`.
+        ``work`` (``column_rows`` CHUNK,): forces of a group by components, and its new history; see
+        :func:`~pfem_petsc.mechanics.kernels.make_kernels`.
         """
         failed = -1
         shortened = False
         stride = len(planes) // 3
         heads, fars, starts, runs = columns.heads, columns.fars, columns.starts, columns.runs
+        kept, wide = columns.kept, len(columns.rest)
+        flat = kept.reshape(-1)
         for group in range(begun, ended):
             first = starts[group]
             n = starts[group + 1] - first
             head, tail = heads[group] - base, fars[group] - base
             low, high, lengths = address(planes, head), address(planes, tail), address(columns.rest, first)
             short = 0
+            changed = 0
             for i in range(n):
                 rest = number_at(lengths, i)
                 real = rest > 0.0
@@ -61,9 +70,25 @@ def make_column_kernels(law: Law, measure: Callable) -> dict[str, Any]:
                 stretch = length / (rest if real else 1.0)
                 short += 0 if stretch >= SHORTENED_STRETCH else 1  # NaN counts
                 strain, slope, _ = measure(stretch)
-                stress, _, _, _ = response(strain, 0.0, step, 0.0, p, ())
+                q = take(kept, first + i, like)
+                rate = 0.0
+                if by_rate and step > 0.0:
+                    rate = (strain - kept[last, first + i]) / step
+                given = extend(p, kept, n_rows, first + i, of_bar)
+                stress, _, new, _ = response(strain, rate, step, 0.0, given, q)
                 section = bar_value(columns.area, first + i) if real else 0.0
-                put_apart(work, 0, i, section * stress * slope / length, (dx, dy, dz))
+                pull = section * stress * slope / length
+                if keeps:
+                    pull = pull if real else 0.0  # what a column without a bar keeps may be anything
+                put_apart(work, 0, i, pull, (dx, dy, dz))
+                if n_rows > 0:
+                    put_apart(work, 3, i, 1.0, new)
+                    changed += 1 if real and (by_rate or differ(new, q)) else 0
+                if by_rate:
+                    put_apart(work, 3 + last, i, 1.0, (strain, stress))
+            if n_rows > 0 and changed > 0:
+                for j in range(n_rows):
+                    copy_run(work, (3 + j) * CHUNK, flat, j * wide + first, n)
             if short > 0:
                 for run in range(runs[group], runs[group + 1]):
                     ahead = sweep.heads[run] - heads[group]
@@ -89,4 +114,4 @@ def make_column_kernels(law: Law, measure: Callable) -> dict[str, Any]:
                 subtract_rows(sums, stride, head, n, work, 0)
         return failed, shortened
 
-    return {"pull_columns": pull_columns if serves else pull_none}
+    return {"pull_columns": pull_columns if law.rupture < 0 else pull_none, "column_rows": 3 + n_rows}

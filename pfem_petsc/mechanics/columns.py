@@ -1,4 +1,4 @@
-"""Columns: the bars of one offset in a block of nodes as one run, for bars whose law has no history.
+"""Columns: the bars of one offset in a block of nodes as one run.
 
 In a lattice the bars of one direction are diagonal runs as long as a row of cells, with a gap of one node between rows.
 Columns for these gaps, and up to nodes whose numbers are multiples of the length of vector instructions, make one run
@@ -13,12 +13,12 @@ from typing import NamedTuple
 import numpy as np
 
 from .compiled import kernel
-from .planes import aligned
+from .planes import aligned, copy_run
 from .rows import CHUNK
 from .strips import APART, LANES
 from .sweep import Sweep
 
-__all__ = ["NO_BAR", "Columns", "make_columns", "no_columns"]
+__all__ = ["NO_BAR", "Columns", "gather_history", "make_columns", "no_columns", "spread_history"]
 
 NO_BAR = -1.0
 """Rest length of a column without a bar [m]."""
@@ -37,6 +37,7 @@ class Columns(NamedTuple):
     close : (groups,) bool, whether vectors of both ends overlap: forces are then added run by run, as in single steps
     rest : (columns,) rest lengths [m]
     area : areas [m2], a number or (columns,)
+    kept : (rows, columns) history of the bars, or rows without columns; see :func:`spread_history`
     counted : number of leading groups whose bars are counted on this rank
     parts : (parts + 1,) int64, first group of each part of the sweep; (0,) if there are no columns
     """
@@ -48,20 +49,33 @@ class Columns(NamedTuple):
     close: np.ndarray
     rest: np.ndarray
     area: float | np.ndarray
+    kept: np.ndarray
     counted: int
     parts: np.ndarray
 
 
-def no_columns(area: float | np.ndarray) -> Columns:
-    """Return the columns of a sweep that has none; ``area``: for its type."""
+def no_columns(area: float | np.ndarray, rows: int) -> Columns:
+    """Return the columns of a sweep that has none, for ``rows`` of a history; ``area``: for its type."""
     none = np.empty(0, dtype=np.uint32)
     empty = np.empty(0)
     area = empty if isinstance(area, np.ndarray) else area
-    return Columns(none, none, none, none, np.empty(0, dtype=np.bool_), empty, area, 0, np.empty(0, dtype=np.int64))
+    return Columns(
+        none,
+        none,
+        none,
+        none,
+        np.empty(0, dtype=np.bool_),
+        empty,
+        area,
+        np.empty((rows, 0)),
+        0,
+        np.empty(0, dtype=np.int64),
+    )
 
 
-def make_columns(sweep: Sweep, rest: np.ndarray, area: float | np.ndarray) -> Columns:
-    """Make the columns of a sweep whose chunks are all diagonal; ``rest`` (b,) [m], ``area`` [m2] a number or (b,)."""
+def make_columns(sweep: Sweep, rest: np.ndarray, area: float | np.ndarray, rows: int) -> Columns:
+    """Make the columns of a sweep of diagonal chunks, with room for ``rows`` of a history; ``rest`` (b,) [m],
+    ``area`` [m2] a number or (b,)."""
     n = len(sweep.heads)
     firsts = np.append(sweep.chunks[sweep.parts].astype(np.int64), n)  # runs that begin a part, or are not counted
     fresh = np.zeros(n + 1, dtype=np.bool_)
@@ -79,7 +93,7 @@ def make_columns(sweep: Sweep, rest: np.ndarray, area: float | np.ndarray) -> Co
         _spread(values, sweep.heads, sweep.starts, runs, heads, starts, 0.0, area)
     close = (fars - heads) < APART
     parts = np.searchsorted(runs, sweep.chunks[sweep.parts]).astype(np.int64)
-    return Columns(heads, fars, starts, runs, close, spread, area, counted, parts)
+    return Columns(heads, fars, starts, runs, close, spread, area, np.zeros((rows, columns)), counted, parts)
 
 
 @kernel
@@ -131,3 +145,29 @@ def _spread(values, run_heads, run_starts, runs, heads, starts, none, spread):
             begin = run_starts[run]
             for k in range(run_starts[run + 1] - begin):
                 spread[at + k] = values[begin + k]
+
+
+@kernel
+def spread_history(sweep, columns, history):
+    """Write the ``history`` (rows, b) of the bars of a sweep to ``columns.kept``, which loops over columns update."""
+    kept, wide, from_wide = columns.kept.reshape(-1), columns.kept.shape[1], history.shape[1]
+    values = history.reshape(-1)
+    for group in range(len(columns.heads)):
+        for run in range(columns.runs[group], columns.runs[group + 1]):
+            begin, count = sweep.starts[run], sweep.starts[run + 1] - sweep.starts[run]
+            at = columns.starts[group] + sweep.heads[run] - columns.heads[group]
+            for j in range(len(history)):
+                copy_run(values, j * from_wide + begin, kept, j * wide + at, count)
+
+
+@kernel
+def gather_history(sweep, columns, history):
+    """Write ``columns.kept`` back to the ``history`` (rows, b) of the bars of a sweep."""
+    kept, wide, to_wide = columns.kept.reshape(-1), columns.kept.shape[1], history.shape[1]
+    values = history.reshape(-1)
+    for group in range(len(columns.heads)):
+        for run in range(columns.runs[group], columns.runs[group + 1]):
+            begin, count = sweep.starts[run], sweep.starts[run + 1] - sweep.starts[run]
+            at = columns.starts[group] + sweep.heads[run] - columns.heads[group]
+            for j in range(len(history)):
+                copy_run(kept, j * wide + at, values, j * to_wide + begin, count)

@@ -20,7 +20,7 @@ from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.dispatcher import Dispatcher
 from numba.extending import _Intrinsic, register_jitable
 
-__all__ = ["Compilation", "code_digest", "inlined", "kernel"]
+__all__ = ["Compilation", "borrowing", "code_digest", "inlined", "kernel"]
 
 # Neither contraction to fused multiply-add nor reassociation: the result of a loop must not depend on how it was
 # compiled, alone or into the fused loop, for one bar or for eight at once. Then a bar evaluated on two ranks has the
@@ -105,6 +105,17 @@ def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a function into the loops that call it, with the options of :func:`kernel`."""
     _distinguish(function)
     return register_jitable(fastmath=_FAST, error_model="numpy")(function)
+
+
+def borrowing(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile a function as :func:`inlined`, without counting references to arrays: for functions that neither make nor
+    return arrays.
+
+    Each slice of an array and each field of a tuple of arrays counts references otherwise, by atomic operations that
+    take as long as several bars.
+    """
+    _distinguish(function)
+    return register_jitable(fastmath=_FAST, error_model="numpy", _nrt=False)(function)
 
 
 class _Cache(FunctionCache):

@@ -47,4 +47,5 @@ def fused_parts(kernels: SimpleNamespace) -> tuple:
         kernels.clear_energies,
         kernels.work_rows,
         kernels.pull_columns,
+        kernels.column_rows,
     )

@@ -14,7 +14,7 @@ from llvmlite import ir
 from numba.core import types
 from numba.extending import intrinsic
 
-from .compiled import kernel
+from .compiled import borrowing
 from .rows import known_ends
 from .strips import Arguments, Strip, for_strips, separate, weave
 
@@ -22,6 +22,7 @@ __all__ = [
     "add_rows",
     "address",
     "aligned",
+    "copy_run",
     "difference_of_ends",
     "join_planes",
     "new_planes",
@@ -123,6 +124,19 @@ add_rows, subtract_rows = _change_planes("fadd"), _change_planes("fsub")
 
 
 @intrinsic
+def copy_run(typingctx, values, first, copy, at, count):  # noqa: ANN001, ANN201
+    """Write ``count`` numbers of ``values`` (n,) from ``first`` on to ``copy`` (m,) from ``at`` on."""
+
+    def generate(context, builder, signature, arguments):  # noqa: ANN001, ANN202
+        given = Arguments(context, builder, signature, arguments)
+        source, target = given.numbers(0, given.index(1)), given.numbers(2, given.index(3))
+        for_strips(builder, given.index(4), lambda place, strip: strip.store(strip.load(source, place), target, place))
+        return context.get_dummy_value()
+
+    return types.void(values, first, copy, at, count), generate
+
+
+@intrinsic
 def split_planes(typingctx, x, first, count, planes, stride, base):  # noqa: ANN001, ANN201
     """Write the vectors of ``count`` nodes of ``x`` (n, 3), from ``first`` on, to ``planes`` (3 stride,), which begin
     at node ``base``."""
@@ -163,7 +177,7 @@ def join_planes(typingctx, planes, stride, base, first, count, f):  # noqa: ANN0
     return types.void(planes, stride, base, first, count, f), generate
 
 
-@kernel
+@borrowing
 def slide_planes(planes, shift, count):
     """Move ``count`` nodes of ``planes`` (3 stride,) from ``shift`` on to the beginning."""
     stride = len(planes) // 3

@@ -92,7 +92,10 @@ def take(typingctx, rows, column, like):  # noqa: ANN001, ANN201 - Numba's types
 
     def generate(context, builder, signature, args):  # noqa: ANN001, ANN202
         places = _places(context, builder, signature, args, -1, 1, count)
-        return context.make_tuple(builder, signature.return_type, [builder.load(place) for place in places])
+        loads = [builder.load(place) for place in places]
+        for load in loads:
+            load.set_metadata("alias.scope", known_ends(builder))
+        return context.make_tuple(builder, signature.return_type, loads)
 
     return like(rows, column, like), generate
 

@@ -7,20 +7,18 @@ see :mod:`~pfem_petsc.integrators._leapfrog`; ``lanes`` are the sums of the bala
 
 from __future__ import annotations
 
-import numpy as np
-
-from ..integrators._leapfrog import advance, advance_loaded, centre, drift, kick, move
-from ..mechanics.compiled import kernel
+from ..integrators._leapfrog import advance, advance_loaded, centre, kick, move
+from ..mechanics.compiled import borrowing
 from ..mechanics.planes import join_planes, split_planes
 from ..mesh.ordering import NODE_BLOCK
 from .balance_loops import INTERNAL, REACTIONS, add_drags, add_loads, add_powers, add_sparse_forces
 from .book_loops import spread
-from .node_loops import explicit_increments, hold, hold_still, react
+from .node_loops import hold_still
 
 __all__ = ["advance_block", "finish_block", "join_block", "move_block", "solve_block", "split_block"]
 
 
-@kernel
+@borrowing
 def move_block(block, n, x, h, half, f, light, planes, pulls, base):
     """Move the nodes of a block, and set their forces to zero; in ``light`` steps those of :func:`split_block`."""
     first = NODE_BLOCK * block
@@ -35,7 +33,7 @@ def move_block(block, n, x, h, half, f, light, planes, pulls, base):
         sums[j] = 0.0
 
 
-@kernel
+@borrowing
 def split_block(first, last, x, planes, pulls, base):
     """Write the positions of nodes [first, last) to ``planes`` (3 stride,), which begin at node ``base``, and set their
     forces in ``pulls`` (3 stride,) to zero."""
@@ -47,14 +45,14 @@ def split_block(first, last, x, planes, pulls, base):
             part[i] = 0.0
 
 
-@kernel
+@borrowing
 def join_block(block, n, pulls, base, f):
     """Write the forces of the nodes of a block from ``pulls``."""
     first = NODE_BLOCK * block
     join_planes(pulls, len(pulls) // 3, base, first, min(NODE_BLOCK, n - first), f)
 
 
-@kernel
+@borrowing
 def advance_block(block, nodes, x, f, half, h, alpha, eta, inverses, factors, speeds, held, support, lanes):
     """Finish the step of a block without walls and damping in one pass: forces alone determine its increments.
 
@@ -97,60 +95,62 @@ def advance_block(block, nodes, x, f, half, h, alpha, eta, inverses, factors, sp
     add_sparse_forces(begin, end, nodes.support_nodes, components, support, lanes[REACTIONS])
 
 
-@kernel
-def solve_block(block, nodes, x, f, half, h, alpha, eta, predictor, stiffness, u, load):
-    """Compute predictors, stiffness and increments ``u`` of a block without contact, and ``load`` (k,), the forces that
-    would move its prescribed components [N]."""
+@borrowing
+def solve_block(block, nodes, x, f, half, h, alpha, eta, inverses, factors, free, u, load, held):
+    """Compute the increments ``u`` (3 m,) of a block without contact, and its ``free`` positions (3 m,); for its
+    prescribed components the increments ``held`` (k,) [m] and ``load`` (k,), the forces that would move them [N].
+
+    ``inverses`` (n,) of the stiffness; ``factors`` (3 NODE_BLOCK,) is a buffer.
+    """
     first = NODE_BLOCK * block
     last = min(first + NODE_BLOCK, len(half))
-    nothing = np.empty((0, 3))
+    where, force, speed = x[first:last].reshape(-1), f[first:last].reshape(-1), half[first:last].reshape(-1)
+    factor = factors[: len(u)]
     damped = len(nodes.damping) > 0
-    explicit_increments(
-        nodes.external[first:last] if len(nodes.external) > 0 else nothing,
-        f[first:last],
-        nodes.mass[first:last],
-        nodes.damping[first:last] if damped else nodes.damping,
-        alpha,
-        eta,
-        nothing,
-        half[first:last] if damped else nothing,
-        stiffness[first:last],
-        u[first:last],
-    )
-    where = predictor[first:last]
-    drift(x[first:last].reshape(-1), h, half[first:last].reshape(-1), where.reshape(-1))
-    hold(
-        nodes.support_starts[block],
-        nodes.support_starts[block + 1],
-        first,
-        nodes.support_nodes,
-        nodes.support_components,
-        nodes.support_positions,
-        where,
-        stiffness[first:last],
-        u[first:last],
-        load,
-    )
+    if len(nodes.external) > 0:
+        given = nodes.external[first:last].reshape(-1)
+        for j in range(len(u)):
+            u[j] = given[j] - force[j]
+    else:
+        for j in range(len(u)):
+            u[j] = -force[j]
+    if damped:
+        spread(nodes.damping[first:last], factor)
+        for j in range(len(u)):
+            u[j] -= factor[j] * speed[j]
+    spread(inverses[first:last], factor)
+    for j in range(len(u)):
+        u[j] *= factor[j]
+        free[j] = where[j] + h * speed[j]
+    for k in range(nodes.support_starts[block], nodes.support_starts[block + 1]):
+        i = nodes.support_nodes[k]
+        j = 3 * (i - first) + nodes.support_components[k]
+        load[k] = (alpha * nodes.mass[i] + (eta * nodes.damping[i] if damped else 0.0)) * u[j]
+        u[j] = held[k] = nodes.support_positions[k] - free[j]
+    for j in range(len(u)):
+        free[j] += u[j]
 
 
-@kernel
-def finish_block(block, nodes, f, half, h, alpha, eta, contact, stiffness, u, load, speeds, drag, support, lanes):
-    """Finish the step of a block from its increments: reactions, velocities half a step later, and powers.
+@borrowing
+def finish_block(block, nodes, f, half, h, alpha, eta, contact, u, load, speeds, drag, support, lanes):
+    """Finish the step of a block from its increments ``u`` (3 m,): reactions, velocities half a step later, and powers.
 
     ``speeds`` and ``drag`` (3 NODE_BLOCK,) are buffers, the latter empty without damping.
     """
     first = NODE_BLOCK * block
     last = min(first + NODE_BLOCK, len(half))
     begin, end = nodes.support_starts[block], nodes.support_starts[block + 1]
-    held, components = nodes.support_nodes, nodes.support_components
-    react(begin, end, first, held, components, load, contact, stiffness[first:last], u[first:last], support)
-    increments, ahead = u[first:last].reshape(-1), half[first:last].reshape(-1)
-    here = speeds[: 3 * (last - first)]
-    kick(increments, alpha, h, ahead)
-    centre(increments, eta, ahead, here)
+    damped = len(drag) > 0
+    for k in range(begin, end):
+        i, c = nodes.support_nodes[k], nodes.support_components[k]
+        stiffness = alpha * nodes.mass[i] + (eta * nodes.damping[i] if damped else 0.0)
+        support[i, c] = stiffness * u[3 * (i - first) + c] - load[k] - contact[i, c]
+    ahead, here = half[first:last].reshape(-1), speeds[: len(u)]
+    kick(u, alpha, h, ahead)
+    centre(u, eta, ahead, here)
     add_powers(f[first:last].reshape(-1), here, lanes[INTERNAL])
-    add_sparse_forces(begin, end, held, components, support, lanes[REACTIONS])
+    add_sparse_forces(begin, end, nodes.support_nodes, nodes.support_components, support, lanes[REACTIONS])
     if len(nodes.external) > 0:
         add_loads(nodes.external[first:last].reshape(-1), here, lanes)
-    if len(drag) > 0:
+    if damped:
         add_drags(nodes.damping[first:last], here, drag, lanes)

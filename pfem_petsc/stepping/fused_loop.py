@@ -15,11 +15,11 @@ from functools import cache
 
 import numpy as np
 
-from ..contact.flat import press_planes
 from ..contact.log import compare_contacts
 from ..integrators._leapfrog import centre
 from ..mechanics.bar_geometry import first_inverted
-from ..mechanics.compiled import inlined, kernel
+from ..mechanics.columns import gather_history, spread_history
+from ..mechanics.compiled import borrowing, kernel
 from ..mechanics.planes import slide_planes
 from ..mechanics.rows import CHUNK, new_rows
 from ..mesh.ordering import NODE_BLOCK
@@ -37,6 +37,7 @@ from .balance_loops import (
 from .book_loops import WORKS, new_lanes
 from .fused_blocks import advance_block, finish_block, join_block, move_block, solve_block, split_block
 from .fused_rows import complete, fill_row, push_particles, stop_at_walls
+from .fused_walls import find_pressed, mark_blocks, new_pressed, press_block
 from .ghost_loops import trade_positions
 from .sum_loops import fill_walls
 
@@ -54,11 +55,13 @@ def make_fused_loop(
     clear_energies: Callable,
     work_rows: int,
     pull_columns: Callable,
+    column_rows: int,
 ) -> Callable:
     """Return the fused loop for a law and strain measure.
 
     ``forces`` is the bar loop over a part of a sweep, with the functions for its energies and the number of its working
-    arrays; ``pull_columns`` is the loop over columns, for steps whose energies nothing reads; see
+    arrays; ``pull_columns``, with ``column_rows`` working arrays, is the loop over columns, for steps
+    whose energies nothing reads; see
     :func:`~pfem_petsc.mechanics.kernels.make_kernels`.
 
     Its arguments are the maximum number of steps; the step [s]; positions, positions of the previous step, which are
@@ -76,13 +79,13 @@ def make_fused_loop(
     that touch walls, and those that have touched them.
     """
 
-    @inlined
+    @borrowing
     def pull(x, bars, begun, ended, h, f, work):
         """Add the forces of some chunks of bars."""
         law = (bars.parameters, bars.area, h, bars.history)
         return forces(x, bars.sweep, begun, ended, bars.far, bars.rest, bars.heat, *law, True, f, work)
 
-    @inlined
+    @borrowing
     def pull_light(x, bars, base, begun, ended, h, work):
         """Add the forces of some groups of columns to the planes."""
         law = (bars.parameters, h)
@@ -117,28 +120,26 @@ def make_fused_loop(
         eta = 0.5 / h
         supported, loaded = len(nodes.support_nodes) > 0, len(nodes.external) > 0
         damped = len(nodes.damping) > 0
-        # increments are kept where forces alone do not determine them
-        kept = n_walls > 0 or damped
-        predictor = np.empty((n if kept else 0, 3))
-        factors, inverses = np.empty(3 * NODE_BLOCK), np.empty(0 if kept else n)
-        for i in range(len(inverses)):
-            inverses[i] = 1.0 / (alpha * nodes.mass[i])
+        plain = n_walls == 0 and not damped  # forces alone determine increments
+        increments, factors, inverses = np.empty(3 * NODE_BLOCK), np.empty(3 * NODE_BLOCK), np.empty(n)
+        for i in range(n):
+            inverses[i] = 1.0 / (alpha * nodes.mass[i] + (eta * nodes.damping[i] if damped else 0.0))
         u = np.empty((n, 3))
         stiffness = np.empty(n)
         load, held = np.empty(len(nodes.support_nodes)), np.empty(len(nodes.support_nodes))
         speeds, drag = np.empty(3 * NODE_BLOCK), np.empty(3 * NODE_BLOCK if damped else 0)
         ends, totals, lanes, room = np.empty(len(WORKS)), np.zeros((6, 3)), new_sums(), new_lanes()
         row_lanes, after = new_sums(), np.empty(len(WORKS))
-        work, columns_work = np.empty(work_rows * CHUNK), new_rows(3)
+        work, columns_work = np.empty(work_rows * CHUNK), new_rows(column_rows)
         push_u = np.empty(impulses.v.shape)
-        near = np.empty(0, dtype=np.int64)
-        stuck_offsets = np.empty((0, n_walls))
-        force, moment = np.zeros((n_walls, 3)), np.zeros((n_walls, 3))
-        contacts = np.zeros(n_walls, dtype=np.int64)
-        touching, places = np.empty((0, n_walls), dtype=np.bool_), np.empty((0, 3))
-        pressed = touched  # nodes with entries in the array of wall forces
+        near = touched  # nodes with entries in the array of wall forces
+        pressed = new_pressed(n, n_walls)
         n_blocks = (n + NODE_BLOCK - 1) // NODE_BLOCK
-        room_for, parts = len(bars.planes) // 3, bars.columns.parts
+        # blocks whose forces alone determine their increments; blocks with nodes that touch walls or have touched them
+        alone, on_walls = np.ones(n_blocks, dtype=np.bool_), np.zeros(n_blocks, dtype=np.bool_)
+        # fields that loops over blocks would count references to
+        planes, pulls, parts, chunks = bars.planes, bars.pulls, bars.columns.parts, bars.sweep.parts
+        room_for, reach = len(planes) // 3, bars.reach
         failed = -1
         turned = -1
         infeasible = -1
@@ -147,6 +148,7 @@ def make_fused_loop(
         kinetic = 0.0
         several = len(x) > n or messages.count > 0
         lost = 0  # error code of MPI
+        spread = False  # whether the history of the bars is that of the columns
         for step in range(count):
             row = sums[step]
             row[_ALARM] = 0.0
@@ -155,7 +157,7 @@ def make_fused_loop(
                 row[_ALARM] = 1.0
                 lost = trade_positions(messages, x, before, False)
                 continue
-            for i in pressed:
+            for i in near:
                 contact[i] = 0.0
             clear_forces(lanes, n, supported, loaded, damped)
             shortened, changed = False, 0
@@ -164,9 +166,15 @@ def make_fused_loop(
             base = 0  # first node of the planes
             # nothing reads the energies of other steps: a failure ends the run
             light = len(parts) > 0 and not (due[step] or step == count - 1)
+            if light != spread:
+                if light:
+                    spread_history(bars.sweep, bars.columns, bars.history)
+                else:
+                    gather_history(bars.sweep, bars.columns, bars.history)
+                spread = light
             if several:
                 while moved < n_blocks:
-                    move_block(moved, n, x, h, half, f, light, bars.planes, bars.pulls, base)
+                    move_block(moved, n, x, h, half, f, light, planes, pulls, base)
                     moved += 1
                 for i in range(n, len(x)):
                     f[i, 0] = f[i, 1] = f[i, 2] = 0.0
@@ -174,97 +182,65 @@ def make_fused_loop(
                 if lost != 0:
                     break
                 if light:
-                    split_block(n, len(x), x, bars.planes, bars.pulls, base)
+                    split_block(n, len(x), x, planes, pulls, base)
                     groups = (bars.columns.counted, len(bars.columns.heads))
                     failed, shortened = pull_light(x, bars, base, *groups, h, columns_work)
                 else:
                     failed, shortened, changed = pull(x, bars, bars.sweep.counted, len(bars.sweep.diagonal), h, f, work)
             clear_energies(work)
+            count_near = 0
+            if n_walls > 0:
+                pressed.force[:], pressed.contacts[:], pressed.moment[:] = 0.0, 0, 0.0
+                mark_blocks(on_walls, touched, True)
+                mark_blocks(on_walls, met, True)
             # Blocks of nodes pass once through the cache: each moves shortly before its first bar, and is finished
-            # after its last one, which belongs to its own block or to one before. Walls take all nodes in between.
-            for stage in range(2):
-                if stage == 1:
-                    if n_walls == 0:
-                        break
-                    near, infeasible, stuck_offsets, total, touching, places, force, contacts, moment = press_planes(
-                        predictor,
-                        u,
-                        walls.fixed,
-                        walls.normals,
-                        walls.offsets,
-                        walls.all_nodes,
-                        walls.members,
-                        walls.tolerance,
-                        stiffness,
-                        walls.room,
+            # after its last one, which belongs to its own block or to one before.
+            for block in range(n_blocks):
+                while moved < min(block + 1 + reach, n_blocks):
+                    if light and room_for < NODE_BLOCK * (moved + 1) - base:
+                        live = NODE_BLOCK * block
+                        slide_planes(planes, live - base, NODE_BLOCK * moved - live)
+                        slide_planes(pulls, live - base, NODE_BLOCK * moved - live)
+                        base = live
+                    move_block(moved, n, x, h, half, f, light, planes, pulls, base)
+                    moved += 1
+                if light:
+                    if block < len(parts) - 1:
+                        at, short = pull_light(x, bars, base, parts[block], parts[block + 1], h, columns_work)
+                        failed = at if failed < 0 else failed
+                        shortened = shortened or short
+                    join_block(block, n, pulls, base, f)
+                elif block < len(chunks) - 1:
+                    at, short, broke = pull(x, bars, chunks[block], chunks[block + 1], h, f, work)
+                    failed = at if failed < 0 else failed
+                    shortened = shortened or short
+                    changed += broke
+                if plain:
+                    advance_block(
+                        block, nodes, x, f, half, h, alpha, eta, inverses, factors, speeds, held, support, lanes
                     )
-                    for j in range(len(near)):
-                        contact[near[j]] = total[j]
-                    pressed = near
-                    if len(near) > 0 or len(touched) > 0:
-                        changes, touched = compare_contacts(
-                            walls.touching, touched, near, touching, walls.present, walls.releases
-                        )
-                for block in range(n_blocks):
-                    if stage == 0:
-                        while moved < min(block + 1 + bars.reach, n_blocks):
-                            if light and room_for < NODE_BLOCK * (moved + 1) - base:
-                                live = NODE_BLOCK * block
-                                slide_planes(bars.planes, live - base, NODE_BLOCK * moved - live)
-                                slide_planes(bars.pulls, live - base, NODE_BLOCK * moved - live)
-                                base = live
-                            move_block(moved, n, x, h, half, f, light, bars.planes, bars.pulls, base)
-                            moved += 1
-                        if light:
-                            if block < len(parts) - 1:
-                                at, short = pull_light(x, bars, base, parts[block], parts[block + 1], h, columns_work)
-                                failed = at if failed < 0 else failed
-                                shortened = shortened or short
-                            join_block(block, n, bars.pulls, base, f)
-                        elif block < len(bars.sweep.parts) - 1:
-                            at, short, broke = pull(
-                                x, bars, bars.sweep.parts[block], bars.sweep.parts[block + 1], h, f, work
-                            )
-                            failed = at if failed < 0 else failed
-                            shortened = shortened or short
-                            changed += broke
-                        if not kept:
-                            advance_block(
-                                block,
-                                nodes,
-                                x,
-                                f,
-                                half,
-                                h,
-                                alpha,
-                                eta,
-                                inverses,
-                                factors,
-                                speeds,
-                                held,
-                                support,
-                                lanes,
-                            )
-                            continue
-                        solve_block(block, nodes, x, f, half, h, alpha, eta, predictor, stiffness, u, load)
-                        if n_walls > 0:
-                            continue
-                    finish_block(
-                        block,
-                        nodes,
-                        f,
-                        half,
-                        h,
-                        alpha,
-                        eta,
-                        contact,
-                        stiffness,
-                        u,
-                        load,
-                        speeds,
-                        drag,
-                        support,
-                        lanes,
+                    continue
+                first, last = NODE_BLOCK * block, min(NODE_BLOCK * (block + 1), n)
+                free, here = speeds[: 3 * (last - first)], increments[: 3 * (last - first)]
+                solve_block(block, nodes, x, f, half, h, alpha, eta, inverses, factors, free, here, load, held)
+                found = find_pressed(block, walls, free) if n_walls > 0 else 0
+                if found > 0:
+                    at = press_block(block, found, nodes, walls, free, here, alpha, eta, contact, pressed, count_near)
+                    infeasible = at if infeasible < 0 else infeasible
+                    count_near += found
+                finish_block(block, nodes, f, half, h, alpha, eta, contact, here, load, speeds, drag, support, lanes)
+                alone[block] = not (damped or on_walls[block] or found > 0)
+                if not alone[block]:
+                    kept = u[first:last].reshape(-1)
+                    for j in range(len(here)):
+                        kept[j] = here[j]
+            if n_walls > 0:
+                mark_blocks(on_walls, touched, False)
+                mark_blocks(on_walls, met, False)
+                near = pressed.nodes[:count_near]
+                if count_near > 0 or len(touched) > 0:
+                    changes, touched = compare_contacts(
+                        walls.touching, touched, near, pressed.touching, walls.present, walls.releases
                     )
             impact = 0.0
             if len(near) > 0:
@@ -276,23 +252,26 @@ def make_fused_loop(
                 impact, met = stop_at_walls(x, half, nodes, walls, alpha, eta, u, v, a, contact, touched, met)
             after[:] = powers
             sum_balance(lanes, n, h, supported, loaded, len(near) > 0, damped, totals, after)
-            push_particles(totals, force, alpha, h, impulses, push_u)
+            push_particles(totals, pressed.force, alpha, h, impulses, push_u)
             ledger[_IMPACT] += impact
             if n_walls > 0:
                 row[_HEAD] = changes
-                fill_walls(row, _HEAD + 1, force, moment, impulses.v, contacts, walls.releases)
+                fill_walls(row, _HEAD + 1, pressed.force, pressed.moment, impulses.v, pressed.contacts, walls.releases)
             done += 1
             wrong = failed >= 0 or infeasible >= 0 or changed > 0 or not np.isfinite(after[INTERNAL])
             if due[step] or shortened or wrong or step == count - 1:
                 turned = -1
-                complete(n, f, half, nodes, alpha, eta, kept, held, stiffness, u, a, v)
+                complete(n, f, half, nodes, alpha, eta, alone, held, stiffness, u, a, v)
                 if shortened or wrong or step == count - 1:
                     start_of_step(x[:n].reshape(-1), h, v.reshape(-1), a.reshape(-1), before[:n].reshape(-1))
                 if failed < 0 and shortened:
                     turned = first_inverted(x, before, bars.ends, bars.watched)
                 wrong = wrong or turned >= 0
             if due[step] or wrong or step == count - 1:
-                if not light:
+                if light:
+                    gather_history(bars.sweep, bars.columns, bars.history)
+                    spread = False
+                else:
                     for k in range(len(energies)):
                         energies[k] = 0.0
                     sum_energies(work, energies)
@@ -307,7 +286,7 @@ def make_fused_loop(
                     state,
                     impulses,
                     push_u,
-                    (force, moment, contacts, walls.releases),
+                    (pressed.force, pressed.moment, pressed.contacts, walls.releases),
                     len(near),
                     powers,
                     row_lanes,
@@ -328,10 +307,17 @@ def make_fused_loop(
             failed,
             turned,
             infeasible,
-            stuck_offsets,
+            pressed.offsets,
             kinetic,
             u,
-            (force, contacts, moment, near, touching, places),
+            (
+                pressed.force,
+                pressed.contacts,
+                pressed.moment,
+                near.copy(),
+                pressed.touching[: len(near)].copy(),
+                pressed.places[: len(near)].copy(),
+            ),
             touched,
             met,
         )

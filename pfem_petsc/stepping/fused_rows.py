@@ -11,6 +11,7 @@ import numpy as np
 from ..contact.impact_loops import join_nodes, plane_gaps, stop_nodes, unpressed
 from ..integrators._leapfrog import centre, kick
 from ..mechanics.compiled import kernel
+from ..mesh.ordering import NODE_BLOCK
 from ..output.sums import HEAD
 from .balance_loops import book_row
 from .impulses import WALLS, fill_impulses
@@ -75,14 +76,28 @@ def push_particles(totals, force, alpha, h, impulses, u):
 
 
 @kernel
-def complete(n, f, half, nodes, alpha, eta, kept, held, stiffness, u, a, v):
-    """Compute the increments of all nodes, unless they are ``kept``, accelerations and velocities."""
-    if not kept:
-        nothing = np.empty((0, 3))
+def complete(n, f, half, nodes, alpha, eta, alone, held, stiffness, u, a, v):
+    """Compute the increments of blocks whose forces ``alone`` (blocks,) determine them, and accelerations and
+    velocities of all nodes; ``held`` (k,): increments of prescribed components of these blocks [m]."""
+    loaded, nothing = len(nodes.external) > 0, np.empty((0, 3))
+    for block in range(len(alone)):
+        if not alone[block]:
+            continue
+        first = NODE_BLOCK * block
+        last = min(first + NODE_BLOCK, n)
         explicit_increments(
-            nodes.external, f[:n], nodes.mass, nodes.damping, alpha, eta, nothing, nothing, stiffness, u
+            nodes.external[first:last] if loaded else nothing,
+            f[first:last],
+            nodes.mass[first:last],
+            nodes.damping,
+            alpha,
+            eta,
+            nothing,
+            nothing,
+            stiffness[first:last],
+            u[first:last],
         )
-        for k in range(len(held)):
+        for k in range(nodes.support_starts[block], nodes.support_starts[block + 1]):
             u[nodes.support_nodes[k], nodes.support_components[k]] = held[k]
     centre(u.reshape(-1), eta, half.reshape(-1), v.reshape(-1))
     accelerations(u.reshape(-1), alpha, a.reshape(-1))

@@ -92,12 +92,12 @@ class Batch:
         self.sums = np.zeros((MOST, recorder.width))
 
     def _columns(self) -> Columns:
-        """Return the columns of the bars, or none if their law keeps data or they are not in diagonal runs."""
+        """Return the columns of the bars, or none if bars are heated, can break or are not in diagonal runs."""
         bars = self.model.bars
         block = bars.blocks[0]
-        if len(block.history) or bars.heat.size or not len(bars.rest) or not block.sweep.diagonal.all():
-            return no_columns(block.area)
-        return make_columns(block.sweep, bars.rest, block.area)
+        if bars.can_break or bars.heat.size or not len(bars.rest) or not block.sweep.diagonal.all():
+            return no_columns(block.area, len(block.history))
+        return make_columns(block.sweep, bars.rest, block.area, len(block.history))
 
     def _planes(self, reach: int, columns: Columns) -> tuple[np.ndarray, np.ndarray]:
         """Return planes for all nodes; on one rank for a window of them, which stays in the cache."""
@@ -187,7 +187,7 @@ class Batch:
         elif failed >= 0 or turned >= 0:
             stepper.fault = SimulationFailure(stepper.collapse(max(failed, turned)))
         elif infeasible >= 0:
-            text = self.model.contact.infeasible_message(touched[3][infeasible], offsets[infeasible])
+            text = self.model.contact.infeasible_message(touched[3][infeasible], offsets)
             stepper.fault = SimulationFailure(f"{stepper.when(stepper.balance)}: {text}")
         done = done if self.model.comm.size == 1 else len(due)
         state.step, state.time = begin + done, (begin + done) * stepper.h

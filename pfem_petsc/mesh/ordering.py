@@ -20,6 +20,12 @@ NODE_BLOCK = 512
 LEAST_RUN = 8
 """Mean number of bars of the runs of constant offset from which a block goes by these: shorter loops do not pay."""
 
+_PLANES = 4
+"""Maximum number of planes of nodes, as a multiple of those of a cubic grid with as many nodes."""
+
+_STEPS = 1 << 20
+"""Planes closer together than this part of the extent count as one."""
+
 # Number of points processed at a time, so that temporary arrays stay in the cache.
 _PIECE = 1 << 15
 
@@ -92,8 +98,9 @@ def _spread(x: np.ndarray) -> np.ndarray:
 def sweep_keys(points: np.ndarray) -> np.ndarray:
     """Return the positions of points in a sweep: layer by layer along the longest extent, row by row in a layer.
 
-    Layers and rows are about one node spacing wide, so that the bars of a node extend over two layers only. A regular
-    lattice is swept exactly in its own order of layers.
+    Along axes on which the nodes lie in few planes, as those of lattices, layers and rows are these planes; the nodes of
+    a row then repeat with the cells, and so do the differences between the numbers of both ends of bars. Along other
+    axes they are about one node spacing wide, so that the bars of a node extend over two layers only.
 
     Parameters
     ----------
@@ -111,10 +118,30 @@ def sweep_keys(points: np.ndarray) -> np.ndarray:
     keys = np.zeros(len(points), np.int64)
     for axis in np.argsort(-extents, kind="stable"):
         if extents[axis] > 0.0:
-            # Nodes of a regular lattice lie at the centres of cells, not on their borders.
-            keys *= int(extents[axis] / spacing + 0.5) + 1
-            keys += ((points[:, axis] - low[axis]) / spacing + 0.5).astype(np.int64)
+            rows = int(extents[axis] / spacing + 0.5) + 1
+            planes = _planes(points[:, axis], float(low[axis]), float(extents[axis]), _PLANES * rows)
+            if planes is None:
+                # Nodes of a regular lattice lie at the centres of cells, not on their borders.
+                planes = ((points[:, axis] - low[axis]) / spacing + 0.5).astype(np.int64)
+                keys *= rows
+            else:
+                keys *= int(planes.max()) + 1
+            keys += planes
     return keys
+
+
+def _planes(x: np.ndarray, low: float, extent: float, most: int) -> np.ndarray | None:
+    """Return the number of the plane of each coordinate, in ascending order, or None if there are more than ``most``."""
+    used = np.zeros(_STEPS + 1, dtype=bool)
+    scale = _STEPS / extent
+    for first in range(0, len(x), _PIECE):
+        used[np.rint((x[first : first + _PIECE] - low) * scale).astype(np.int64)] = True
+    begins = used.copy()
+    begins[1:] &= ~used[:-1]  # rounding may divide a plane between two steps
+    number = np.cumsum(begins) - 1
+    if number[-1] >= most:
+        return None
+    return number[np.rint((x - low) * scale).astype(np.int64)]
 
 
 def _spacing(extents: np.ndarray, n: int) -> float:

@@ -190,6 +190,21 @@ def test_a_lattice_is_swept_in_its_own_order(cells):
     np.testing.assert_array_equal(np.argsort(sweep_keys(mesh.points), kind="stable"), np.arange(mesh.n_nodes))
 
 
+@pytest.mark.parametrize("kind", ["octet", "bcc", "diamond"])
+def test_bars_of_lattices_repeat_from_cell_to_cell(kind, comm):
+    """Bars of one direction have the same difference of node numbers all along a row of cells, in whatever numbering."""
+    n = 10
+    mesh = lattice.generate(lattice.Parameters(kind=kind, cells=[n, n, n], pitch=0.1), 0, 1)
+    shift = 1e-12 * np.random.default_rng(2).standard_normal(mesh.points.shape)  # rounding of a file
+    number = np.empty(mesh.n_nodes, dtype=np.int64)
+    number[np.argsort(sweep_keys(mesh.points + shift), kind="stable")] = np.arange(mesh.n_nodes)
+    ends = np.sort(number[mesh.bars], axis=1)
+    offset, low = ends[:, 1] - ends[:, 0], ends[:, 0]
+    order = np.lexsort((low, offset))
+    runs = 1 + np.count_nonzero((np.diff(low[order]) != 1) | (np.diff(offset[order]) != 0))
+    assert len(mesh.bars) > n * runs
+
+
 def test_bars_lie_close_to_each_other_in_memory(comm):
     """A lattice numbered at random is brought back to bars that span little more than a layer of nodes."""
     n = 9

@@ -16,7 +16,7 @@ class HardeningKeys(PlasticKeys):
     isotropic_hardening: NonNegativeFloat = 0.0
     """isotropic hardening modulus K [Pa]"""
     saturation_stress: NonNegativeFloat = 0.0
-    """increase Q of the yield stress at saturation, as of the law voce [Pa]"""
+    """increase Q of the yield stress at saturation, as in the law voce [Pa]"""
     saturation_rate: NonNegativeFloat = 0.0
     """rate b of saturation over the accumulated plastic strain [-]"""
 

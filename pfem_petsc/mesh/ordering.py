@@ -98,8 +98,8 @@ def _spread(x: np.ndarray) -> np.ndarray:
 def sweep_keys(points: np.ndarray) -> np.ndarray:
     """Return the positions of points in a sweep: layer by layer along the longest extent, row by row in a layer.
 
-    Along axes on which the nodes lie in few planes, as those of lattices, layers and rows are these planes; the nodes of
-    a row then repeat with the cells, and so do the differences between the numbers of both ends of bars. Along other
+    Along axes on which the nodes lie in few planes, as those of lattices, layers and rows are these planes; the nodes
+    of a row then repeat with the cells, and so do the differences between the numbers of both ends of bars. Along other
     axes they are about one node spacing wide, so that the bars of a node extend over two layers only.
 
     Parameters
@@ -131,7 +131,7 @@ def sweep_keys(points: np.ndarray) -> np.ndarray:
 
 
 def _planes(x: np.ndarray, low: float, extent: float, most: int) -> np.ndarray | None:
-    """Return the number of the plane of each coordinate, in ascending order, or None if there are more than ``most``."""
+    """Return the numbers of the planes of coordinates, in ascending order, or None if there are more than ``most``."""
     used = np.zeros(_STEPS + 1, dtype=bool)
     scale = _STEPS / extent
     for first in range(0, len(x), _PIECE):

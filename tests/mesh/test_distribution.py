@@ -192,7 +192,7 @@ def test_a_lattice_is_swept_in_its_own_order(cells):
 
 @pytest.mark.parametrize("kind", ["octet", "bcc", "diamond"])
 def test_bars_of_lattices_repeat_from_cell_to_cell(kind, comm):
-    """Bars of one direction have the same difference of node numbers all along a row of cells, in whatever numbering."""
+    """Bars of one direction have the same difference of node numbers along a row of cells, in whatever numbering."""
     n = 10
     mesh = lattice.generate(lattice.Parameters(kind=kind, cells=[n, n, n], pitch=0.1), 0, 1)
     shift = 1e-12 * np.random.default_rng(2).standard_normal(mesh.points.shape)  # rounding of a file

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..mesh.ordering import LEAST_RUN, NODE_BLOCK
+from ..mesh.ordering import FEW, LEAST_RUN, NODE_BLOCK
 from .compiled import kernel
 from .rows import CHUNK
 
@@ -55,9 +55,14 @@ def make_sweep(bars: np.ndarray, start: int, counted: int, stop: int, chunk: int
     diagonal = np.empty(len(firsts) - 1, dtype=np.bool_)
     chunks = np.empty(len(firsts), dtype=np.uint32)
     none = np.empty(0, dtype=np.uint32)
-    runs = _find_runs(bars, firsts, diagonal, chunks, none, none, none)
+    runs = _find_runs(bars, firsts, False, diagonal, chunks, none, none, none)
+    short = np.diff(firsts.astype(np.int64))[~diagonal].sum()
+    forced = bool(0 < short <= FEW * (stop - start))
+    if forced:  # few bars: the others have faster loops if all chunks are alike
+        diagonal[:] = True
+        runs = _find_runs(bars, firsts, True, diagonal, chunks, none, none, none)
     heads, fars, starts = (np.empty(n, dtype=np.uint32) for n in (runs, runs, runs + 1))
-    _find_runs(bars, firsts, diagonal, chunks, heads, fars, starts)
+    _find_runs(bars, firsts, forced, diagonal, chunks, heads, fars, starts)
     starts[runs] = stop
     chunks_counted = int(np.searchsorted(firsts[:-1], counted))
     lower = bars[firsts[:chunks_counted]].min(axis=1) // NODE_BLOCK
@@ -83,15 +88,17 @@ def _cut(bars, start, counted, stop, chunk, firsts):
 
 
 @kernel
-def _find_runs(bars, firsts, diagonal, chunks, heads, fars, starts):
-    """Return the number of runs; write chunks, the first run of each, and the runs unless ``heads`` is empty."""
+def _find_runs(bars, firsts, forced, diagonal, chunks, heads, fars, starts):
+    """Return the number of runs; write chunks, the first run of each, and the runs unless ``heads`` is empty, and which
+    chunks are ``diagonal``, unless ``forced``."""
     count = 0
     for c in range(len(firsts) - 1):
         chunks[c] = count
         breaks = 1
         for k in range(firsts[c] + 1, firsts[c + 1]):
             breaks += 0 if _follows(bars, k) else 1
-        diagonal[c] = firsts[c + 1] - firsts[c] >= LEAST_RUN * breaks
+        if not forced:
+            diagonal[c] = firsts[c + 1] - firsts[c] >= LEAST_RUN * breaks
         for k in range(firsts[c], firsts[c + 1]):
             low = min(bars[k, 0], bars[k, 1])
             if k > firsts[c]:

@@ -10,8 +10,8 @@ from mpi4py import MPI
 
 from ..parallel.natural import NaturalOrder
 from .exchange import GhostExchange, Messages, Router
-from .ordering import bar_order, node_order, sweep_keys
-from .partition import partition
+from .ordering import bar_order, node_order, sweep_axes, sweep_keys
+from .partition import bounding_box, partition
 from .slab import MeshSlab, index_type, slab_of
 
 __all__ = ["Block", "DistributedMesh", "distribute"]
@@ -188,7 +188,7 @@ def _among_ranks(mesh: DistributedMesh, slab: MeshSlab, section: np.ndarray, own
     points = to_owner.send(slab.points)
     if not keep:
         slab.points = slab.points[:0].copy()
-    order = node_order(sweep_keys(points), ids)
+    order = node_order(sweep_keys(points, sweep_axes(*bounding_box(points, comm))), ids)
     n_owned = len(ids)
     starts = np.concatenate([[0], np.cumsum(comm.allgather(n_owned))]).astype(np.int64)
     numbers = np.empty(n_owned, np.int64)

@@ -9,7 +9,17 @@ from __future__ import annotations
 
 import numpy as np
 
-__all__ = ["BITS", "LEAST_RUN", "NODE_BLOCK", "bar_order", "hilbert_keys", "node_order", "sweep_keys"]
+__all__ = [
+    "BITS",
+    "FEW",
+    "LEAST_RUN",
+    "NODE_BLOCK",
+    "bar_order",
+    "hilbert_keys",
+    "node_order",
+    "sweep_axes",
+    "sweep_keys",
+]
 
 BITS = 21
 """Bits of each coordinate in a key: three times this fits in 64 bits."""
@@ -20,8 +30,14 @@ NODE_BLOCK = 512
 LEAST_RUN = 8
 """Mean number of bars of the runs of constant offset from which a block goes by these: shorter loops do not pay."""
 
+FEW = 0.15
+"""Share of the bars whose runs may be shorter, so that all go by runs of constant offset."""
+
 _PLANES = 4
 """Maximum number of planes of nodes, as a multiple of those of a cubic grid with as many nodes."""
+
+_LONGER = 1.5
+"""Ratio of extents from which rows are along the longer one, whatever the order of the axes."""
 
 _STEPS = 1 << 20
 """Planes closer together than this part of the extent count as one."""
@@ -95,8 +111,20 @@ def _spread(x: np.ndarray) -> np.ndarray:
     return x
 
 
-def sweep_keys(points: np.ndarray) -> np.ndarray:
-    """Return the positions of points in a sweep: layer by layer along the longest extent, row by row in a layer.
+def sweep_axes(low: np.ndarray, high: np.ndarray) -> tuple[int, ...]:
+    """Return the axes of a sweep through the box from ``low`` to ``high`` (3,): across layers, across rows, along rows.
+
+    Layers across the longest extent have the fewest nodes; rows along the longer extent of a layer have the most.
+    """
+    extents = high - low
+    layers, middle, rows = (int(axis) for axis in np.argsort(-extents, kind="stable"))
+    if extents[middle] > _LONGER * extents[rows]:
+        middle, rows = rows, middle
+    return layers, middle, rows
+
+
+def sweep_keys(points: np.ndarray, axes: tuple[int, ...] | None = None) -> np.ndarray:
+    """Return the positions of points in a sweep, layer by layer, and row by row in a layer.
 
     Along axes on which the nodes lie in few planes, as those of lattices, layers and rows are these planes; the nodes
     of a row then repeat with the cells, and so do the differences between the numbers of both ends of bars. Along other
@@ -105,6 +133,8 @@ def sweep_keys(points: np.ndarray) -> np.ndarray:
     Parameters
     ----------
     points : (n, 3) float64 [m]
+    axes : see :func:`sweep_axes`; None: of the points. Where parts of a mesh have the same axes, the nodes on both
+        sides of their borders are in the same order
 
     Returns
     -------
@@ -112,11 +142,11 @@ def sweep_keys(points: np.ndarray) -> np.ndarray:
     """
     if len(points) == 0:
         return np.empty(0, np.int64)
-    low = points.min(axis=0)
-    extents = points.max(axis=0) - low
+    low, high = points.min(axis=0), points.max(axis=0)
+    extents = high - low
     spacing = _spacing(extents, len(points))
     keys = np.zeros(len(points), np.int64)
-    for axis in np.argsort(-extents, kind="stable"):
+    for axis in sweep_axes(low, high) if axes is None else axes:
         if extents[axis] > 0.0:
             rows = int(extents[axis] / spacing + 0.5) + 1
             planes = _planes(points[:, axis], float(low[axis]), float(extents[axis]), _PLANES * rows)
@@ -170,7 +200,8 @@ def bar_order(bars: np.ndarray, group: np.ndarray | None, n_local: int) -> np.nd
     """Return the order (indices) of bars by group and block of nodes of the lower local end.
 
     In a block bars are in order of the offset between both ends, then of the lower end, if many have the same offset,
-    else in order of the lower, then of the higher end.
+    else in order of the lower, then of the higher end; if few bars of the rank are in such blocks, all are in the first
+    order.
 
     Parameters
     ----------
@@ -199,6 +230,8 @@ def bar_order(bars: np.ndarray, group: np.ndarray | None, n_local: int) -> np.nd
     scattered = _scattered(key[order], block[order], LEAST_RUN)
     if len(scattered):
         stars = np.isin(block, scattered)
+        if np.count_nonzero(stars) <= FEW * len(block):
+            return order
         key[stars] = (block[stars] * NODE_BLOCK + low[stars]) * n_local + offset[stars]
         order = np.argsort(key, kind="stable")
     return order

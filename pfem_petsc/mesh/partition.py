@@ -10,7 +10,7 @@ from .exchange import Router
 from .ordering import BITS, hilbert_keys
 from .slab import MeshSlab, slab_of
 
-__all__ = ["PARTITIONERS", "UNEVEN", "bounding_cube", "partition"]
+__all__ = ["PARTITIONERS", "UNEVEN", "bounding_box", "bounding_cube", "partition"]
 
 PARTITIONERS = ("auto", "ptscotch", "coordinates")
 
@@ -58,13 +58,19 @@ def partition(slab: MeshSlab, comm: MPI.Comm, partitioner: str = "auto") -> tupl
     return _by_coordinates(slab, _works(slab, comm), comm), "coordinates"
 
 
-def bounding_cube(points: np.ndarray, comm: MPI.Comm) -> tuple[np.ndarray, float]:
-    """Return the lowest corner (3,) [m] and largest extent [m] of the points of all ranks. Collective."""
+def bounding_box(points: np.ndarray, comm: MPI.Comm) -> tuple[np.ndarray, np.ndarray]:
+    """Return the lowest and highest corners (3,) [m] of the box around the points of all ranks. Collective."""
     box = np.full((2, 3), np.inf)
     if len(points):
         box[0], box[1] = points.min(axis=0), -points.max(axis=0)
     comm.Allreduce(MPI.IN_PLACE, box, op=MPI.MIN)
-    return box[0], float((-box[1] - box[0]).max())
+    return box[0], -box[1]
+
+
+def bounding_cube(points: np.ndarray, comm: MPI.Comm) -> tuple[np.ndarray, float]:
+    """Return the lowest corner (3,) [m] and largest extent [m] of the points of all ranks. Collective."""
+    low, high = bounding_box(points, comm)
+    return low, float((high - low).max())
 
 
 def _works(slab: MeshSlab, comm: MPI.Comm) -> np.ndarray:

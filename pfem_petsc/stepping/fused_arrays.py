@@ -30,6 +30,7 @@ class BarArrays(NamedTuple):
     slack: int
     counted: int
     reach: int
+    meeting: int
     can_break: bool
     columns: Columns
     planes: np.ndarray

@@ -38,7 +38,7 @@ from .book_loops import WORKS, new_lanes
 from .fused_blocks import advance_block, finish_block, join_block, move_block, solve_block, split_block
 from .fused_rows import complete, fill_row, push_particles, stop_at_walls
 from .fused_walls import find_pressed, mark_blocks, new_pressed, press_block
-from .ghost_loops import trade_positions
+from .ghost_loops import finish_positions, start_positions
 from .sum_loops import fill_walls
 
 __all__ = ["make_fused_loop"]
@@ -148,6 +148,7 @@ def make_fused_loop(
         kinetic = 0.0
         several = len(x) > n or messages.count > 0
         lost = 0  # error code of MPI
+        aside = np.empty(len(work) if several else 0)  # energies of bars that other ranks count
         spread = False  # whether the history of the bars is that of the columns
         for step in range(count):
             row = sums[step]
@@ -155,7 +156,10 @@ def make_fused_loop(
             if failed >= 0 or turned >= 0 or infeasible >= 0:
                 # the other ranks still need messages, until all know of the failure
                 row[_ALARM] = 1.0
-                lost = trade_positions(messages, x, before, False)
+                lost = start_positions(messages, x, h, half)
+                lost = finish_positions(messages, x, before, False) if lost == 0 else lost
+                if lost != 0:
+                    break
                 continue
             for i in near:
                 contact[i] = 0.0
@@ -173,20 +177,10 @@ def make_fused_loop(
                     gather_history(bars.sweep, bars.columns, bars.history)
                 spread = light
             if several:
-                while moved < n_blocks:
-                    move_block(moved, n, x, h, half, f, light, planes, pulls, base)
-                    moved += 1
-                for i in range(n, len(x)):
-                    f[i, 0] = f[i, 1] = f[i, 2] = 0.0
-                lost = trade_positions(messages, x, before, True)
+                lost = start_positions(messages, x, h, half)
                 if lost != 0:
                     break
-                if light:
-                    split_block(n, len(x), x, planes, pulls, base)
-                    groups = (bars.columns.counted, len(bars.columns.heads))
-                    failed, shortened = pull_light(x, bars, base, *groups, h, columns_work)
-                else:
-                    failed, shortened, changed = pull(x, bars, bars.sweep.counted, len(bars.sweep.diagonal), h, f, work)
+            waiting = several
             clear_energies(work)
             count_near = 0
             if n_walls > 0:
@@ -194,10 +188,34 @@ def make_fused_loop(
                 mark_blocks(on_walls, touched, True)
                 mark_blocks(on_walls, met, True)
             # Blocks of nodes pass once through the cache: each moves shortly before its first bar, and is finished
-            # after its last one, which belongs to its own block or to one before.
-            for block in range(n_blocks):
+            # after its last one, which belongs to its own block or to one before. Messages are on their way until the
+            # first block that needs ghosts.
+            for block in range(n_blocks + 1):
+                if waiting and block == min(bars.meeting, n_blocks):
+                    while moved < n_blocks:
+                        move_block(moved, n, x, h, half, f, light, planes, pulls, base)
+                        moved += 1
+                    for i in range(n, len(x)):
+                        f[i, 0] = f[i, 1] = f[i, 2] = 0.0
+                    lost = finish_positions(messages, x, before, True)
+                    if lost != 0:
+                        break
+                    broke = 0
+                    if light:
+                        split_block(n, len(x), x, planes, pulls, base)
+                        groups = (bars.columns.counted, len(bars.columns.heads))
+                        at, short = pull_light(x, bars, base, *groups, h, columns_work)
+                    else:
+                        groups = (bars.sweep.counted, len(bars.sweep.diagonal))
+                        at, short, broke = pull(x, bars, *groups, h, f, aside)
+                    failed = at if at >= 0 else failed
+                    shortened = shortened or short
+                    changed += broke
+                    waiting = False
+                if block == n_blocks:
+                    break
                 while moved < min(block + 1 + reach, n_blocks):
-                    if light and room_for < NODE_BLOCK * (moved + 1) - base:
+                    if light and not several and room_for < NODE_BLOCK * (moved + 1) - base:
                         live = NODE_BLOCK * block
                         slide_planes(planes, live - base, NODE_BLOCK * moved - live)
                         slide_planes(pulls, live - base, NODE_BLOCK * moved - live)
@@ -242,6 +260,8 @@ def make_fused_loop(
                     changes, touched = compare_contacts(
                         walls.touching, touched, near, pressed.touching, walls.present, walls.releases
                     )
+            if lost != 0:
+                break
             impact = 0.0
             if len(near) > 0:
                 for i in near:

@@ -67,6 +67,7 @@ class Batch:
             block.law.slack_row,
             counted,
             reach,
+            self._meeting(),
             bars.can_break,
             columns,
             *self._planes(reach, columns),
@@ -111,6 +112,19 @@ class Batch:
         ends = self.model.bars.ends
         blocks = ends.max(axis=1) // NODE_BLOCK - ends.min(axis=1) // NODE_BLOCK
         return int(blocks.max(initial=0))
+
+    def _meeting(self) -> int:
+        """Return the first block of nodes that needs ghosts, or whose nodes have bars that other ranks count.
+
+        Forces of these bars come first at each node: a block before must neither have nor reach such a node.
+        """
+        ends, n_owned = self.model.bars.ends, len(self.model.inertia.mass)
+        block = self.model.bars.blocks[0]
+        late = np.zeros(len(self.model.mesh.points), dtype=bool)
+        late[n_owned:] = True
+        late[ends[block.counted - block.start :].reshape(-1)] = True
+        reached = ends[late[ends].any(axis=1)]
+        return int(reached.min(initial=n_owned)) // NODE_BLOCK
 
     @staticmethod
     def serves(stepper: Stepper, ledger: Ledger) -> bool:

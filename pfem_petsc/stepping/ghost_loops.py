@@ -11,7 +11,7 @@ from numba.extending import intrinsic
 
 from ..mechanics.compiled import kernel
 
-__all__ = ["trade_positions"]
+__all__ = ["finish_positions", "start_positions"]
 
 _INT, _SHORT, _BYTES = ir.IntType(64), ir.IntType(32), ir.IntType(8).as_pointer()
 
@@ -42,17 +42,25 @@ def _wait_all(typingctx, address, count, requests, statuses):  # noqa: ANN001, A
 
 
 @kernel
-def trade_positions(messages, x, before, fill):
-    """Exchange positions ``x`` (local, 3); if ``fill``, update the ghosts, with their previous positions in ``before``;
-    return MPI's error code. ``messages``: a :class:`~pfem_petsc.mesh.exchange.Messages`."""
-    rows, leaving, arriving = messages.rows, messages.leaving, messages.arriving
+def start_positions(messages, x, h, half):
+    """Send the positions that owned nodes reach in a step, x + h ``half`` (owned, 3); return MPI's error code.
+
+    ``messages``: a :class:`~pfem_petsc.mesh.exchange.Messages`.
+    """
+    rows, leaving = messages.rows, messages.leaving
     for k in range(len(rows)):
         i = rows[k]
         for c in range(3):
-            leaving[k, c] = x[i, c]
-    failed = _start_all(messages.start_all, messages.count, messages.requests)
-    if failed == 0:
-        failed = _wait_all(messages.wait_all, messages.count, messages.requests, messages.statuses)
+            leaving[k, c] = x[i, c] + h * half[i, c]
+    return _start_all(messages.start_all, messages.count, messages.requests)
+
+
+@kernel
+def finish_positions(messages, x, before, fill):
+    """Wait for the messages of :func:`start_positions`; if ``fill``, update the ghosts in ``x`` (local, 3), with their
+    previous positions in ``before``. Return MPI's error code."""
+    arriving = messages.arriving
+    failed = _wait_all(messages.wait_all, messages.count, messages.requests, messages.statuses)
     first = len(x) - len(arriving)
     for k in range(len(arriving) if fill else 0):
         for c in range(3):

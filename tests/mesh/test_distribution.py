@@ -184,10 +184,16 @@ def test_hilbert_curve_visits_neighbour_after_neighbour():
     np.testing.assert_array_equal(steps, 1.0)
 
 
-@pytest.mark.parametrize("cells", [[5, 5, 5], [9, 4, 2]])
+@pytest.mark.parametrize("cells", [[5, 5, 5], [9, 4, 3]])
 def test_a_lattice_is_swept_in_its_own_order(cells):
     mesh = lattice.generate(lattice.Parameters(kind="cubic", cells=cells, pitch=0.013), 0, 1)
     np.testing.assert_array_equal(np.argsort(sweep_keys(mesh.points), kind="stable"), np.arange(mesh.n_nodes))
+
+
+def test_rows_of_a_thin_lattice_are_long():
+    mesh = lattice.generate(lattice.Parameters(kind="cubic", cells=[9, 8, 1], pitch=0.1), 0, 1)
+    order = np.argsort(sweep_keys(mesh.points), kind="stable")
+    np.testing.assert_allclose(np.diff(mesh.points[order][:9], axis=0), [[0.0, 0.1, 0.0]] * 8, atol=1e-15)
 
 
 @pytest.mark.parametrize("kind", ["octet", "bcc", "diamond"])

@@ -15,6 +15,7 @@ from mpi4py import MPI
 
 from ..errors import InputError, SimulationFailure
 from ..parallel.agreement import agreed, on_root
+from .growing import Growing
 
 __all__ = [
     "HDF5_ERRORS",
@@ -205,22 +206,7 @@ def writes_together(comm: MPI.Comm) -> bool:
 
 def write_rows(dataset: h5py.Dataset, first: int, rows: np.ndarray | None, collective: bool = False) -> None:
     """Write rows (n, ...) starting at row ``first``; None or no rows: join a collective transfer without data."""
-    transfer = h5py.h5p.create(h5py.h5p.DATASET_XFER)
-    if collective:
-        transfer.set_dxpl_mpio(h5py.h5fd.MPIO_COLLECTIVE)
-    elif rows is None:
-        return
-    target = dataset.id.get_space()
-    if rows is None or rows.size == 0:
-        rows = np.empty((1,) * max(1, len(dataset.shape)), dtype=dataset.dtype)
-        source = h5py.h5s.create_simple(rows.shape)
-        source.select_none()
-        target.select_none()
-    else:
-        rows = np.ascontiguousarray(rows, dtype=dataset.dtype)
-        source = h5py.h5s.create_simple(rows.shape)
-        target.select_hyperslab((first,) + (0,) * (rows.ndim - 1), rows.shape)
-    dataset.id.write(source, target, rows, dxpl=transfer)
+    Growing(dataset).write(first, rows, collective)
 
 
 def set_text(group: h5py.Group, name: str, text: str) -> None:

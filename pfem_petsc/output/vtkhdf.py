@@ -152,16 +152,15 @@ class ResultWriter:
             On all ranks, for example if the disk is full or the file is missing.
         """
         file = self._ready()
-        slabs = self._data.slabs(points, point_data, cell_data)
-        self._require_room(self._data.n_bytes(slabs))
-        digests = self._data.digests(slabs)
+        arrays = self._data.arrays(points, point_data, cell_data)
+        self._require_room(self._data.n_bytes(arrays))
         n = self.n_snapshots
         with self._whole_or_failed():
             if not self._data.exists:
                 with writing(self.comm, self.path):
-                    self._data.create(slabs)
+                    self._data.create(arrays)
                     self._index.create_checks()
-            self._data.append(n, slabs)
+            digests = self._data.append(n, arrays)
             self._index.append(n, step, time, digests)
             self._rows.write()
             with writing(self.comm, self.path):

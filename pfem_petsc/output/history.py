@@ -12,8 +12,8 @@ from mpi4py import MPI
 
 from ..errors import InputError
 from .digests import CHECKS, RowDigests
-from .growing import Growing
-from .hdf5 import create_growing, dataset_names, set_unit, writing
+from .growing import Growing, create_growing
+from .hdf5 import dataset_names, set_unit, writing
 from .row import RowLayout
 from .units import unit_of
 

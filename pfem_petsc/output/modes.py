@@ -15,7 +15,8 @@ import numpy as np
 from mpi4py import MPI
 
 from .digests import CHECKS, numbers_digest, snapshot_digests, stored_digest
-from .hdf5 import chunk_rows, create_growing, grow, set_unit, writing
+from .growing import chunk_rows, create_growing
+from .hdf5 import grow, set_unit, writing
 from .integrity import word_sum
 
 if TYPE_CHECKING:

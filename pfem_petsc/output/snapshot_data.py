@@ -11,7 +11,7 @@ import numpy as np
 from mpi4py import MPI
 
 from .digests import snapshot_digests
-from .growing import Growing
+from .growing import Growing, is_compressed
 from .hdf5 import writes_together, writing
 from .integrity import word_sum
 from .layout import create_field, field_datasets
@@ -49,6 +49,8 @@ class SnapshotData:
         precision: np.dtype,
     ) -> None:
         self._together = writes_together(comm)
+        # the chunks of several ranks are compressed by one of them
+        self._compressed = comm.size > 1 and is_compressed(file["VTKHDF/Points"])
         self._vtk, self.comm, self.path = file["VTKHDF"], comm, path
         self._fields, self._precision = fields, precision
         self._nodes, self._bars = mesh.node_order, mesh.bar_order
@@ -111,7 +113,8 @@ class SnapshotData:
         with writing(self.comm, self.path):
             for name in arrays:
                 self._data[name].grow((n + 1) * self._order(name).n_global)
-        sums = self._write_together(n, arrays) if self._together else self._write_alone(n, arrays)
+        together = self._together or self._compressed
+        sums = self._write_together(n, arrays) if together else self._write_alone(n, arrays)
         return snapshot_digests(self.comm, sums)
 
     def _write_together(self, n: int, arrays: Mapping[str, np.ndarray]) -> dict[str, int]:

@@ -139,6 +139,8 @@ class OutputKeys(StrictModel):
     """names of the fields to write; default: all"""
     precision: Literal["float64", "float32"] = "float64"
     """precision of the fields in the result file"""
+    compression: Literal["none", "gzip"] = "none"
+    """lossless, of positions and fields in the result file; "gzip" takes ten times as long to write"""
 
 
 class Output(OutputKeys):

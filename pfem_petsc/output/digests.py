@@ -19,6 +19,7 @@ from .integrity import BLOCK, word_sum
 
 __all__ = [
     "CHECKS",
+    "RowDigests",
     "damages",
     "mark_digest",
     "mesh_digest",
@@ -32,13 +33,12 @@ CHECKS = "checks"
 _ODD = 0x9E3779B97F4A7C15
 
 
-def snapshot_digests(comm: MPI.Comm, slabs: Mapping[str, tuple[np.ndarray, int]]) -> np.ndarray:
+def snapshot_digests(comm: MPI.Comm, sums: Mapping[str, int]) -> np.ndarray:
     """Return checksums (fields,) uint64 of arrays distributed in slabs over the ranks, sorted by name. Collective.
 
-    ``slabs``: name to this rank's rows, in the type in which they are stored, and the global index of the first row.
+    ``sums``: name to :func:`~.integrity.word_sum` of this rank's rows, in the type in which they are stored.
     """
-    mine = [_seeded(name, word_sum(slab, first)) for name, (slab, first) in sorted(slabs.items())]
-    total = np.array(mine, dtype=np.uint64)
+    total = np.array([_seeded(name, part) for name, part in sorted(sums.items())], dtype=np.uint64)
     comm.Allreduce(MPI.IN_PLACE, total, op=MPI.SUM)
     return total
 
@@ -79,6 +79,33 @@ def row_digests(columns: Mapping[str, np.ndarray], first: int) -> np.ndarray:
         factors = _factors(np.arange(words.shape[1], dtype=np.uint64) + np.uint64(_number(name.encode())))
         total += np.sum(words * factors, axis=1, dtype=np.uint64)
     return total
+
+
+class RowDigests:
+    """What :func:`row_digests` gives, from rows as vectors of float64.
+
+    Parameters
+    ----------
+    places : name to the first and the end position of a column in the vector, and its type in the file
+    """
+
+    def __init__(self, places: Mapping[str, tuple[int, int, np.dtype]]) -> None:
+        self._factors = np.zeros(max((end for _, end, _ in places.values()), default=0), dtype=np.uint64)
+        # columns whose numbers in the file have other words than those in the vector
+        self._others = [place for place in places.values() if place[2] != np.float64]
+        for name, (first, end, _) in places.items():
+            index = np.arange(end - first, dtype=np.uint64)
+            self._factors[first:end] = _factors(index + np.uint64(_number(name.encode())))
+
+    def __call__(self, rows: np.ndarray, first: int) -> np.ndarray:
+        """Return checksums (n,) of rows (n, width), of which the first is row ``first`` of the table."""
+        words = np.ascontiguousarray(rows).view(np.uint64)
+        if self._others:
+            words = words.copy()
+        for begin, end, dtype in self._others:
+            words[:, begin:end] = rows[:, begin:end].astype(dtype).view(f"u{dtype.itemsize}")
+        numbers = np.arange(first + 1, first + len(rows) + 1, dtype=np.uint64)
+        return numbers * np.uint64(_ODD) + (words * self._factors).sum(axis=1, dtype=np.uint64)
 
 
 def damages(file: h5py.File, deep: bool = True) -> Iterator[str]:
@@ -149,6 +176,8 @@ def _stored_sum(dataset: h5py.Dataset, first: int, count: int) -> int:
     """Return :func:`~.integrity.word_sum` of stored rows, read in pieces and numbered from 0."""
     per_row = max(1, int(np.prod(dataset.shape[1:], dtype=np.int64)))
     piece, total = max(1, BLOCK // per_row), 0
+    if dataset.compression is not None:  # a chunk is read as a whole
+        piece = max(1, piece // dataset.chunks[0]) * dataset.chunks[0]
     for start in range(0, count, piece):
         stop = min(start + piece, count)
         total += word_sum(dataset[first + start : first + stop], start)

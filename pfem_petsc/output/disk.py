@@ -39,7 +39,7 @@ def require_room(comm: MPI.Comm, path: Path, n_bytes: int, target: Path | None =
             raise SimulationFailure(
                 f"{path}: disk full: {free / 1e6:.1f} MB are free, and the next write may take {needed / 1e6:.1f} MB. "
                 "What was written before is complete; make room and continue with --restart, or write less "
-                "(fields_every, fields, precision in [output])"
+                "(fields_every, fields, precision, compression in [output])"
             )
 
     on_root(comm, look)

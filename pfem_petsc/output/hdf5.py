@@ -15,12 +15,11 @@ from mpi4py import MPI
 
 from ..errors import InputError, SimulationFailure
 from ..parallel.agreement import agreed, on_root
+from .growing import Growing
 
 __all__ = [
     "HDF5_ERRORS",
-    "chunk_rows",
     "create_checked",
-    "create_growing",
     "create_new",
     "dataset_names",
     "first_line",
@@ -39,7 +38,6 @@ __all__ = [
 # Exceptions that h5py raises for errors of the HDF5 library, depending on the call, such as reading a damaged file.
 HDF5_ERRORS = (OSError, RuntimeError, ValueError, KeyError)
 
-CHUNK_BYTES = 1 << 20
 # Lowest and highest format of a result file. With the superblock of 1.8 and objects of 1.10 all HDF5 metadata have
 # checksums, and chunks along one growing dimension are indexed by an extensible array, whose entries do not move. The
 # B-tree of earlier formats is split from time to time, and a kill between the writes of a split lost the file. With the
@@ -135,43 +133,6 @@ def open_shared(path: Path, comm: MPI.Comm) -> h5py.File:
     return h5py.File(path, "r+", driver="mpio", comm=comm, libver=OBJECTS)
 
 
-def chunk_rows(n_rows: int, row_bytes: int) -> int:
-    """Return the number of rows per chunk for blocks of ``n_rows`` rows: blocks up to 1 MiB, else equal parts.
-
-    It depends on the global size only, so that files from any number of ranks have the same chunks. A divisor of the
-    block is preferred, because then no chunk contains rows of two snapshots.
-    """
-    most = max(1, CHUNK_BYTES // row_bytes)
-    if n_rows <= most:
-        return max(1, n_rows)
-    parts = -(-n_rows // most)
-    for divisor in range(parts, 4 * parts):
-        if n_rows % divisor == 0:
-            return n_rows // divisor
-    return -(-n_rows // parts)
-
-
-def create_growing(
-    group: h5py.Group, name: str, row_shape: tuple[int, ...], dtype: np.dtype | type, rows_per_chunk: int
-) -> h5py.Dataset:
-    """Create an empty dataset (0, *row_shape) that grows by rows, and its parents. Collective for a shared file."""
-    shape = (0, *row_shape)
-    space = h5py.h5s.create_simple(shape, (h5py.h5s.UNLIMITED, *row_shape))
-    properties = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-    properties.set_chunk((rows_per_chunk, *(max(1, extent) for extent in row_shape)))
-    # Parallel writes need chunks allocated when the dataset grows, also in a file created by one rank.
-    properties.set_alloc_time(h5py.h5d.ALLOC_TIME_EARLY)
-    # Ranks would write zeros into new chunks, one chunk after the other; rows count only once they are written.
-    properties.set_fill_time(h5py.h5d.FILL_TIME_NEVER)
-    *parents, leaf = name.split("/")
-    if parents:
-        group = group.require_group("/".join(parents))
-    made = h5py.h5d.create(
-        group.id, leaf.encode(), h5py.h5t.py_create(np.dtype(dtype), logical=True), space, properties
-    )
-    return h5py.Dataset(made)
-
-
 def grow(dataset: h5py.Dataset, n_rows: int) -> None:
     """Set the number of rows. Collective for a shared file."""
     dataset.id.set_extent((n_rows, *dataset.shape[1:]))
@@ -205,22 +166,7 @@ def writes_together(comm: MPI.Comm) -> bool:
 
 def write_rows(dataset: h5py.Dataset, first: int, rows: np.ndarray | None, collective: bool = False) -> None:
     """Write rows (n, ...) starting at row ``first``; None or no rows: join a collective transfer without data."""
-    transfer = h5py.h5p.create(h5py.h5p.DATASET_XFER)
-    if collective:
-        transfer.set_dxpl_mpio(h5py.h5fd.MPIO_COLLECTIVE)
-    elif rows is None:
-        return
-    target = dataset.id.get_space()
-    if rows is None or rows.size == 0:
-        rows = np.empty((1,) * max(1, len(dataset.shape)), dtype=dataset.dtype)
-        source = h5py.h5s.create_simple(rows.shape)
-        source.select_none()
-        target.select_none()
-    else:
-        rows = np.ascontiguousarray(rows, dtype=dataset.dtype)
-        source = h5py.h5s.create_simple(rows.shape)
-        target.select_hyperslab((first,) + (0,) * (rows.ndim - 1), rows.shape)
-    dataset.id.write(source, target, rows, dxpl=transfer)
+    Growing(dataset).write(first, rows, collective)
 
 
 def set_text(group: h5py.Group, name: str, text: str) -> None:

@@ -11,8 +11,9 @@ import numpy as np
 from mpi4py import MPI
 
 from ..errors import InputError
-from .digests import CHECKS, row_digests
-from .hdf5 import create_growing, dataset_names, grow, set_unit, write_rows, writing
+from .digests import CHECKS, RowDigests
+from .growing import Growing, create_growing
+from .hdf5 import dataset_names, set_unit, writing
 from .row import RowLayout
 from .units import unit_of
 
@@ -91,19 +92,22 @@ class HistoryWriter:
     ) -> None:
         self._comm, self._path = comm, path
         group = file[table]
-        self._datasets = {name: group[name] for name in columns}
-        self._digests = file[CHECKS][table]
+        datasets = {name: group[name] for name in columns}
+        self._columns = {name: Growing(dataset) for name, dataset in datasets.items()}
+        self._digests = Growing(file[CHECKS][table])
         self._rows_attribute = h5py.h5a.open(group.id, b"rows")
         self.n_rows = int(group.attrs["rows"])
-        row_bytes = sum(d.dtype.itemsize * int(np.prod(d.shape[1:], dtype=np.int64)) for d in self._datasets.values())
+        row_bytes = sum(d.dtype.itemsize * int(np.prod(d.shape[1:], dtype=np.int64)) for d in datasets.values())
         self._capacity = max(1, min(BUFFER_ROWS, BUFFER_BYTES // max(1, row_bytes)))
         # Disk space of a write: the rows, and a new chunk in each column.
-        self.reserve_bytes = self._capacity * row_bytes + len(self._datasets) * CHUNK_BYTES
+        self.reserve_bytes = self._capacity * row_bytes + len(datasets) * CHUNK_BYTES
         self.n_buffered = 0
         self._layout = RowLayout(
-            {name: dataset.shape[1:] for name, dataset in self._datasets.items()},
-            {name: dataset.dtype for name, dataset in self._datasets.items()},
+            {name: dataset.shape[1:] for name, dataset in datasets.items()},
+            {name: dataset.dtype for name, dataset in datasets.items()},
         )
+        places = self._layout.places
+        self._checksums = RowDigests({name: (*places[name][:2], datasets[name].dtype) for name in places})
         self._buffer = np.empty((self._capacity if comm.rank == 0 else 0, self._layout.width))
 
     @property
@@ -123,16 +127,14 @@ class HistoryWriter:
             return
         first, self.n_rows = self.n_rows, self.n_rows + self.n_buffered
         with writing(self._comm, self._path):
-            for dataset in (*self._datasets.values(), self._digests):
-                grow(dataset, self.n_rows)
+            for dataset in (*self._columns.values(), self._digests):
+                dataset.grow(self.n_rows)
         with writing(self._comm, self._path):
             if self._comm.rank == 0:
-                values = {}
+                rows = self._buffer[: self.n_buffered]
                 for name, (at, end, shape, _) in self._layout.places.items():
-                    rows = self._buffer[: self.n_buffered, at:end].reshape(self.n_buffered, *shape)
-                    values[name] = rows.astype(self._datasets[name].dtype)
-                    write_rows(self._datasets[name], first, values[name])
-                write_rows(self._digests, first, row_digests(values, first))
+                    self._columns[name].write(first, rows[:, at:end].reshape(len(rows), *shape))
+                self._digests.write(first, self._checksums(rows, first))
         self.n_buffered = 0
 
     def commit(self) -> None:

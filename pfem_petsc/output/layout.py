@@ -9,7 +9,8 @@ import h5py
 import numpy as np
 
 from .digests import CHECKS
-from .hdf5 import chunk_rows, create_growing, dataset_names, set_unit
+from .growing import chunk_rows, compressed_rows, create_growing, is_compressed
+from .hdf5 import dataset_names, set_unit
 from .history import EVENT, ROWS_PER_CHUNK, create_history
 from .modes import create_modes
 from .provenance import write_case
@@ -41,10 +42,12 @@ def create_result(
     attributes: Mapping[str, Any],
     modes: str | None = None,
     events: Mapping[str, Any] | None = None,
+    compressed: bool = False,
 ) -> None:
     """Create the structure of a result file without fields: VTKHDF 2.0 without steps, history, case.
 
-    ``events``: columns of the table of events with their types, empty for none.
+    ``events``: columns of the table of events with their types, empty for none; ``compressed``: points, and fields that
+    are created later.
 
     The mesh is one part, whatever the number of ranks, and all steps use the same connectivity (offset 0).
     ``modes`` is the kind of those that there will be.
@@ -63,7 +66,8 @@ def create_result(
     vtk.create_dataset("Connectivity", shape=(2 * n_bars,), dtype=np.int64)
     vtk.create_dataset("Offsets", shape=(n_bars + 1,), dtype=np.int64)
     vtk.create_dataset("Types", data=np.full(n_bars, VTK_LINE, dtype=np.uint8))
-    create_growing(vtk, "Points", (3,), np.float64, chunk_rows(n_nodes, 24))
+    rows = compressed_rows(n_nodes, 24) if compressed else chunk_rows(n_nodes, 24)
+    create_growing(vtk, "Points", (3,), np.float64, rows, compressed)
     steps = vtk.create_group("Steps")
     steps.attrs["NSteps"] = np.int64(0)
     create_growing(steps, "Values", (), np.float64, STEPS_PER_CHUNK)
@@ -92,12 +96,14 @@ def create_result(
 def create_field(vtk: h5py.Group, kind: str, name: str, row_shape: tuple[int, ...], dtype: np.dtype) -> h5py.Dataset:
     """Create a field, ``kind`` "PointData" or "CellData". Collective for a shared file.
 
-    All point fields of a snapshot start at the same row, as do all cell fields. Their offsets are one dataset with
-    several names (hard links), so they are always consistent.
+    It is compressed if the points are. All point fields of a snapshot start at the same row, as do all cell fields.
+    Their offsets are one dataset with several names (hard links), so they are always consistent.
     """
     n_rows = int(vtk["NumberOfPoints" if kind == "PointData" else "NumberOfCells"][0])
     row_bytes = dtype.itemsize * int(np.prod(row_shape, dtype=np.int64))
-    dataset = create_growing(vtk[kind], name, row_shape, dtype, chunk_rows(n_rows, row_bytes))
+    compressed = is_compressed(vtk["Points"])
+    rows = compressed_rows(n_rows, row_bytes) if compressed else chunk_rows(n_rows, row_bytes)
+    dataset = create_growing(vtk[kind], name, row_shape, dtype, rows, compressed)
     set_unit(dataset, field_unit(name))
     vtk["Steps"][kind + "Offsets"][name] = vtk["Steps"]["PointOffsets" if kind == "PointData" else "CellDataRows"]
     return dataset

@@ -15,7 +15,9 @@ import numpy as np
 from mpi4py import MPI
 
 from .digests import CHECKS, numbers_digest, snapshot_digests, stored_digest
-from .hdf5 import chunk_rows, create_growing, grow, set_unit, writing
+from .growing import chunk_rows, create_growing
+from .hdf5 import grow, set_unit, writing
+from .integrity import word_sum
 
 if TYPE_CHECKING:
     from ..parallel.natural import NaturalOrder
@@ -91,7 +93,7 @@ def write_modes(
     digests = np.zeros(n, dtype=np.uint64)
     for k in range(n):
         slab = np.ascontiguousarray(order.to_slab(shapes[k]))
-        total = snapshot_digests(comm, {"shape": (slab, order.first)})[0]
+        total = snapshot_digests(comm, {"shape": word_sum(slab, order.first)})[0]
         digests[k] = total ^ np.uint64(numbers_digest(k, eigenvalues[k], values[k]))
         with writing(comm, path):
             _write_slab(group["shape"], k, order.first, slab, comm.size > 1)

@@ -15,6 +15,7 @@ import numpy as np
 from ..errors import InputError
 from .digests import CHECKS
 from .disk import fsync_all
+from .growing import is_compressed
 from .hdf5 import create_checked, dataset_names, grow, write_rows
 from .history import EVENT, check_columns
 from .layout import (
@@ -201,7 +202,8 @@ def _rebuild(
     columns = {name: history[name].shape[1:] for name in dataset_names(history)}
     types = {name: history[name].dtype for name in columns}
     events = {name: dataset.dtype for name, dataset in source[EVENT].items()} if EVENT in source else {}
-    create_result(target, n_nodes, n_bars, columns, types, case_text, attributes, events=events)
+    compressed = is_compressed(vtk["Points"])
+    create_result(target, n_nodes, n_bars, columns, types, case_text, attributes, events=events, compressed=compressed)
     rows: dict[str, int] = {"VTKHDF/Connectivity": 2 * n_bars, "VTKHDF/Offsets": n_bars + 1, f"{CHECKS}/mesh": 1}
     rows |= {f"VTKHDF/Steps/{name}": n_snapshots for name in (*PER_STEP, "Values")}
     rows |= {f"snapshots/{name}": n_snapshots for name in ("step", "time")}
@@ -220,6 +222,8 @@ def _rebuild(
         if new.maxshape[0] is None:
             grow(new, n)
         piece = max(1, PIECE // max(1, old.dtype.itemsize * int(np.prod(old.shape[1:], dtype=np.int64))))
+        if is_compressed(new):
+            piece = max(1, piece // new.chunks[0]) * new.chunks[0]
         for first in range(0, n, piece):
             write_rows(new, first, old[first : min(first + piece, n)])
     target["VTKHDF/Steps"].attrs.modify("NSteps", np.int64(n_snapshots))

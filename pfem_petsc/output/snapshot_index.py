@@ -10,7 +10,8 @@ import numpy as np
 from mpi4py import MPI
 
 from .digests import CHECKS, mark_digest
-from .hdf5 import grow, write_rows, writing
+from .growing import Growing
+from .hdf5 import writing
 from .layout import PER_STEP, create_snapshot_checks
 
 if TYPE_CHECKING:
@@ -36,16 +37,18 @@ class SnapshotIndex:
         self._file, self.comm, self.path = file, comm, path
         self.n_nodes, self.n_bars = int(mesh.n_nodes), int(mesh.n_bars)
         steps = file["VTKHDF/Steps"]
-        self._per_step = {name: steps[name] for name in PER_STEP}
-        self._times = steps["Values"]
-        self._marks = {name: file["snapshots"][name] for name in ("step", "time")}
+        self._per_step = {name: Growing(steps[name]) for name in PER_STEP}
+        # one column, because there is one type of cell
+        self._wide = {name: (1, *steps[name].shape[1:]) for name in PER_STEP}
+        self._times = Growing(steps["Values"])
+        self._marks = {name: Growing(file["snapshots"][name]) for name in ("step", "time")}
         self._n_steps = h5py.h5a.open(steps.id, b"NSteps")
         # created with the first snapshot, which defines the fields
-        self._digests = file[CHECKS]["snapshots"] if steps.attrs["NSteps"] else None
+        self._digests = Growing(file[CHECKS]["snapshots"]) if steps.attrs["NSteps"] else None
 
     def create_checks(self) -> None:
         """Create the dataset of digests, once the fields exist. Collective."""
-        self._digests = create_snapshot_checks(self._file)
+        self._digests = Growing(create_snapshot_checks(self._file))
 
     def append(self, n: int, step: int, time: float, digests: np.ndarray) -> None:
         """Write the rows of snapshot n, except its time in ``/VTKHDF``. Collective.
@@ -57,16 +60,16 @@ class SnapshotIndex:
         """
         with writing(self.comm, self.path):
             for dataset in (*self._per_step.values(), *self._marks.values(), self._digests):
-                grow(dataset, n + 1)
+                dataset.grow(n + 1)
         rows = {"PointOffsets": n * self.n_nodes, "CellDataRows": n * self.n_bars, "NumberOfParts": 1}
         with writing(self.comm, self.path):
             if self.comm.rank == 0:
                 for name, dataset in self._per_step.items():
-                    write_rows(dataset, n, np.full((1, *dataset.shape[1:]), rows.get(name, 0)))
-                write_rows(self._marks["step"], n, np.array([step]))
-                write_rows(self._marks["time"], n, np.array([time]))
+                    dataset.write(n, np.full(self._wide[name], rows.get(name, 0)))
+                self._marks["step"].write(n, np.array([step]))
+                self._marks["time"].write(n, np.array([time]))
                 mark = np.array([mark_digest(n, step, time)], dtype=np.uint64)
-                write_rows(self._digests, n, np.concatenate([mark, digests])[None])
+                self._digests.write(n, np.concatenate([mark, digests])[None])
 
     def publish(self, n: int, time: float) -> None:
         """Count snapshot n, whose data have been flushed, and then write its time [s]. Collective."""
@@ -74,7 +77,7 @@ class SnapshotIndex:
             self._n_steps.write(np.array(n + 1, dtype=np.int64))
             self._file.flush()
         with writing(self.comm, self.path):
-            grow(self._times, n + 1)
+            self._times.grow(n + 1)
             if self.comm.rank == 0:
-                write_rows(self._times, n, np.array([time], dtype=np.float64))
+                self._times.write(n, np.array([time], dtype=np.float64))
             self._file.flush()

@@ -60,6 +60,8 @@ class ResultWriter:
         Stored as attributes of ``/case``: numbers, texts, or any JSON data.
     precision : "float64" or "float32"
         Of the fields. Points are always float64, because strains from positions in single precision are noise.
+    compressed : bool
+        Whether points and fields are compressed without loss; a file that is continued keeps what it has.
     append_after_step : int, optional
         Continue an existing file; data after this step are removed.
     last : (int, int), optional
@@ -89,6 +91,7 @@ class ResultWriter:
         case_text: str,
         attributes: Mapping[str, Any],
         precision: str = "float64",
+        compressed: bool = False,
         append_after_step: int | None = None,
         last: tuple[int, int] | None = None,
         modes: str | None = None,
@@ -108,7 +111,7 @@ class ResultWriter:
         described = describe_run(comm, attributes)
         sizes = (self.n_nodes, self.n_bars)
         if append_after_step is None:
-            structure = (*sizes, columns, column_types, case_text, described, modes, events)
+            structure = (*sizes, columns, column_types, case_text, described, modes, events, compressed)
             self._unpublished = create_new(self.path, comm, create_result, *structure, checked=True)
         else:
             last = last or (append_after_step, append_after_step)
@@ -152,16 +155,15 @@ class ResultWriter:
             On all ranks, for example if the disk is full or the file is missing.
         """
         file = self._ready()
-        slabs = self._data.slabs(points, point_data, cell_data)
-        self._require_room(self._data.n_bytes(slabs))
-        digests = self._data.digests(slabs)
+        arrays = self._data.arrays(points, point_data, cell_data)
+        self._require_room(self._data.n_bytes(arrays))
         n = self.n_snapshots
         with self._whole_or_failed():
             if not self._data.exists:
                 with writing(self.comm, self.path):
-                    self._data.create(slabs)
+                    self._data.create(arrays)
                     self._index.create_checks()
-            self._data.append(n, slabs)
+            digests = self._data.append(n, arrays)
             self._index.append(n, step, time, digests)
             self._rows.write()
             with writing(self.comm, self.path):

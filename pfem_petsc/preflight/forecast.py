@@ -59,7 +59,8 @@ def forecast(
             f"about {duration(_seconds(model, plan))} of steps on idle cores, to a factor of 3; start, "
             "compiling and output come on top"
         )
-        entries["result file"] = f"about {engineering(size, 'B', 3)}"
+        most = "at most " if case.output.compression != "none" else "about "
+        entries["result file"] = f"{most}{engineering(size, 'B', 3)}"
     if case.output.checkpoint_every or case.output.checkpoint_minutes:
         entries["checkpoints"] = f"two of about {engineering(checkpoint_bytes(model), 'B', 3)}"
     return entries

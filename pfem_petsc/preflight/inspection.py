@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 from .chains import chain_nodes, chain_warning
 from .forecast import memory_warning
 from .motions import jumping_motions
-from .overlaps import nodes_on_bars, overlapping_bars
+from .nodes_on_bars import nodes_on_bars
+from .overlaps import overlapping_bars
 from .parts import count_parts
 from .reach import bars_larger_than_walls
 from .rigidity import global_rigidity, model_directions, unbraced_nodes

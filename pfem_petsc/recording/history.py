@@ -6,7 +6,6 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from mpi4py import MPI
 
 from ..analysis import Step
 from ..output.row import Row
@@ -126,12 +125,10 @@ class History(Observer):
     def take_sums(self, sums: np.ndarray) -> bool:
         """Take the row of this rank's sums (width,) at the state's step and time, unless a rank has a fault; return
         whether none has. Collective."""
-        if self._model.comm.size > 1:
-            sums = sums.copy()
-            self._model.comm.Allreduce(MPI.IN_PLACE, sums)
-            if sums[HEAD.first("alarm")] > 0.0:
-                return False
-        self.take(self.recorder.row_of(sums))
+        total = self.recorder.total(sums)
+        if self._model.comm.size > 1 and total[HEAD.first("alarm")] > 0.0:
+            return False
+        self.take(self.recorder.row_of(total))
         return True
 
     def take(self, row: Row) -> None:

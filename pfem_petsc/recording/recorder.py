@@ -12,6 +12,7 @@ from ..energies import BAR_ENERGIES, ENERGIES
 from ..output.row import Row, RowLayout
 from ..output.sums import HEAD, PAIR
 from ..stepping.ledger import Ledger
+from .probes import PROBED, Probes
 
 if TYPE_CHECKING:
     from ..stepping.stepper import Stepper
@@ -25,7 +26,6 @@ _SUMMED = [energy for energy in ENERGIES if energy.source != "derived"]
 _ENERGIES = [HEAD.first(energy.name) for energy in _SUMMED]
 _SIDES = {energy.name: energy.side for energy in ENERGIES} | {p: e.side for e in ENERGIES for p in e.parts}
 _SIGNS = np.array([{"supplied": -1.0, "part": 0.0}.get(_SIDES[energy.name], 1.0) for energy in _SUMMED])
-_PROBED = ("position", "velocity", "acceleration", "reaction")
 
 
 class Recorder:
@@ -64,23 +64,17 @@ class Recorder:
         self.types |= {name: kind for name, _, kind in contact_columns(self.model.contact) if kind is not float}
         for name in self.model.links.columns:
             self.columns |= {f"{name}/{what}": (3,) for what in PAIR.sizes}
-        self.probe_nodes: dict[str, np.ndarray] = {}
-        self._probes: list[tuple[str, np.ndarray, np.ndarray]] = []
-        for probe in case.output.probe:
-            local = self.model.nodes[probe.node_set]
-            ids = mesh.node_ids[local]
-            all_nodes = np.sort(np.concatenate(comm.allgather(ids)))
-            self.probe_nodes[probe.name] = all_nodes
-            self._probes.append((probe.name, local, np.searchsorted(all_nodes, ids)))
-            for quantity in _PROBED:
-                self.columns[f"probe/{probe.name}/{quantity}"] = (len(all_nodes), 3)
+        probes = {probe.name: self.model.nodes[probe.node_set] for probe in case.output.probe}
+        self._probes = Probes(comm, probes, mesh.node_ids)
+        self.probe_nodes = self._probes.ids
+        for name, ids in self.probe_nodes.items():
+            self.columns |= {f"probe/{name}/{quantity}": (len(ids), 3) for quantity in PROBED}
         self.layout = RowLayout(self.columns, self.types)
         self.carried: np.ndarray | None = None
         self._contact = ContactColumns(self.model.contact)
-        probed = sum(12 * len(nodes) for nodes in self.probe_nodes.values())
         links = PAIR.width * len(self.model.links.columns)
         # where the sums of walls, links and probes begin
-        self._starts = np.cumsum([HEAD.width, self._contact.size, links, probed])
+        self._starts = np.cumsum([HEAD.width, self._contact.size, links, self._probes.size])
         self._sums = np.zeros(self._starts[-1])
         # indices of the numbers of the head in a row, and where walls, links and probes begin there
         recorded = [name for name in HEAD.sizes if name in self.columns]
@@ -93,20 +87,13 @@ class Recorder:
 
     @property
     def width(self) -> int:
-        """Number of sums in a row."""
+        """Number of sums in this rank's share of a row; those of probes are of its own nodes alone."""
         return len(self._sums)
 
     def probed(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return this rank's nodes of all probes; where their positions are among the sums of probes; and the number of
-        nodes of their probe on all ranks. Arrays (m,) int64."""
-        nodes, places, counts, begin = [], [], [], 0
-        for name, local, place in self._probes:
-            size = len(self.probe_nodes[name])
-            nodes.append(local)
-            places.append(begin + 3 * place)
-            counts.append(np.full(len(local), size))
-            begin += 12 * size
-        return tuple(np.concatenate([np.empty(0), *parts]).astype(np.int64) for parts in (nodes, places, counts))
+        """Return this rank's nodes of all probes; where their positions are among its sums of probes; and the distance
+        between the vectors of a node there, over three. Arrays (m,) int64."""
+        return self._probes.nodes, self._probes.places(), np.ones(len(self._probes.nodes), dtype=np.int64)
 
     def count(self, newton: int, linear: int) -> None:
         """Add the iterations of a step to those of the next row."""
@@ -118,18 +105,24 @@ class Recorder:
 
         ``alarm``: whether this rank has a fault; :attr:`alarmed` is then true on all ranks.
         """
-        model, sums = self.model, self._sums
-        self._fill(sums, alarm)
-        if model.comm.size > 1:
-            model.comm.Allreduce(MPI.IN_PLACE, sums)
-        return self.row_of(sums)
+        self._fill(self._sums, alarm)
+        return self.row_of(self.total(self._sums))
 
-    def row_of(self, sums: np.ndarray) -> Row:
-        """Return the row at the state's step and time from its sums (width,) over all ranks. Collective."""
-        model = self.model
-        self.alarmed = sums[HEAD.first("alarm")] > 0.0
-        model.contact.log.meet(model.comm, self._contact.contacts(sums[HEAD.width :]))
-        return Row(self.layout, self._unpack(sums))
+    def total(self, sums: np.ndarray) -> np.ndarray:
+        """Return the sums over all ranks from this rank's share (width,), and the probes of all. Collective."""
+        probes = self._starts[2]
+        total = np.empty(probes + self._probes.width)
+        total[:probes] = sums[:probes]
+        if self.model.comm.size > 1:
+            self.model.comm.Allreduce(MPI.IN_PLACE, total[:probes])
+        self._probes.unite(sums[probes:], total[probes:])
+        return total
+
+    def row_of(self, total: np.ndarray) -> Row:
+        """Return the row at the state's step and time from what :meth:`total` gives. Collective."""
+        self.alarmed = total[HEAD.first("alarm")] > 0.0
+        self.model.contact.log.meet(self.model.comm, self._contact.contacts(total[HEAD.width :]))
+        return Row(self.layout, self._unpack(total))
 
     def _fill(self, sums: np.ndarray, alarm: bool) -> None:
         """Write this rank's share of a row."""
@@ -148,14 +141,8 @@ class Recorder:
         if self._contact.size:
             self._contact.fill(sums[walls:links], solution.walls, ledger.impulses)
         ledger.impulses.fill_links(sums[links:at].reshape(-1, PAIR.width))
-        a = stepper.acceleration() if self._probes else state.a
-        for name, local, place in self._probes:
-            size = 12 * len(self.probe_nodes[name])
-            nodes = sums[at : at + size].reshape(4, -1, 3)
-            nodes[:] = 0.0
-            reaction = state.support[local] + state.contact[local]
-            nodes[:, place] = state.x[local], state.v[local], a[local], reaction
-            at += size
+        if self.probe_nodes:
+            self._probes.fill(sums[at:], state, stepper.acceleration())
 
     def _unpack(self, sums: np.ndarray) -> np.ndarray:
         """Return the values of a row from the sums over ranks."""

@@ -82,6 +82,7 @@ def open_result_file(
         case_text=case.to_toml(),
         attributes=_attributes(case, model, plan, history.recorder),
         precision=case.output.precision,
+        compressed=case.output.compression == "gzip",
         append_after_step=step if continues else None,
         last=restart.last if continues else None,
         modes=case.modes.kind if case.modes is not None else None,

@@ -38,7 +38,10 @@ KINDS = {
         "rod_impact", ("time.integrator=newmark", "time.end=2.5", "mesh.elements=60", "output.fields_every=5")
     ),
     "multistep": Kind("pendulum", ("time.integrator=houbolt", "time.end=0.5", "time.step=1e-3")),
-    "implicit, plastic": Kind("bar_collision_plastic", ("time.integrator=wilson", "time.theta=1.5", "time.end=1.5e-4")),
+    "implicit, plastic, compressed": Kind(
+        "bar_collision_plastic",
+        ("time.integrator=wilson", "time.theta=1.5", "time.end=1.5e-4", "output.compression=gzip"),
+    ),
 }
 """One to a few seconds of steps each."""
 

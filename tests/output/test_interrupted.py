@@ -30,7 +30,7 @@ from helpers.launch import environment
 from helpers.truss import Truss, options, write
 from pfem_petsc.output.vtkhdf import ResultWriter
 truss = Truss(MPI.COMM_SELF, n_nodes=400, n_bars=900)
-writer = ResultWriter(sys.argv[2], MPI.COMM_SELF, truss.mesh, **options())
+writer = ResultWriter(sys.argv[2], MPI.COMM_SELF, truss.mesh, **options(compressed=sys.argv[3] == "True"))
 print("open", flush=True)
 for step in range(80):
     write(writer, truss, [step], every=1)
@@ -53,9 +53,9 @@ for path in sys.argv[2:]:
 """
 
 
-def killed_writer(path, seconds):
+def killed_writer(path, seconds, compressed):
     """Write a step at a time until killed."""
-    command = [sys.executable, "-c", WRITER, str(HERE), str(path)]
+    command = [sys.executable, "-c", WRITER, str(HERE), str(path), str(compressed)]
     writer = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment())
     try:
         assert writer.stdout.readline() == "open\n"
@@ -73,8 +73,8 @@ def killed_writer(path, seconds):
 def test_killed_at_any_moment_the_file_is_readable_and_can_be_continued(tmp_path, chance):
     truss = Truss(MPI.COMM_SELF, n_nodes=400, n_bars=900)
     paths = [tmp_path / f"{i}.vtkhdf" for i in range(12)]
-    for path in paths:
-        killed_writer(path, chance.uniform(0.0, 0.2))
+    for i, path in enumerate(paths):
+        killed_writer(path, chance.uniform(0.0, 0.2), compressed=i % 2 == 1)
     done = subprocess.run(
         [sys.executable, "-c", READER, str(HERE), *map(str, paths)],
         capture_output=True,

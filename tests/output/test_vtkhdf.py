@@ -10,6 +10,8 @@ from mpi4py import MPI
 from vtkmodules.util.numpy_support import vtk_to_numpy
 
 from pfem_petsc.errors import InputError, SimulationFailure
+from pfem_petsc.output import growing
+from pfem_petsc.output.digests import damages
 from pfem_petsc.output.layout import complete_snapshots
 from pfem_petsc.output.result import open_result
 from pfem_petsc.output.vtkhdf import ResultWriter
@@ -140,6 +142,51 @@ def test_going_on_after_a_step_gives_the_same_file(shared_tmp_path, after):
         grid, n_steps = read_with_vtk(path, 4)
         assert n_steps == 5
         assert_grid_is(grid, truss, 20)
+
+
+@pytest.mark.parallel
+@pytest.mark.parametrize(("n_nodes", "n_bars"), [(24, 40), (23, 41)])
+def test_compressed_snapshots(shared_tmp_path, monkeypatch, n_nodes, n_bars):
+    """Chunks that several ranks share, of parts of a snapshot or, for prime numbers of rows, of a whole one."""
+    monkeypatch.setattr(growing, "CHUNK_BYTES", 128)
+    monkeypatch.setattr(growing, "_SMALLER", 4)
+    paths = [shared_tmp_path / f"{name}.vtkhdf" for name in ("together", "restarted", "alone", "plain")]
+    truss = Truss(COMM, n_nodes, n_bars, idle=(1,) if COMM.size > 1 else ())
+    for path in paths[:2]:
+        with ResultWriter(path, COMM, truss.mesh, **options(compressed=True)) as writer:
+            write(writer, truss, STEPS)
+    with ResultWriter(paths[1], COMM, truss.mesh, **options(append_after_step=7, compressed=True)) as writer:
+        write(writer, truss, range(8, STEPS.stop))
+    if COMM.rank == 0:
+        one = Truss(MPI.COMM_SELF, n_nodes, n_bars)
+        for path, compressed in zip(paths[2:], (True, False), strict=True):
+            with ResultWriter(path, MPI.COMM_SELF, one.mesh, **options(compressed=compressed)) as writer:
+                write(writer, one, STEPS)
+        together, restarted, alone, plain = (tree(path) for path in paths)
+        assert together == alone
+        restarted.pop("case attributes"), alone.pop("case attributes")
+        assert restarted == alone
+        values = [{name: item[-1] for name, item in each.items() if type(item) is tuple} for each in (alone, plain)]
+        assert values[0] == values[1]
+        with h5py.File(paths[1]) as file:
+            points, stress = file["VTKHDF/Points"], file["VTKHDF/CellData/stress"]
+            assert (points.compression, stress.compression) == ("gzip", "gzip")
+            # no chunk has rows of two snapshots, so that none is written twice
+            assert (n_nodes % points.chunks[0], n_bars % stress.chunks[0]) == (0, 0)
+            assert (points.chunks[0] < n_nodes) == (n_nodes == 24)
+            assert list(damages(file)) == []
+        for i, step in enumerate(WRITTEN):
+            assert_grid_is(read_with_vtk(paths[1], i)[0], truss, step)
+
+
+def test_compression_makes_files_smaller(tmp_path):
+    sizes = []
+    for compressed in (False, True):
+        truss = Truss(MPI.COMM_SELF, 3_000, 3_000)
+        with ResultWriter(tmp_path / "r", MPI.COMM_SELF, truss.mesh, **options(compressed=compressed)) as writer:
+            write(writer, truss, STEPS)
+        sizes.append((tmp_path / "r").stat().st_size)
+    assert sizes[1] < 0.8 * sizes[0]
 
 
 @pytest.mark.slow

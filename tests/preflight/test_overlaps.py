@@ -5,8 +5,10 @@ import pytest
 from helpers.mesh_files import case_of
 
 from pfem_petsc import Case, Simulation
+from pfem_petsc.preflight import nodes_on_bars as search
 from pfem_petsc.preflight.inspection import warnings_before
-from pfem_petsc.preflight.overlaps import nodes_on_bars, overlapping_bars
+from pfem_petsc.preflight.nodes_on_bars import nodes_on_bars
+from pfem_petsc.preflight.overlaps import overlapping_bars
 
 pytestmark = pytest.mark.parallel
 
@@ -82,16 +84,40 @@ def test_nodes_on_bars_are_those_of_all_pairs(comm, shared_tmp_path):
     assert nodes_on_bars(model.mesh).between == expected
 
 
+def test_first_ones_shown_are_the_lowest_of_all(comm, shared_tmp_path):
+    """Of 1,200 nodes on bars and as many pairs of coinciding nodes, from bars in no order."""
+    n, random = 1200, np.random.default_rng(5)
+    at = np.arange(n, dtype=float)[:, None] * [0.0, 1.0, 0.0]
+    points = np.concatenate([at, at + [1.0, 0, 0], at + [0.5, 0, 0], at + [1.0, 0, 0]])
+    chain = np.arange(n - 1)
+    ladder = [(2 * n + chain, 2 * n + chain + 1), (3 * n + chain, 3 * n + chain + 1)]
+    rungs = np.stack([np.arange(n), n + np.arange(n)], axis=1)[random.permutation(n)]
+    bars = np.concatenate([rungs, *(np.stack(pair, axis=1) for pair in ladder), [[0, 2 * n], [n - 1, 4 * n - 1]]])
+    found = nodes_on_bars(Simulation(case_of(shared_tmp_path, comm, points, bars), comm, check_only=True).mesh)
+    assert (found.between, found.coinciding) == (n + 1, 2 * n)  # the last bar passes a node as well
+    assert found.shown_coinciding == [f"nodes {n + k} and {3 * n + k}" for k in range(5)]
+    on = [f"node {2 * n + a} on bar {k} (nodes {a} and {b})" for k, (a, b) in enumerate(rungs[:5].tolist())]
+    assert found.shown_between == on
+
+
+def test_ranks_hold_the_nodes_near_their_bars(comm, monkeypatch):
+    held = []
+    near = search._near
+    monkeypatch.setattr(search, "_near", lambda *given: held.append(near(*given)) or held[0])
+    mesh = Simulation(Case.load("lattice_drop", ["mesh.cells=[60,2,2]"]), comm, check_only=True).mesh
+    assert nodes_on_bars(mesh).between == 0
+    if comm.size > 1:
+        assert mesh.n_owned < len(held[0].keys) < 1.5 * mesh.n_nodes / comm.size
+
+
 def test_nodes_on_bars_of_a_graded_mesh(comm, shared_tmp_path, monkeypatch):
     """Most nodes are crowded into a corner; where even that is too much, it is said."""
-    from pfem_petsc.preflight import overlaps
-
     x = np.concatenate([[0.0], np.geomspace(1e-5, 1.0, 3000)])
     points = np.stack([x, np.zeros_like(x), np.zeros_like(x)], axis=1)
     bars = [*((i, i + 1) for i in range(3000)), (2990, 2992)]
     entries, warnings = told(shared_tmp_path, comm, points, bars)
     assert any("node 2991 on bar 3000" in text for text in warnings)
-    monkeypatch.setattr(overlaps, "_PIECES", 1.5)
+    monkeypatch.setattr(search, "_PIECES", 1.5)
     entries, warnings = told(shared_tmp_path, comm, points, bars)
     assert entries["nodes on bars"].startswith("not looked for")
 

@@ -19,10 +19,7 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() or c in "\n\t" else ascii(c)[1:-1] for c in text)
 
 
-NUMPY_REMEDY = (
-    "NumPy was replaced by a version with which the installed petsc4py, mpi4py or h5py do not work: "
-    'python -m pip install "numpy<2"'
-)
+NUMPY_REMEDY = 'the installed NumPy is incompatible with petsc4py, mpi4py or h5py: python -m pip install "numpy<2"'
 
 
 def numpy_is_too_new(error: BaseException) -> bool:

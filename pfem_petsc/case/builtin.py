@@ -34,7 +34,7 @@ def read_text(path: Path) -> str:
         return path.read_bytes().decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = error.object[: error.start].count(b"\n") + 1
-        raise InputError(f"{path}: line {line}: a case file is TOML text in UTF-8, and this is not") from error
+        raise InputError(f"{path}: line {line}: this is not UTF-8 text; a case file is TOML in UTF-8") from error
     except FileNotFoundError as error:
         names = built_in_cases()
         near = difflib.get_close_matches(str(path), names, n=1)

@@ -144,7 +144,7 @@ def _text_columns(text: str) -> Columns:
         if rows and len(words) != len(rows[0]):
             raise InputError(
                 f"line {number}: expected {len(rows[0])} columns as in line {numbers[0]}, got {line.strip()[:60]!r}; "
-                "lines that are no rows start with #, or stand before the first row"
+                "lines that are not rows must start with # or precede the first row"
             )
         rows.append(words)
         numbers.append(number)

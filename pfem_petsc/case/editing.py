@@ -123,7 +123,7 @@ def _initial(entries: Sequence[Any]) -> dict[str, Any]:
     """Return the table [initial] of a list of its entries."""
     everywhere = [entry for entry in entries if not isinstance(entry, Mapping) or "node_set" not in entry]
     if len(everywhere) > 1 or not all(isinstance(entry, Mapping) for entry in everywhere):
-        raise InputError("initial: expected tables, of which one at most has no node_set")
+        raise InputError("initial: expected tables, at most one of which has no node_set")
     on = [entry for entry in entries if "node_set" in entry]
     return {**(everywhere[0] if everywhere else {}), **({"on": on} if on else {})}
 

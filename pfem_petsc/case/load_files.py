@@ -116,7 +116,7 @@ def _from_arrays(arrays: dict[str, np.ndarray]) -> Forces:
         raise InputError("array 'nodes': a node number is listed twice")
     if force.ndim == 3:
         if "factor" in arrays:
-            raise InputError("array 'factor' goes with forces (m, 3)")
+            raise InputError("array 'factor' requires forces (m, 3)")
         times = _times(arrays)
         _shape("force", force, (len(times), len(nodes), 3))
         return _histories(times, nodes.tolist(), force)

@@ -30,7 +30,7 @@ class Load(StrictModel):
     @model_validator(mode="after")
     def _interpolates(self) -> Load:
         if self.interpolation == "smooth" and self.table is None:
-            raise ValueError('interpolation = "smooth" goes with table')
+            raise ValueError('interpolation = "smooth" requires table')
         return self
 
 
@@ -120,5 +120,5 @@ class Temperature(StrictModel):
         if (self.value is None) == (self.table is None):
             raise ValueError("expected exactly one of the keys value, table, table_file")
         if self.interpolation == "smooth" and self.table is None:
-            raise ValueError('interpolation = "smooth" goes with table')
+            raise ValueError('interpolation = "smooth" requires table')
         return self

@@ -12,9 +12,9 @@ __all__ = ["checked_name", "nearest_key"]
 
 _ARGUMENTS = {
     "name": "the name of a case is that of its file, or an argument: Case(..., name=...), case.copy(name=...)",
-    "source": "it is an argument of Case(...), and stays",
-    "folder": "it is an argument of Case(...), and stays",
-    "overrides": "it is an argument of Case(...), and stays; update and copy take changes by key",
+    "source": "it is an argument of Case(...) and cannot be changed",
+    "folder": "it is an argument of Case(...) and cannot be changed",
+    "overrides": "it is an argument of Case(...)and cannot be changed; update and copy take changes by key",
     "comment": "comments of TOML begin with #",
 }
 

@@ -52,10 +52,10 @@ class Spring(_GroundOrNodes):
     def _as_many_as_directions(cls, value: Any, info: ValidationInfo) -> Any:
         if info.data.get("between") is not None:
             if not is_finite_number(value) or not value > 0.0:
-                raise ValueError("between nodes expected one number > 0 [N/m], along the line from one to the other")
+                raise ValueError("expected one number > 0 [N/m] between nodes, along the line from one to the other")
             return float(value)
         if not isinstance(value, list | tuple) or len(value) != 3 or not all(map(is_finite_number, value)):
-            raise ValueError("to the ground expected three numbers [kx, ky, kz] [N/m]")
+            raise ValueError("expected three numbers [kx, ky, kz] [N/m] to the ground")
         if min(value) < 0.0:
             raise ValueError("expected values >= 0")
         return tuple(map(float, value))
@@ -65,7 +65,7 @@ class Spring(_GroundOrNodes):
         if self.frame is not None:
             if self.between is not None:
                 raise ValueError(
-                    "frame gives the axes of springs to the ground; those between nodes are along the line"
+                    "frame defines the axes of springs to the ground; springs between nodes act along their line"
                 )
             check_frame(self.frame)
         return self
@@ -81,5 +81,5 @@ class Dashpot(_GroundOrNodes):
     @classmethod
     def _acts(cls, value: float, info: ValidationInfo) -> float:
         if info.data.get("between") is not None and not value:
-            raise ValueError("between nodes expected a number > 0")
+            raise ValueError("expected a number > 0 between nodes")
         return value

@@ -68,7 +68,7 @@ class Problems:
         if name not in known:
             hint = nearest(name, list(known)) if known else "; the case defines none"
             if what == "node set":
-                hint += f'; a group of the mesh is made one by node_set.NAME = {{ group = "{name}" }}'
+                hint += f'; a group of the mesh becomes one by node_set.NAME = {{ group = "{name}" }}'
             self.add(path, f"there is no {what} of this name{hint}", name)
 
     def raise_if_any(self) -> None:
@@ -204,7 +204,7 @@ _SIMPLE = {
     "bool_type": "expected true or false",
     "model_type": "expected a table",
     "finite_number": "expected a finite number",
-    "string_too_short": "expected a text that is not empty",
+    "string_too_short": "expected a non-empty text",
     "string_pattern_mismatch": "expected a name without slashes and control characters",
 }
 _BOUNDS = {"greater_than": ">", "greater_than_equal": ">=", "less_than": "<", "less_than_equal": "<="}
@@ -226,7 +226,7 @@ def _expected(kind: str, value: Any, context: Mapping[str, Any], field: FieldInf
         return "unknown value" + hint
     if kind in ("tuple_type", "list_type"):
         return f"expected {_shape(field)}" + (", in SI units without quotes and unit" if isinstance(value, str) else "")
-    return f"refused ({kind.replace('_', ' ')})"
+    return f"rejected ({kind.replace('_', ' ')})"
 
 
 def table_list(data: Any, path: Path, problems: Problems) -> Sequence[Any]:

@@ -172,7 +172,7 @@ def _initial(data: Mapping[str, Any], problems: Problems) -> list[t.Initial]:
     everywhere = {k: v for k, v in table.items() if k != "on"}
     entries = []
     if "node_set" in everywhere:
-        problems.add(("initial", "node_set"), "a node set's own velocity goes under a heading [[initial.on]]")
+        problems.add(("initial", "node_set"), "the velocity of a node set belongs under a heading [[initial.on]]")
     elif everywhere:
         entries.append(problems.read(t.Initial, everywhere, ("initial",), known=["on"]))
     for i, row in enumerate(table_list(table.get("on"), ("initial", "on"), problems)):
@@ -222,7 +222,7 @@ def _analyses(data: Mapping[str, Any], problems: Problems) -> dict[str, Any]:
     if "time" in data and "static" in data:
         problems.add((), "[time] and [static] exclude each other: give one of them")
     if not any(key in data for key in ("time", "static", "stage", "modes")):
-        problems.add((), "the table [time] is missing, or one of [static], [[stage]], [modes]: what is to be computed")
+        problems.add((), "the table [time] is missing, or one of [static], [[stage]], [modes], which give the analysis")
     return {
         "time": _time(data, problems) if "time" in data else None,
         "static": _static(data, problems) if "static" in data else None,
@@ -263,7 +263,7 @@ def _time(data: Mapping[str, Any], problems: Problems) -> s.Time | None:
     scheme = problems.read(model, others, ("time",), known=known, taker=name, siblings=lambda: _siblings(INTEGRATORS))
     automatic = keys is not None and keys.step == "auto"
     if automatic and not lookup(INTEGRATORS, name, "time.integrator").Scheme.explicit:
-        message = f"only explicit schemes can choose their step, and {name} is implicit: give it in seconds"
+        message = f'"auto" is for explicit schemes, and {name} is implicit: give the step in seconds'
         problems.add(("time", "step"), message, "auto")
     if keys is None or scheme is None:
         return None

@@ -156,7 +156,8 @@ def _sections(given: Any, common: Any, k: int, problems: Problems) -> Any:
         if not isinstance(common.get(name), Mapping):
             problems.add(path, f"there is no section of this name{nearest(str(name), list(common))}")
         elif not isinstance(table, Mapping) or len(table) != 1 or not set(table) <= set(PRESTRESSES):
-            problems.add(path, f"a stage changes the prestress of a section: expected one of {', '.join(PRESTRESSES)}")
+            known = ", ".join(PRESTRESSES)
+            problems.add(path, f"a stage can only change the prestress of a section: expected one of {known}")
         else:
             kept = {key: value for key, value in common[name].items() if key not in PRESTRESSES}
             merged[name] = {**kept, **table}

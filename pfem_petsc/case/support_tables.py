@@ -31,7 +31,7 @@ def check_frame(frame: tuple[tuple[float, float, float], tuple[float, float, flo
     """Refuse two vectors that give no frame."""
     first, second = (np.array(row) / np.linalg.norm(row) for row in frame)
     if np.linalg.norm(np.cross(first, second)) < _PARALLEL:
-        raise ValueError("the two vectors of frame are parallel; the second gives the side of y")
+        raise ValueError("the two vectors of frame are parallel; the second must point to the side of the y axis")
 
 
 def _moves_along(normal: tuple, rows: tuple, velocity: tuple | None) -> None:
@@ -39,7 +39,7 @@ def _moves_along(normal: tuple, rows: tuple, velocity: tuple | None) -> None:
     given = np.array([row[1:] for row in rows] + ([velocity] if velocity is not None else []))
     unit = np.array(normal) / np.linalg.norm(normal)
     if given.any() and np.abs(given @ unit).max() <= _PARALLEL * np.abs(given).max():
-        raise ValueError("the motion has no component along normal, so that it would move nothing")
+        raise ValueError("the motion has no component along normal, so it would have no effect")
 
 
 class Support(StrictModel):
@@ -87,12 +87,12 @@ class Support(StrictModel):
                 f"expected at most one of the keys motion, velocity, acceleration, acceleration_file; got {keys}"
             )
         if self.interpolation == "linear" and self.motion is None:
-            raise ValueError('interpolation = "linear" goes with motion: accelerations are linear between rows anyway')
+            raise ValueError('interpolation = "linear" requires motion; accelerations are always linear between rows')
         if (self.fix is None) == (self.normal is None):
             raise ValueError("expected exactly one of the keys fix, normal")
         if self.frame is not None:
             if self.fix is None:
-                raise ValueError("frame gives the axes of fix; expected the key fix")
+                raise ValueError("frame defines the axes of fix; expected the key fix")
             check_frame(self.frame)
         if self.normal is not None:
             _moves_along(self.normal, self.motion or self.acceleration or (), self.velocity)

@@ -39,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=_size,
         nargs="+",
         default=[10_000, 100_000, 1_000_000],
-        help="about so many bars",
+        help="approximate numbers of bars",
     )
     parser.add_argument("--kind", choices=KINDS, default="cubic", help="cells of the lattice")
     parser.add_argument("--jobs", choices=JOBS, nargs="+", default=list(JOBS), help="what to time; default: all")
@@ -52,11 +52,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="bars that yield; default: in explicit_contact only",
     )
     parser.add_argument("--history-every", metavar="N", type=_size, default=1, help="steps between rows of the history")
-    parser.add_argument("--seconds", metavar="T", type=float, default=2.0, help="to time each job for, about")
+    parser.add_argument("--seconds", metavar="T", type=float, default=2.0, help="approximate time for each job")
     parser.add_argument(
         "--compile", action="store_true", help="only compile the loops of the jobs for later runs; measure nothing"
     )
-    parser.add_argument("--roofline", metavar="FILE.png", type=Path, help="draw what the jobs reach of this machine")
+    parser.add_argument("--roofline", metavar="FILE.png", type=Path, help="draw a roofline plot of the jobs")
     parser.add_argument("-o", "--output", metavar="FILE", type=Path, help="write all figures as JSON")
 
 

@@ -28,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--env",
         action="store_true",
-        help="check this machine instead: versions, MPI, HDF5, PETSc, OpenGL, and what brings the missing",
+        help="check this machine instead: versions, MPI, HDF5, PETSc, OpenGL, and how to install what is missing",
     )
 
 
@@ -74,6 +74,6 @@ def _check_machine(arguments: argparse.Namespace) -> int:
     print("\n".join(printable(line) for line in report(found)))
     missing = [each.name for each in found if each.state == "missing"]
     if missing:
-        raise InputError(f"check --env: missing: {', '.join(missing)}; the list above has the commands that bring it")
-    print("All that runs need is here.")
+        raise InputError(f"check --env: missing: {', '.join(missing)}; the list above has the commands to install it")
+    print("This machine has everything that runs need.")
     return 0

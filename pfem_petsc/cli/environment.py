@@ -101,7 +101,7 @@ def report(found: Iterable[Finding]) -> list[str]:
     lines = [f"  {each.state:8}  {each.name:{width}}  {each.text}" for each in found]
     commands = dict.fromkeys(each.remedy for each in found if each.state != "ok" and each.remedy)
     if commands:
-        lines += ["", "what is missing comes with:", *(f"  {command}" for command in commands)]
+        lines += ["", "to install what is missing:", *(f"  {command}" for command in commands)]
     return lines
 
 
@@ -214,7 +214,7 @@ def _mpi_and_petsc(bring: dict[str, str], run: Callable[[list[str]], tuple[int, 
     uses = {"mumps": "direct solver on ranks", "hypre": "-pc_type hypre", "ptscotch": "partitions of mesh files"}
     for name, use in uses.items():
         if about[name] is None:
-            found.append(Finding(f"petsc: {name}", "optional", f"not told by this petsc4py ({use})"))
+            found.append(Finding(f"petsc: {name}", "optional", f"not reported by this petsc4py ({use})"))
         elif about[name]:
             found.append(Finding(f"petsc: {name}", "ok", use))
         else:
@@ -237,7 +237,7 @@ def _launcher(bring: dict[str, str], run: Callable[[list[str]], tuple[int, str]]
         return Finding(name, "missing", f"mpirun -n 2 fails: {_last(output)}", bring["mpi4py"])
     mpi, petsc, parallel, hdf5, file = json.loads(line[1])
     if not mpi == petsc == 2:
-        text = f"mpi4py sees {mpi} rank(s) and PETSc {petsc}: they, and mpirun, are of different MPIs"
+        text = f"mpi4py sees {mpi} rank(s) and PETSc {petsc}: these and mpirun belong to different MPI installations"
         return Finding(name, "missing", text, bring["petsc4py"])
     if not parallel:
         remedy = bring["h5py"]

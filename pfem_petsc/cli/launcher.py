@@ -174,7 +174,7 @@ def _message(error: BaseException) -> tuple[int, str]:
         reason = " ".join(str(error).split())
         return (
             InputError.exit_status,
-            f"error: PETSc refuses an option: {reason}; check what follows -- (docs/linear_solvers.md)",
+            f"error: PETSc rejects an option: {reason}; check what follows -- (docs/linear_solvers.md)",
         )
     detail = " ".join(str(error).split()) or "no message"
 

@@ -53,15 +53,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     convert = add("convert", "Write a mesh file in another format.", "INPUT", "OUTPUT")
     refine = add("refine", "Divide each bar into several.", "INPUT", "OUTPUT")
-    refine.add_argument("--parts", metavar="N", type=int, default=2, help="bars in the place of one; default: 2")
-    merge = add("merge", "Put several files together, and join nodes at the same place.")
+    refine.add_argument("--parts", metavar="N", type=int, default=2, help="number of bars that replace one; default: 2")
+    merge = add("merge", "Merge several files, and join nodes at the same position.")
     merge.add_argument("inputs", metavar="INPUT", type=Path, nargs="+")
     merge.add_argument("-o", "--output", metavar="OUTPUT", type=Path, required=True)
     clean = add(
         "clean", "Merge nodes, remove double bars, bars without length, and nodes without bars.", "INPUT", "OUTPUT"
     )
     clean.add_argument("--sum-areas", action="store_true", help="add up the areas of bars between the same nodes")
-    info = add("info", "Show counts, sizes, groups, and what is wrong with mesh files.")
+    info = add("info", "Show counts, sizes, groups and defects of mesh files.")
     info.add_argument("inputs", metavar="FILE", type=Path, nargs="+")
     picture = add("picture", "Draw a mesh file.", "INPUT")
     picture.add_argument("-o", "--output", metavar="PNG", type=Path, help="default: INPUT with the suffix .png")
@@ -72,7 +72,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             "--tolerance",
             metavar="METRES",
             type=_distance,
-            help="distance up to which nodes are at the same place; default: 1e-6 of the mean length of the bars",
+            help="distance up to which nodes are at the same position; default: 1e-6 of the mean length of the bars",
         )
     for sub in (convert, refine, merge, clean, info, picture):
         sub.add_argument(
@@ -80,11 +80,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
             metavar="METRES",
             type=float,
             default=1.0,
-            help="metres in the unit of the file: 0.001 for millimetres, with MPa and t/mm3",
+            help="metres per unit of the file: 0.001 for millimetres, with MPa and t/mm3",
         )
     for sub in (generate, convert, refine, merge, clean):
-        sub.add_argument("--area", metavar="M2", type=_distance, help="area of all bars, over that of the file")
-        sub.add_argument("--case", metavar="TOML", type=Path, help="write a case file for OUTPUT as well")
+        sub.add_argument("--area", metavar="M2", type=_distance, help="area of all bars; replaces that of the file")
+        sub.add_argument("--case", metavar="TOML", type=Path, help="also write a case file for OUTPUT")
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -144,7 +144,7 @@ def _write(arguments: argparse.Namespace, mesh: WholeMesh) -> None:
             keys.update(area=arguments.area)
             keys.pop("area_field", None)
     if arguments.case is not None and arguments.case.exists():
-        raise InputError(f"--case {arguments.case}: there is such a file; remove it, or give another name")
+        raise InputError(f"--case {arguments.case}: this file exists; remove it, or give another name")
     path = write_whole(arguments.output, mesh)
     print(printable(f"{arguments.output}: {len(mesh.points):,} nodes, {len(mesh.bars):,} bars"))
     if arguments.case is not None:
@@ -152,7 +152,7 @@ def _write(arguments: argparse.Namespace, mesh: WholeMesh) -> None:
             arguments.case.write_text(skeleton(mesh, path, arguments.case), encoding="utf-8")
         except OSError as error:
             raise InputError(f"--case {arguments.case}: cannot be written: {error.strerror}") from error
-        print(printable(f"{arguments.case}: a case for it; see what it says at its top"))
+        print(printable(f"{arguments.case}: a case for this mesh; see the comments at its top"))
 
 
 def _generate(arguments: argparse.Namespace) -> None:

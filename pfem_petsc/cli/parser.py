@@ -42,7 +42,7 @@ def add_case(parser: argparse.ArgumentParser, optional: bool = False) -> None:
         nargs="+",
         action="extend",
         default=[],
-        help="set values over those of the case: time.step=1e-5 wall.0.point=[1,0,0]; KEY= removes a key",
+        help="values that replace those of the case: time.step=1e-5 wall.0.point=[1,0,0]; KEY= removes a key",
     )
 
 

@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "-o", "--output", metavar="DIR", type=Path, help="folder of the pictures; default: the result's"
     )
     parser.add_argument("--field", default="stress", help="field that colours the bars; default: %(default)s")
-    parser.add_argument("--component", help="x, y or z of a vector field; default: its length")
+    parser.add_argument("--component", help="x, y or z of a vector field; default: its magnitude")
     parser.add_argument(
         "--frames", metavar="N[,N...]", type=_frames, help="how many snapshots to draw, or their numbers; default: all"
     )
@@ -61,9 +61,9 @@ def _add_picture(parser: argparse.ArgumentParser) -> None:
         "--size", metavar="WxH", type=_size, default=(1280, 720), help="pixels, or 720p, 1080p, 4k; default: 1280x720"
     )
     parser.add_argument("--video", help="mp4, gif, both, webm, webp or none; default: mp4, webm with --transparent")
-    parser.add_argument("--no-poster", dest="poster", action="store_false", help="no page of six instants")
+    parser.add_argument("--no-poster", dest="poster", action="store_false", help="write no page of six instants")
     parser.add_argument(
-        "--clim", metavar=("LOW", "HIGH"), nargs=2, type=float, help="range of the colours [SI]; default: the values'"
+        "--clim", metavar=("LOW", "HIGH"), nargs=2, type=float, help="range of the colours [SI]; default: of the values"
     )
     parser.add_argument("--symmetric", action="store_true", help="range of the colours symmetric about zero")
     parser.add_argument("--cmap", help="name of a matplotlib colour map")
@@ -92,7 +92,7 @@ def _add_camera(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--zoom", type=float, default=1.0, help="factor on the size in the picture; default: 1")
     parser.add_argument(
-        "--orbit", metavar="DEGREES", type=float, default=0.0, help="angle that the camera goes around in the film"
+        "--orbit", metavar="DEGREES", type=float, default=0.0, help="angle of the camera's orbit during the film"
     )
     parser.add_argument("--path", metavar="FILE", help="CSV of time, azimuth, elevation [degrees], zoom of the camera")
     parser.add_argument(
@@ -119,7 +119,7 @@ def _add_extras(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--labels", metavar="TEXT", nargs="+", help="of several results; default: their folders")
     parser.add_argument(
-        "--html", action="store_true", help="write render.html instead, the last state for turning in a browser"
+        "--html", action="store_true", help="write render.html instead: the last state, to be turned in a browser"
     )
     parser.add_argument("--window", action="store_true", help="show an interactive window instead; needs a display")
 

@@ -162,8 +162,8 @@ class ExplicitContact:
             node = self.contact.mesh.node_ids[nodes[np.argmax(np.abs(moved - at).max(axis=1))]]
             raise SimulationFailure(
                 f"the position of node {node} on curved walls did not converge in {_CURVED_ROUNDS} "
-                "iterations: walls and supports may leave it no place; move the walls apart, free the node, or reduce "
-                "time.step"
+                "iterations: walls and supports may be infeasible together; move the walls apart, free the node, or "
+                "reduce time.step"
             )
         strength = multipliers * stiffness[nodes][:, None]
         force = strength[:, :, None] * normals

@@ -31,18 +31,18 @@ def refuse_inclined(source: str, mesh: DistributedMesh, nodes: np.ndarray, conta
     """
     numbers = mesh.node_ids[nodes]
     with agreed(mesh.comm):
-        what = "a [[support]] prescribes a direction that is no axis at node"
+        what = "a [[support]] prescribes a direction that is not an axis at node"
         for k, name in enumerate(contact.names):
             both = numbers[contact.members[nodes, k]]
             if len(both):
                 raise InputError(
-                    f"{source}: wall {name!r}: {what} {both.min()}, which the wall could stop too: contact knows "
-                    "supports along axes only; give the wall a node_set without such nodes"
+                    f"{source}: wall {name!r}: {what} {both.min()}, which the wall could also stop: contact "
+                    "requires supports along axes; give the wall a node_set without such nodes"
                 )
         for link in links:
             both = np.intersect1d(numbers, link.numbers)
             if len(both):
                 raise InputError(
-                    f"{source}: contact_pair, constraint: {what} {both[0]}, which is part of one: these know supports "
-                    "along axes only"
+                    f"{source}: contact_pair, constraint: {what} {both[0]}, which is part of one: these require "
+                    "supports along axes"
                 )

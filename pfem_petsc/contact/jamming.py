@@ -39,8 +39,8 @@ def jam(contact: Contact, node: int, normals: np.ndarray) -> str:
         return ""
     wall = int(np.flatnonzero(jams)[0])
     return (
-        f"friction jams node {contact.mesh.node_ids[node]}: its supports guide it at an angle at which wall "
-        f"{contact.names[wall]!r} cannot push it along from a coefficient of {least[wall]:.3g} on, and has "
-        f"{contact.static_friction[wall]:.3g}; lower the friction, free the node, or name the nodes that the wall "
+        f"friction jams node {contact.mesh.node_ids[node]}: its supports let it move only at an angle at which wall "
+        f"{contact.names[wall]!r} cannot push it if the coefficient of friction is {least[wall]:.3g} or more, and it "
+        f"is {contact.static_friction[wall]:.3g}; reduce the friction, free the node, or name the nodes that the wall "
         "stops with 'node_set'"
     )

@@ -143,8 +143,8 @@ class PairLinkCoordinates:
         if blocked is not None:
             first, second, name = blocked
             raise NotConverged(
-                f"walls take all directions in which nodes {first} and {second} of contact_pair {name!r} can separate; "
-                "use an explicit integrator"
+                f"walls bound all directions in which nodes {first} and {second} of contact_pair {name!r} can separate"
+                "; use an explicit integrator"
             )
         return True
 

@@ -93,7 +93,7 @@ class Piercing:
                 bars = f"bar {bar} lies" if count == 1 else f"{count} bars, bar {bar} among them, lie"
                 told.append(
                     f"t = {time:.6g} s: {bars} across wall {self._model.contact.names[k]!r}: only nodes touch walls; "
-                    "take shorter bars or a larger wall"
+                    "use shorter bars or a larger wall"
                 )
         return told
 

@@ -252,7 +252,7 @@ class RowCoordinates:
                 ends = rows.ends[blocked[0]]
                 nodes = ", ".join(map(str, rows.numbers[ends[ends >= 0]]))
                 raise NotConverged(
-                    f"walls and other constraints take all directions in which nodes {nodes} can keep constraint "
+                    f"walls and other constraints bound all directions in which nodes {nodes} can satisfy constraint "
                     f"{self.link.names[rows.source[blocked[0]]]!r}; use an explicit integrator"
                 )
         lost = (values[self._placed] < -slack).any() or (np.abs(values[pressed]) > slack).any()

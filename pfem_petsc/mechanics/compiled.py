@@ -41,7 +41,7 @@ def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
             raise
         _warn_once(
             "compiled code cannot be cached (neither the package folder nor the home folder is writable), so every "
-            "start compiles anew; set NUMBA_CACHE_DIR to a writable folder"
+            "start compiles again; set NUMBA_CACHE_DIR to a writable folder"
         )
         return numba.njit(**options)(function)
     cache = getattr(compiled, "_cache", None)

@@ -127,12 +127,12 @@ def _pairs(
         at = int(away.argmin())
         if away[at] == np.inf:
             raise InputError(
-                f"{key}: node {number} is all that {between[0]!r} has, and in {between[1]!r}; give two nodes"
+                f"{key}: node {number} is the only node of {between[0]!r}, and also in {between[1]!r}; name two nodes"
             )
         if not away[at] > 0.0:
             raise InputError(
-                f"{key}: node {number} of {between[1]!r} and node {first[at]} of {between[0]!r} are at the same place, "
-                "so that no line leads from one to the other; take nodes that are apart"
+                f"{key}: node {number} of {between[1]!r} and node {first[at]} of {between[0]!r} have the same position,"
+                " so there is no line between them; use nodes at different positions"
             )
         pairs[k], lengths[k] = (first[at], number), away[at]
     return pairs, lengths

@@ -24,7 +24,7 @@ _SHOWN = 5
 _PIECE = 1 << 18  # number of bars that are checked at a time, to keep temporary arrays small
 
 _NO_LINES = (
-    "; where there are physical groups, Gmsh saves nothing else: put the lines into one "
+    "; if there are physical groups, Gmsh saves nothing else: put the lines into one "
     '(Physical Curve("bars") = {:}), or save all (Mesh.SaveAll = 1)'
 )
 
@@ -120,7 +120,7 @@ def _check_lengths(slab: MeshSlab, comm: MPI.Comm, length: np.ndarray) -> list[s
     short = np.flatnonzero(length < SHORT * mean)
     lines = [f"{_bar(slab, i)}, length {length[i]:g} m" for i in short[:_SHOWN]]
     text = _sentence(comm, lines, len(short), f"bars are far shorter than the mean length {mean:g} m")
-    return [f"{slab.source}: {text}; the explicit time step shrinks with the shortest bar"] if text else []
+    return [f"{slab.source}: {text}; the explicit time step decreases with the shortest bar"] if text else []
 
 
 def _check_duplicates(slab: MeshSlab, comm: MPI.Comm) -> None:

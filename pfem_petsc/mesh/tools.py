@@ -187,7 +187,7 @@ def merged(meshes: Sequence[WholeMesh], tolerance: float | None = None) -> tuple
                 rows = together.tables[table]  # that of the first file that has one
             into: dict[str, Any] = together.tables.setdefault(table, {})
             differing = [name for name, keys in rows.items() if into.setdefault(name, keys) != keys]
-            told = "differs from that of a file before, which is kept"
+            told = "differs from that of an earlier file, which is kept"
             done += [f"{table} {name} of {mesh.source} {told}" for name in differing]
     result, removed = cleaned(together, tolerance)
     return result, done + removed

@@ -87,12 +87,12 @@ def choose(settings: Modes, free: int, source: str) -> str:
     limits = {"dense": DENSE_AT_MOST, "scipy": GATHERED_AT_MOST}
     if asked in limits and free > limits[asked]:
         raise InputError(
-            f'{source}: modes.solver = "{asked}": {free:,} free components are too many, it takes up to '
-            f'{limits[asked]:,}; take "slepc" or "auto"'
+            f'{source}: modes.solver = "{asked}": {free:,} free components exceed its limit of '
+            f'{limits[asked]:,}; use "slepc" or "auto"'
         )
     if asked in LIBRARIES and not available(LIBRARIES[asked]):
         package = LIBRARIES[asked].partition(".")[0]
-        raise InputError(f'{source}: modes.solver = "{asked}": {package} is not installed; install it, or take "auto"')
+        raise InputError(f'{source}: modes.solver = "{asked}": {package} is not installed; install it, or use "auto"')
     return asked
 
 

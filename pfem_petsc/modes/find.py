@@ -150,7 +150,7 @@ def _buckling(
     model.comm.Allreduce(MPI.IN_PLACE, largest, op=MPI.MAX)
     if largest[0] <= _NO_LOAD * 1e-3 * largest[1]:
         raise SimulationFailure(
-            f'{source}: modes: kind = "buckling" takes the axial forces of the state as the reference load, and the '
+            f'{source}: modes: kind = "buckling" uses the axial forces of the state as the reference load, and the '
             "state has none: give the case an analysis that loads the truss ([static] with a small load)"
         )
     geometric[3:] *= -1.0
@@ -166,8 +166,8 @@ def _buckling(
         if solver.definite is False:
             raise SimulationFailure(
                 f'{source}: modes: kind = "buckling": the unstressed truss is a mechanism or is not held: its '
-                "stiffness is singular, and no factor of the load is defined; brace and support it, or take "
-                'kind = "vibration", whose eigenvalues have the state\'s stresses in them'
+                "stiffness is singular, and no factor of the load is defined; brace and support it, or use "
+                'kind = "vibration", whose eigenvalues include the stresses of the state'
             )
         theta, shapes = _lowest(model, holds, pencil, solver, _basis(model, state), count, np.reciprocal, 0.0, _NOTHING)
     finally:

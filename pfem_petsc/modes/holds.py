@@ -169,7 +169,7 @@ class _Walls:
         touched = np.abs(gaps) <= 10.0 * BEYOND * contact.length
         unknown = nodes[~touched.any(axis=1) & ~tied[nodes]]
         if len(unknown):
-            what = f"node {model.mesh.node_ids[unknown[0]]} has a contact force, and no wall is there"
+            what = f"node {model.mesh.node_ids[unknown[0]]} has a contact force, but there is no wall"
             raise SimulationFailure(_LINKED.format(what))
         massive = [k for k in contact.motion.bodies.at if touched[:, k].any()]
         if massive:

@@ -133,7 +133,7 @@ def _checked(path: Path, raw: BinaryIO) -> str:
     except (ValueError, KeyError, TypeError, IndexError, OverflowError, AttributeError):
         sound = False
     if not sound:
-        raise InputError(f"{path}: damaged: what describes its content does not match the digest; {remedy(path)}")
+        raise InputError(f"{path}: damaged: the description of its content does not match the digest; {remedy(path)}")
     return str(digest)
 
 

@@ -183,7 +183,7 @@ class Progress:
         wall, steps = now - self._begin, step - self._start[0]
         text = f"{outcome}: {steps:,} steps in {duration(wall)}"
         if self._compiling >= 0.1:
-            text += f", of it {duration(self._compiling)} for compiling"
+            text += f", including {duration(self._compiling)} for compiling"
         if steps and wall > self._compiling:
             text += f" ({_speed(steps / (wall - self._compiling))})"
         text += f", {self._axis.place(time)}"

@@ -124,7 +124,7 @@ def direction(
         towards = np.asarray(view, dtype=float)
         size = float(np.linalg.norm(towards)) if towards.shape == (3,) else 0.0
         if not (size > 0.0 and np.isfinite(size)):
-            raise InputError(f"render: view = {view!r} is no direction; give three numbers that are not all zero")
+            raise InputError(f"render: view = {view!r} is not a direction; give three numbers that are not all zero")
         towards = towards / size
         if np.linalg.norm(np.cross(up, towards)) < 1e-3:
             up = np.eye(3)[(int(np.argmax(np.abs(up))) + 2) % 3]

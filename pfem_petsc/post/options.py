@@ -37,7 +37,7 @@ def kinds_of_films(
     if video not in VIDEOS:
         raise InputError(f"render: video = {video!r} is not known; it is one of {', '.join(VIDEOS)}")
     if transparent and video in ("mp4", "both"):
-        raise InputError(f"render: video = {video!r}: MP4 has no transparent background; take webm, webp, gif or none")
+        raise InputError(f"render: video = {video!r}: MP4 has no transparent background; use webm, webp, gif or none")
     if size[0] < 160 or size[1] < 120 or max(size) > 8192:
         raise InputError(
             f"render: size = {size[0]} x {size[1]} pixels is out of range; widths are 160 to 8192, heights 120 to 8192"

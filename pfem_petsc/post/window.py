@@ -44,7 +44,7 @@ def show(
     """
     if sys.platform.startswith("linux") and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise InputError(
-            "render: --window: there is no display (DISPLAY is not set); take --html, which writes a page for a browser"
+            "render: --window: there is no display (DISPLAY is not set); use --html, which writes a page for a browser"
         )
     # a window that is shown is not one of those that draw without a display
     os.environ.pop(VARIABLE, None)

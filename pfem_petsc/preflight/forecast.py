@@ -56,8 +56,8 @@ def forecast(
     if plan.steps is not None:
         size = result_bytes(case, model.mesh, plan.steps, fields.points, fields.cells, columns, types)
         entries["run time"] = (
-            f"about {duration(_seconds(model, plan))} of steps on idle cores, to a factor of 3; start, "
-            "compiling and output come on top"
+            f"about {duration(_seconds(model, plan))} of steps on idle cores, within a factor of 3; start, "
+            "compilation and output are extra"
         )
         most = "at most " if case.output.compression != "none" else "about "
         entries["result file"] = f"{most}{engineering(size, 'B', 3)}"

@@ -101,11 +101,11 @@ def _is_own(case: Case) -> bool:
 def _nodes_on_bars(mesh: DistributedMesh, entries: dict[str, str]) -> list[str]:
     found = nodes_on_bars(mesh)
     if found is None:
-        entries["nodes on bars"] = "not looked for: too many nodes, or bars of too different lengths"
+        entries["nodes on bars"] = "not checked: too many nodes, or bars of too different lengths"
         return []
     if found.coinciding:
         pairs = _list(found.coinciding // 2, found.shown_coinciding)
-        entries["same place"] = f"{found.coinciding:,} nodes, {pairs}: merge them unless they are of different bodies"
+        entries["same place"] = f"{found.coinciding:,} nodes, {pairs}: merge them unless they are on different bodies"
     if not found.between:
         return []
     many = "nodes lie on bars that they are not connected to"

@@ -19,7 +19,7 @@ def jumping_motions(case: Case, plan: Plan) -> list[str]:
     moved += [(f"wall {entry.name!r}", entry) for entry in case.wall]
     return [
         f'{name}: with interpolation = "linear" the velocity jumps at each of the {len(entry.motion)} rows of motion, '
-        f"and {case.time.integrator} with these parameters keeps the vibrations that this causes; take "
+        f"and {case.time.integrator} with these parameters preserves the vibrations that this causes; use "
         'interpolation = "smooth", or a scheme with numerical dissipation'
         for name, entry in moved
         if entry.interpolation == "linear"

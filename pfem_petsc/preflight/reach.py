@@ -61,7 +61,7 @@ def bars_larger_than_walls(case: Case, model: Model) -> list[str]:
             told.append(
                 f"wall {contact.names[k]!r} is {engineering(width, 'm')} wide, and {count} bar{'s' * (count > 1)} near "
                 f"its path {'are' if count > 1 else 'is'} longer (up to {engineering(longest, 'm')}): only nodes touch "
-                "walls, so that it can pass between the nodes of such a bar; take a larger wall or shorter bars"
+                "walls, so that it can pass between the nodes of such a bar; use a larger wall or shorter bars"
             )
     return told
 

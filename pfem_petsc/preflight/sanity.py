@@ -78,7 +78,7 @@ def _sections(case: Case) -> Iterator[str]:
 def _weightless(case: Case) -> Iterator[str]:
     for wall in case.wall:
         if wall.gravity and case.gravity is None:
-            yield f"wall {wall.name!r}: gravity = true, but the case has no [gravity]: none acts on it"
+            yield f"wall {wall.name!r}: gravity = true, but the case has no [gravity], so none acts on it"
 
 
 def _slender(case: Case, model: Model) -> Iterator[str]:
@@ -116,8 +116,8 @@ def far_points(case: Case, model: Model) -> dict[str, str]:
         distance, node = min(comm.allgather(here))
         if distance > longest:
             found[f"node set {name}"] = (
-                f"the nearest node is node {node}, {engineering(distance, 'm')} away from the point: farther than the "
-                "longest bar is long"
+                f"the nearest node is node {node}, {engineering(distance, 'm')} away from the point, more than the "
+                "length of the longest bar"
             )
     return found
 
@@ -135,7 +135,7 @@ def _mesh(case: Case, model: Model) -> Iterator[str]:
     if model.reach > 1e6 * max(model.length, np.finfo(float).tiny):
         yield (
             f"the truss is {engineering(model.length, 'm')} in size and {engineering(model.reach, 'm')} away from the "
-            "origin: strains lose that ratio in digits; move it to the origin"
+            "origin: strains lose accuracy by this ratio; move it to the origin"
         )
     v = model.initial_velocity()
     with np.errstate(over="ignore"):  # reported below

@@ -64,8 +64,8 @@ class BlowUp:
         self._strange = self._strange + 1 if created > _CREATED * self._most else 0
         if self._strange > _ROWS:
             raise SimulationFailure(
-                f"{when}: the integration has created {created:.3g} J, where {self._most:.3g} J were put in: the "
-                f"motion is unstable, fastest at {self._fastest(state)}; reduce time.step"
+                f"{when}: the integration has created {created:.3g} J, but only {self._most:.3g} J were supplied: "
+                f"the motion is unstable and fastest at {self._fastest(state)}; reduce time.step"
             )
 
     def _where(self, state: State) -> str:

@@ -82,15 +82,15 @@ class ContactWatch:
         if self.touched:
             self.told = True
             self.tell(
-                f"{at}: contact has made {made}: {self.what} gains "
-                "energy at impacts; take another contact.treatment or time.integrator, or a smaller time.step "
+                f"{at}: contact has produced {made}: {self.what} gains "
+                "energy in impacts; use another contact.treatment or time.integrator, or a smaller time.step "
                 "(docs/contact.md, phases of an impact)"
             )
         elif self.rows >= (_AT_END if row["step"] >= self.last else _ROWS):
             self.told = True
             self.tell(
-                f"{at}: the total energy, dissipated energy included, has grown by {made}, without contact: the "
-                f"steps are too large for the motion within them{self._causes(row)}; reduce {self.key}"
+                f"{at}: the total energy, including dissipated energy, has grown by {made}, without contact: the "
+                f"steps are too large for the motion{self._causes(row)}; reduce {self.key}"
             )
 
     def _swing(self, row: dict[str, Any]) -> float:

@@ -201,7 +201,7 @@ def _prepare(folder: Path, restart: Restart | None, plan: Plan) -> Path | None:
         elif any((folder / name).exists() for name in (RESULT, NAME, PREVIOUS)):
             if folder.resolve() in (here := Path.cwd().resolve(), *here.parents):
                 raise InputError(
-                    f"{folder}: holds results, which cannot be moved aside from under the current folder; "
+                    f"{folder}: holds results, which cannot be moved aside because the current folder is inside; "
                     "give another with -o, or continue them with --restart"
                 )
             number = 1

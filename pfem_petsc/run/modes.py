@@ -77,7 +77,7 @@ def _told(found: Found, asked: int) -> list[str]:
     if zeros:
         lines.append(f"{zeros} frequencies are zero: rigid-body motions or mechanisms, which no stiffness resists")
     if len(found.values) < asked:
-        lines.append(f"{asked} modes are asked for, the state has {len(found.values)}")
+        lines.append(f"{asked} modes are requested, but the state has {len(found.values)}")
     for first in range(0, len(found.values), _PER_LINE):
         numbers = "  ".join(f"{value:.6g}" for value in found.values[first : first + _PER_LINE])
         last = min(first + _PER_LINE, len(found.values))

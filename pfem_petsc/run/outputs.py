@@ -105,7 +105,7 @@ class Outputs:
             # before any change to the folder, because the checkpoint may be refused
             checkpoint = checkpoints.restore(restart)
         aside = prepare_folder(model.comm, folder, restart, plan)
-        notes = [*notes, *([] if aside is None else [f"{folder}: held results, which are in {aside} now"])]
+        notes = [*notes, *([] if aside is None else [f"{folder}: earlier results were moved to {aside}"])]
         start = stepper.number, stepper.place
         self.progress = open_progress(case, model, plan, start, folder, self._quiet, notes)
         self._compilation.progress = self.progress

@@ -41,5 +41,5 @@ def tell_restart(restart: Restart, progress: Progress, place: str, functions: in
     if before != functions:
         progress.warning(
             f"{restart.path}: the run had {before} function{'s' * (before != 1)} for forces, and this one has "
-            f"{functions}: functions are not in checkpoints; give them by Simulation.external_force before the run"
+            f"{functions}: functions are not in checkpoints; register them by Simulation.external_force before the run"
         )

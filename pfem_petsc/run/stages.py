@@ -188,13 +188,13 @@ class Stages:
         """
         if not any(stage.time is not None for stage in self._cases):
             raise InputError(
-                f"{self.case.source}: external_force: forces by a function act in motion, and this case has no [time]; "
-                "use [[load]]"
+                f"{self.case.source}: external_force: a function acts in dynamic analyses only, and this case has "
+                "no [time]; use [[load]]"
             )
         if any(stage.contact.treatment == "mass_redistribution" for stage in self._cases if stage.time is not None):
             raise InputError(
                 f'{self.case.source}: external_force: contact.treatment = "mass_redistribution" leaves nodes without '
-                "mass, which cannot follow forces that depend on their velocity; take another contact.treatment"
+                "mass, which cannot follow forces that depend on their velocity; use another contact.treatment"
             )
         self.functions.append(function)
         if self.model.case.time is not None:

@@ -48,5 +48,5 @@ class StopRequest(SignalNotes):
     def reason(self, code: int) -> str:
         """Describe a code."""
         if code == _WALL_TIME:
-            return f"the wall time of {duration(self.wall_time or 0.0)} is over"
+            return f"the wall time of {duration(self.wall_time or 0.0)} has elapsed"
         return f"{signal.Signals(code).name} received"

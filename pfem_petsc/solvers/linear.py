@@ -114,11 +114,11 @@ def choose_linear(
 def _check(request: str, operator: str, symmetric: bool) -> None:
     """Refuse combinations that do not exist."""
     if operator == "matrix_free" and not symmetric:
-        raise InputError('solver.operator = "matrix_free": this integrator needs a matrix; take "assembled" or "auto"')
+        raise InputError('solver.operator = "matrix_free": this integrator needs a matrix; use "assembled" or "auto"')
     if request == "multigrid" and not symmetric:
-        raise InputError('solver.linear = "multigrid": the matrix of this integrator is not symmetric; take "gamg"')
+        raise InputError('solver.linear = "multigrid": the matrix of this integrator is not symmetric; use "gamg"')
     if request == "multigrid" and operator == "assembled":
-        raise InputError('solver.linear = "multigrid" has no matrix: take operator = "matrix_free", or linear = "gamg"')
+        raise InputError('solver.linear = "multigrid" is matrix-free: use operator = "matrix_free", or linear = "gamg"')
 
 
 def unsymmetric(choice: LinearChoice) -> LinearChoice:

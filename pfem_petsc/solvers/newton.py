@@ -150,7 +150,7 @@ class NewtonSolver:
                 self._solver(bounded)
         except PETSc.Error as error:
             words = re.split(r"\[\d+\]", str(error))[-1].strip()
-            raise InputError(f"options after --: PETSc refuses one of those of the solvers: {words}") from error
+            raise InputError(f"options after --: PETSc rejects an option of the solvers: {words}") from error
 
     def destroy(self) -> None:
         """Free the PETSc objects."""

@@ -132,12 +132,12 @@ def _check(model: Model) -> None:
         )
     if model.bars.springs is not None and case.static.method != "newton":
         raise InputError(
-            f'{source}: spring: static.method = "{case.static.method}" does not have springs to the ground; take '
-            '"newton", or bars to supported nodes as springs'
+            f'{source}: spring: static.method = "{case.static.method}" does not support springs to the ground; '
+            'use "newton", or bars to supported nodes as springs'
         )
     if model.external.wind is not None and model.external.wind.fastest():
         raise InputError(
-            f"{source}: wind: drag turns with the bars, which a static analysis does not follow; take [time] with "
+            f"{source}: wind: drag turns with the bars, which a static analysis does not follow; use [time] with "
             "damping, or the forces as [[load]]; a stage may have [stage.wind]"
         )
     for wall in case.wall:
@@ -151,7 +151,7 @@ def _check(model: Model) -> None:
         if law.rate and not law.static_limit:
             raise InputError(
                 f'{source}: material.{name}.law = "{law_name(dict(material))}" depends on the rate of strain, and a '
-                "static analysis has no time; take another law"
+                "static analysis has no time; use another law"
             )
     if not model.supports.any and not model.can_touch and model.bars.springs is None:
         raise InputError(

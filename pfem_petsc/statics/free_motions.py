@@ -62,7 +62,7 @@ def _text(model: Model, state: State, free: list[np.ndarray]) -> str:
     elif rigid:
         text += f", {rigid} of them of the truss as a rigid body"
     told = "; ".join(_nodes(model, motion) for motion in free[:_TOLD])
-    return f"{text}: {told}. Give supports or bars that stop them"
+    return f"{text}: {told}. Add supports or bars that prevent them"
 
 
 def _rigid(model: Model, state: State, free: list[np.ndarray]) -> int:

@@ -70,7 +70,7 @@ class PathKeys(StrictModel):
         if (self.node_set is None) != (self.direction is None):
             raise InputError("node_set and direction belong together; give both or none")
         if self.direction is not None and not np.any(self.direction):
-            raise InputError("direction = [0, 0, 0] is none; give a vector")
+            raise InputError("direction = [0, 0, 0] has zero length; give a vector")
         if self.displacement is not None and self.node_set is None:
             raise InputError("displacement needs node_set and direction")
         if 0 in self.branch_at:

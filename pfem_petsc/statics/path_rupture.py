@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 __all__ = ["settle_broken"]
 
-PARTED = "no bar that is left carries the load"
+PARTED = "no remaining bar carries the load"
 
 
 def settle_broken(stepper: PathStepper) -> tuple[bool, str]:
@@ -48,7 +48,7 @@ def settle_broken(stepper: PathStepper) -> tuple[bool, str]:
             stepper.commit(point)
         except NotConverged as failure:
             raise SimulationFailure(
-                f"{stepper.arrived()}: what is left of the truss finds no equilibrium at this displacement after bars "
+                f"{stepper.arrived()}: the rest of the truss finds no equilibrium at this displacement after bars "
                 "broke: a part of it is a mechanism, or the next equilibrium is distant; [time] follows the motion. "
                 f"The last attempt: {failure}{free_motions(stepper.model, stepper.state)}"
             ) from failure

@@ -29,13 +29,13 @@ def check_path(model: Model, keys: PathKeys) -> None:
     case = model.case
     if case.remove:
         raise InputError(
-            f'{case.source}: static.method = "{case.static.method}" passes a load factor several times or never, so '
-            'that [[remove]] has no time there; remove bars and supports with static.method = "newton"'
+            f'{case.source}: static.method = "{case.static.method}" can pass a load factor several times or never, '
+            'so that [[remove]] has no defined time; remove bars and supports with static.method = "newton"'
         )
     if model.can_touch:
         raise InputError(
             f'{case.source}: static.method = "{case.static.method}" follows paths without contact; remove walls, '
-            'contact pairs and constraints, or take static.method = "newton", with static.stabilise beyond limit points'
+            'contact pairs and constraints, or use static.method = "newton", with static.stabilise beyond limit points'
         )
     if not (model.external.active or model.supports.moves or model.bars_vary):
         raise InputError(f"{case.source}: static: nothing depends on the load factor; give a [[load]] or a table")
@@ -65,7 +65,7 @@ def first_point(stepper: PathStepper) -> tuple[Point, bool]:
     if not size > 0.0 or not np.isfinite(size):
         raise SimulationFailure(
             f"{stepper.model.case.source}: static: the load factor moves no node at the start of the path: loads act "
-            "on supports alone, or tables are constant there"
+            "on supports only, or tables are constant there"
         )
     stepper.weight = stepper.metric.weight = 1.0 / size**2
     sign = _scale_component(stepper, response, size) if stepper.by_component else 1.0
@@ -81,7 +81,7 @@ def _scale_component(stepper: PathStepper, response: np.ndarray, size: float) ->
     if not abs(along) > 1e-12 * size:
         raise SimulationFailure(
             "static.direction: the load does not move the nodes of static.node_set along it at the start of "
-            'the path; take another direction, or static.method = "arc_length"'
+            'the path; use another direction, or static.method = "arc_length"'
         )
     stepper.scale = abs(along)
     return float(np.sign(along))

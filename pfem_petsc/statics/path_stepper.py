@@ -90,7 +90,7 @@ class PathStepper(StaticStepper):
         self._point: Point | None = None
         if self.points.stability is not None and self.points.stability.refusal is not None:
             refusal = self.points.stability.refusal
-            self.scheme.notice = f"bifurcations are not looked for, only limit points: {refusal}"
+            self.scheme.notice = f"bifurcations are not searched for, only limit points: {refusal}"
 
     def _make_system(self) -> None:
         """Create what solves for points, for the supports as they are. Collective."""
@@ -238,7 +238,7 @@ class PathStepper(StaticStepper):
         chosen = self.keys.branch_mode
         if chosen > len(choices):
             many = f"{len(choices)} mode" + "s" * (len(choices) > 1)
-            self.message(f"bifurcation {number} has {many} to leave along: static.branch_mode = 1 is taken")
+            self.message(f"bifurcation {number} has only {many}: static.branch_mode = 1 is used")
             chosen = 1
         self._turn = 1 if wanted[0] > 0 else -1
         self.mode = choices[chosen - 1]
@@ -253,7 +253,7 @@ class PathStepper(StaticStepper):
         """Return the message about a path that cannot be continued."""
         hint = ""
         if self.control.scale:
-            hint = '; where the displacement along static.direction turns back, static.method = "arc_length" goes on'
+            hint = '; if the displacement along static.direction turns back, static.method = "arc_length" continues'
         return SimulationFailure(
             f"the path cannot be followed beyond point {self.state.step} at load factor {self.state.time:.6g} with "
             f"steps down to {self.keys.smallest:.3g}: {failure}{hint}{free_motions(self.model, self.state)}"

@@ -230,7 +230,7 @@ class PseudoMotion:
             if self.energy.failed >= 0:
                 bar = model.mesh.bar_ids[self.energy.failed]
                 raise SimulationFailure(
-                    f"{when}: bar {bar} collapsed to no length: the load crushes it; reduce the load or static.step"
+                    f"{when}: bar {bar} collapsed to zero length: the load crushes it; reduce the load or static.step"
                 )
             if not np.isfinite(self.x).all() or not np.isfinite(self.f).all():
                 raise SimulationFailure(f"{when}: positions or forces are not finite; reduce static.step")

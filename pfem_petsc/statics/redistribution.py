@@ -54,7 +54,7 @@ def _solve_again(stepper: StaticStepper) -> None:
         stepper._make_part(stepper.state.time)
     except NotConverged as failure:
         raise SimulationFailure(
-            f"{stepper.arrived()}: what is left of the truss finds no equilibrium after bars or supports went: it "
+            f"{stepper.arrived()}: the rest of the truss finds no equilibrium after bars or supports went: it "
             f'collapses, or a part of it is a mechanism; static.method = "relaxation" finds distant equilibria, '
             f"[time] follows the motion. The last attempt: {failure}{free_motions(stepper.model, stepper.state)}"
         ) from failure

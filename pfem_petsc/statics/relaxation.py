@@ -122,8 +122,8 @@ class RelaxationStepper(StaticStepper):
         if count > 0:
             self.message(
                 f"load factor {motion.time:.6g}: the equilibrium is unstable, with {count} negative "
-                f"eigenvalue{'s' * (count > 1)} of the stiffness: nothing has moved it away from there, as in a "
-                "symmetric start; add a small load that does"
+                f"eigenvalue{'s' * (count > 1)} of the stiffness: nothing perturbs it, as from a "
+                "symmetric start; add a small perturbing load"
             )
 
     def _polish(self, balance: Balance) -> Solution | None:
@@ -198,12 +198,12 @@ def _check(model: Model) -> None:
     if model.links:
         what = "contact_pair" if case.contact_pair else "constraint"
         raise InputError(
-            f'{case.source}: static.method = "relaxation" does not know [[{what}]]; use static.method = "newton"'
+            f'{case.source}: static.method = "relaxation" does not support [[{what}]]; use static.method = "newton"'
         )
     for k, name in enumerate(model.contact.names):
         if model.contact.static_friction[k]:
             raise InputError(
-                f'{case.source}: wall {name!r}: friction: with static.method = "relaxation" walls are frictionless: '
-                'the pseudo-motion is not a way along which friction could act; use static.method = "newton", or '
+                f'{case.source}: wall {name!r}: friction: with static.method = "relaxation" walls are frictionless, '
+                'because the pseudo-motion is not the path along which friction acts; use static.method = "newton", or '
                 "remove friction"
             )

@@ -67,7 +67,7 @@ class Stability:
             why = "" if self._mumps else ", and this PETSc does not have MUMPS"
             self.refusal = f"the model has {unknowns:,} unknowns, more than {largest:,}{why}"
         elif self.comm.size > 1 and not self._mumps:
-            self.refusal = "on several ranks it takes MUMPS, which this PETSc does not have"
+            self.refusal = "on several ranks it requires MUMPS, which this PETSc does not have"
 
     def look(self) -> Spectrum:
         """Count at the stiffness that the matrix holds now."""

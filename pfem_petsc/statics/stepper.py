@@ -192,8 +192,8 @@ class StaticStepper(ImplicitStepper):
             self._make_part(self.end)
         except NotConverged as failure:
             raise SimulationFailure(
-                f"load factor {self.end:.6g} was reached with static.stabilise, but there is no equilibrium near "
-                f"without it: reduce static.stabilise or static.step. The last attempt: {failure}"
+                f"load factor {self.end:.6g} was reached with static.stabilise, but there is no equilibrium "
+                f"nearby without it: reduce static.stabilise or static.step. The last attempt: {failure}"
             ) from failure
         finally:
             self.scheme.releases = False
@@ -224,13 +224,13 @@ class StaticStepper(ImplicitStepper):
         """Return the message about the load factor beyond which no equilibrium was found."""
         slips = ""
         others = (
-            'static.method = "arc_length" follows the path beyond a limit point, static.stabilise and stages in time '
-            'lead beyond jumps, as of struts that snap, and "relaxation" finds the equilibrium of slack structures'
+            'static.method = "arc_length" follows the path beyond a limit point, static.stabilise and dynamic stages '
+            'pass jumps, such as struts that snap, and "relaxation" finds the equilibrium of slack structures'
         )
         if self.model.can_touch:
-            others = "static.stabilise, or supports that move the truss instead of loads, lead beyond a limit point"
+            others = "static.stabilise, or supports that move the truss instead of loads, pass a limit point"
             if self.model.contact.any and self.model.contact.symmetric:
-                others = f"walls without friction do not hold nodes along them: give supports; {others}"
+                others = f"walls without friction do not hold nodes along them: add supports; {others}"
             elif self.model.contact.any:
                 slips = ", or the friction of walls does not hold it"
         return SimulationFailure(

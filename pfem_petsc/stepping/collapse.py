@@ -48,7 +48,7 @@ def _cause(stepper: Stepper, wave: float) -> str:
     fastest = _speed_of_case(case)
     if fastest >= _STRONG * wave:
         return (
-            f"at {engineering(fastest, 'm/s')} the impact is too strong for a truss model: take a lower speed, a "
+            f"at {engineering(fastest, 'm/s')} the impact is too strong for a truss model: use a lower speed, a "
             "stronger material, or a smaller time.step"
         )
     others = [stepper.remedy]

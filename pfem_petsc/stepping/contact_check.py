@@ -76,12 +76,12 @@ def warn_of_gain(case: Case, step: float, across: float = np.inf) -> str:
         return (
             f"contact: wilson{f' ({named})' if named else ''} with contact and steps of {step:.2g} times the explicit "
             "limit gains energy in impacts: its first steps after a node is stopped overshoot, by more the larger the "
-            f"step, at any theta; take {_remedies(time, asked)}"
+            f"step, at any theta; use {_remedies(time, asked)}"
         )
     return (
         f'contact: {time.integrator}{f" ({named})" if named else ""} with contact.treatment = "{asked.treatment}", '
         f'{restitution}time.mass = "{time.mass}" and steps of {step:.2g} times the explicit limit gains energy in '
-        f"impacts: {size} in the worst of {PHASES} phases of a step at which a rod meets a wall; take "
+        f"impacts: {size} in the worst of {PHASES} phases of a step at which a rod meets a wall; use "
         f"{_remedies(time, asked)}"
     )
 

@@ -118,7 +118,7 @@ def make_plan(model: Model, recorded: Mapping[str, Any] | None = None) -> Plan:
     safe = scheme.limit(min(ratio + local, 1e3)) if local else limit
     if limit == 0.0:
         raise InputError(
-            f"{case.source}: time: {time.integrator} with these parameters is unstable at any step; take gamma >= 1/2"
+            f"{case.source}: time: {time.integrator} with these parameters is unstable at any step; use gamma >= 1/2"
         )
     betas = [case.material[section.material].stiffness_damping for section in case.section.values()]
     viscous = viscous_rate(case, model.bars, model.inertia.mass, model.inertia.consistent)

@@ -59,8 +59,8 @@ class Removals:
             elif self._model.links or self._model.inertia.redistribution is not None:
                 what = "contact pairs and constraints" if self._model.links else "massless contact nodes"
                 raise InputError(
-                    f"{key}.supports = {entry.supports!r}: {what} need supports that stay; remove bars instead, or do "
-                    "without them"
+                    f"{key}.supports = {entry.supports!r}: {what} require supports that remain; remove bars "
+                    "instead, or leave them out"
                 )
 
     def _done(self, k: int) -> bool:

@@ -32,7 +32,7 @@ def start_in_motion(stepper: Stepper) -> None:
         model.external.follow(state.position, state.v)
     if stepper.massless is not None and stepper.massless.settle(state.x, 0.0, 0.0) > BEYOND * model.length:
         stepper.fault = SimulationFailure(
-            "step 0, t = 0 s: contact nodes without mass found no equilibrium; take another contact.treatment"
+            "step 0, t = 0 s: contact nodes without mass found no equilibrium; use another contact.treatment"
         )
     stepper.evaluate(commit=True)
     if model.external.active:

@@ -158,7 +158,7 @@ REFUSED = {
     "unknown interpolation": (["support.0.interpolation=smoth"], ["support[0].interpolation", "'smooth'?"]),
     "lines of accelerations": (
         ["support.0.acceleration=[[0.0, 0.0, 1.0, 0.0]]", "support.0.interpolation=linear"],
-        ["support[0]", "goes with motion"],
+        ["support[0]", "requires motion"],
     ),
     "two choices of nodes": (["node_set.tip.all=true"], ["node_set.tip", "exactly one", "got nearest and all"]),
     "no choice of nodes": (["node_set.tip={}"], ["node_set.tip", "exactly one", "got none"]),

@@ -81,7 +81,7 @@ def test_what_is_here_is_told():
             "COMM_WORLD.rank",
             (0, 'found [2, 1, true, "1.10", "/usr/h5py.py"]'),
             "2 ranks",
-            "different MPIs",
+            "different MPI installations",
             "petsc4py-real",
         ),
         (
@@ -140,7 +140,7 @@ def test_what_is_missing_has_its_remedy(monkeypatch, capsys, part, answer, name,
     found = inspect_environment(machine(**{part: answer}))
     (missing,) = (each for each in found if each.state == "missing")
     assert missing.name == name and text in missing.text and remedy in missing.remedy
-    assert missing.remedy in "\n".join(report(found)).partition("what is missing comes with:")[2]
+    assert missing.remedy in "\n".join(report(found)).partition("to install what is missing:")[2]
     monkeypatch.setattr(environment, "_run", machine(**{part: answer}))
     assert main(["check", "--env"]) == 2
     assert f"check --env: missing: {name}; the list above" in capsys.readouterr().err

@@ -58,10 +58,10 @@ def test_a_run_says_where_earlier_results_went_and_how_energy_drifts(tmp_path, c
     folder = tmp_path / "swing"
     words = ["pendulum", "-o", str(folder), "--set", "time.end=0.2"]
     assert main(words) == 0
-    assert "held results" not in capsys.readouterr().out
+    assert "earlier results" not in capsys.readouterr().out
     assert main(words) == 0
     shown = capsys.readouterr().out
-    assert f"{folder}: held results, which are in {folder}.1 now" in shown
+    assert f"{folder}: earlier results were moved to {folder}.1" in shown
     assert "\n  ranks          1\n" in shown
     assert abs(float(re.search(r"energy drift (\S+)", shown)[1])) < 1e-9
 

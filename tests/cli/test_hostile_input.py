@@ -135,7 +135,7 @@ def test_the_current_folder_is_not_moved_aside(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "result.vtkhdf").write_text("x")
     for folder in (Path("."), tmp_path):
-        with pytest.raises(InputError, match="cannot be moved aside from under the current folder.*-o"):
+        with pytest.raises(InputError, match="cannot be moved aside because the current folder is inside.*-o"):
             _prepare(folder, None, None)
 
 

@@ -155,7 +155,7 @@ def test_wilson_beyond_the_explicit_limit_is_always_warned_of(treatment):
         case = Case.load("rod_impact", overrides)
         text = warn_of_gain(case, 2.0)
         assert "gains energy in impacts" in text
-        assert "theta = 2 " not in text.split("; take ")[1]
+        assert "theta = 2 " not in text.split("; use ")[1]
     assert warn_of_gain(Case.load("rod_impact", ["time.integrator=wilson", "time.theta=1.8"]), 1.0) == ""
     assert warn_of_gain(Case.load("rod_impact", ["time.integrator=houbolt"]), 5.0) == ""
 
@@ -228,7 +228,7 @@ def test_gain_is_told_while_it_runs(tmp_path, capfd):
     run = Simulation(case, MPI.COMM_SELF, output=tmp_path, quiet=True)
     assert any("gains energy in impacts" in text for text in run.model.warnings)
     run.run()
-    assert capfd.readouterr().err.count("contact has made") == 1
+    assert capfd.readouterr().err.count("contact has produced") == 1
 
 
 def rod_held_at_one_end(integrator, step, **material):

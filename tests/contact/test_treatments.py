@@ -197,7 +197,7 @@ def test_mass_redistribution_without_a_matrix(comm, shared_tmp_path):
 @pytest.mark.parametrize(
     "tables, message",
     [
-        ({"contact": {"treatment": "conserving"}}, "goes with the integrators energy_momentum, houbolt, newmark"),
+        ({"contact": {"treatment": "conserving"}}, "with the integrators energy_momentum, houbolt, newmark"),
         (
             {"contact": {"treatment": "mass_redistribution"}},
             "must be a plane, not curved nor a rectangle, and name a node_set",

@@ -175,7 +175,7 @@ def test_curved_walls_that_leave_no_room(comm, shared_tmp_path):
     bowl = {"type": "sphere", "side": "inside", "point": [0.0, 0.0, 0.0], "radius": 1e-9, "node_set": "corner"}
     post = {"type": "cylinder", "axis": [0.0, 0.3, 1.0], "point": [-0.5, 0.0, 0.0], "radius": 0.5, "node_set": "corner"}
     case = lattice_case([bowl, post], node_set={"corner": {"nearest": [0.0, 0.0, 0.0]}}, velocity=[-1.0, 0.5, 0.0])
-    with pytest.raises(SimulationFailure, match=r"node 0 on curved walls .* no place; move the walls apart"):
+    with pytest.raises(SimulationFailure, match=r"node 0 on curved walls .* infeasible together; move the walls apart"):
         simulation(case, comm, shared_tmp_path).run()
 
 

@@ -148,7 +148,7 @@ def test_fields_that_are_refused(tmp_path, field, text):
 
 @pytest.mark.parametrize("name", ["x", "sin", "a b", "and", "1a"])
 def test_names_of_fields_are_checked(name):
-    with pytest.raises(ValidationError, match="expected a name for expressions"):
+    with pytest.raises(ValidationError, match="expected a name of letters"):
         generated(fields={name: {"file": "a.vti", "array": "a"}})
 
 

@@ -243,7 +243,7 @@ def test_sections_of_beams(tmp_path, text):
         ("10, 1.D+0, 0., 0.", "10. 1. 0. 0.", r"line 6: \*NODE: '10. 1. 0. 0.' is not a number"),
         ("10, 1.D+0, 0., 0.", "10.5, 1, 0., 0.", r"line 4: \*NODE: 10.5 is not the label of a node"),
         ("10, 1.D+0, 0., 0.", "-10, 1, 0., 0.", r"line 4: \*NODE: -10 is not the label of a node"),
-        ("10, 1.D+0, 0., 0.", "1, 1, 0., 0.", r"\*NODE: node 1 is listed more than once, at different places"),
+        ("10, 1.D+0, 0., 0.", "1, 1, 0., 0.", r"\*NODE: node 1 is listed more than once, at different positions"),
         ("10, 1.D+0, 0., 0.", "10, 1, 2, 3, 4, 5, 6, 7, 8", r"line 6: \*NODE: .* has 9 values; expected 1 to 7"),
         ("2, 10, 7", "2, 10", r"line 14: \*ELEMENT: '2, 10' has 2 values; expected 3 to 5 with commas"),
         ("2, 10, 7", "2, 10, 8", r"line 11: \*ELEMENT: node 8 of element 2 is not defined"),

@@ -172,7 +172,7 @@ def test_bars_of_several_groups_in_gmsh_2(tmp_path):
     assert {name: members.tolist() for name, members in mesh.bar_groups.items()} == {"one": [0, 1], "two": [0, 2]}
     assert mesh.bar_fields["area"].tolist() == [1e-4, 3e-4, 4e-4]
     (warning,) = mesh.warnings
-    assert "section $ElementData 'part' is left out: it has not a value for each line" in warning
+    assert "section $ElementData 'part' is left out: it does not have a value for each line" in warning
     # of the same group they are two bars at the same place, which a case refuses
     path.write_text(gmsh_elements([(1, 7, 1, 2), (1, 7, 1, 2), (1, 8, 2, 3), (2, 9, 3, 1)]))
     assert len(read_whole(path).bars) == 4

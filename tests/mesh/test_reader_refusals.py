@@ -91,7 +91,7 @@ def test_gmsh_points_without_lines_say_what_gmsh_saves(tmp_path):
         "$Elements\n1\n1 15 2 1 1 1\n$EndElements\n"
     )
     assert refusal(path) == (
-        "FILE: 1 nodes and 0 bars: nothing to simulate; where there are physical groups, Gmsh saves nothing else: put "
+        "FILE: 1 nodes and 0 bars: nothing to simulate; if there are physical groups, Gmsh saves nothing else: put "
         'the lines into one (Physical Curve("bars") = {:}), or save all (Mesh.SaveAll = 1)'
     )
 

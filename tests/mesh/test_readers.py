@@ -94,7 +94,7 @@ def test_vtk_with_other_cells_between_the_lines(comm, shared_tmp_path):
 
     slab = read(written(comm, shared_tmp_path, "mixed.vtu", write), comm)
     (warning,) = slab.warnings
-    assert warning.endswith("mixed.vtu: left out 2 cells that are no lines")
+    assert warning.endswith("mixed.vtu: left out 2 cells that are not lines")
     check_sample(whole(slab, comm), ("group_2",), ("section_1",))
 
 

@@ -111,7 +111,7 @@ def test_first_step_and_compiling_are_no_measure_of_what_remains():
         left = 100 - int(line.split("/")[0].split()[-1])
         assert "  8 steps/s" in line
         assert f"ETA {duration(left / 8.0)}" in line
-    assert "done: 100 steps in 40.5 s, of it 8.00 s for compiling (3.1 steps/s)" in stream.getvalue()
+    assert "done: 100 steps in 40.5 s, including 8.00 s for compiling (3.1 steps/s)" in stream.getvalue()
 
 
 def test_quiet_writes_the_log_only(tmp_path, capsys):

@@ -203,7 +203,7 @@ def test_stages_and_restart_are_bitwise(scheme, comm, tmp_path):
         ({"spring": [{"between": ["a"], "stiffness": 2.0}]}, r"spring\[0\].between"),
         (
             {"dashpot": [{"between": ["a", "a"], "coefficient": 2.0}]},
-            r"dashpot\[0\].between: node 1 is all that 'a' has",
+            r"dashpot\[0\].between: node 1 is the only node of 'a'",
         ),
         ({"dashpot": [{"between": ["a", "b"], "coefficient": 0.0}]}, r"dashpot\[0\].coefficient.*> 0"),
     ],

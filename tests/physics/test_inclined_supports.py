@@ -324,14 +324,14 @@ REFUSED = {
     ),
     "wall": (
         {"support": [ROLLER], "wall": [{"type": "plane", "point": [0, 0, -1.0], "normal": [0, 0, 1.0], "name": "w"}]},
-        "wall 'w': a [[support]] prescribes a direction that is no axis at node 1",
+        "wall 'w': a [[support]] prescribes a direction that is not an axis at node 1",
     ),
     "pair": (
         {
             "support": [ROLLER],
             "contact_pair": [{"name": "p", "first": "start", "second": "end", "direction": [1.0, 0, 0]}],
         },
-        "contact_pair, constraint: a [[support]] prescribes a direction that is no axis at node 1",
+        "contact_pair, constraint: a [[support]] prescribes a direction that is not an axis at node 1",
     ),
 }
 

@@ -253,13 +253,13 @@ def test_refusals(tmp_path):
         case(**some, spring=[{"node_set": "end", "stiffness": [1.0, -1.0, 0.0]}])
     with pytest.raises(InputError, match=r"spring\[0\].*the two vectors of frame are parallel"):
         case(**some, spring=[{"node_set": "end", "stiffness": [1.0, 1.0, 0.0], "frame": [[1, 0, 0], [2, 0, 0]]}])
-    with pytest.raises(InputError, match=r"spring\[0\].*frame gives the axes of springs to the ground"):
+    with pytest.raises(InputError, match=r"spring\[0\].*frame defines the axes of springs to the ground"):
         between = {"between": ["start", "end"], "stiffness": 1.0, "frame": [[1, 0, 0], [0, 1, 0]]}
         case(**some, spring=[between])
     with pytest.raises(InputError, match=r"dashpot\[0\].node_set"):
         case(**some, dashpot=[{"node_set": "ende", "coefficient": 1.0}])
     for method in ("arc_length", "relaxation"):
-        with pytest.raises(InputError, match=f'spring: static.method = "{method}" does not have springs'):
+        with pytest.raises(InputError, match=f'spring: static.method = "{method}" does not support springs'):
             Simulation(case(static={"method": method}), MPI.COMM_SELF, output=tmp_path / method, quiet=True)
     wall = {"name": "w", "type": "plane", "point": [0.0, 0.0, -9.0], "normal": [0.0, 0.0, 1.0], "node_set": "start"}
     massless = {"wall": [wall], "contact": {"treatment": "mass_redistribution"}, **some}

@@ -23,7 +23,7 @@ def test_wall_time(tmp_path, capsys):
     words = ["rod_impact", "-o", str(folder), "--quiet", "--set", "time.end=1000"]
     assert main([*words, "--wall-time", "0.5"]) == 4
     said = capsys.readouterr().err
-    assert said.startswith("stopped: the wall time of 0.50 s is over")
+    assert said.startswith("stopped: the wall time of 0.50 s has elapsed")
     assert "continue with --restart" in said
     reached = steps(folder)[0][-1]
     assert 0 < reached < 100_000

@@ -221,9 +221,9 @@ def test_same_motion_as_with_a_factorisation(comm, shared_tmp_path, scheme):
 
 
 def test_what_it_cannot_do_is_refused():
-    with pytest.raises(InputError, match='solver.linear = "multigrid".*not symmetric; take "gamg"'):
+    with pytest.raises(InputError, match='solver.linear = "multigrid".*not symmetric; use "gamg"'):
         choose_linear("multigrid", 30_000, 100.0, symmetric=False)
-    with pytest.raises(InputError, match='solver.linear = "multigrid" has no matrix'):
+    with pytest.raises(InputError, match='solver.linear = "multigrid" is matrix-free'):
         choose_linear("multigrid", 30_000, 100.0, operator="assembled")
 
 

@@ -57,7 +57,7 @@ def test_a_limit_point_ends_the_run_with_the_load_factor_that_was_reached(shared
     case = truss(shared_tmp_path, comm, push=(0.0, 0.0, -600.0))
     with pytest.raises(SimulationFailure, match=r"no equilibrium found beyond load factor 0\.49.*arc_length") as error:
         history_of(case, comm, shared_tmp_path)
-    assert "static.stabilise and stages in time" in str(error.value)
+    assert "static.stabilise and dynamic stages" in str(error.value)
     assert "solver.linear" not in str(error.value)  # the linear solver is direct already
     history = open_result(shared_tmp_path / "out" / "result.vtkhdf").history
     z = np.linspace(0.0, HEIGHT, 200001)

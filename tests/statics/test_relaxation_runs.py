@@ -73,7 +73,7 @@ def test_crushed_bars_end_the_run_on_all_ranks(comm, shared_tmp_path):
         ({"wall": [{"name": "floor", "type": "plane", "point": [0.0, 0.0, -9.0], "normal": [0.0, 0.0, 1.0],
                     "friction": 0.2}]}, "wall 'floor': friction"),
         ({"contact_pair": [{"name": "pair", "first": "at1", "second": "at2", "direction": [1.0, 0.0, 0.0]}]},
-         r"does not know \[\[contact_pair\]\]"),
+         r"does not support \[\[contact_pair\]\]"),
         ({"static": {"method": "relaxation", "damping": "viscous"}}, "static.damping"),
         ({"static": {"method": "relaxation", "tolerance": 2.0}}, "static.tolerance"),
     ],

@@ -185,7 +185,7 @@ def test_a_block_that_slips_has_no_equilibrium(shared_tmp_path, comm):
     history = open_result(shared_tmp_path / "out" / "result.vtkhdf").history
     assert 0.4 <= history["load_factor"][-1] <= 0.5
     viscous = block({"step": 0.1, "stabilise": 1e-3}, **pushed(push))
-    with pytest.raises(SimulationFailure, match="no equilibrium near without it"):
+    with pytest.raises(SimulationFailure, match="no equilibrium nearby without it"):
         history_of(viscous, comm, shared_tmp_path / "viscous")
     history = open_result(shared_tmp_path / "viscous" / "out" / "result.vtkhdf").history
     force = history["wall/floor/force"][history["load_factor"] > 0.65]
@@ -263,7 +263,7 @@ def test_a_rod_that_two_walls_hold(shared_tmp_path, comm, elements, fix, frictio
 
 
 def test_a_rod_that_nothing_holds_along_walls_is_told_what_would(shared_tmp_path, comm):
-    with pytest.raises(SimulationFailure, match="walls without friction do not hold nodes along them: give supports"):
+    with pytest.raises(SimulationFailure, match="walls without friction do not hold nodes along them: add supports"):
         rod_between_walls(shared_tmp_path, comm, 4, "z", 0.0)
 
 

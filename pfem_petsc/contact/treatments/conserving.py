@@ -31,7 +31,8 @@ class Treatment(Base):
         if scheme.force_acts_once:
             return None
         schemes = {name: lookup(INTEGRATORS, name, "").Scheme for name in choices(INTEGRATORS)}
-        return f"goes with the integrators {', '.join(name for name, one in schemes.items() if one.force_acts_once)}"
+        suited = ", ".join(name for name, one in schemes.items() if one.force_acts_once)
+        return f"is compatible with the integrators {suited}"
 
     def before(self) -> None:
         """Record the initial positions of nodes and the forces there."""

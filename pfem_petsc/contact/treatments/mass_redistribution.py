@@ -88,21 +88,19 @@ def redistribute(model: Model) -> Redistribution:
         if not wall.flat or wall.partial or contact.all_nodes[k]:
             raise InputError(
                 f"{key}: wall {contact.names[k]!r} must be a plane, not curved nor a rectangle, and name a node_set: "
-                "its nodes lose mass; take another contact.treatment"
+                "its nodes lose mass; use another contact.treatment"
             )
     if inertia.damped:
-        raise InputError(
-            f"{key}: a node without mass cannot be damped; take a material without damping, no [[dashpot]]"
-        )
+        raise InputError(f"{key}: a node without mass cannot be damped; use a material without damping, no [[dashpot]]")
     if model.bars.springs is not None:
-        raise InputError(f"{key}: a node without mass cannot have a [[spring]]; take another contact.treatment")
+        raise InputError(f"{key}: a node without mass cannot have a [[spring]]; use another contact.treatment")
     if model.supports.inclined is not None:
         raise InputError(
-            f"{key}: does not know a [[support]] with a normal or frame along no axis; take another contact.treatment"
+            f"{key}: normal and frame of a [[support]] must be along axes; or use another contact.treatment"
         )
     if model.external.state_forces:
         raise InputError(
-            f"{key}: a node without mass cannot follow [wind], whose force depends on its velocity; take another "
+            f"{key}: a node without mass cannot follow [wind], whose force depends on its velocity; use another "
             "contact.treatment"
         )
     owned = mesh.n_owned
@@ -175,8 +173,8 @@ class Treatment(Base):
         """Redistribute the mass of the contact nodes. Collective."""
         if model.links:
             raise InputError(
-                f'{model.case.source}: contact.treatment = "mass_redistribution": only walls can take mass from nodes; '
-                "take another treatment with contact_pair"
+                f'{model.case.source}: contact.treatment = "mass_redistribution": only walls can have massless nodes; '
+                "use another treatment with contact_pair"
             )
         model.inertia.redistribution = redistribute(model)
 

@@ -59,7 +59,7 @@ class WallKeys(WallParameters):
         if self.velocity is not None and self.motion is not None:
             raise ValueError("expected at most one of the keys velocity, motion")
         if self.interpolation == "linear" and self.motion is None:
-            raise ValueError('interpolation = "linear" goes with motion')
+            raise ValueError('interpolation = "linear" requires motion')
         if self.gravity and self.mass is None:
             raise ValueError("gravity = true needs the wall's mass [kg]")
         if self.mass is not None and self.motion is not None:
@@ -67,7 +67,7 @@ class WallKeys(WallParameters):
         if self.static_friction is not None and self.static_friction < self.friction:
             raise ValueError(f"static_friction must be no less than friction = {self.friction!r}")
         if self.tied and (self.friction or self.static_friction or self.restitution):
-            raise ValueError("a wall that is tied takes no friction and no restitution: nodes neither slip nor leave")
+            raise ValueError("a tied wall cannot have friction or restitution: nodes neither slip nor leave")
         return self
 
 

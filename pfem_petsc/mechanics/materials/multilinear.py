@@ -44,7 +44,7 @@ class Parameters(MaterialKeys):
         plastic = self._plastic()
         for k in range(1, len(plastic)):
             if not self.curve[k][1] >= self.curve[k - 1][1]:
-                raise ValueError(f"curve[{k}]: the stress falls; it must not, from row to row")
+                raise ValueError(f"curve[{k}]: the stress decreases; it must not decrease from row to row")
             if not plastic[k] > plastic[k - 1]:
                 raise ValueError(
                     f"curve[{k}]: the plastic strain, strain - stress/young_modulus, must increase from row to row; it "

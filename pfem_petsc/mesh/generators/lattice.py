@@ -93,7 +93,7 @@ class Parameters(StrictModel):
     def _expressions(self) -> Parameters:
         for name in self.fields or {}:
             if not name.isidentifier() or name in RESERVED:
-                raise ValueError(f"fields.{name}: expected a name for expressions of letters, digits and underscores")
+                raise ValueError(f"fields.{name}: expected a name of letters, digits and underscores")
         texts = {f"bar_fields.{name}": text for name, text in (self.bar_fields or {}).items()}
         texts |= {"keep": self.keep} if self.keep is not None else {}
         texts |= {f"map[{axis}]": text for axis, text in enumerate(self.map or ())}

@@ -92,7 +92,7 @@ def cell_of(
         at -= at.min(axis=0)
         one, two = (int(number[p]), *at[0].tolist()), (int(number[q]), *at[1].tolist())
         if one == two:
-            raise ValueError(f"strut {len(strut_of)} ({list(row)}) has no length: its ends are the same place")
+            raise ValueError(f"strut {len(strut_of)} ({list(row)}) has no length: its ends coincide")
         key = next((k for k in ((*one, *two), (*two, *one)) if k in found), (*one, *two))
         strut_of.append(found.setdefault(key, len(found)))
     rows = np.array(list(found), dtype=np.int64).reshape(-1, 2, 4)

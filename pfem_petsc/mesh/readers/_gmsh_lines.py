@@ -70,6 +70,6 @@ def element_data(path: Path, payload: bytes, layout: Format, bar_tags: np.ndarra
     order = np.argsort(tags, kind="stable")
     at = np.minimum(np.searchsorted(tags[order], bar_tags), max(n - 1, 0))
     if n == 0 or not np.array_equal(tags[order][at], bar_tags):
-        mesh.warnings.append(f"{where} {name!r} is left out: it has not a value for each line")
+        mesh.warnings.append(f"{where} {name!r} is left out: it does not have a value for each line")
         return
     mesh.bar_fields[name] = values[order[at], 0]

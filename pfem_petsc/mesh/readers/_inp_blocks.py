@@ -162,7 +162,7 @@ def blocks(path: Path) -> Iterator[Block]:
                 yield current
             current = part
         elif current is None:
-            raise InputError(f"{part.path}: line {part.line}: {_shown(part.text)!r} stands before the first *KEYWORD")
+            raise InputError(f"{part.path}: line {part.line}: {_shown(part.text)!r} precedes the first *KEYWORD")
         else:
             current.pieces.append(part)
     if current is not None:

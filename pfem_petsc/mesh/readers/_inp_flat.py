@@ -238,7 +238,7 @@ def _numbered(
     if len(nodes) < len(labels):
         moved = np.flatnonzero((points != points[first[at.ravel()]]).any(axis=1))
         if len(moved):
-            raise InputError(f"{path}: *NODE: node {labels[moved[0]]} is listed more than once, at different places")
+            raise InputError(f"{path}: *NODE: node {labels[moved[0]]} is listed more than once, at different positions")
         keep = np.sort(first)
         labels, points = labels[keep], points[keep]
     order = np.argsort(labels, kind="stable")

@@ -118,7 +118,7 @@ def _modes(block: Block) -> tuple[dict[str, dict[str, Any]], str]:
     """Buckling factors are those of the loads of the step, which a static analysis applies."""
     count = _values(block, 1)[0]
     keys: dict[str, Any] = {"count": int(count) if count else 10}
-    told = "" if count else "all frequencies below a limit are not asked for: modes.count = 10"
+    told = "" if count else "a limit of the frequencies is not supported: modes.count = 10"
     if block.keyword == "FREQUENCY":
         return {"modes": {**keys, "kind": "vibration"}}, told
     return {"static": {"step": 1.0}, "modes": {**keys, "kind": "buckling"}}, told

@@ -80,9 +80,9 @@ def _arrays(grid: Any, fields: tuple[str, ...]) -> dict[str, np.ndarray]:
     offsets = vtk_to_numpy(grid.GetCells().GetOffsetsArray()).astype(np.int64)
     first, size = offsets[cells], offsets[cells + 1] - offsets[cells]
     if np.any((size != 2) & (kinds[cells] == _VTK_LINE)) or np.any(size < 2):
-        raise ValueError("lines that have not two ends; a bar has two")
+        raise ValueError("lines that do not have two ends; a bar has two")
     if first.min() < 0 or (first + size).max() > len(ends):
-        raise ValueError("lines whose nodes are not there: a damaged file")
+        raise ValueError("lines whose nodes do not exist: a damaged file")
     # a line of several points is as many bars less one: the cell of each bar, and where its ends are listed
     lines = np.repeat(cells, size - 1)
     place = np.arange(len(lines)) - np.repeat(np.cumsum(size - 1) - (size - 1), size - 1) + np.repeat(first, size - 1)

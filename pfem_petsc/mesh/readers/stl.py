@@ -80,7 +80,7 @@ def _text(path: Path, content: bytes) -> np.ndarray:
                 whole = False
             if not whole:
                 shown = match.group(1)[:60].decode("utf-8", "replace")
-                raise InputError(f"{path}: line {line}: 'vertex {shown}' has not three numbers")
+                raise InputError(f"{path}: line {line}: 'vertex {shown}' does not have three numbers")
         raise InputError(
             f"{path}: has {len(found)} lines 'vertex x y z', not three for each triangle; is it truncated?"
         )

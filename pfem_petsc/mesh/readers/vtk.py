@@ -64,7 +64,7 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
             for key in arrays.files:
                 kind, slash, name = key.partition("/")
                 if key == "left_out" and arrays[key]:
-                    mesh.warnings.append(f"{path}: left out {arrays[key]} cells that are no lines")
+                    mesh.warnings.append(f"{path}: left out {arrays[key]} cells that are not lines")
                 if slash:
                     getattr(mesh, kind)[name] = arrays[key]
             mesh.known_fields = arrays["cell_fields"].tolist()

@@ -100,7 +100,7 @@ class Solver:
         except PETSc.Error as failure:
             reason = str(failure).strip().splitlines()[-1]
             raise SimulationFailure(
-                f"modes: {self.name}: PETSc or SLEPc failed ({reason}); take another modes.solver, or other options "
+                f"modes: {self.name}: PETSc or SLEPc failed ({reason}); use another modes.solver, or other options "
                 f"-{_PREFIX}..."
             ) from failure
         finally:

@@ -271,7 +271,7 @@ def test_file_that_cannot_be_read(tmp_path):
         Case.load("zero\0byte")
     latin = tmp_path / "latin.toml"
     latin.write_bytes(b'title = "\xe9"\n')
-    with pytest.raises(InputError, match=r"line 1: a case file is TOML text in UTF-8"):
+    with pytest.raises(InputError, match=r"line 1: this is not UTF-8 text"):
         Case.load(latin)
 
 

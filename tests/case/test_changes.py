@@ -248,6 +248,6 @@ def test_prestress_of_a_stage_is_changed_in_the_stage():
     case.stage[0].section["all"].area = 2e-4  # of the case
     assert [each.section["all"].area for each in (case, *case.stages)] == [2e-4] * 3
     assert [each.section["all"].pretension for each in (case, *case.stages)] == [None, None, 2e3]
-    with pytest.raises(InputError, match=r"stage\[1\]\.section\.all.*: a stage changes the prestress"):
+    with pytest.raises(InputError, match=r"stage\[1\]\.section\.all.*: a stage can only change the prestress"):
         case.stage[1].section["all"].area = 1.0
     assert Case.from_toml(case.to_toml()) == case

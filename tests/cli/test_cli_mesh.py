@@ -111,7 +111,7 @@ def test_a_case_for_a_mesh_that_tells_nothing(mesh):
     assert load_slab(case.mesh, MPI.COMM_SELF).n_bars == 2
     # an existing case is not replaced
     status, _, err = mesh("convert", "a.h5", "b.vtu", "--case", "c.toml")
-    assert status == 2 and "--case c.toml: there is such a file" in err and not Path("b.vtu").exists()
+    assert status == 2 and "--case c.toml: this file exists" in err and not Path("b.vtu").exists()
 
 
 @pytest.mark.parametrize(

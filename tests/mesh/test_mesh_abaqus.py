@@ -259,7 +259,7 @@ def test_sections_of_beams(tmp_path, text):
         ("*NSET, NSET=Feet, GENERATE", "*NGEN", r"line 23: \*NGEN is not read: write the nodes and elements one by"),
         ("*NSET, NSET=Top", "*INSTANCE, NAME=I, PART=P\n*END INSTANCE\n*NSET, NSET=Top", r"there is no part P"),
         ("*NSET, NSET=Top", "*NSET, NSET=Top, INSTANCE=J", r"line 21: \*NSET: there is no instance J"),
-        ("*HEADING\n A", "A", r"line 1: 'A tripod, written by hand' stands before the first \*KEYWORD"),
+        ("*HEADING\n A", "A", r"line 1: 'A tripod, written by hand' precedes the first \*KEYWORD"),
         ("*HEADING", "*", r"line 1: '\*' is no keyword"),
     ],
 )

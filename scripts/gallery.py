@@ -34,10 +34,10 @@ SIZE = "960x540"
 
 HEAD = """# Gallery
 
-The built-in cases. Each runs as shown, and a test runs it (some shortened) and compares the number
-([tests/cases/test_built_in_cases.py](../tests/cases/test_built_in_cases.py)). Times are those of one core of a virtual
-machine, without the start of Python and the compilation of loops at the first run ever. `scripts/gallery.py` runs the
-cases, draws the pictures and writes this page from [gallery.toml](gallery.toml).
+This page shows the built-in cases. A test runs each case (some of them shortened) and compares the listed result
+([tests/cases/test_built_in_cases.py](../tests/cases/test_built_in_cases.py)). Times are for one core of a virtual
+machine, without the start of Python and the compilation of the loops in the very first run. `scripts/gallery.py` runs
+the cases, draws the pictures and writes this page from [gallery.toml](gallery.toml).
 
 ```
 python -m pfem_petsc CASE
@@ -59,14 +59,14 @@ def page() -> str:
 def _section(name: str, entry: dict[str, Any]) -> str:
     title = Case.load(name).title
     cost = "a moment" if entry["seconds"] < 0.1 else f"{entry['seconds']:.2g} s"
-    steps = f", {entry['steps']:,} steps" if entry["steps"] else ", modes of the initial state"
+    steps = f", {entry['steps']:,} step{'s' * (entry['steps'] > 1)}" if entry["steps"] else ", modes of the initial state"
     rows = [
         ("", ""),
         ("---", "---"),
-        ("size and cost", f"{entry['bars']:,} bars{steps}, {cost}"),
-        ("number", f"{entry['quantity']}: {_number(entry)}"),
+        ("size and cost", f"{entry['bars']:,} bar{'s' * (entry['bars'] > 1)}{steps}, {cost}"),
+        ("result", f"{entry['quantity']}: {_number(entry)}"),
         ("reference", entry["reference"]),
-        ("the test", f"`{name}`" + (f", with `{entry['smaller']}`" if "smaller" in entry else "")),
+        ("test", f"`{name}`" + (f", with `{entry['smaller']}`" if "smaller" in entry else "")),
         ("case file", f"[{name}.toml](../pfem_petsc/cases/{name}.toml)"),
     ]
     table = "\n".join(f"| {left} | {right} |" for left, right in rows).replace("| --- | --- |", "|---|---|")

@@ -59,7 +59,9 @@ def page() -> str:
 def _section(name: str, entry: dict[str, Any]) -> str:
     title = Case.load(name).title
     cost = "a moment" if entry["seconds"] < 0.1 else f"{entry['seconds']:.2g} s"
-    steps = f", {entry['steps']:,} step{'s' * (entry['steps'] > 1)}" if entry["steps"] else ", modes of the initial state"
+    steps = (
+        f", {entry['steps']:,} step{'s' * (entry['steps'] > 1)}" if entry["steps"] else ", modes of the initial state"
+    )
     rows = [
         ("", ""),
         ("---", "---"),

@@ -52,8 +52,8 @@ def _around(m: Measures) -> Claim:
         "5.2, Figs. 7, 8",
         "After the separation the velocity of the impact point oscillates around 5.13 m/s.",
         f"Elastic (Fig. 7), mean of the tip's velocity: Δt = 0.5 µs: {listed(small)} m/s; Δt = 2 µs: {listed(large)} "
-        f"m/s, Newmark low by numerical damping. Elastoplastic (Fig. 8): {min(plastic):.2f} to {max(plastic):.2f} "
-        "m/s, since the plastic work is lost.",
+        f"m/s; Newmark's is low because of numerical damping. Elastoplastic (Fig. 8): {min(plastic):.2f} to "
+        f"{max(plastic):.2f} m/s, since the plastic work is lost.",
         REPRODUCED if all(near) and min(plastic) > 4.9 else PARTLY if sum(near) > len(near) / 2 else NOT,
     )
 
@@ -65,8 +65,8 @@ def _vibration(m: Measures) -> Claim:
     return Claim(
         "5.2, Figs. 7, 8",
         "This is the bar's vibration after the impact, which the simplified analytical solution does not represent.",
-        f"There is a vibration, but it is the mesh's: its standard deviation is {text}. The exact elastic bar leaves "
-        "the wall stress-free, so the analytical solution lacks nothing.",
+        f"There is a vibration, but it is a property of the mesh: its standard deviation is {text}. The exact elastic "
+        "bar leaves the wall stress-free, so the analytical solution is complete.",
         PARTLY if falls else REPRODUCED,
     )
 

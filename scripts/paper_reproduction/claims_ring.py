@@ -123,7 +123,8 @@ def _identical(m: Measures, far: dict[str, dict[str, float]]) -> Claim:
     return Claim(
         "5.3, Figs. 12, 13",
         "At both steps central differences and Newmark are practically identical.",
-        "; ".join(parts) + ". Node 2 flies on unaffected in the time shown: that all schemes agree on it says nothing.",
+        "; ".join(parts)
+        + ". Node 2 is not affected in the time shown, so the agreement of all schemes on it is not significant.",
         REPRODUCED if all(same) else PARTLY if any(same) else NOT,
     )
 
@@ -157,7 +158,7 @@ def _reflection(m: Measures) -> Claim:
         "5.3",
         "Explicit methods and Newmark: reflection at 0.035 s, second impact near 0.12 s.",
         f"Contact, Δt = 0.05 ms [ms]: {text}. The geometry was chosen because it does this, so it proves nothing "
-        "about the paper; that all of these schemes and both steps agree was a part of the choice.",
+        "about the paper; the agreement of all these schemes and both steps was a criterion of the choice.",
         FITTED if all(good) else PARTLY if any(good) else NOT,
     )
 
@@ -233,7 +234,7 @@ def conclusion_claims(m: Measures) -> list[Claim]:
             "and Wilson are unsatisfactory.",
             f"False releases in the rod's contact: {listed(pick(m.rod, PAPER, 'releases'), 'd')} contacts where one is "
             f"right; force roughness {listed(pick(m.rod, PAPER, 'roughness'))}. Two reservations: Newmark with γ = "
-            "3/2 is first order, loses much energy, and stops rotation; Souza & Moura we cannot judge.",
+            "3/2 is first order, loses much energy, and stops rotation; Souza & Moura's scheme cannot be judged.",
             PARTLY if max(m.rod[s].releases for s in SMOOTH) == 1 < min(m.rod[s].releases for s in ROUGH) else NOT,
         ),
         _small_steps(m),

@@ -58,7 +58,7 @@ def rod_claims(m: Measures) -> list[Claim]:
         Claim(
             "5.1, Fig. 3",
             "Moura & Souza's method oscillates less, but takes longer than Newmark's to calm down.",
-            "Their scheme is not known to us. Our stand-in was chosen because it does this (undershoot "
+            "The source of their scheme was not found. The stand-in was chosen because it does this (undershoot "
             f"{undershoot['souza_moura']:.2f} v₀ and {rest['souza_moura']} steps, Newmark "
             f"{undershoot['newmark']:.2f} v₀ and {rest['newmark']}), so its agreement proves nothing.",
             OPEN,

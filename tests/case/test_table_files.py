@@ -75,7 +75,11 @@ DAMAGED = {
     "no number": ("t,p\n0,1\n1,x\n", ["t", "p"], "line 3: expected numbers, got 'x'"),
     "not finite": ("t,p\n0,1\n1,inf\n", ["t", "p"], "line 3: expected two finite numbers"),
     "not increasing": ("t,p\n0,1\n\n0,2\n", ["t", "p"], "line 4: times must increase, but 0.0 follows 0.0"),
-    "uneven": ("t,p\n0,1\n1\n", ["t", "p"], "line 3: expected 2 columns as in line 2, got '1'; lines that are not rows"),
+    "uneven": (
+        "t,p\n0,1\n1\n",
+        ["t", "p"],
+        "line 3: expected 2 columns as in line 2, got '1'; lines that are not",
+    ),
     "words in the first row": ("t,p\n0,x\n1,2\n", ["t", "p"], "line 2: expected numbers, got 'x'"),
     "title, not commented, in the rows": ("t,p\n0,1\nend\n", ["t", "p"], "line 3: expected 2 columns"),
     "decimal commas alone": ("0,0;1,5\n1,0;2,5\n", None, "line 1: expected numbers, got '0,0'"),

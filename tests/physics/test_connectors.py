@@ -224,7 +224,7 @@ def test_nodes_at_the_same_place_are_refused(comm, tmp_path):
         node_set=sets,
         spring=[{"between": ["a", "b"], "stiffness": 1.0}],
     )
-    with pytest.raises(InputError, match=r"spring\[0\].between: node 2 of 'b' and node 1 of 'a' are at the same place"):
+    with pytest.raises(InputError, match=r"spring\[0\].between: node 2 of 'b' and node 1 of 'a' have the same pos"):
         Simulation(case, comm, check_only=True)
 
 

@@ -1,7 +1,7 @@
-"""Dynamics of large trusses that fly, hit things, buckle and yield: positional finite elements on PETSc over MPI.
+"""Dynamics and statics of large trusses: positional finite elements on PETSc over MPI.
 
-``from pfem_petsc import Case, Simulation, Truss, open_result, write_mesh``; nothing heavy is imported before one of
-them is used.
+``from pfem_petsc import Case, Simulation, Truss, open_result, write_mesh``; these names are imported lazily, at their
+first use.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ NUMPY_REMEDY = 'the installed NumPy is incompatible with petsc4py, mpi4py or h5p
 
 
 def numpy_is_too_new(error: BaseException) -> bool:
-    """Whether an import failed because a package is compiled against another NumPy than the one that is here."""
+    """Return whether an import failed because a package was compiled against another version of NumPy."""
     text = str(error)
     return isinstance(error, ValueError | ImportError) and (
         "numpy.dtype size changed" in text or "compiled using NumPy 1" in text

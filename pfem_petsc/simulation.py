@@ -42,9 +42,9 @@ __all__ = ["Simulation", "Step"]
 
 
 class Simulation(WithEquations):
-    """The simulation of a case on a communicator; a context manager that closes it.
+    """Simulation of a case on a communicator, and context manager that closes it.
 
-    Only one run at a time writes into an output folder: the folder is locked from :meth:`start` to the end of the
+    Only one run at a time can write to an output folder: the folder is locked from :meth:`start` to the end of the
     iteration or to :meth:`close`. The ``analysis`` advances the state, and the ``outputs`` write the results.
 
     Parameters
@@ -55,8 +55,8 @@ class Simulation(WithEquations):
     output : Path or None
         Folder of the results; default ``results/<case name>``. Existing results are moved aside.
     restart : None, True or Path
-        Continue from the newest checkpoint of the output folder, of another one, or from a file; bit for bit on as many
-        ranks.
+        Continue from the newest checkpoint of the output folder (True), from that of another folder, or from a file.
+        Results are bitwise identical on the same number of ranks.
     quiet : bool
         Print nothing on stdout.
     wall_time : float, optional
@@ -88,14 +88,14 @@ class Simulation(WithEquations):
                 "Case.from_dict from tables"
             )
         stop = StopRequest(wall_time)
-        # later changes of the case are those of other simulations
+        # later changes of the case do not affect this simulation
         self.case = case = case.copy(fixed=True)
         self.comm = comm if comm is not None else MPI.COMM_WORLD
         self.folder = Path(output) if output is not None else Path("results") / case.name
         self.quiet = quiet
         self._compilation = ReportedCompilation(self.comm, quiet)
         lock = FolderLock(self.folder)
-        # of a simulation that was dropped without close()
+        # also if the simulation is deleted without close()
         for held in (stop, lock):
             weakref.finalize(self, held.release)
         if not check_only:
@@ -139,8 +139,8 @@ class Simulation(WithEquations):
     def close(self) -> None:
         """Close the results, free PETSc objects, restore signal handlers and unlock the folder. Collective.
 
-        A second call does nothing. State, last row and mesh remain accessible; everything else is refused. A run that
-        was not at its end can be continued from its last checkpoint.
+        A second call does nothing. State, last row and mesh remain accessible; other methods raise an error. A run that
+        has not reached its end can be continued from its last checkpoint.
         """
         if self._loop.closed:
             return
@@ -156,17 +156,17 @@ class Simulation(WithEquations):
 
     @property
     def analysis(self) -> Analysis:
-        """What advances the state, of the present stage."""
+        """The analysis that advances the state, in the current stage."""
         return self._stages.analysis
 
     @property
     def model(self) -> Model:
-        """The model, of the present stage."""
+        """The model of the current stage."""
         return self.analysis.model
 
     @property
     def stepper(self) -> Stepper:
-        """What makes the steps of the present stage."""
+        """The stepper of the current stage."""
         return self.analysis.stepper
 
     @property
@@ -185,12 +185,12 @@ class Simulation(WithEquations):
         return self.outputs.history.row if self.outputs.history is not None else None
 
     def summary(self) -> dict[str, str]:
-        """Return label and text of a summary for the user before a run. Collective."""
+        """Return a summary before a run: text by label. Collective."""
         self._usable()
         return summarise(self.case, self.model, self.plan)
 
     def inspect(self) -> tuple[dict[str, str], list[str]]:
-        """Return label and text of further checks and of a forecast of the run; and warnings. Collective."""
+        """Return further checks and a forecast of the run (text by label), and warnings. Collective."""
         self._usable()
         recorder = Recorder(self.stepper, None)
         entries, warnings = inspect(self.model.case, self.model)
@@ -216,20 +216,20 @@ class Simulation(WithEquations):
         self.outputs.call(function, int(every))
 
     def external_force(self, function: Callable[[float, ForceState], Any]) -> None:
-        """Register a function that gives external forces; call it on all ranks, before the run.
+        """Register a function that computes external forces. Collective; call it before the run.
 
-        It is called on each rank as ``function(t, state)`` with a time [s] and a
+        The function is called on each rank as ``function(t, state)`` with a time [s] and a
         :class:`~pfem_petsc.mechanics.state_forces.ForceState`, and returns forces (owned, 3) [N] on this rank's nodes,
-        which are added to the loads. ``state`` has their positions, velocities and mesh numbers, predicted for this
-        time from the last state. The function may be called several times in a step, and again with a bisected one, so
-        that it must depend on its arguments alone. Its work is part of ``external_work``. It acts where motion is
-        computed: in a case with stages t is counted from the start of the stage, and static stages are without it.
-        Functions are not in checkpoints: give them again before a restarted run.
+        which are added to the loads. ``state`` contains their mesh numbers, and positions and velocities predicted
+        for this time from the last state. The function may be called several times in a step, and again if the step is
+        bisected, so it must depend only on its arguments. Its work is part of ``external_work``. It acts in dynamic
+        analyses only; in a case with stages, t is counted from the start of the stage. Functions are not stored in
+        checkpoints: register them again before a restarted run.
 
         Raises
         ------
         InputError
-            If the run has started, or computes no motion.
+            If the run has started, or the case has no dynamic analysis.
         """
         self._usable()
         if not callable(function):

@@ -92,12 +92,12 @@ class Editable:
         owner.edit(placed)
 
     def edit(self, changes: Iterable[tuple[KeyPath, Any]]) -> None:
-        """Make changes at key paths; :meth:`update` is the method for keys as texts.
+        """Make changes at key paths; :meth:`update` takes keys as strings.
 
         Raises
         ------
         InputError
-            The case is as it was.
+            The case is unchanged.
         """
         self._check_not_fixed()
         new = type(self).from_dict(changed_data(self, changes), name=self.name, source=self.source, folder=self.folder)
@@ -115,17 +115,17 @@ class Editable:
             )
 
     def update(self, changes: Mapping[str, Any] | None = None, /, **named: Any) -> None:
-        """Make several changes, which are validated together.
+        """Make several changes, and validate them together.
 
         Parameters
         ----------
         changes : values by key, ``{"time.step": 1e-5, "wall[0].point": [0, 0, 1]}``; None removes a key
-        named : values of top-level keys, as those of the constructor: ``name="stiff"``, ``wall=[]``
+        named : values of top-level keys, as for the constructor: ``name="stiff"``, ``wall=[]``
 
         Raises
         ------
         InputError
-            The case is as it was.
+            The case is unchanged.
         """
         values = {**(changes or {}), **named}
         of_stage = self.editor[0] is not self
@@ -137,7 +137,7 @@ class Editable:
             self.__dict__["name"] = name
 
     def copy(self, changes: Mapping[str, Any] | None = None, /, *, fixed: bool = False, **named: Any) -> Self:
-        """Return a copy, with changes as of :meth:`update`; if ``fixed``, it cannot be changed any more."""
+        """Return a copy, with changes as for :meth:`update`; if ``fixed``, the copy cannot be changed."""
         made = copied(self)
         if self.number or self.editor[0] is not self:  # of a stage
             made.__dict__.update(number=0, given=())

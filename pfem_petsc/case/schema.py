@@ -116,19 +116,19 @@ class Case(Editable):
 
     @property
     def stages(self) -> tuple[Case, ...]:
-        """What is computed one after the other: the cases of the stages, or the case itself."""
+        """The successive analyses: the cases of the stages, or the case itself."""
         return self.stage or (self,)
 
     @property
     def every_wall(self) -> list[Any]:
-        """The walls of all stages, one for each name, as it is first given."""
+        """The walls of all stages, one for each name: the first with that name."""
         named: dict[str, Any] = {}
         for stage in self.stages:
             named = {**{wall.name: wall for wall in stage.wall}, **named}
         return list(named.values())
 
     def holds(self, table: str) -> bool:
-        """Whether what a table describes goes on from the stage before, as it was at its end."""
+        """Whether a table keeps its state at the end of the previous stage."""
         return self.number > 0 and table not in self.given
 
     @property
@@ -156,8 +156,8 @@ class Case(Editable):
         Parameters
         ----------
         path_or_name : TOML file, or name of a built-in case
-        overrides : texts such as ``"time.step=1e-5"`` that override values of the file
-        mesh : Truss instead of the mesh of the file
+        overrides : strings such as ``"time.step=1e-5"`` that override values of the file
+        mesh : Truss that replaces the mesh of the file
 
         Raises
         ------

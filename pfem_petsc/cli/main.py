@@ -107,7 +107,7 @@ def make_parser() -> tuple[Parser, dict[str, ModuleType]]:
 
     parser = Parser(
         prog=PROGRAM,
-        description="Dynamics of large trusses that fly, hit things, buckle and yield.",
+        description="Dynamics and statics of large trusses: impact, buckling, yielding, form finding.",
         epilog=EXAMPLES,
     )
     parser.add_argument("--version", action="version", version=f"pfem_petsc {__version__}")

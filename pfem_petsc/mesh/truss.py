@@ -1,4 +1,4 @@
-"""Trusses from arrays, as meshes of cases."""
+"""Trusses from arrays, used as meshes of cases."""
 
 from __future__ import annotations
 
@@ -31,31 +31,31 @@ INLINE = 10_000
 class Truss:
     """Nodes and bars as the mesh of a case: ``Case(mesh=truss, ...)``.
 
-    Without ``comm`` every rank gives the same arrays, and has them whole; that the ranks agree is checked when the mesh
-    is distributed. With ``comm``, rank 0 alone gives arrays (they are ignored elsewhere, where they may be None),
-    checks them, and sends each rank its part when the mesh is distributed (a truss of up to 10,000 nodes and bars to
-    all of them at once); the call is then collective.
+    Without ``comm``, every rank passes the same arrays and keeps all of them; their equality is checked when the mesh
+    is distributed. With ``comm``, only rank 0 passes arrays (those of other ranks are ignored and may be None). It
+    checks them, and sends each rank its part when the mesh is distributed, or at once to all ranks if the truss has at most
+    10,000 nodes and bars. The call is then collective.
 
     Parameters
     ----------
     points : (nodes, 3) positions [m]
-    bars : (bars, 2) integers, the nodes at the ends of each bar, numbered from 0
+    bars : (bars, 2) integers, the nodes at both ends of each bar, numbered from 0
     node_groups, bar_groups : numbers of the members, or a boolean mask, for each name
     bar_fields : (bars,) numbers for each name, such as areas [m2] for ``area_field`` of sections
-    comm : whose rank 0 gives the arrays; default: all ranks give the same
+    comm : communicator whose rank 0 passes the arrays; default: all ranks pass the same arrays
     source : name of the truss in messages
 
     Attributes
     ----------
     n_nodes, n_bars : int
-    points, bars, node_groups, bar_groups, bar_fields : as given, read-only; None where another rank has them
+    points, bars, node_groups, bar_groups, bar_fields : as passed, read-only; None if only rank 0 has them
     digest : str
         Identifies the content.
     tables : dict
-        Tables of a case (``material``, ``section``, ``node_set``, ``support``, ``load``, ``gravity``), as far as the
-        file had them that the truss was read from.
+        Tables of a case (``material``, ``section``, ``node_set``, ``support``, ``load``, ``gravity``), if the truss was
+        read from a file that has them.
     warnings : list of str
-        About bars that are far shorter than the others, and what was left out of a file.
+        About bars that are far shorter than the others, and parts of a file that were left out.
 
     Raises
     ------
@@ -120,7 +120,7 @@ class Truss:
         path : name of the file, whose suffix chooses the reader
         bar_fields : names of the bar fields to be read; default: all
         clean : distance [m] up to which nodes are merged before double bars, bars without length and nodes without bars
-            are removed (0: nodes at the same place); default: a file with such is refused
+            are removed (0: coincident nodes); default: files with these defects are rejected
 
         Raises
         ------
@@ -138,7 +138,7 @@ class Truss:
 
     @classmethod
     def from_mesh(cls, mesh: WholeMesh) -> Truss:
-        """Return the truss of a mesh that a reader has returned; its tables and warnings are kept."""
+        """Return the truss of a mesh returned by a reader, with its tables and warnings."""
         from .whole import case_tables, without_slashes
 
         named: dict[str, Any] = {
@@ -150,7 +150,7 @@ class Truss:
         return truss
 
     def to_mesh(self) -> WholeMesh:
-        """Return the truss as a mesh that a writer takes."""
+        """Return the truss as a mesh for writers."""
         from .whole import WholeMesh
 
         self._require("written")
@@ -189,7 +189,7 @@ class Truss:
         return {"generator": "arrays", "truss": self}
 
     def table(self) -> dict[str, Any]:
-        """Return the truss as nested lists with the keys of ``[mesh]``; a large one by its digest."""
+        """Return the truss as nested lists with the keys of ``[mesh]``; for a large truss, only its digest."""
         if self.points is None or self.n_nodes + self.n_bars > INLINE:
             return {"digest": self.digest}
         tables = {"node_groups": self.node_groups, "bar_groups": self.bar_groups, "bar_fields": self.bar_fields}

@@ -1,4 +1,4 @@
-"""A mesh from arrays, as a file that cases name."""
+"""Mesh files from arrays."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ def write_mesh(
 
     Parameters
     ----------
-    path : name of the file; its suffix chooses the format (``docs/meshes.md``), ``.h5`` has everything exactly
+    path : name of the file; its suffix selects the format (``docs/meshes.md``); ``.h5`` stores everything exactly
     points : (nodes, 3) positions [m]
-    bars : (bars, 2) integers, the nodes at the ends of each bar, numbered from 0
+    bars : (bars, 2) integers, the nodes at both ends of each bar, numbered from 0
     node_groups, bar_groups : numbers of the members, or a boolean mask, for each name
     bar_fields : (bars,) numbers for each name, such as areas [m2] for ``area_field`` of sections
-    comm : default: the world; its rank 0 writes its arrays
+    comm : communicator whose rank 0 writes its arrays; default: COMM_WORLD
 
     Returns
     -------

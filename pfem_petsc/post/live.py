@@ -1,4 +1,4 @@
-"""Curves of a run while it runs: a function for :meth:`~pfem_petsc.simulation.Simulation.on_step`."""
+"""Curves of a running simulation: a function for :meth:`~pfem_petsc.simulation.Simulation.on_step`."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ class LivePlot:
     """Curves of columns of the history, redrawn during a run: ``simulation.on_step(LivePlot("kinetic_energy"), 10)``.
 
     In a notebook the picture below the cell is updated; elsewhere a file is written, if one is given. Steps that are
-    not recorded (``output.history_every``) are left out. Only rank 0 draws.
+    not recorded (``output.history_every``) are omitted. Only rank 0 draws.
 
     Parameters
     ----------
     names : columns of the history; vectors are drawn as three curves
-    interval : least time between two drawings [s]
-    file : PNG that is written at each drawing
+    interval : minimum time between two updates [s]
+    file : PNG file that is written at each update
 
     Attributes
     ----------
-    times : list of float, of the rows so far [s]
-    columns : their values by name, lists
+    times : list of float, times of the rows so far [s]
+    columns : lists of their values, by name
     """
 
     def __init__(self, *names: str, interval: float = 1.0, file: Path | str | None = None) -> None:
@@ -55,7 +55,7 @@ class LivePlot:
         self._handle: Any = None
 
     def __call__(self, step: Step) -> None:
-        """Take the row of a step, and draw if that is due."""
+        """Add the row of a step, and update the picture if that is due."""
         if step.row is None:
             return
         for name in self.names:  # on all ranks, so that all raise

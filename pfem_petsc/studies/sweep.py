@@ -40,29 +40,29 @@ def sweep(
 ) -> Table:
     """Run a case for all combinations of values of some keys, and return a table with a row for each.
 
-    Each run is made on one rank, in a process other than this one. A run that is refused, fails or crashes is a row
-    with its status and message, and the sweep goes on. Rows are in the order of the combinations, and are also written
-    to ``sweep.csv`` in the output folder as soon as they are there.
+    Each run uses one rank, in a separate process. A run that is rejected, fails or crashes is a row with its status
+    and message, and the sweep continues. Rows are in the order of the combinations, and are also written to
+    ``sweep.csv`` in the output folder as soon as they are available.
 
     Parameters
     ----------
     case : Case
     vary : values by key, ``{"time.step": [1e-5, 2e-5], "material.steel.young_modulus": [2e11]}``: all combinations, the
-        last key varying fastest; or a list of changes, each as of :meth:`Case.copy`, one for each run
+        last key varying fastest; or a list of changes, each as for :meth:`Case.copy`, one for each run
     processes : number of runs at a time
     results : columns of results: a function of the finished :class:`Result` for each name, or a column of the history,
-        whose last value is taken; or one function that returns values by name. Functions are called in this process;
-        what they raise is the message of the row, whose status is 1. Default: the last values of time and of the
+        whose last value is used; or one function that returns values by name. Functions are called in this process;
+        an exception becomes the message of the row, whose status is then 1. Default: the last values of time and of the
         energies that occur [J], and the largest forces of walls and supports [N]
     output : folder of the results, which are in folders ``0000``, ``0001``, ... in it; default:
         ``results/<case name>-sweep``. An existing one is moved aside
-    keep : whether the results of the runs are kept, or removed as soon as their row is there (those of status 0)
+    keep : whether the results of the runs are kept; otherwise those with status 0 are removed after their row is made
     wall_time : limit for each run [s]; a run that reaches it has status 4
     quiet : print no progress
 
     Returns
     -------
-    Table with the columns ``run``, one for each key, ``status`` (0: done, 2: refused, 3: failed, 4: stopped, 1 or
+    Table with the columns ``run``, one for each key, ``status`` (0: done, 2: rejected, 3: failed, 4: stopped, 1 or
     negative: an unexpected error or signal), ``message``, ``wall_time`` [s], ``steps``, and the results (nan for runs
     without).
 

@@ -90,9 +90,9 @@ class Piercing:
             self.seen[k] += count > 0
             if count and k not in self.first:
                 self.first[k] = time = self._model.origin + time
-                bars = f"bar {bar} lies" if count == 1 else f"{count} bars, bar {bar} among them, lie"
+                bars = f"bar {bar} intersects" if count == 1 else f"{count} bars, including bar {bar}, intersect"
                 told.append(
-                    f"t = {time:.6g} s: {bars} across wall {self._model.contact.names[k]!r}: only nodes touch walls; "
+                    f"t = {time:.6g} s: {bars} wall {self._model.contact.names[k]!r}: only nodes touch walls; "
                     "use shorter bars or a larger wall"
                 )
         return told
@@ -113,7 +113,7 @@ class Piercing:
         """Return messages for the end of the run."""
         names = self._model.contact.names
         return [
-            f"bars lay across wall {names[k]!r} in {self.seen[k]} of {self.looks} snapshots, first at t = "
+            f"bars intersected wall {names[k]!r} in {self.seen[k]} of {self.looks} snapshots, first at t = "
             f"{self.first[k]:.6g} s: only nodes touch walls"
             for k in self.walls
             if k in self.first

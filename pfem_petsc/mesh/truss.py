@@ -33,8 +33,8 @@ class Truss:
 
     Without ``comm``, every rank passes the same arrays and keeps all of them; their equality is checked when the mesh
     is distributed. With ``comm``, only rank 0 passes arrays (those of other ranks are ignored and may be None). It
-    checks them, and sends each rank its part when the mesh is distributed, or at once to all ranks if the truss has at most
-    10,000 nodes and bars. The call is then collective.
+    checks them, and sends each rank its part when the mesh is distributed. A truss of up to 10,000 nodes and bars is
+    sent to all ranks at once. The call is then collective.
 
     Parameters
     ----------

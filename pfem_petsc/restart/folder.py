@@ -89,7 +89,7 @@ def find_restart(case: Case, comm: MPI.Comm, folder: Path, asked: bool | Path | 
         return None
     path = on_root(comm, asked_checkpoint, folder, asked)
     if path is None:
-        return f"{folder}: no checkpoint there to restart from: starting from zero"
+        return f"{folder}: no checkpoint to restart from: starting from zero"
     file = OpenCheckpoint(path, comm)
     check_version(path, file.attributes)
     changed = changed_keys(path, file.attributes["case"], case.to_dict(), case.source)

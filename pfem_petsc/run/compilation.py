@@ -29,7 +29,7 @@ class ReportedCompilation(Compilation):
 
     def _tell(self, name: str) -> None:
         text = (
-            f"compiling loops for this machine (once, up to a minute in all): {name}, and others that this kind of "
+            f"compiling loops for this machine (once, up to a minute in total): {name}, and others that this kind of "
             "case needs; later runs load them"
         )
         if self.progress is not None:

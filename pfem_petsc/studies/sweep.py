@@ -119,7 +119,7 @@ def _require_one_rank() -> None:
     from mpi4py import MPI
 
     if MPI.COMM_WORLD.size > 1:
-        raise InputError("sweep: makes each run in a process of its own, on one rank: start it without mpirun")
+        raise InputError("sweep: each run has its own process on one rank: start the sweep without mpirun")
 
 
 def _cases(case: Case, changes: list[dict[str, Any]]) -> tuple[dict[int, Case], dict[int, str]]:

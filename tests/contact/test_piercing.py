@@ -48,13 +48,13 @@ def test_wall_that_flies_through_a_bar(shape, comm, shared_tmp_path, capfd):
     assert run.run() == 0
     error = capfd.readouterr().err
     if comm.rank == 0:
-        assert error.count("bar 0 lies across wall 'it'") == 1
+        assert error.count("bar 0 intersects wall 'it'") == 1
         log = (shared_tmp_path / "it" / "log.txt").read_text()
         assert "wall 'it' was never touched by a node" in log
         assert "wall 'far' was never touched by a node" in log
         # at 2 m/s: within 0.3 m of the axis from 0.15 to 0.45 s, snapshots every 0.05 s; or for the rectangle's height
         seen = 7 if shape != "rectangle" else 3
-        found = [line for line in log.splitlines() if "bars lay across wall 'it' in" in line]
+        found = [line for line in log.splitlines() if "bars intersected wall 'it' in" in line]
         assert len(found) == 1
         count = int(found[0].split(" snapshots")[0].split()[-3])
         assert abs(count - seen) <= 2 and "of 13 snapshots" in found[0]
@@ -75,7 +75,7 @@ def test_a_chord_of_a_wall_is_no_defect(comm, shared_tmp_path, capfd):
     case = bar("sphere", radius=5.0, point=[1.0, 0.0, -5.2], velocity=[0.0, 0.0, 0.01], node_set="start").to_dict()
     run = Simulation(Case.from_dict(case), comm, output=shared_tmp_path / "it", quiet=True)
     assert run.run() == 0
-    assert "across wall" not in capfd.readouterr().err
+    assert "only nodes touch walls" not in capfd.readouterr().err
 
 
 def test_distances_against_sampling():

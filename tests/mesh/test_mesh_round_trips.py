@@ -213,7 +213,7 @@ def test_tables_as_spreadsheets_save_them(tmp_path):
     assert mesh.bars.tolist() == [[0, 1], [1, 2]]
     assert mesh.bar_fields["area"].tolist() == [1.5e-4, 2e-4]
     assert {name: members.tolist() for name, members in mesh.node_groups.items()} == {"feet": [0, 1], "right": [1]}
-    assert mesh.warnings == [f"{tmp_path}/bars tower.csv: left out column 'Note', which has other texts than numbers"]
+    assert mesh.warnings == [f"{tmp_path}/bars tower.csv: left out column 'Note', which has text other than numbers"]
 
 
 @pytest.mark.parametrize(

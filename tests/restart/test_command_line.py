@@ -32,7 +32,7 @@ def test_nothing_to_restart_from(tmp_path, capsys):
     words = rod(tmp_path / "new", "--restart")
     words.remove("--quiet")
     assert main(words) == 0
-    assert "no checkpoint there to restart from: starting from zero" in capsys.readouterr().out
+    assert "no checkpoint to restart from: starting from zero" in capsys.readouterr().out
     assert len(steps(tmp_path / "new")[0]) == 51
 
 

@@ -92,7 +92,7 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     for name in bars.others():
         values = bars.maybe_numbers(name)
         if values is None:
-            mesh.warnings.append(f"{of_bars}: left out column {name!r}, which has other texts than numbers")
+            mesh.warnings.append(f"{of_bars}: left out column {name!r}, which has text other than numbers")
         else:
             mesh.bar_fields[name] = values
     return mesh

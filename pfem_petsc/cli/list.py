@@ -43,7 +43,7 @@ def run(arguments: argparse.Namespace) -> int:
     for kind, lines in sections.items():
         print(f"{kind}:")
         if not lines:
-            print("  none is built in; CONTRIBUTING.md has one, and says how to add it")
+            print("  none is built in; CONTRIBUTING.md has an example and says how to add one")
         for name, text in lines.items():
             print(f"  {name:{width}}  {text}")
     return 0

@@ -22,10 +22,10 @@ examples:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the verb."""
     parser.add_argument(
-        "results", metavar="RESULT", nargs="+", help="result file, or its folder; several: drawn over each other"
+        "results", metavar="RESULT", nargs="+", help="result file, or its folder; several are drawn in one picture"
     )
     parser.add_argument(
-        "-o", "--output", metavar="DIR", type=Path, help="folder of the pictures; default: the first result's"
+        "-o", "--output", metavar="DIR", type=Path, help="folder of the pictures; default: that of the first result"
     )
     parser.add_argument(
         "--curves",
@@ -44,14 +44,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--window",
         default="hann",
-        help="of spectra: hann, flattop, hamming, blackman, rectangular; default: %(default)s",
+        help="window of spectra: hann, flattop, hamming, blackman, rectangular; default: %(default)s",
     )
     parser.add_argument("--highest", metavar="HZ", type=float, help="frequency at which the spectra end")
     parser.add_argument(
         "--filter",
         dest="force_filter",
         metavar="FILTER",
-        help="of forces, and of --curves: cfc:CLASS (SAE J211), butterworth:HZ[:ORDER], mean:SECONDS, none; "
+        help="filter of forces and of --curves: cfc:CLASS (SAE J211), butterworth:HZ[:ORDER], mean:SECONDS, none; "
         "default: forces by the mean of 2 %% of the run",
     )
     parser.add_argument(
@@ -62,9 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="extend",
         help="png, svg, pdf; csv writes what the pictures show as tables; default: png",
     )
-    parser.add_argument(
-        "--no-closed-form", dest="closed_forms", action="store_false", help="no closed form, where the case has one"
-    )
+    parser.add_argument("--no-closed-form", dest="closed_forms", action="store_false", help="do not draw closed forms")
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "result", metavar="RESULT", nargs="+", help="result file, or its folder; several are drawn side by side"
     )
     parser.add_argument(
-        "-o", "--output", metavar="DIR", type=Path, help="folder of the pictures; default: the result's"
+        "-o", "--output", metavar="DIR", type=Path, help="folder of the pictures; default: that of the result"
     )
     parser.add_argument("--field", default="stress", help="field that colours the bars; default: %(default)s")
     parser.add_argument("--component", help="x, y or z of a vector field; default: its magnitude")
@@ -68,17 +68,21 @@ def _add_picture(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--symmetric", action="store_true", help="range of the colours symmetric about zero")
     parser.add_argument("--cmap", help="name of a matplotlib colour map")
     parser.add_argument(
-        "--scale", type=float, default=1.0, help="of nodes' displacements, not of walls; default: %(default)g"
+        "--scale", type=float, default=1.0, help="scale factor of displacements, not of walls; default: %(default)g"
     )
     parser.add_argument(
-        "--style", default="auto", help="tubes of the sections' radii, lines, or auto: tubes up to 20,000 bars"
+        "--style",
+        default="auto",
+        help="tubes (with the radii of the sections), lines, auto: tubes up to 20,000 bars",
     )
-    parser.add_argument("--radius-scale", type=float, default=1.0, help="of the radii of tubes; default: %(default)g")
-    parser.add_argument("--bar-width", metavar="PIXELS", type=float, help="least width of the bars")
+    parser.add_argument(
+        "--radius-scale", type=float, default=1.0, help="factor on the radii of tubes; default: %(default)g"
+    )
+    parser.add_argument("--bar-width", metavar="PIXELS", type=float, help="minimum width of the bars")
     parser.add_argument(
         "--nodes", action=argparse.BooleanOptionalAction, help="draw nodes as balls; default: for small models"
     )
-    parser.add_argument("--title", help="default: the case's")
+    parser.add_argument("--title", help="title of the pictures; default: that of the case")
     parser.add_argument("--transparent", action="store_true", help="transparent background")
 
 
@@ -117,7 +121,7 @@ def _add_extras(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--inset", metavar="COLUMN", help="curve of the history with a moving marker, as wall/floor/force.z"
     )
-    parser.add_argument("--labels", metavar="TEXT", nargs="+", help="of several results; default: their folders")
+    parser.add_argument("--labels", metavar="TEXT", nargs="+", help="captions of the results; default: their folders")
     parser.add_argument(
         "--html", action="store_true", help="write render.html instead: the last state, to be turned in a browser"
     )

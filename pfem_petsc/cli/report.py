@@ -19,14 +19,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the verb."""
     add_result(parser)
     parser.add_argument(
-        "-o", "--output", metavar="FILE", type=Path, help="the file; default: report.html beside the result"
+        "-o",
+        "--output",
+        metavar="FILE",
+        type=Path,
+        help="file name; default: report.html in the folder of the result",
     )
     parser.add_argument(
         "--no-pictures", dest="pictures", action="store_false", help="do not draw the truss, which takes some seconds"
     )
     parser.add_argument("--field", default="stress", help="field that colours the bars; default: %(default)s")
     parser.add_argument(
-        "--filter", dest="force_filter", metavar="FILTER", help="of forces, like cfc:180: see plot --help"
+        "--filter", dest="force_filter", metavar="FILTER", help="filter of forces, like cfc:180: see plot --help"
     )
 
 

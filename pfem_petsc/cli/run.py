@@ -43,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="continue from a checkpoint, or the newest of a folder; default: of the output folder; earlier "
         "--set values stay in force",
     )
-    parser.add_argument("--quiet", action="store_true", help="no progress on the screen")
+    parser.add_argument("--quiet", action="store_true", help="print no progress")
     parser.add_argument(
         "--wall-time",
         metavar="TIME",

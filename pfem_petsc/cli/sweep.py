@@ -29,18 +29,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         action="extend",
         required=True,
-        help="values of a key, with commas between them; several keys: all combinations",
+        help="values of a key, separated by commas; with several keys, all combinations",
     )
     parser.add_argument(
         "-o", "--output", metavar="DIR", type=Path, help="output folder; default: results/NAME OF THE CASE-sweep"
     )
     parser.add_argument("--processes", metavar="N", type=int, default=1, help="number of runs at a time; default: 1")
     parser.add_argument(
-        "--results", metavar="NAME", nargs="+", help="columns of the history whose last values the table has"
+        "--results", metavar="NAME", nargs="+", help="columns of the history whose last values are in the table"
     )
     parser.add_argument("--remove", action="store_true", help="remove the results of the runs, and keep the table only")
     parser.add_argument("--wall-time", metavar="TIME", type=seconds, help="stop a run after this time")
-    parser.add_argument("--quiet", action="store_true", help="no progress on the screen")
+    parser.add_argument("--quiet", action="store_true", help="print no progress")
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -1,4 +1,4 @@
-"""Plastic bar of Johnson and Cook: Y = (A + B a^n) (1 + C ln(da/dt/e_0)) (1 - T*^m), on request heated adiabatically.
+"""Plastic bar of Johnson and Cook: Y = (A + B a^n) (1 + C ln(da/dt/e_0)) (1 - T*^m), optionally with adiabatic heating.
 
 G. R. Johnson and W. H. Cook, A constitutive model and data for metals subjected to large strains, high strain rates and
 high temperatures, 7th International Symposium on Ballistics, The Hague 1983, 541-547. T* = (T + r)/T_melt, between 0

@@ -1,4 +1,4 @@
-"""Nodes and bars as they are given: by arrays from Python, or by lists in the case file."""
+"""Nodes and bars given by arrays from Python, or by lists in the case file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A tensegrity prism: two polygons of cables, cables between them, and struts that touch only at their ends' nodes."""
+"""A tensegrity prism: two polygons of cables, cables between them, and struts connected only at their end nodes."""
 
 from __future__ import annotations
 

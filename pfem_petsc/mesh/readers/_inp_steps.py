@@ -92,9 +92,7 @@ def _static(block: Block) -> tuple[dict[str, dict[str, Any]], str]:
     keys: dict[str, Any] = {"step": _short(step)}
     if "RIKS" in block.parameters:
         end = _values(block, 5)[4]
-        told = (
-            "" if end else "end = 1 of the load factor is not in the file: *STATIC, RIKS may end at a displacement"
-        )
+        told = "" if end else "end = 1 of the load factor is not in the file: *STATIC, RIKS may end at a displacement"
         return {"static": {"method": "arc_length", **keys, "end": end or 1.0}}, told
     if "DIRECT" not in block.parameters and step < 1.0:
         keys["max_step"] = _short(min(most / period, 1.0)) if most else 1.0

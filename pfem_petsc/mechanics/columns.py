@@ -152,7 +152,7 @@ def spread_history(sweep, columns, history):
     """Write the ``history`` (rows, b) of the bars of a sweep to ``columns.kept``, which loops over columns update."""
     kept, wide, from_wide = columns.kept.reshape(-1), columns.kept.shape[1], history.shape[1]
     values = history.reshape(-1)
-    for group in range(len(columns.heads)):
+    for group in range(len(columns.heads) if len(history) > 0 else 0):
         for run in range(columns.runs[group], columns.runs[group + 1]):
             begin, count = sweep.starts[run], sweep.starts[run + 1] - sweep.starts[run]
             at = columns.starts[group] + sweep.heads[run] - columns.heads[group]
@@ -165,7 +165,7 @@ def gather_history(sweep, columns, history):
     """Write ``columns.kept`` back to the ``history`` (rows, b) of the bars of a sweep."""
     kept, wide, to_wide = columns.kept.reshape(-1), columns.kept.shape[1], history.shape[1]
     values = history.reshape(-1)
-    for group in range(len(columns.heads)):
+    for group in range(len(columns.heads) if len(history) > 0 else 0):
         for run in range(columns.runs[group], columns.runs[group + 1]):
             begin, count = sweep.starts[run], sweep.starts[run + 1] - sweep.starts[run]
             at = columns.starts[group] + sweep.heads[run] - columns.heads[group]

@@ -8,6 +8,8 @@ import numpy as np
 from mpi4py import MPI
 
 from ..mechanics.compiled import kernel
+from ..mesh.exchange import Router
+from ..mesh.slab import slab_of
 
 if TYPE_CHECKING:
     from ..mesh.distribution import DistributedMesh
@@ -50,10 +52,12 @@ def count_parts(mesh: DistributedMesh) -> tuple[int, int, int]:
         if comm.allreduce(int(not np.array_equal(before, label[:owned])), op=MPI.MAX) == 0:
             break
     names, sizes = np.unique(label[:owned, 0].astype(np.int64), return_counts=True)
-    total: dict[int, int] = {}
-    # one entry per part and rank: few, unless the truss consists of many parts
-    for some in comm.allgather(dict(zip(names.tolist(), sizes.tolist(), strict=True))):
-        for name, size in some.items():
-            total[name] = total.get(name, 0) + size
-    smallest = min(total, key=lambda name: (total[name], name))
-    return len(total), total[smallest], smallest
+    # a rank adds up the parts whose lowest node is in its range of the mesh numbers, however many there are
+    router = Router(comm, slab_of(names, mesh.n_nodes, comm.size))
+    received, shares = router.send(names), router.send(sizes)
+    own, places = np.unique(received, return_inverse=True)
+    total = np.bincount(places.ravel(), weights=shares, minlength=len(own))
+    at = int(np.argmin(total)) if len(own) else -1
+    mine = (int(total[at]), int(own[at])) if len(own) else (mesh.n_nodes + 1, -1)
+    smallest, name = min(comm.allgather(mine))
+    return comm.allreduce(len(own)), smallest, name

@@ -23,6 +23,7 @@ __all__ = ["free_motions"]
 _ZERO = 1e-11  # of the largest stiffness of a node; limit points that steps come close to have 1e-6 and more
 _MOST = 8  # motions that are looked at
 _TOLD = 3
+_NAMED = 4  # nodes besides the one that moves most
 _MOVES = 0.3  # of the largest displacement of a motion, above which a node is named
 
 
@@ -86,12 +87,17 @@ def _nodes(model: Model, motion: np.ndarray) -> str:
     size = np.linalg.norm(motion, axis=1)
     largest = max(model.comm.allgather(float(size.max(initial=0.0))))
     at = np.flatnonzero(size > _MOVES * largest)
-    mine = [(-float(size[k].round(9)), int(model.mesh.node_ids[k]), motion[k] / size[k]) for k in at]
+    ids = model.mesh.node_ids[at]
+    # the node that moves most, and the lowest ones of those that are named; a motion may move all nodes
+    most = at[np.lexsort((ids, -size[at].round(9)))][:1]
+    mine = [(-float(size[k].round(9)), int(model.mesh.node_ids[k]), motion[k] / size[k]) for k in most]
     moved = sorted((entry[:2], entry[2]) for part in model.comm.allgather(mine) for entry in part)
     (_, first), direction = moved[0]
-    others = sorted(node for (_, node), _ in moved[1:])
+    lowest = sorted(node for part in model.comm.allgather(np.sort(ids)[: _NAMED + 1].tolist()) for node in part)
+    others = [node for node in lowest if node != first][:_NAMED]
+    more = model.comm.allreduce(len(at)) - 1 - len(others)
     way = "(" + ", ".join(f"{part:.2g}" for part in direction.round(3) + 0.0) + ")"
     text = f"node {first} along {way}"
     if others:
-        text += f", with node{'s' * (len(others) > 1)} " + ", ".join(map(str, others[:4]))
-    return text + (f" and {len(others) - 4} more" if len(others) > 4 else "")
+        text += f", with node{'s' * (len(others) > 1)} " + ", ".join(map(str, others))
+    return text + (f" and {more} more" if more else "")

@@ -9,6 +9,7 @@ from pfem_petsc.preflight import nodes_on_bars as search
 from pfem_petsc.preflight.inspection import warnings_before
 from pfem_petsc.preflight.nodes_on_bars import nodes_on_bars
 from pfem_petsc.preflight.overlaps import overlapping_bars
+from pfem_petsc.preflight.parts import count_parts
 
 pytestmark = pytest.mark.parallel
 
@@ -128,3 +129,13 @@ def test_generated_meshes_have_no_overlaps(comm, name):
     mesh = Simulation(Case.load(name, overrides), comm, check_only=True).mesh
     assert overlapping_bars(mesh) == (0, [])
     assert nodes_on_bars(mesh)[::2] == (0, 0)
+
+
+def test_many_parts_are_counted_where_their_lowest_nodes_are(comm, shared_tmp_path):
+    """70 loose bars and a triangle; no rank has a list of all parts."""
+    random = np.random.default_rng(6)
+    numbers = random.permutation(143)
+    bars = [*numbers[:140].reshape(-1, 2).tolist(), numbers[140:142].tolist(), numbers[141:].tolist()]
+    points = random.random((143, 3))
+    mesh = Simulation(case_of(shared_tmp_path, comm, points, bars), comm, check_only=True).mesh
+    assert count_parts(mesh) == (71, 2, int(numbers[:140].min()))

@@ -33,7 +33,7 @@ class SignalNotes:
     def watch(self) -> None:
         """Install the signal handlers, in the main thread only, as Python requires.
 
-        An ignored hang-up signal, as under ``nohup``, stays ignored.
+        An ignored hang-up signal, as under ``nohup``, remains ignored.
         """
         if threading.current_thread() is not threading.main_thread() or self._before:
             return

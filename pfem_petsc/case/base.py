@@ -1,7 +1,7 @@
 """Base of all tables of a case file: a strict model and its number types.
 
-Generators, integrators and walls declare their keys with these types, so that an invalid case file is refused, with the
-name of the key, before any work is done. Imports pydantic only.
+Generators, integrators and walls declare their keys with these types, so that an invalid case file is rejected with
+the name of the key before any work is done. Imports pydantic only.
 """
 
 from __future__ import annotations

@@ -18,8 +18,8 @@ def check_names(case: Mapping[str, Any], data: Mapping[str, Any], problems: Prob
 
     Parameters
     ----------
-    case : the validated tables by name, without those that were refused
-    data : the case as read; names whose table was refused are not reported again
+    case : the validated tables by name, without rejected ones
+    data : the case as read; names whose table was rejected are not reported again
     problems : receives the problems
     """
     materials, sections, node_sets = (_names(data, key) for key in ("material", "section", "node_set"))

@@ -2,7 +2,7 @@
 
 The tables of a :class:`~pfem_petsc.case.schema.Case` know their place in it. A change is put into the nested tables
 that were given, without defaults; these are read again, and the objects of the case then take the values that were
-read, so that references to tables stay valid. A refused change changes nothing.
+read, so that references to tables stay valid. A rejected change has no effect.
 """
 
 from __future__ import annotations

@@ -35,7 +35,7 @@ def internal_variables(materials: Mapping[str, StrictModel]) -> dict[str, str]:
 
 
 def read_materials(data: Mapping[str, Any], problems: Problems) -> dict[str, StrictModel]:
-    """Read the tables [material.NAME] in file order; refused ones are reported in ``problems`` and left out."""
+    """Read the tables [material.NAME] in file order; rejected ones are reported in ``problems`` and left out."""
     tables = data.get("material", {})
     if not isinstance(tables, Mapping):
         problems.add(("material",), "expected tables, each under a heading [material.NAME]", tables)

@@ -13,7 +13,7 @@ __all__ = ["Dashpot", "NodalMass", "Spring"]
 
 
 class NodalMass(StrictModel):
-    """Mass of each node of a node set, besides that of its bars."""
+    """Mass of each node of a node set, in addition to that of its bars."""
 
     node_set: str
     """name of a node set"""

@@ -90,7 +90,7 @@ class Problems:
         taker: str = "",
         siblings: Callable[[], Mapping[str, Sequence[str]]] = dict,
     ) -> M | None:
-        """Validate a table; if it is refused, add the problems and return None.
+        """Validate a table; if it is rejected, add the problems and return None.
 
         Parameters
         ----------

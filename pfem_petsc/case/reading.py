@@ -41,7 +41,7 @@ VARYING = (("gravity", (t.Gravity, t.VaryingGravity)), ("wind", (t.Wind, t.Varyi
 
 
 def read_tables(data: Mapping[str, Any], folder: Path, problems: Problems) -> dict[str, Any]:
-    """Validate all tables of a case; refused ones are reported in ``problems`` and left out or None.
+    """Validate all tables of a case; rejected ones are reported in ``problems`` and left out or None.
 
     Parameters
     ----------

@@ -36,7 +36,7 @@ FileName = Annotated[str, Field(min_length=1)]
 
 
 def increasing(rows: Rows) -> Rows:
-    """Return the rows of a table over time; refuse it if it is empty or its times do not increase."""
+    """Return the rows of a table over time; reject it if it is empty or its times do not increase."""
     if not rows:
         raise ValueError("expected at least one row")
     for k in range(1, len(rows)):

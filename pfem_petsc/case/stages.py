@@ -88,7 +88,7 @@ class _Located(Problems):
 
 
 def stages_of(data: Mapping[str, Any], problems: Problems) -> list[StageTables]:
-    """The stages of a case's nested tables; those that are refused are noted in ``problems`` and left out."""
+    """The stages of a case's nested tables; rejected ones are reported in ``problems`` and left out."""
     rows = data["stage"]
     if not isinstance(rows, list) or not rows:
         problems.add(("stage",), "expected a list of at least one table, each under a heading [[stage]]", rows)

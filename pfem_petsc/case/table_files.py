@@ -64,7 +64,7 @@ class TableFiles:
     def resolved(
         self, table: Any, path: KeyPath, problems: Problems, keys: tuple[str, ...], others: tuple[str, ...] = ()
     ) -> Any:
-        """Return a table with rows for files, None if a file is refused.
+        """Return a table with rows for files, None if a file is rejected.
 
         Parameters
         ----------

@@ -74,7 +74,7 @@ class Finding(NamedTuple):
 
 
 def inspect_environment(run: Callable[[list[str]], tuple[int, str]] | None = None) -> list[Finding]:
-    """Return what is there and what is missing. Each probe is a process of its own, because broken libraries crash.
+    """Return what is there and what is missing. Each probe is a separate process, because broken libraries may crash.
 
     Parameters
     ----------

@@ -26,7 +26,7 @@ def start_petsc(options: Sequence[str], rank: int) -> None:
     Raises
     ------
     InputError
-        If an options file is missing, or PETSc refuses an option.
+        If an options file is missing, or PETSc rejects an option.
     """
     import petsc4py
 

@@ -1,7 +1,7 @@
 """Check of contact when results are written: a node beyond a wall is an error, whatever the treatment.
 
 The positions that a step solves for satisfy every wall to rounding, with all schemes and treatments, so these are
-checked. With Wilson's method they are x_tau at t + theta h, not x1, which may lie beyond a wall by at most the
+checked. With Wilson's method they are x_tau at t + theta h, not x1, which may be beyond a wall by at most the
 displacement between the two, (theta - 1) h v. Walls whose ``node_set`` does not contain the node are skipped, and so
 are rectangles, which nodes can pass beside. Supports that prescribe a node along the normal override the wall. If they
 move a node beyond it, the input contradicts itself and is reported too, for rectangles by the step that crosses them.

@@ -15,5 +15,5 @@ def free_squares(fixed: np.ndarray, normals: np.ndarray) -> np.ndarray:
 
 
 def held_by_supports(fixed: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Return (...,) bool: supports alone determine the motion of a node along these unit normals."""
+    """Return (...,) bool: only supports determine the motion of a node along these unit normals."""
     return free_squares(fixed, normals) <= FREE_PART

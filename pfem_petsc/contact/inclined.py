@@ -1,6 +1,6 @@
 """Supports along directions that are no axes exclude contact at their nodes.
 
-Contact takes the components that supports prescribe as axes: a free direction that is none would have to enter
+Contact requires that supports prescribe components along axes: a free direction that is none would have to enter
 projections, frames, friction and the treatments of impact.
 """
 

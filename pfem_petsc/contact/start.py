@@ -1,4 +1,4 @@
-"""Nodes that start beyond walls: ``adjust = true`` moves them before the model is built; others are refused."""
+"""Nodes that start beyond walls: ``adjust = true`` moves them before the model is built; others are rejected."""
 
 from __future__ import annotations
 

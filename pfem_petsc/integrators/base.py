@@ -128,7 +128,7 @@ class Scheme(ABC):
         return np.inf
 
     def expected_move(self, state: State, h: float) -> np.ndarray:
-        """Displacement (owned, 3) of a step if the motion so far goes on [m]."""
+        """Return the displacement (owned, 3) of a step predicted from the current motion [m]."""
         return h * state.v
 
     def start(self, state: State, h: float) -> None:

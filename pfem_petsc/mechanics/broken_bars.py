@@ -1,4 +1,4 @@
-"""What is rarely asked of bars that break or are removed: the stress at the break, and the removal of a share."""
+"""Rarely used queries of bars that break or are removed: the stress at the break, and the removal of a share."""
 
 from __future__ import annotations
 

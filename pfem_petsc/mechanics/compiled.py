@@ -56,7 +56,7 @@ def kernel(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _distinguish(function: Callable[..., Any]) -> None:
-    """Give a closure a name of its own.
+    """Give a closure a unique name.
 
     The names of functions in machine code are made of module, name, types and a count in the process that has compiled
     them. Closures of one place, such as the loops of two laws, could then have the same name in machine code of two

@@ -47,7 +47,7 @@ def consistent_product(bars, lengths, start, stop, density, u, out):
 
 
 class PointInertia:
-    """Masses and dashpots of nodes besides those of their bars. A node in several tables gets their sum.
+    """Masses and dashpots of nodes in addition to those of their bars. A node in several tables gets their sum.
 
     Attributes
     ----------

@@ -95,7 +95,7 @@ class RestLengths:
             bars.rest_at_start = bars.rest.copy()
 
     def hold(self, rest: np.ndarray) -> None:
-        """Take the rest lengths (b,) [m] of the stage before, where they stay."""
+        """Take over the rest lengths (b,) [m] of the previous stage if they remain in force."""
         if self.any:
             for part in self._held:
                 self._bars.rest[part] = rest[part]

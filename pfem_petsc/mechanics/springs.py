@@ -1,4 +1,4 @@
-"""Springs from nodes to the ground: forces -K (x - X) about the positions X of the mesh, along axes that stay.
+"""Springs from nodes to the ground: forces -K (x - X) about the positions X of the mesh, along constant axes.
 
 K is diagonal in the frame of each table, by default that of the model; tables of one node add up.
 

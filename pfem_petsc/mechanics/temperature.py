@@ -59,7 +59,7 @@ class Temperatures:
             bars.heat_at_start = bars.heat.copy()
 
     def hold(self, heat: np.ndarray) -> None:
-        """Take the thermal strains and temperatures [K] (2, b) of the stage before, where they stay in force."""
+        """Take over the thermal strains and temperatures [K] (2, b) of the previous stage if they remain in force."""
         if self._holds and self.any:
             self._bars.heat[:] = heat
             self._bars.heat_at_start = self._bars.heat.copy()

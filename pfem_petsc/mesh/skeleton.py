@@ -21,9 +21,9 @@ _CONDITIONS = ("support", "load", "gravity")
 
 
 def tables_of(mesh: WholeMesh) -> tuple[dict[str, Any], list[str]]:
-    """Return the tables of a case, and the keys of sections and materials that the mesh did not tell.
+    """Return the tables of a case, and the keys of sections and materials that the mesh does not have.
 
-    Keys that it did not tell have the values of steel and an area of 1 cm2.
+    Keys that it does not have get the values of steel and an area of 1 cm2.
     """
     made: list[str] = []
     materials = {name: dict(keys) for name, keys in mesh.tables.get("material", {}).items()}

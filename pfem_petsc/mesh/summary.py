@@ -20,7 +20,7 @@ def summary(mesh: WholeMesh, tolerance: float | None = None) -> list[tuple[str, 
 
     Parameters
     ----------
-    tolerance : distance [m] up to which nodes are at the same place; default: 1e-6 of the mean length of the bars
+    tolerance : distance [m] up to which nodes coincide; default: 1e-6 of the mean length of the bars
     """
     return [*_sizes(mesh), *_named(mesh), *_topology(mesh), *problems_of(mesh, tolerance)]
 

@@ -60,7 +60,7 @@ def coincident(points: np.ndarray, tolerance: float) -> np.ndarray:
     Parameters
     ----------
     points : (nodes, 3) [m]
-    tolerance : distance [m] up to which two nodes are at the same place, also over a third one; 0: equal coordinates
+    tolerance : distance [m] up to which two nodes coincide, also through a third one; 0: equal coordinates
     """
     if not np.isfinite(points).all():
         bad = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
@@ -100,7 +100,7 @@ def cleaned(mesh: WholeMesh, tolerance: float | None = None, sum_areas: bool = F
     Parameters
     ----------
     tolerance : distance [m] up to which nodes are merged; default: 1e-6 of the mean length of the bars
-    sum_areas : whether the bar that stays of several between the same nodes has the sum of their areas
+    sum_areas : whether the bar kept of several between the same nodes has the sum of their areas
 
     Returns
     -------
@@ -153,7 +153,7 @@ def _renumbered(groups: dict[str, np.ndarray], new: np.ndarray) -> dict[str, np.
 
 
 def merged(meshes: Sequence[WholeMesh], tolerance: float | None = None) -> tuple[WholeMesh, list[str]]:
-    """Put meshes together, join nodes at the same place, and remove what :func:`cleaned` removes.
+    """Merge meshes, join coincident nodes, and remove what :func:`cleaned` removes.
 
     Groups of the same name become one. The bars and nodes of each file are groups with the name of the file, where no
     other group has it. Bar fields that not all meshes have are left out, which the lines tell that are returned.

@@ -72,7 +72,7 @@ class InitialStatePlan:
     axis: Axis = TIME
 
     def beyond(self, steps: np.ndarray, times: np.ndarray) -> np.ndarray:
-        """Return which of the recorded steps and times lie beyond the end."""
+        """Return which of the recorded steps and times are beyond the end."""
         return steps > 0
 
     def entries(self, case: Case) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""Buckling of single bars as columns, which modes of the truss do not contain: nodes move, bars stay straight."""
+"""Buckling of single bars as columns, which modes of the truss do not contain: nodes move, bars remain straight."""
 
 from __future__ import annotations
 

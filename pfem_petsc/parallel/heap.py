@@ -22,7 +22,7 @@ _LARGE = 1 << 20
 def returning_freed_memory() -> Iterator[None]:
     """Have the C library return the memory of large arrays as they are freed; elsewhere than with glibc nothing.
 
-    Afterwards it keeps what is freed: getting pages anew in every step would make implicit steps 4 % slower.
+    Afterwards it keeps what is freed: requesting pages again in every step would make implicit steps 4 % slower.
     """
     library = _glibc()
     if library is None:

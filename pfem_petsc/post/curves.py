@@ -1,4 +1,4 @@
-"""Curves that are asked for by name: over time or another column, of one result or several."""
+"""Curves selected by name: over time or another column, of one result or several."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def make_chart(
 
 
 def column(history: History, name: str) -> dict[str, np.ndarray]:
-    """Return the curves (n,) that a name stands for: a column, or ``.x``, ``.y``, ``.z``, ``.norm`` of one.
+    """Return the curves (n,) of a name: a column, or ``.x``, ``.y``, ``.z``, ``.norm`` of one.
 
     Columns of nodes are the mean over the nodes, of reactions the sum. A vector without component gives those that are
     not zero up to rounding.
@@ -213,7 +213,7 @@ def _single(history: History, name: str) -> np.ndarray:
 
 
 def labels_of(results: Sequence[Any]) -> list[str]:
-    """Return names of results that tell them apart: those of their folders, or as much of the paths as it takes."""
+    """Return distinct names of results: those of their folders, or as much of the paths as it takes."""
     paths = [Path(result.path).absolute() for result in results]
     for count in range(1, max(len(path.parts) for path in paths)):
         labels = ["/".join(path.parent.parts[-count:]) for path in paths]

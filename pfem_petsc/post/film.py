@@ -28,7 +28,7 @@ _ROOM = 220  # pixels: the narrowest tile with an inset
 
 @dataclass(frozen=True)
 class Look:
-    """What a film looks like, apart from what it shows.
+    """The look of a film, independent of its content.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""A picture of a mesh, by matplotlib alone: bars coloured by their groups."""
+"""A picture of a mesh, drawn by matplotlib only: bars coloured by their groups."""
 
 from __future__ import annotations
 

@@ -74,7 +74,7 @@ class ModeFrames:
         return self._amplitudes[i // self._period]
 
     def caption(self, i: int) -> str:
-        """What stands under frame i."""
+        """The caption of frame i."""
         return self._labels[i // self._period]
 
     def instants(self, count: int) -> list[int]:

@@ -184,7 +184,7 @@ class Motion:
         return points[np.unique(self.bars[~gone])]
 
     def time(self, frame: int) -> str:
-        """What stands above a frame."""
+        """The heading of a frame."""
         if hasattr(self.result, "caption"):
             return self.result.caption(frame)
         axis, time = self.result.axis, self.result.times[frame]

@@ -81,7 +81,7 @@ def wall_shifts(result: Any, times: Sequence[float]) -> np.ndarray:
     """Return displacements (times, walls, 3) [m] of a result's walls from their initial positions.
 
     Positions of walls with mass are interpolated linearly between rows of the history; others follow from the case.
-    A wall that a stage no longer has stays where it was; :func:`walls_present` says which are there.
+    A wall that a stage no longer has remains at its last position; :func:`walls_present` says which are there.
     """
     walls = result.case.every_wall
     if result.case.stage:

@@ -1,4 +1,4 @@
-"""Nodes that lie on bars they are not connected to, and nodes at the same place.
+"""Nodes on bars that they are not connected to, and coincident nodes.
 
 Space is divided into cells of about the length of a bar. A rank holds the nodes of cells that a hash assigns to it, and
 sends those of a cell to the ranks whose bars pass it: each rank holds its share of the nodes twice, and those near its
@@ -71,7 +71,7 @@ class _Bars(NamedTuple):
 
 
 def nodes_on_bars(mesh: DistributedMesh) -> NodesOnBars | None:
-    """Find nodes that lie on bars to which they are not connected. Collective.
+    """Find nodes on bars to which they are not connected. Collective.
 
     Time and memory are proportional to the number of nodes and bars of a rank, if the lengths of bars and the distances
     of nodes do not differ too much.

@@ -1,4 +1,4 @@
-"""Values out of any engineering range, mostly due to units other than SI. They are reported, never refused."""
+"""Values out of any engineering range, mostly due to units other than SI. They are reported, never rejected."""
 
 from __future__ import annotations
 

@@ -51,7 +51,7 @@ class RunLoop:
         self.started = self.closed = False
 
     def check_open(self) -> None:
-        """Refuse to go on after the simulation was closed.
+        """Raise an error if the simulation was closed.
 
         Raises
         ------

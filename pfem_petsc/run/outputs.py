@@ -138,7 +138,7 @@ class Outputs:
         self._report = ProgressReport(self.progress, analysis, self.history)
 
     def begin_stage(self) -> None:
-        """End the present stage with a row and a snapshot, begin the next, and go on with it. Collective.
+        """End the current stage with a row and a snapshot, and begin the next. Collective.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""What a restart gives to the observers of a run, and tells its user."""
+"""What a restart passes to the observers of a run, and reports to the user."""
 
 from __future__ import annotations
 

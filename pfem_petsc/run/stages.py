@@ -78,7 +78,7 @@ class StagedPlan:
         return AXIS._replace(key=f"stage[{len(self.plans) - 1}].{self.plans[-1].axis.key}")
 
     def beyond(self, steps: np.ndarray, times: np.ndarray) -> np.ndarray:
-        """Which of recorded steps with their times lie beyond the end."""
+        """Return which of the recorded steps and times are beyond the end."""
         return times > (np.inf if self.end is None else self.end * (1.0 + TIME))
 
     def entries(self, case: Case) -> dict[str, str]:
@@ -90,7 +90,7 @@ class StagedPlan:
         return found
 
     def record(self) -> dict[str, Any]:
-        """What a restart must not work out anew."""
+        """Choices that a restart must keep."""
         return {"stages": [plan.record() for plan in self.plans]}
 
 

@@ -143,7 +143,7 @@ class NewtonSolver:
         Raises
         ------
         InputError
-            On all ranks, if PETSc refuses an option.
+            On all ranks, if PETSc rejects an option.
         """
         try:
             for bounded in (False, True) if contact else (False,):

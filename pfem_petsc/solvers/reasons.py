@@ -54,8 +54,8 @@ def linear_reason(reason: int) -> str:
 
 
 def is_failed_factorisation(error: PETSc.Error) -> bool:
-    """Return whether MUMPS could not factorise a matrix: on several ranks PETSc 3.18 goes on to solve with the remains.
+    """Return whether MUMPS could not factorise a matrix.
 
-    The solver is then in the middle of a solve, and must be made anew.
+    On several ranks PETSc 3.18 continues the solve with the incomplete factors. The solver must then be created again.
     """
     return error.ierr == _EXTERNAL_LIBRARY and "MUMPS" in str(error)

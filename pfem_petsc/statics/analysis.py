@@ -54,7 +54,7 @@ class StaticPlan:
     axis: Axis = LOAD_FACTOR
 
     def beyond(self, steps: np.ndarray, times: np.ndarray) -> np.ndarray:
-        """Return which of the recorded steps and times lie beyond the end."""
+        """Return which of the recorded steps and times are beyond the end."""
         return times > (np.inf if self.end is None else self.end * (1.0 + TIME))
 
     def entries(self, case: Case) -> dict[str, str]:

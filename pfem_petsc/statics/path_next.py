@@ -1,4 +1,4 @@
-"""The next point of a path: predicted along the tangent, corrected, and refused where it belongs to another path."""
+"""The next point of a path: predicted along the tangent, corrected, and rejected if it belongs to another path."""
 
 from __future__ import annotations
 

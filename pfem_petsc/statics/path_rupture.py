@@ -35,7 +35,7 @@ def settle_broken(stepper: PathStepper) -> tuple[bool, str]:
     Raises
     ------
     SimulationFailure
-        On all ranks, if what is left of the truss finds no equilibrium.
+        On all ranks, if the rest of the truss finds no equilibrium.
     """
     broke, ended = False, ""
     if not stepper.model.bars.can_break:

@@ -22,7 +22,7 @@ def redistribute(stepper: StaticStepper) -> None:
     Raises
     ------
     SimulationFailure
-        On all ranks, if what is left of the truss finds no equilibrium.
+        On all ranks, if the rest of the truss finds no equilibrium.
     """
     changed = stepper.removals.apply()
     if not stepper.model.bars.can_break and not changed:
@@ -47,7 +47,7 @@ def hold_detached(stepper: StaticStepper) -> None:
 def _solve_again(stepper: StaticStepper) -> None:
     """Find the equilibrium at the present load factor with the bars that are left. Collective.
 
-    The guard is not asked: what moves when bars go has nothing to do with the increments before.
+    The guard is not used: what moves when bars go has nothing to do with the increments before.
     """
     guard, stepper.guard, stepper.scheme.releases = stepper.guard, None, True
     try:

@@ -52,7 +52,7 @@ def _fail(stepper: Stepper, where: str) -> None:
 def _expected(stepper: Stepper, balance: Balance, time: float) -> tuple[np.ndarray, np.ndarray]:
     """Return positions and velocities (owned, 3) at a time [s] of a balance that is not solved yet.
 
-    The acceleration is that of the state; nodes in contact, whose acceleration may jump, go on without.
+    The acceleration is that of the state; nodes in contact, whose acceleration may jump, are predicted without it.
     """
     state = stepper.state
     a = np.where((state.contact != 0.0).any(axis=1)[:, None], 0.0, state.a)

@@ -143,7 +143,7 @@ class Model:
         return self.start.time if self.start is not None else 0.0
 
     def begin_stage(self, start: StageStart) -> None:
-        """Hold supports, loads and walls that stay in force as they are at the start of a stage. Collective."""
+        """Hold supports, loads and walls that remain in force as they are at the start of a stage. Collective."""
         self.start = start
         self.supports.hold(start.position)
         active = self.comm.allreduce(bool(start.force.any()) or bool(start.gravity.any()), op=MPI.LOR)

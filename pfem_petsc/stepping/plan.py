@@ -62,7 +62,7 @@ class Plan:
         return self.step * self.steps
 
     def beyond(self, steps: np.ndarray, times: np.ndarray) -> np.ndarray:
-        """Which of recorded steps with their times lie beyond the end."""
+        """Return which of the recorded steps and times are beyond the end."""
         return steps > self.steps
 
     def entries(self, case: Case) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""The stepper of a plan, with the treatment of impact; combinations that do not work are refused."""
+"""The stepper of a plan, with the treatment of impact; incompatible combinations are rejected."""
 
 from __future__ import annotations
 

@@ -120,7 +120,7 @@ class Removals:
         self._release(self.gone)
 
     def follow(self, before: Removals) -> None:
-        """Begin a stage after that of other removals: supports that are gone stay away, and bars go entirely."""
+        """Begin a stage after that of other removals: removals remain, and bars are removed entirely."""
         for k, entry in enumerate(before._entries):
             if entry.bars is not None and before.times[k] >= 0.0:
                 self._remove_bars(before._members[entry.bars], 1.0)

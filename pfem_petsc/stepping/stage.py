@@ -2,7 +2,7 @@
 
 Within a stage time is counted from its start, for its tables and for its steps; ``StageStart`` says where that lies on
 the axis of the results. Positions, velocities, internal variables, temperatures, contact pairs and who touches which
-wall go over; the scheme begins anew from them, as it does at the start of a run.
+wall go over; the scheme starts again from them, as at the start of a run.
 """
 
 from __future__ import annotations

@@ -33,7 +33,7 @@ def environment() -> dict[str, str]:
 
 
 class _Process:
-    """A worker in a process of its own, started with its first task, and again after it has died."""
+    """A worker in a separate process, started with its first task, and again after it has ended."""
 
     def __init__(self) -> None:
         self._process: subprocess.Popen[bytes] | None = None

@@ -40,7 +40,7 @@ class Report(NamedTuple):
 
 
 def perform(task: Task) -> Report:
-    """Make a run on this process alone, and return how it has ended."""
+    """Execute a run in this process, and return its outcome."""
     from mpi4py import MPI
 
     from ..errors import PfemError

@@ -21,7 +21,7 @@ __all__ = ["Constraint", "ConstraintKeys", "NodeSetName", "NodesOf", "SetPart"]
 class SetPart(NamedTuple):
     """This rank's part of a node set in ascending order of mesh numbers: a range of the whole.
 
-    Of sets of the same size all ranks have the same ranges, so that nodes in the same place meet.
+    The ranges of sets of the same size agree, so that corresponding nodes of two sets are on the same rank.
     """
 
     count: int
@@ -29,25 +29,25 @@ class SetPart(NamedTuple):
     numbers: np.ndarray
     """(m,) mesh numbers, ascending."""
     places: np.ndarray
-    """(m, 3) places in the mesh [m]."""
+    """(m, 3) positions in the mesh [m]."""
 
 
 NodesOf = Callable[[str], SetPart]
-"""Name of a node set, from a key of type ``NodeSetName``, to this rank's part of it."""
+"""Function from the name of a node set (a key of type ``NodeSetName``) to this rank's part of it."""
 
 
 class Constraint(ABC):
     """The rows of one table.
 
-    A constructor makes rows of this rank's parts of node sets. It does not communicate, and what it refuses on one rank
-    is refused on all. The rows of all ranks together, in the order of the ranks, must not depend on how many ranks
-    there are. Rows are then sent to where their nodes are: from then on :attr:`nodes` and :attr:`data` are of other
-    rows, and ``values``, ``gradients`` and ``drift`` may be asked of any of them, see :meth:`of`.
+    The constructor creates rows for this rank's parts of node sets. It does not communicate; an error that it raises on
+    one rank is raised on all. The rows of all ranks, in the order of the ranks, must not depend on the number of
+    ranks. Rows are then sent to the ranks of their nodes: from then on :attr:`nodes` and :attr:`data` belong to other
+    rows, and ``values``, ``gradients`` and ``drift`` may be called for any subset of them, see :meth:`of`.
 
     Attributes
     ----------
-    nodes : (r, k) mesh numbers of the nodes of each row; k on all ranks the same
-    data : (r, m) float64, numbers that belong to each row, as a length; m on all ranks the same, by default none
+    nodes : (r, k) mesh numbers of the nodes of each row; k is the same on all ranks
+    data : (r, m) float64, numbers of each row, such as a length; m is the same on all ranks, zero by default
     """
 
     nodes: np.ndarray

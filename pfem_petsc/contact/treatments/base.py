@@ -30,8 +30,8 @@ class Jump:
     nodes : (m,) owned local indices
     v, a : (m, 3) before the jump [m/s], [m/s2]
     energy : kinetic energy that this rank's nodes gained [J]
-    memory : what the scheme remembered of them (m, 3), by name
-    friction : what the drag that goes with the jump took of it [J]
+    memory : arrays of the scheme's memory at these nodes (m, 3), by name
+    friction : energy that friction during the jump has dissipated [J]
     """
 
     nodes: np.ndarray
@@ -113,7 +113,7 @@ class Treatment(ABC):
             speeds[tied] = rates[contact.ties.walls(nodes[tied])]
         infeasible = self.sticking(nodes, touching, normals)
         holds = infeasible.any(axis=1)
-        if holds.any():  # there may be no walls at all, but pairs
+        if holds.any():  # there may be pairs without any wall
             normal[holds] = np.eye(3)
             speeds[holds] = rates[infeasible[holds].argmax(axis=1)]
         return nodes, normal, speeds

@@ -65,7 +65,7 @@ class Treatment(Restitution):
             self.jump.friction = friction
 
     def _dragged(self, nodes: np.ndarray, v: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-        """Velocities and accelerations (m, 3) of held nodes with the drag that goes with jumps, and what it takes [J].
+        """Velocities and accelerations (m, 3) of held nodes with friction of jumps, and its dissipation [J].
 
         With the free parts F of the normals N and the directions s of the slip, the jumps are D lambda, D = F - mu s,
         as large along the normals as without friction.

@@ -104,7 +104,7 @@ class MaterialKeys(StrictModel):
         return own if not self.stiffness_damping else (own, self.young_modulus * self.stiffness_damping)
 
     def choose(self, law: Law) -> Law:
-        """Return the variant of the law that the keys ask for: the law itself, softened by temperature, or with damping
+        """Return the variant of the law that the keys select: the law itself, softened by temperature, or with damping
         proportional to its stiffness."""
         chosen = law if self.softening is None else softened(law)
         return damped(chosen) if self.stiffness_damping else chosen
@@ -138,9 +138,9 @@ class Law:
         of the rate (1/step)
     internal : name and unit of each internal variable of a bar, zero at the start; the unit ``""`` is a pure number.
         They are fields of the snapshots if a case selects them, and arrays of the checkpoints. A variable named
-        ``slack`` is 1 while the bar is slack: it is counted in the history and seen in the field ``status``
+        ``slack`` is 1 while the bar is slack: it is counted in the history and shown in the field ``status``
     energies : names of the energy densities, of :data:`~pfem_petsc.energies.BAR_ENERGIES`: functions of strain and
-        internal variables. If the dissipation is no such function, the law keeps it as another internal variable
+        internal variables. If the dissipation is not such a function, the law stores it in a further internal variable
     bar_data : names of the numbers that differ from bar to bar and that ``Parameters.pack_bars`` gives; the response
         reads them after the packed parameters, ``p = (*pack(), *pack_bars())``
     rate : whether the law depends on the rate or on the step; strain and stress at the end of the last step are then
@@ -148,21 +148,21 @@ class Law:
     smooth : whether the tangent is constant
     mean_stress : compiled function of (stress0, strain0, strain, rate, step, temperature, p, q): returns the mean
         stress [Pa] over the step from stress0 and strain0 to strain, whose work is the change of energies, and its
-        derivative with respect to strain. The energy-momentum scheme requires it; None: the law is refused there
+        derivative with respect to strain. The energy-momentum scheme requires it; None: the scheme rejects the law
     mean_correction : ``mean_stress`` minus the mean of both ends [Pa], as a function of p without data of bars, the
         change of stress and the internal variables before and after, (variables, bars), for the work of changing
         temperatures; None for zero
     mean_of_work : whether ``mean_stress`` is the change of all energies over that of the strain, from ``_work.py``; it
         then holds for the work of changing temperatures too
-    static_limit : for a law with ``rate``: whether it has a limit at the rate zero, which static analyses take; the
+    static_limit : for a law with ``rate``: whether it has a limit at the rate zero, which static analyses use; the
         step is then infinite
-    softening : how the law softens by the key ``softening``; None: the key is refused
+    softening : how the law softens by the key ``softening``; None: the key is rejected
     modulus : function of p and temperatures (bars,) that returns the modulus of the elastic strain (bars,) [Pa], if it
         depends on the temperature
     no_mean_stress : why there is no ``mean_stress``, for the message
-    rupture : place of the internal variable that tells which share of a bar has left the model, see
+    rupture : index of the internal variable with the fraction of a bar that has left the model, see
         :mod:`~pfem_petsc.mechanics.rupture`; -1 for laws whose bars cannot break
-    whole : the law of bars that are intact, if this one is made of it
+    whole : the law of intact bars from which this one is derived, if any
     """
 
     response: Callable[..., Any]

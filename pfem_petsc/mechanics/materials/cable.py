@@ -1,7 +1,7 @@
 """Cable: carries tension only, and may yield in tension.
 
 With the plastic strain e_p, the strain at which it becomes slack, the stress is E (e - e_p) where this is positive, and
-zero below. It yields at s_Y + K e_p; a yielded cable is longer, and takes up the slack later.
+zero below. It yields at s_Y + K e_p; a yielded cable is longer, and becomes taut later.
 """
 
 from __future__ import annotations

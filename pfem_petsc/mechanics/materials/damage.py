@@ -33,7 +33,7 @@ class Parameters(MaterialKeys):
         return float(self.young_modulus), float(self.tensile_strength), self.tensile_strength / self.young_modulus
 
     def pack_bars(self, bars: BarShapes) -> tuple[np.ndarray, ...]:
-        """Return the strain e_c at which each bar is parted; refuse bars too long for the fracture energy."""
+        """Return the strain e_c at which each bar is parted; reject bars too long for the fracture energy."""
         parted = 2.0 * self.fracture_energy / (self.tensile_strength * bars.length)
         bad = np.flatnonzero(parted <= self.tensile_strength / self.young_modulus)
         if len(bad):

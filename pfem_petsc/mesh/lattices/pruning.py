@@ -1,4 +1,4 @@
-"""Lattices of which nodes and bars are left out: the rest is numbered anew, in the same order."""
+"""Lattices of which nodes and bars are left out: the rest is renumbered in the same order."""
 
 from __future__ import annotations
 

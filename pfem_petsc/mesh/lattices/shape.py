@@ -46,7 +46,7 @@ def _mixed(z: np.ndarray) -> np.ndarray:
 
 
 def perturbation(block: Block, amplitude: float, seed: int) -> Move:
-    """Return the move of each node by up to ``amplitude`` [m] along each axis; nodes of outer faces stay in them."""
+    """Return the move of each node by up to ``amplitude`` [m] along each axis; nodes of outer faces remain in them."""
 
     def move(points: np.ndarray, numbers: np.ndarray, places: Places) -> np.ndarray:
         points = points.copy()

@@ -96,7 +96,7 @@ class Surface:
     def inside_parts(
         self, starts: np.ndarray, ends: np.ndarray, inside: np.ndarray | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the parts of lines that lie inside.
+        """Return the parts of lines inside the surface.
 
         Parameters
         ----------
@@ -135,7 +135,7 @@ class Surface:
         return line[first], np.stack([span[first, 0], span[last, 1]], axis=1)
 
     def _crossings(self, starts: np.ndarray, ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the lines that meet triangles, and where: from 0 at their start to 1 at their end."""
+        """Return the lines that intersect triangles, and where: from 0 at their start to 1 at their end."""
         from vtkmodules.vtkCommonCore import vtkIdList, vtkPoints
 
         points, cells, locator = vtkPoints(), vtkIdList(), self._locator

@@ -144,7 +144,7 @@ class Flat:
                 yield from ((block, names.get(full, short or name), members) for full, members in parts)
 
     def _bare_assembly(self) -> list[tuple[str, Scope]]:
-        """Return the assembly if it has no nodes and elements of its own: it may have sections of sets of instances."""
+        """Return the assembly if it has no own nodes and elements: it may have sections of sets of instances."""
         return [] if "*ASSEMBLY" in self._placed else [("*ASSEMBLY", self._model.assembly)]
 
     def _members(self, kind: str, key: str, table: SetTable, above: tuple[str, ...] = ()) -> np.ndarray:

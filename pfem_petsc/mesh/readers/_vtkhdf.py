@@ -1,4 +1,4 @@
-"""Files of VTK's HDF5 format that hold lines alone, read by all ranks, each its share; VTK reads all others.
+"""Files of VTK's HDF5 format that only hold lines; each rank reads its share; VTK reads all others.
 
 Those are an UnstructuredGrid in one part, without steps, whose cells are lines of two points in the order of
 ``Connectivity``. Groups and bar fields are those of :mod:`.vtk`.

@@ -3,7 +3,7 @@
 T3D2 and T2D2 are bars; other trusses and beams are read as bars with a warning, other elements are left out with
 one. Node sets and element sets are groups. Sections give the bar field ``area``; sections and materials are tables of
 a case, as are fixed nodes, nodal forces and gravity up to the end of the first step, and its analysis. Included files
-are read. Keywords that generate nodes and elements are refused.
+are read. Keywords that generate nodes and elements are rejected.
 """
 
 from __future__ import annotations

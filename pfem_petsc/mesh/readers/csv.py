@@ -175,7 +175,7 @@ class _Table:
         return values  # type: ignore[return-value]
 
     def maybe_numbers(self, name: str) -> np.ndarray | None:
-        """Return the numbers of a column; None if it has other texts."""
+        """Return the numbers of a column; None if it has other text."""
         return self._converted(self._columns[self.headings.index(name)])
 
     def others(self) -> list[str]:

@@ -1,6 +1,6 @@
 """STL files, ASCII and binary: the edges of the triangles are bars.
 
-Corners at the same place are one node; an edge between two triangles is one bar. STL has no unit: coordinates are taken
+Coincident corners are one node; an edge between two triangles is one bar. STL has no unit: coordinates are taken
 as metres.
 """
 

@@ -46,7 +46,7 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
 
 
 def _model_name(path: Path, archive: zipfile.ZipFile) -> str:
-    """Return the name of the model, which the relationships of the package tell."""
+    """Return the name of the model from the relationships of the package."""
     targets: list[str] = []
 
     def start(tag: str, attributes: dict[str, str]) -> None:

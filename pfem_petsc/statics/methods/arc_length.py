@@ -1,4 +1,4 @@
-"""The path of equilibria by lengths of arc: it goes on where the load factor turns, and where displacements do."""
+"""The path of equilibria by lengths of arc: it passes turning points of the load factor and of displacements."""
 
 from __future__ import annotations
 

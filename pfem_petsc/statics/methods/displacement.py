@@ -1,4 +1,4 @@
-"""The path of equilibria by increments of a displacement, which goes on where the load factor turns."""
+"""The path of equilibria by increments of a displacement, which passes turning points of the load factor."""
 
 from __future__ import annotations
 

@@ -72,5 +72,5 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
 
 
 def read_on(path: Path, comm: MPI.Comm, fields: Mapping[str, str]) -> MeshSlab | None:
-    """Return this rank's slab of a .vtkhdf file that only holds lines; None for files that VTK must read. Collective."""
+    """Return this rank's slab of a .vtkhdf file of lines only; None for files that VTK must read. Collective."""
     return _vtkhdf.read_on(path, comm, fields) if path.suffix.lower() == ".vtkhdf" else None

@@ -1,5 +1,7 @@
 """Paths that cannot be followed, cases that ask for what paths do not have, and motions that meet no stiffness."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from mpi4py import MPI
@@ -10,6 +12,7 @@ from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.errors import InputError, SimulationFailure
 from pfem_petsc.solvers.linear import has_mumps
 from pfem_petsc.statics.bordered import BorderedSystem
+from pfem_petsc.statics.free_motions import _nodes
 
 
 def von_mises(static=None, **tables):
@@ -199,3 +202,13 @@ def test_a_factorisation_that_fails_within_a_solve_shortens_the_step(tmp_path, m
         simulation.run()
     assert len(attempts) > 4 and attempts[4] is not attempts[3]
     assert open_result(tmp_path / "a").history["step"][-1] == 4
+
+
+@pytest.mark.parallel
+def test_a_motion_of_many_nodes_names_the_lowest(comm):
+    """Node 7 of 40 moves most, node 3 hardly; no rank has a list of all."""
+    ids = np.random.default_rng(7).permutation(40)
+    ids = ids[ids % comm.size == comm.rank]
+    motion = np.where(ids == 7, 2.0, np.where(ids == 3, 0.1, 1.0))[:, None] * [0.0, 1.0, 0.0]
+    model = SimpleNamespace(comm=comm, mesh=SimpleNamespace(node_ids=ids))
+    assert _nodes(model, motion) == "node 7 along (0, 1, 0), with nodes 0, 1, 2, 4 and 34 more"

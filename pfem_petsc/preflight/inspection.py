@@ -101,7 +101,7 @@ def _is_own(case: Case) -> bool:
 def _nodes_on_bars(mesh: DistributedMesh, entries: dict[str, str]) -> list[str]:
     found = nodes_on_bars(mesh)
     if found is None:
-        entries["nodes on bars"] = "not checked: too many nodes, or bars of too different lengths"
+        entries["nodes on bars"] = "not checked: bars of too different lengths"
         return []
     if found.coinciding:
         pairs = _list(found.coinciding // 2, found.shown_coinciding)

@@ -120,7 +120,7 @@ def test_nodes_on_bars_of_a_graded_mesh(comm, shared_tmp_path, monkeypatch):
     assert any("node 2991 on bar 3000" in text for text in warnings)
     monkeypatch.setattr(search, "_PIECES", 1.5)
     entries, warnings = told(shared_tmp_path, comm, points, bars)
-    assert entries["nodes on bars"].startswith("not looked for")
+    assert entries["nodes on bars"].startswith("not checked")
 
 
 @pytest.mark.parametrize("name", ["rod_impact", "ring_impact", "lattice_drop", "tumbling_lattice"])

@@ -225,7 +225,7 @@ def test_trajectories_grow(tmp_path, flying):
         ({"scale": math.nan}, "scale = nan"),
         ({"fps": math.inf}, "fps = inf"),
         ({"bar_width": 1e9}, "500 pixels at most"),
-        ({"view": (0.0, 0.0, 0.0)}, "no direction"),
+        ({"view": (0.0, 0.0, 0.0)}, "is not a direction"),
         ({"rate": 1e9}, "give 2 to 20000 frames"),
         ({"rate": 100.0, "frames": 3}, "give one of the two"),
         ({"span": (0.4, 0.3)}, "two increasing times"),

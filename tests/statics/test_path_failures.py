@@ -39,7 +39,7 @@ FOLLOWED = {"node_set": "apex", "direction": [0.0, 0.0, -1.0]}
         ({"method": "arc_length", "displacement": 0.1}, "displacement needs node_set"),
         ({"method": "arc_length", "node_set": "apex"}, "node_set and direction belong together"),
         ({"method": "arc_length", "node_set": "apx", "direction": [0.0, 0.0, 1.0]}, "apex"),
-        ({"method": "arc_length", **FOLLOWED, "direction": [0.0, 0.0, 0.0]}, "is none"),
+        ({"method": "arc_length", **FOLLOWED, "direction": [0.0, 0.0, 0.0]}, "has zero length"),
         ({"method": "arc_length", "step": 0.1, "max_step": 0.01}, "max_step = 0.01 is smaller"),
         ({"method": "arc_length", "branch_at": [0]}, "from 1"),
         ({"method": "arc_length", "branch_at": [1], "critical_points": False}, "critical_points"),

@@ -11,7 +11,7 @@ from pfem_petsc.output.result import open_result
 
 pytestmark = pytest.mark.parallel
 
-COLLAPSE = r"step \d+, t = \S+ s: bar 19 between nodes 19 and 20 has gone through zero length, from 0\.05 m; .*take a"
+COLLAPSE = r"step \d+, t = \S+ s: bar 19 between nodes 19 and 20 has gone through zero length, from 0\.05 m; .*use a"
 
 
 def failing(comm, folder, *overrides):

@@ -49,8 +49,9 @@ class Link(Protocol):
 
         Gives whether any row presses on a node of this rank.
 
-        ``stiffness`` (owned,) is the force for a displacement of a node [N/m], ``contact`` (owned, 3) takes the forces
-        [N], ``tolerance`` [m] is the depth up to which a row counts as kept.
+        ``stiffness`` (owned,) is the force for a displacement of a node [N/m]; as long as its values stay the same, it
+        is the same array, on all ranks. ``contact`` (owned, 3) takes the forces [N], ``tolerance`` [m] is the depth up
+        to which a row counts as kept.
 
         Raises
         ------

@@ -14,6 +14,7 @@ from ..mechanics.compiled import kernel
 
 __all__ = [
     "broken_pairs",
+    "compliances",
     "leaving_rows",
     "mark_nodes",
     "move_nodes",
@@ -26,7 +27,7 @@ __all__ = [
 
 
 @kernel
-def part_nodes(where, x, u, stiffness, far, normals, along, least, free, held, force, load):
+def part_nodes(where, x, u, stiffness, far, axes, normals, soft, least, free, held, force, load):
     """Move the nodes of pairs so that the bounds are satisfied; each node is in one pair only.
 
     Parameters
@@ -34,8 +35,9 @@ def part_nodes(where, x, u, stiffness, far, normals, along, least, free, held, f
     where : (2, p)
     x, u : (owned, 3); positions are their sum [m]; u is changed
     stiffness : (owned,) force for a displacement of a node [N/m]
-    far : (partners, 4) positions [m] and 1/stiffness
-    normals, along, least : (p, 3); (2, p) compliance factor of ends along the direction; (p,) bounds [m]
+    far : (partners, k) components ``axes`` of positions [m]
+    axes : (k,) components in which any direction is not zero
+    normals, soft, least : (p, 3); (p,) compliance, see :func:`compliances`; (p,) bounds [m]
     free, held : (2, p, 3) 0.0 where supports prescribe a component; (2, p) bool, ends with such components
     force : (p,) output, zero or positive [N]
     load : (owned, 3) to which the forces on nodes are added, unless it is (0, 3) [N]
@@ -47,23 +49,20 @@ def part_nodes(where, x, u, stiffness, far, normals, along, least, free, held, f
     """
     count = 0
     loaded = len(load) > 0
-    apart = np.empty(3)
+    apart = np.zeros(3)
     for p in range(len(force)):
         # inlined by hand: a call that passes the arrays costs more than all the rest
         i, j = where[0, p], where[1, p]
-        for c in range(3):
-            there = x[j, c] + u[j, c] if j >= 0 else far[-1 - j, c]
-            here = x[i, c] + u[i, c] if i >= 0 else far[-1 - i, c]
+        for k in range(len(axes)):
+            c = axes[k]
+            there = x[j, c] + u[j, c] if j >= 0 else far[-1 - j, k]
+            here = x[i, c] + u[i, c] if i >= 0 else far[-1 - i, k]
             apart[c] = normals[p, c] * (there - here)
         short = least[p] - ((apart[0] + apart[2]) + apart[1])
         force[p] = 0.0
-        if short <= 0.0:
+        if short <= 0.0 or not soft[p] > 0.0:
             continue
-        soft = (1.0 / stiffness[i] if i >= 0 else far[-1 - i, 3]) * along[0, p]
-        soft += (1.0 / stiffness[j] if j >= 0 else far[-1 - j, 3]) * along[1, p]
-        if not soft > 0.0:
-            continue
-        force[p] = short / max(soft, 1e-300)
+        force[p] = short / max(soft[p], 1e-300)
         count += 1
         for end in range(2):
             node = where[end, p]
@@ -71,7 +70,7 @@ def part_nodes(where, x, u, stiffness, far, normals, along, least, free, held, f
                 continue
             hard = stiffness[node]
             strength = force[p] if end == 1 else -force[p]
-            for c in range(3):
+            for c in axes:
                 push = strength * normals[p, c]
                 if loaded:
                     load[node, c] += push
@@ -82,13 +81,25 @@ def part_nodes(where, x, u, stiffness, far, normals, along, least, free, held, f
 
 
 @kernel
-def leaving_rows(rows, x, u, stiffness, leaving):
-    """Write x + u (owned, 3) and 1/stiffness of the nodes that partners need into ``leaving`` (rows, 4)."""
-    for k in range(len(rows)):
-        i = rows[k]
-        for c in range(3):
-            leaving[k, c] = x[i, c] + u[i, c]
-        leaving[k, 3] = 1.0 / stiffness[i]
+def compliances(where, stiffness, far, along, soft):
+    """Compute the displacement ``soft`` (p,) by which a unit force parts each pair [m/N].
+
+    ``stiffness`` (owned,), ``far`` (partners,) 1/stiffness; ``along`` (2, p) compliance factors of ends along the
+    direction.
+    """
+    for p in range(len(soft)):
+        i, j = where[0, p], where[1, p]
+        soft[p] = (1.0 / stiffness[i] if i >= 0 else far[-1 - i]) * along[0, p]
+        soft[p] += (1.0 / stiffness[j] if j >= 0 else far[-1 - j]) * along[1, p]
+
+
+@kernel
+def leaving_rows(rows, x, u, axes, leaving):
+    """Write components ``axes`` (k,) of x + u (owned, 3) of the nodes that partners need into ``leaving`` (rows, k)."""
+    for m in range(len(rows)):
+        i = rows[m]
+        for k in range(len(axes)):
+            leaving[m, k] = x[i, axes[k]] + u[i, axes[k]]
 
 
 @kernel

@@ -22,7 +22,16 @@ from mpi4py import MPI
 from ..mesh.exchange import swap
 from ..parallel.agreement import agreed
 from .coupled import CoupledPairs
-from .pair_loops import leaving_rows, move_nodes, needed_forces, part_nodes, pressed_nodes, push_nodes, table_forces
+from .pair_loops import (
+    compliances,
+    leaving_rows,
+    move_nodes,
+    needed_forces,
+    part_nodes,
+    pressed_nodes,
+    push_nodes,
+    table_forces,
+)
 from .pair_search import find_pairs
 
 if TYPE_CHECKING:
@@ -62,6 +71,8 @@ class ContactPairs:
         self.first, self.second = found.numbers
         directions = [np.array(pair.direction) / np.linalg.norm(pair.direction) for pair in case.contact_pair]
         self.normals = np.array(directions)[self.table]
+        self._axes = np.flatnonzero(np.any(directions, axis=0))  # components on which distances depend
+        self._soft, self._softened = np.empty(len(self.table)), None
         self.gaps = np.array([pair.gap for pair in case.contact_pair], dtype=float)[self.table]
         self.mine = self.where >= 0
         self.local = np.maximum(self.where, 0)
@@ -111,7 +122,10 @@ class ContactPairs:
             self.force = self.coupled.part(predictor, u, stiffness, time, tolerance)
             self._move(u, self.force, stiffness, contact)
         else:
-            self.force = self.part(predictor, u, stiffness, contact)
+            if stiffness is not self._softened:
+                self._soften(stiffness)
+                self._softened = stiffness
+            self.force = self._part(predictor, u, stiffness, contact)
         return bool(self.force.any())
 
     def pressed(self) -> tuple[np.ndarray, np.ndarray]:
@@ -129,21 +143,30 @@ class ContactPairs:
         """Set all forces to zero."""
         self.force = np.zeros(len(self.table))
 
-    def part(
-        self, predictor: np.ndarray, u: np.ndarray, stiffness: np.ndarray, contact: np.ndarray | None = None
-    ) -> np.ndarray:
-        """Change u (owned, 3) [m] so that predictor + u satisfies all pairs; return their forces (p,) [N]. Collective.
+    def part(self, predictor: np.ndarray, u: np.ndarray, stiffness: np.ndarray) -> np.ndarray:
+        """Change u (owned, 3) [m] so that predictor + u satisfies all pairs; return their forces (p,) [N].
 
-        ``contact`` (owned, 3): forces on the nodes, to which those of the pairs are added [N].
+        Collective.
         """
-        force, load = np.empty(len(self.table)), self._none if contact is None else contact
-        far = np.empty((0, 4))
+        self._soften(stiffness)
+        self._softened = None  # the values of the array may change
+        return self._part(predictor, u, stiffness, self._none)
+
+    def _soften(self, stiffness: np.ndarray) -> None:
+        """Compute the compliances of the pairs. Collective."""
+        far = np.empty((0, 1))
         if not self.partners.alone:
-            leaving = self.partners.leaving(4)
-            leaving_rows(self.partners.rows, predictor, u, stiffness, leaving)
+            far = self.partners.bring(1.0 / stiffness[self.partners.rows, None])
+        compliances(self.where, stiffness, far[:, 0], self._along, self._soft)
+
+    def _part(self, predictor: np.ndarray, u: np.ndarray, stiffness: np.ndarray, load: np.ndarray) -> np.ndarray:
+        force, axes, far = np.empty(len(self.table)), self._axes, np.empty((0, len(self._axes)))
+        if not self.partners.alone:
+            leaving = self.partners.leaving(len(axes))
+            leaving_rows(self.partners.rows, predictor, u, axes, leaving)
             far = self.partners.bring(leaving)
-        arrays = self.where, predictor, u, stiffness, far, self.normals, self._along, self.gaps, self.free, self._held
-        part_nodes(*arrays, force, load)
+        positions = self.where, predictor, u, stiffness, far, axes
+        part_nodes(*positions, self.normals, self._soft, self.gaps, self.free, self._held, force, load)
         return force
 
     def together(

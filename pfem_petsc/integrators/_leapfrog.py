@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from ..mechanics.compiled import kernel
 
-__all__ = ["advance", "advance_loaded", "centre", "drift", "kick", "move"]
+__all__ = ["advance", "advance_loaded", "centre", "drift", "finish", "kick", "move"]
 
 
 @kernel
@@ -37,6 +37,18 @@ def centre(u, eta, half, v):
     """Compute velocities ``v`` of the balance from the increments and the velocities half a step later."""
     for i in range(len(u)):
         v[i] = half[i] - eta * u[i]
+
+
+@kernel
+def finish(u, alpha, eta, h, half, v, a):
+    """Advance ``half`` by a step, and compute velocities ``v`` and accelerations ``a`` of the balance: :func:`kick` and
+    :func:`centre` in one pass."""
+    for i in range(len(u)):
+        pull = alpha * u[i]
+        ahead = half[i] + h * pull
+        half[i] = ahead
+        v[i] = ahead - eta * u[i]
+        a[i] = pull
 
 
 @kernel

@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ._leapfrog import centre, drift, kick
+from ._leapfrog import drift
+from ._leapfrog import finish as finish_step
 from .base import Balance, ExplicitScheme, NoParameters, State
 
 __all__ = ["Parameters", "Scheme"]
@@ -55,7 +56,6 @@ class Scheme(ExplicitScheme):
         )
 
     def finish(self, state: State, balance: Balance, u: np.ndarray, h: float) -> None:
-        state.a, state.v = balance.alpha * u, np.empty_like(u)
-        half, increments = state.memory["half_velocity"].reshape(-1), u.reshape(-1)
-        kick(increments, balance.alpha, h, half)
-        centre(increments, balance.eta, half, state.v.reshape(-1))
+        state.a, state.v = np.empty_like(u), np.empty_like(u)
+        arrays = (array.reshape(-1) for array in (state.memory["half_velocity"], state.v, state.a))
+        finish_step(u.reshape(-1), balance.alpha, balance.eta, h, *arrays)

@@ -58,6 +58,7 @@ class ExternalForce:
         self.reactions: list[tuple[np.ndarray, float, float]] = []
         changes = (self._loads is not None and not self._loads.steady) or (varies and not self._keeps[1])
         self._steady = not self.ramped and not changes
+        self._constant: np.ndarray | None = None
 
     @property
     def steady(self) -> bool:
@@ -98,6 +99,14 @@ class ExternalForce:
             force.add(time, self._state, out)
         return out
 
+    def constant(self) -> np.ndarray | None:
+        """(owned, 3) [N], which must not be changed, if the forces are the same at all times, else None."""
+        if not self.steady or self.reactions:
+            return None
+        if self._constant is None:
+            self._constant = self.at(0.0, np.empty((len(self.inertia.mass), 3)))
+        return self._constant
+
     def gravity_at(self, time: float) -> np.ndarray:
         """Acceleration (3,) [m/s2] at a time [s], or at a load factor."""
         if self._keeps[1]:
@@ -132,7 +141,7 @@ class ExternalForce:
 
     def hold(self, force: np.ndarray, gravity: np.ndarray, wind: np.ndarray, active: bool) -> None:
         """Take over what acts at the start of a stage: loads (owned, 3) [N], gravity [m/s2] and wind [m/s], (3,)."""
-        self.held, self.held_gravity = force, gravity
+        self.held, self.held_gravity, self._constant = force, gravity, None
         if self.wind is not None:
             self.wind.held = wind
         self.active = self.active or active

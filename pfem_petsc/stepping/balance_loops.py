@@ -166,16 +166,19 @@ def book_balance(f, external, damping, support, contact, v, h, totals, powers):
     """
     n = len(v)
     lanes = new_sums()
-    speeds = v.reshape(-1)
-    add_powers(f.reshape(-1), speeds, lanes[INTERNAL])
-    if len(support) > 0:
-        add_forces(support.reshape(-1), lanes[REACTIONS])
-    if len(external) > 0:
-        add_loads(external.reshape(-1), speeds, lanes)
-    if len(contact) > 0:
-        add_powers(contact.reshape(-1), speeds, lanes[CONTACT])
-    if len(damping) > 0:
-        add_drags(damping, speeds, np.empty(3 * n), lanes)
+    drag = np.empty(WIDE)
+    for first in range(0, n, LANES):  # velocities are read once from memory
+        last = min(first + LANES, n)
+        speeds = v[first:last].reshape(-1)
+        add_powers(f[first:last].reshape(-1), speeds, lanes[INTERNAL])
+        if len(support) > 0:
+            add_forces(support[first:last].reshape(-1), lanes[REACTIONS])
+        if len(external) > 0:
+            add_loads(external[first:last].reshape(-1), speeds, lanes)
+        if len(contact) > 0:
+            add_powers(contact[first:last].reshape(-1), speeds, lanes[CONTACT])
+        if len(damping) > 0:
+            add_drags(damping[first:last], speeds, drag, lanes)
     sum_balance(lanes, n, h, len(support) > 0, len(external) > 0, len(contact) > 0, len(damping) > 0, totals, powers)
 
 

@@ -38,6 +38,7 @@ class ExplicitStepper(Stepper):
         self._none = np.empty((0, 3))
         self._nobody = np.empty(0, dtype=np.int64)
         self.other_force = np.zeros_like(self.state.f)
+        self._stiffness, self._stiffness_of = np.empty(0), (0.0, 0.0, self._none)
 
     def evaluate(self, commit: bool) -> None:
         self.state.f, self.other_force = self.other_force, self.state.f
@@ -57,10 +58,19 @@ class ExplicitStepper(Stepper):
             if self.fault is None:
                 self.fault = SimulationFailure(f"{self.when(balance)}: {failure}")
 
+    def _stiffness_for(self, balance: Balance) -> np.ndarray:
+        """Return the array (owned,) for alpha m + eta c: another one if it changes, on all ranks in the same step."""
+        alpha, eta, damping = self._stiffness_of
+        inertia = self.model.inertia
+        if (alpha, eta) != (balance.alpha, balance.eta) or damping is not inertia.damping:
+            self._stiffness_of = balance.alpha, balance.eta, inertia.damping
+            self._stiffness = np.empty_like(inertia.mass)
+        return self._stiffness
+
     def solve(self, balance: Balance) -> Solution:
         model, state = self.model, self.state
         inertia = model.inertia
-        u, stiffness = np.empty_like(state.v), np.empty_like(inertia.mass)
+        u, stiffness = np.empty_like(state.v), self._stiffness_for(balance)
         explicit_increments(
             state.external if model.external.active else self._none,
             state.f,

@@ -80,6 +80,37 @@ def test_nothing_is_of_the_size_of_all_pairs(comm, shared_tmp_path):
     assert reduced[0] == reduced[1]
 
 
+@pytest.mark.parallel
+def test_a_step_sends_what_the_distance_depends_on(comm, shared_tmp_path):
+    """One number per node and direction along an axis, and compliances only where the stiffness is another array."""
+    case = two_lattices(shared_tmp_path / "m.vtu", "central_differences", direction=(2.0, 0.0, 0.0))
+    model = Model(Case.from_dict(case), comm)
+    pairs, widths = model.pairs, []
+    bring = pairs.partners.bring
+
+    def counting(leaving):
+        widths.append(leaving.shape[1])
+        return bring(leaving)
+
+    pairs.partners.bring = counting
+    x = model.mesh.points[: model.mesh.n_owned].copy()
+    approach = 0.01 * np.where(x[:, :1] > 0.1015, -1.0, 1.0) * [1.0, 0.3, 0.2]
+    forces, sent = [], [2, 1, 2]  # messages of steps with a stiffness, with the same one, and with another one
+    for hard, messages in zip((soft := np.full(len(x), 2.0), soft, np.full(len(x), 4.0)), sent, strict=True):
+        u, contact = approach.copy(), np.zeros_like(x)
+        widths.clear()
+        pairs.explicit(x, u, hard, contact, 0.0, 1e-12)
+        assert widths == ([] if pairs.partners.alone else [1] * messages)
+        forces.append(pairs.force.copy())
+        gap = pairs.distances(pairs.gather(x + u))
+        assert gap[pairs.force > 0.0] == pytest.approx(0.0, abs=1e-15)
+        assert np.allclose(u, approach + contact / hard[:, None], rtol=0, atol=1e-15)
+        assert (contact[:, 1:] == 0.0).all()
+    assert pairs.any_pressed()
+    assert np.array_equal(forces[0], forces[1])
+    assert np.allclose(2.0 * forces[0], forces[2], rtol=1e-14, atol=0.0)
+
+
 CASES = {
     "explicit": ("central_differences", False, {}),
     "explicit, supported": ("chung_lee", False, {"supports": [{"node_set": "held", "fix": "y"}]}),

@@ -19,7 +19,9 @@ if TYPE_CHECKING:
 
 __all__ = ["AssembledPreconditioner"]
 
-_FEW = 64  # nodes a rank; aggregates of fewer unknowns than rigid body modes make PETSc 3.18 fail on several ranks
+# Nodes a rank. Aggregates of fewer unknowns than rigid body modes make PETSc 3.18 fail on several ranks, and let solves
+# stagnate on one.
+_FEW = 64
 _DENSE = 3.0  # entries of coarse matrices relative to the finest; cubic and octet lattices have 0.2 to 0.5
 _PREFIX = "pfem_assembled_"
 
@@ -104,7 +106,7 @@ class AssembledPreconditioner:
         centre = self.mesh.comm.allreduce(x.sum(axis=0)) / self.mesh.n_nodes
         # multigrid builds the rigid body modes from them, which it must not damp. MatNullSpaceCreateRigidBody would
         # orthogonalise them, with rounding that is not reproducible in PETSc 3.26
-        if self.mesh.comm.size == 1 or self.mesh.n_nodes > _FEW * self.mesh.comm.size:
+        if self.mesh.n_nodes > _FEW * self.mesh.comm.size:
             self._inner.setCoordinates(x - centre)
         with reproducible_products(self.mesh.comm):
             self._inner.setUp()

@@ -74,7 +74,11 @@ def test_messages_of_ghosts_are_counted_with_their_bytes(comm):
     sent, received, leaving, arriving = mesh.traffic(np.empty((mesh.n_local, 3)))
     assert arriving == 24 * (mesh.n_local - mesh.n_owned)
     assert comm.allreduce(leaving) == comm.allreduce(arriving)
-    assert comm.allreduce(sent) == comm.allreduce(received) == 2 * (comm.size - 1)  # a chain
+    owned = comm.allgather(set(mesh.node_ids[: mesh.n_owned].tolist()))
+    ghosts = set(mesh.node_ids[mesh.n_owned :].tolist())
+    assert received == sum(bool(ghosts & other) for other in owned)
+    assert comm.allreduce(sent) == comm.allreduce(received)
+    assert received > 0 or comm.size == 1
     counters = _Counters()
     before = [place.value for place in counters._places]
     counters.add((sent, received, leaving, arriving))

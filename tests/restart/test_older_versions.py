@@ -1,7 +1,7 @@
 """Files of runs of older versions, kept as they were written: results open, checkpoints are refused.
 
-A rod of two bars flies towards a wall at 1 m/s and meets it after 10 steps of 1 µs; the run of 20 steps has snapshots every
-10 steps and a row of the history every 5. The files of 0.1.0 are from before it wrote checksums.
+A rod of two bars flies towards a wall at 1 m/s and meets it after 10 steps of 1 µs; the run of 20 steps has snapshots
+every 10 steps and a row of the history every 5. The files of 0.1.0 are from before it wrote checksums.
 """
 
 import lzma
@@ -83,7 +83,7 @@ def test_checkpoints_are_refused(version, tmp_path, capsys):
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     assert main([str(case), "-o", str(folder), "--restart", "--set", "time.end=3e-5"]) == 2
     assert (
-        f"checkpoint.h5: holds version {VERSIONS[version]} of a run's state, this program reads {STATE_VERSION}: restart "
-        f"with the version of pfem_petsc that wrote it ({version}), or start without --restart"
+        f"checkpoint.h5: holds version {VERSIONS[version]} of a run's state, this program reads {STATE_VERSION}: "
+        f"restart with the version of pfem_petsc that wrote it ({version}), or start without --restart"
     ) in capsys.readouterr().err
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before

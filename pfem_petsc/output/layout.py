@@ -135,7 +135,8 @@ def complete_snapshots(file: h5py.File) -> int:
         len(file["snapshots/time"]),
     ]
     lengths += [len(steps[name]) for name in PER_STEP]
-    lengths.append(len(file[CHECKS]["snapshots"]) if "snapshots" in file[CHECKS] else 0)
+    if CHECKS in file:  # 0.1.0 wrote none
+        lengths.append(len(file[CHECKS]["snapshots"]) if "snapshots" in file[CHECKS] else 0)
     n_nodes, n_bars = int(vtk["NumberOfPoints"][0]), int(vtk["NumberOfCells"][0])
     for name, dataset in field_datasets(vtk).items():
         rows = n_bars if name.startswith("CellData") else n_nodes
@@ -151,7 +152,7 @@ def complete_rows(file: h5py.File, table: str = "history") -> int:
     return min(
         [
             int(rows.attrs["rows"]),
-            len(file[CHECKS][table]),
+            *([len(file[CHECKS][table])] if CHECKS in file else []),
             *(len(rows[name]) for name in dataset_names(rows)),
         ]
     )

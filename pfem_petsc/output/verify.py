@@ -86,6 +86,7 @@ def _main(path: Path, deep: bool) -> int:
 
     from .digests import CHECKS, damages
     from .hdf5 import dataset_names
+    from .provenance import read_attributes
     from .result import readable
 
     try:
@@ -95,9 +96,10 @@ def _main(path: Path, deep: bool) -> int:
             for name in ("VTKHDF", "VTKHDF/Steps", "history", "case"):
                 dict(file[name].attrs)
             if CHECKS not in file:
+                version = read_attributes(file["case"]).get("pfem_petsc", "an earlier one")
                 raise InputError(
-                    f"{path}: has no checksums: it was written by an earlier version of pfem_petsc; "
-                    "run the case again, or read it with that version"
+                    f"{path}: has no checksums: version {version} of pfem_petsc wrote it; "
+                    "run the case again, or read it with that version, open_result or ParaView"
                 )
             for line in damages(file, deep):
                 print(line, flush=True)

@@ -158,15 +158,15 @@ def split_planes(typingctx, x, first, count, planes, stride, base):  # noqa: ANN
 
 
 @intrinsic
-def join_planes(typingctx, planes, stride, base, first, count, f):  # noqa: ANN001, ANN201
+def join_planes(typingctx, planes, stride, base, first, count, f, row):  # noqa: ANN001, ANN201
     """Write the vectors of ``count`` nodes from ``first`` on in ``planes`` (3 stride,), which begin at node ``base``,
-    to ``f`` (n, 3)."""
+    to ``f`` (n, 3), from ``row`` on."""
 
     def generate(context, builder, signature, values):  # noqa: ANN001, ANN202
         given = Arguments(context, builder, signature, values)
         first = given.index(3)
         ends = [given.plane(0, builder.sub(first, given.index(2)), given.index(1), c) for c in _AXES]
-        nodes = given.numbers(5, first, 3)
+        nodes = given.numbers(5, given.index(6), 3)
 
         def body(at: Any, strip: Strip) -> None:
             strip.store_nodes(weave(builder, [strip.load(end, at) for end in ends]), nodes, at)
@@ -174,7 +174,7 @@ def join_planes(typingctx, planes, stride, base, first, count, f):  # noqa: ANN0
         for_strips(builder, given.index(4), body)
         return context.get_dummy_value()
 
-    return types.void(planes, stride, base, first, count, f), generate
+    return types.void(planes, stride, base, first, count, f, row), generate
 
 
 @borrowing

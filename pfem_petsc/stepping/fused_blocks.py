@@ -2,7 +2,8 @@
 
 ``nodes`` are a :class:`~pfem_petsc.stepping.fused_arrays.NodeArrays`; ``alpha``, ``eta`` and ``h`` are the scheme's,
 see :mod:`~pfem_petsc.integrators._leapfrog`; ``lanes`` are the sums of the balance, see
-:mod:`~pfem_petsc.stepping.balance_loops`. Other arrays have a row for each owned node, except buffers of a block.
+:mod:`~pfem_petsc.stepping.balance_loops`. Other arrays have a row for each owned node, except buffers of a block; the
+internal forces ``f`` begin at node ``start``, because steps whose forces nothing reads keep those of one block only.
 """
 
 from __future__ import annotations
@@ -46,14 +47,14 @@ def split_block(first, last, x, planes, pulls, base):
 
 
 @borrowing
-def join_block(block, n, pulls, base, f):
+def join_block(block, n, pulls, base, f, start):
     """Write the forces of the nodes of a block from ``pulls``."""
     first = NODE_BLOCK * block
-    join_planes(pulls, len(pulls) // 3, base, first, min(NODE_BLOCK, n - first), f)
+    join_planes(pulls, len(pulls) // 3, base, first, min(NODE_BLOCK, n - first), f, first - start)
 
 
 @borrowing
-def advance_block(block, nodes, x, f, half, h, alpha, eta, inverses, factors, speeds, held, support, lanes):
+def advance_block(block, nodes, x, f, start, half, h, alpha, eta, inverses, factors, speeds, held, support, lanes):
     """Finish the step of a block without walls and damping in one pass: forces alone determine its increments.
 
     ``inverses`` (n,) of the stiffness; ``factors`` and ``speeds`` (3 NODE_BLOCK,) buffers; the increments of prescribed
@@ -64,6 +65,7 @@ def advance_block(block, nodes, x, f, half, h, alpha, eta, inverses, factors, sp
     begin, end = nodes.support_starts[block], nodes.support_starts[block + 1]
     components = nodes.support_components
     here, factor = speeds[: 3 * (last - first)], factors[: 3 * (last - first)]
+    forces = f[first - start : last - start]
     spread(inverses[first:last], factor)
     hold_still(
         begin,
@@ -74,7 +76,7 @@ def advance_block(block, nodes, x, f, half, h, alpha, eta, inverses, factors, sp
         nodes.support_positions,
         nodes.mass,
         nodes.external,
-        f,
+        forces,
         x,
         half,
         h,
@@ -83,7 +85,7 @@ def advance_block(block, nodes, x, f, half, h, alpha, eta, inverses, factors, sp
         held,
         support,
     )
-    force, ahead = f[first:last].reshape(-1), half[first:last].reshape(-1)
+    force, ahead = forces.reshape(-1), half[first:last].reshape(-1)
     if len(nodes.external) > 0:
         load = nodes.external[first:last].reshape(-1)
         advance_loaded(force, load, factor, alpha, eta, h, ahead, here, lanes[INTERNAL])
@@ -96,7 +98,7 @@ def advance_block(block, nodes, x, f, half, h, alpha, eta, inverses, factors, sp
 
 
 @borrowing
-def solve_block(block, nodes, x, f, half, h, alpha, eta, inverses, factors, free, u, load, held):
+def solve_block(block, nodes, x, f, start, half, h, alpha, eta, inverses, factors, free, u, load, held):
     """Compute the increments ``u`` (3 m,) of a block without contact, and its ``free`` positions (3 m,); for its
     prescribed components the increments ``held`` (k,) [m] and ``load`` (k,), the forces that would move them [N].
 
@@ -104,7 +106,8 @@ def solve_block(block, nodes, x, f, half, h, alpha, eta, inverses, factors, free
     """
     first = NODE_BLOCK * block
     last = min(first + NODE_BLOCK, len(half))
-    where, force, speed = x[first:last].reshape(-1), f[first:last].reshape(-1), half[first:last].reshape(-1)
+    where, speed = x[first:last].reshape(-1), half[first:last].reshape(-1)
+    force = f[first - start : last - start].reshape(-1)
     factor = factors[: len(u)]
     damped = len(nodes.damping) > 0
     if len(nodes.external) > 0:
@@ -132,7 +135,7 @@ def solve_block(block, nodes, x, f, half, h, alpha, eta, inverses, factors, free
 
 
 @borrowing
-def finish_block(block, nodes, f, half, h, alpha, eta, contact, u, load, speeds, drag, support, lanes):
+def finish_block(block, nodes, f, start, half, h, alpha, eta, contact, u, load, speeds, drag, support, lanes):
     """Finish the step of a block from its increments ``u`` (3 m,): reactions, velocities half a step later, and powers.
 
     ``speeds`` and ``drag`` (3 NODE_BLOCK,) are buffers, the latter empty without damping.
@@ -148,7 +151,7 @@ def finish_block(block, nodes, f, half, h, alpha, eta, contact, u, load, speeds,
     ahead, here = half[first:last].reshape(-1), speeds[: len(u)]
     kick(u, alpha, h, ahead)
     centre(u, eta, ahead, here)
-    add_powers(f[first:last].reshape(-1), here, lanes[INTERNAL])
+    add_powers(f[first - start : last - start].reshape(-1), here, lanes[INTERNAL])
     add_sparse_forces(begin, end, nodes.support_nodes, nodes.support_components, support, lanes[REACTIONS])
     if len(nodes.external) > 0:
         add_loads(nodes.external[first:last].reshape(-1), here, lanes)

@@ -91,6 +91,16 @@ def make_fused_loop(
         law = (bars.parameters, h)
         return pull_columns(x, bars.planes, bars.pulls, base, bars.sweep, bars.columns, begun, ended, *law, work)
 
+    @borrowing
+    def pull_again(x, n, bars, h, f, work, aside):
+        """Compute all forces in the order of a step."""
+        flat = f.reshape(-1)
+        for j in range(len(flat)):
+            flat[j] = 0.0
+        if len(x) > n:
+            pull(x, bars, bars.sweep.counted, len(bars.sweep.diagonal), h, f, aside)
+        pull(x, bars, 0, bars.sweep.counted, h, f, work)
+
     @kernel
     def fused_loop(
         count,
@@ -131,6 +141,7 @@ def make_fused_loop(
         ends, totals, lanes, room = np.empty(len(WORKS)), np.zeros((6, 3)), new_sums(), new_lanes()
         row_lanes, after = new_sums(), np.empty(len(WORKS))
         work, columns_work = np.empty(work_rows * CHUNK), new_rows(column_rows)
+        pulled = np.empty((NODE_BLOCK, 3))  # forces of a block
         push_u = np.empty(impulses.v.shape)
         near = touched  # nodes with entries in the array of wall forces
         pressed = new_pressed(n, n_walls)
@@ -150,6 +161,7 @@ def make_fused_loop(
         lost = 0  # error code of MPI
         aside = np.empty(len(work) if several else 0)  # energies of bars that other ranks count
         spread = False  # whether the history of the bars is that of the columns
+        shortened = False
         for step in range(count):
             row = sums[step]
             row[_ALARM] = 0.0
@@ -164,7 +176,7 @@ def make_fused_loop(
             for i in near:
                 contact[i] = 0.0
             clear_forces(lanes, n, supported, loaded, damped)
-            shortened, changed = False, 0
+            changed = 0
             changes = 0
             moved = 0
             base = 0  # first node of the planes
@@ -176,6 +188,11 @@ def make_fused_loop(
                 else:
                     gather_history(bars.sweep, bars.columns, bars.history)
                 spread = light
+            # Forces that nothing reads stay in the cache. The check of shortened bars reads them, as the next one is
+            # likely to; those of laws with history could not be computed again.
+            brief = light and not shortened and len(bars.history) == 0
+            forces = pulled if brief else f
+            shortened = False
             if several:
                 lost = start_positions(messages, x, h, half)
                 if lost != 0:
@@ -222,12 +239,13 @@ def make_fused_loop(
                         base = live
                     move_block(moved, n, x, h, half, f, light, planes, pulls, base)
                     moved += 1
+                start = NODE_BLOCK * block if brief else 0
                 if light:
                     if block < len(parts) - 1:
                         at, short = pull_light(x, bars, base, parts[block], parts[block + 1], h, columns_work)
                         failed = at if failed < 0 else failed
                         shortened = shortened or short
-                    join_block(block, n, pulls, base, f)
+                    join_block(block, n, pulls, base, forces, start)
                 elif block < len(chunks) - 1:
                     at, short, broke = pull(x, bars, chunks[block], chunks[block + 1], h, f, work)
                     failed = at if failed < 0 else failed
@@ -235,18 +253,34 @@ def make_fused_loop(
                     changed += broke
                 if plain:
                     advance_block(
-                        block, nodes, x, f, half, h, alpha, eta, inverses, factors, speeds, held, support, lanes
+                        block,
+                        nodes,
+                        x,
+                        forces,
+                        start,
+                        half,
+                        h,
+                        alpha,
+                        eta,
+                        inverses,
+                        factors,
+                        speeds,
+                        held,
+                        support,
+                        lanes,
                     )
                     continue
                 first, last = NODE_BLOCK * block, min(NODE_BLOCK * (block + 1), n)
                 free, here = speeds[: 3 * (last - first)], increments[: 3 * (last - first)]
-                solve_block(block, nodes, x, f, half, h, alpha, eta, inverses, factors, free, here, load, held)
+                given = (block, nodes, x, forces, start, half)
+                solve_block(*given, h, alpha, eta, inverses, factors, free, here, load, held)
                 found = find_pressed(block, walls, free) if n_walls > 0 else 0
                 if found > 0:
                     at = press_block(block, found, nodes, walls, free, here, alpha, eta, contact, pressed, count_near)
                     infeasible = at if infeasible < 0 else infeasible
                     count_near += found
-                finish_block(block, nodes, f, half, h, alpha, eta, contact, here, load, speeds, drag, support, lanes)
+                ahead = (block, nodes, forces, start, half)
+                finish_block(*ahead, h, alpha, eta, contact, here, load, speeds, drag, support, lanes)
                 alone[block] = not (damped or on_walls[block] or found > 0)
                 if not alone[block]:
                     kept = u[first:last].reshape(-1)
@@ -281,6 +315,8 @@ def make_fused_loop(
             wrong = failed >= 0 or infeasible >= 0 or changed > 0 or not np.isfinite(after[INTERNAL])
             if due[step] or shortened or wrong or step == count - 1:
                 turned = -1
+                if brief:
+                    pull_again(x, n, bars, h, f, work, aside)
                 complete(n, f, half, nodes, alpha, eta, alone, held, stiffness, u, a, v)
                 if shortened or wrong or step == count - 1:
                     start_of_step(x[:n].reshape(-1), h, v.reshape(-1), a.reshape(-1), before[:n].reshape(-1))

@@ -20,6 +20,10 @@ CASES = {
         "wall": [FLOOR],
     },
     "block": {"mesh": BLOCK | {"cells": [9, 10, 11]}},
+    "shortened bars": {
+        "mesh": BLOCK | {"cells": [9, 10, 11]},
+        "load": [{"node_set": "corner", "force": [1e5, 3e3, 0.0]}],  # by up to 17 %
+    },
     "missing bars": {"mesh": BLOCK | {"cells": [16, 17, 16], "missing": 0.02, "seed": 4}},
     "moving window": {"mesh": BLOCK | {"cells": [45, 12, 12]}},
     "held on a wall": {

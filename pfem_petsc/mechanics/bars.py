@@ -82,9 +82,10 @@ class Bars:
         self.can_break = any(law.rupture >= 0 for law in laws)
         self._watched = np.empty(len(mesh.bars) if self.can_break else 0)
         self.kept_names = list(dict.fromkeys(name for law in laws for name, _ in law.rows))
-        self.far = np.maximum(
-            mesh.bars[:, 0], mesh.bars[:, 1], out=np.empty(len(mesh.bars), dtype=np.uint32), casting="unsafe"
-        )
+        # loops over diagonal runs know the ends from those of the first bar
+        count = 0 if all(block.sweep.diagonal.all() for block in self.blocks) else len(mesh.bars)
+        self.far = np.empty(count, dtype=np.uint32)
+        np.maximum(mesh.bars[:count, 0], mesh.bars[:count, 1], out=self.far, casting="unsafe")
 
     @property
     def slackens(self) -> bool:

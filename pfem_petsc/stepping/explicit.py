@@ -27,7 +27,8 @@ class ExplicitStepper(Stepper):
 
     Attributes
     ----------
-    other_force : (local, 3) internal force before the last evaluation [N], overwritten by the next one
+    other_force : (local, 3) internal force before the last evaluation [N], overwritten by the next one; None after fused
+        steps, which keep one force
     """
 
     renews_forces = True
@@ -37,11 +38,12 @@ class ExplicitStepper(Stepper):
         super().__init__(model, scheme, h)
         self._none = np.empty((0, 3))
         self._nobody = np.empty(0, dtype=np.int64)
-        self.other_force = np.zeros_like(self.state.f)
+        self.other_force: np.ndarray | None = None
         self._stiffness, self._stiffness_of = np.empty(0), (0.0, 0.0, self._none)
 
     def evaluate(self, commit: bool) -> None:
-        self.state.f, self.other_force = self.other_force, self.state.f
+        other = np.empty_like(self.state.f) if self.other_force is None else self.other_force
+        self.state.f, self.other_force = other, self.state.f
         super().evaluate(commit)
 
     def accelerate(self, load: np.ndarray) -> np.ndarray:

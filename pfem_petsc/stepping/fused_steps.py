@@ -164,6 +164,7 @@ class Batch:
         pushed = ledger.impulses.state
         impulses = ImpulseArrays(pushed.memory["half_velocity"], pushed.a, pushed.v)
         ledger.sums[_BROKEN] = stepper.ruptures.count
+        stepper.other_force, stepper.solution.u = None, stepper.zero  # room for what the loop needs
         done, lost, changed, failed, turned, infeasible, offsets, kinetic, u, touched, log.last, met = self._fused_loop(
             len(due),
             stepper.h,

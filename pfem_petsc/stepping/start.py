@@ -62,7 +62,8 @@ def start_in_motion(stepper: Stepper) -> None:
         v, speeds = state.v, motion.speeds
         solve_and_finish(stepper, state.time)
         stepper.totals_solved = stepper.totals()
-        stepper.velocity_solved = state.v
+        if model.inertia.damped:
+            stepper.velocity_solved = state.v
         # nodes on a wall have not lost their velocity yet; the scheme continues from its own memory
         state.v = v
         motion.set_speeds(speeds)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-import shutil
 import subprocess
 import sys
+from shutil import which
 
 import pytest
 
@@ -216,7 +216,7 @@ def test_bash_completes(script, line, expected, not_expected):
         f'compopt() {{ :; }}; source {script}; COMP_LINE="{line}"; COMP_POINT=${{#COMP_LINE}}; _pfem_petsc; '
         'printf "%s\\n" "${COMPREPLY[@]}"'
     )
-    done = subprocess.run([shutil.which("bash") or "/bin/bash", "-c", code], capture_output=True, text=True, check=True)
+    done = subprocess.run([which("bash") or "/bin/bash", "-c", code], capture_output=True, text=True, check=True)
     found = set(done.stdout.split())
     assert expected <= found and not found & not_expected and not done.stderr
 
@@ -259,7 +259,7 @@ IN_SHELLS = [
 
 @pytest.mark.parametrize(("line", "expected", "not_expected"), IN_SHELLS)
 def test_fish_completes(scripts, line, expected, not_expected):
-    if shutil.which("fish") is None:
+    if which("fish") is None:
         pytest.skip("no fish here")
     code = f"source {scripts['fish']}; complete -C '{line}'"
     done = subprocess.run(["fish", "--no-config", "-c", code], capture_output=True, text=True, check=True)
@@ -270,7 +270,7 @@ def test_fish_completes(scripts, line, expected, not_expected):
 @pytest.mark.parametrize(("line", "expected", "not_expected"), IN_SHELLS)
 @pytest.mark.parametrize("name", ["_pfem_petsc_zsh", "_pfem-petsc"])  # sourced, and found in a folder of $fpath
 def test_zsh_completes(scripts, line, expected, not_expected, name):
-    if shutil.which("zsh") is None:
+    if which("zsh") is None:
         pytest.skip("no zsh here")
     words = line.split()
     code = "compadd() { print -l -- $@ }; compdef() { :; }; _files() { :; };"

@@ -7,6 +7,8 @@ Hilbert curve 4.6, 5.5 and more, blocks and columns of cells are in between, a r
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 __all__ = [
@@ -44,6 +46,8 @@ _STEPS = 1 << 20
 
 # Number of points processed at a time, so that temporary arrays stay in the cache.
 _PIECE = 1 << 15
+
+_BARS = 1 << 20  # bars sorted at a time, to keep temporary arrays small
 
 
 def hilbert_keys(points: np.ndarray, low: np.ndarray, extent: float) -> np.ndarray:
@@ -212,29 +216,51 @@ def bar_order(bars: np.ndarray, group: np.ndarray | None, n_local: int) -> np.nd
     n_local : int
         Number of local nodes.
     """
-    low = np.minimum(bars[:, 0], bars[:, 1])
-    block = (low // NODE_BLOCK).astype(np.int64)
-    low %= NODE_BLOCK
-    offset = np.abs(bars[:, 1] - bars[:, 0])
-    blocks = n_local // NODE_BLOCK + 1
+    block = np.minimum(bars[:, 0], bars[:, 1])
+    block //= NODE_BLOCK
     if group is not None:
-        if int(group.max(initial=0) + 1) * blocks * NODE_BLOCK * n_local >= 1 << 63:
-            order = np.lexsort((low, offset, block, group))
-            return order
-        block += group.astype(np.int64) * blocks
-    key = block * n_local
-    key += offset
-    key *= NODE_BLOCK
-    key += low
-    order = np.argsort(key, kind="stable")
-    scattered = _scattered(key[order], block[order], LEAST_RUN)
-    if len(scattered):
-        stars = np.isin(block, scattered)
-        if np.count_nonzero(stars) <= FEW * len(block):
-            return order
-        key[stars] = (block[stars] * NODE_BLOCK + low[stars]) * n_local + offset[stars]
-        order = np.argsort(key, kind="stable")
+        block = block + group.astype(np.int64) * (n_local // NODE_BLOCK + 1)
+    order = np.argsort(block, kind="stable").astype(np.int32 if len(bars) < 1 << 31 else np.int64)
+    block = block[order]
+    irregular, short = 0, []
+    for first, last in _pieces(block):
+        rows = order[first:last]
+        number, low, offset = _places(bars[rows], block[first:last])
+        key = (number * n_local + offset) * NODE_BLOCK + low
+        place = np.argsort(key, kind="stable")
+        order[first:last] = rows[place]
+        scattered = _scattered(key[place], number, LEAST_RUN)
+        if len(scattered):
+            irregular += np.count_nonzero(np.isin(number, scattered))
+            short.append((first, last, scattered))
+    if irregular <= FEW * len(bars):
+        return order
+    for first, last, scattered in short:
+        rows = order[first:last]
+        number, low, offset = _places(bars[rows], block[first:last])
+        stars = np.isin(number, scattered)
+        major, minor = np.where(stars, low, offset), np.where(stars, offset, low)
+        order[first:last] = rows[np.lexsort((minor, major, number))]
     return order
+
+
+def _pieces(block: np.ndarray) -> Iterator[tuple[int, int]]:
+    """Yield ranges [first, last) of the sorted ``block`` (b,): whole blocks of about :data:`_BARS` bars, or one."""
+    first = 0
+    while first < len(block):
+        last = len(block)
+        if first + _BARS < last:
+            last = int(np.searchsorted(block, block[first + _BARS], side="left"))
+            last = last if last > first else int(np.searchsorted(block, block[first], side="right"))
+        yield first, last
+        first = last
+
+
+def _places(bars: np.ndarray, block: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return consecutive numbers of the sorted ``block`` (b,) of bars, their lower ends in it, and the offsets of their
+    ends."""
+    low, high = bars.min(axis=1).astype(np.int64), bars.max(axis=1)
+    return np.cumsum(np.diff(block, prepend=block[:1]) != 0), low % NODE_BLOCK, high - low
 
 
 def _scattered(key: np.ndarray, block: np.ndarray, least: float) -> np.ndarray:

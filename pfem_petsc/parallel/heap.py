@@ -10,7 +10,7 @@ import contextlib
 import ctypes
 from collections.abc import Iterator
 
-__all__ = ["returning_freed_memory"]
+__all__ = ["return_freed_memory", "returning_freed_memory"]
 
 _TRIM_THRESHOLD, _MMAP_THRESHOLD, _MMAP_MAX = -1, -3, -4  # of mallopt(3) of the GNU C library
 
@@ -37,6 +37,13 @@ def returning_freed_memory() -> Iterator[None]:
         library.malloc_trim(0)
         library.mallopt(_MMAP_MAX, 0)
         library.mallopt(_TRIM_THRESHOLD, -1)
+
+
+def return_freed_memory() -> None:
+    """Return what is free now, for example before steps that need less than those before."""
+    library = _glibc()
+    if library is not None:
+        library.malloc_trim(0)
 
 
 def _glibc() -> ctypes.CDLL | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -41,8 +42,13 @@ class Checkpoints:
         self.comm = stepper.model.comm
         self.state = RunState(stepper)
         self.last_step = -1
+        self._model = stepper.model
+
+    @cached_property
+    def _mark(self) -> int:
+        """Checksum of the mesh, which runs without checkpoints do not need. Collective at first use."""
         state = self.state
-        self._mark = mesh_mark(stepper.model, state.node_order, state.bar_order, state.counted)
+        return mesh_mark(self._model, state.node_order, state.bar_order, state.counted)
 
     @property
     def wanted(self) -> bool:

@@ -102,7 +102,7 @@ def mesh_mark(model: Model, node_order: NaturalOrder, bar_order: NaturalOrder, c
     """Return a checksum of coordinates and bar ends, the same on any number of ranks. Collective."""
     mesh = model.mesh
     points = node_order.to_slab(mesh.points[: mesh.n_owned])
-    ends = bar_order.to_slab(mesh.node_ids[mesh.bars[counted]].astype(np.int64).reshape(-1, 2))
+    ends = bar_order.to_slab(mesh.node_ids[mesh.bars[counted]].astype(np.int64, copy=False).reshape(-1, 2))
     comm: MPI.Comm = model.comm
     return checksum(comm, points, node_order.first) ^ checksum(comm, ends, bar_order.first)
 

@@ -27,8 +27,8 @@ class ExplicitStepper(Stepper):
 
     Attributes
     ----------
-    other_force : (local, 3) internal force before the last evaluation [N], overwritten by the next one; None after fused
-        steps, which keep one force
+    other_force : (local, 3) internal force before the last evaluation [N], overwritten by the next one; None after
+        fused steps, which keep one force
     """
 
     renews_forces = True

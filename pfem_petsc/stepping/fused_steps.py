@@ -16,6 +16,7 @@ from ..mechanics.kernels import fused_parts
 from ..mechanics.planes import new_planes
 from ..mesh.ordering import NODE_BLOCK
 from ..output.sums import HEAD, WALL
+from ..parallel.heap import return_freed_memory
 from ..tolerances import PROJECTED
 from .fused_arrays import BarArrays, ImpulseArrays, NodeArrays, ProbeArrays, StateArrays, WallArrays
 from .fused_loop import make_fused_loop
@@ -91,6 +92,7 @@ class Batch:
         self._probes = ProbeArrays(*recorder.probed())
         self._messages = model.mesh.messages()
         self.sums = np.zeros((MOST, recorder.width))
+        self._first = True
 
     def _columns(self) -> Columns:
         """Return the columns of the bars, or none if bars are heated, can break or are not in diagonal runs."""
@@ -165,6 +167,9 @@ class Batch:
         impulses = ImpulseArrays(pushed.memory["half_velocity"], pushed.a, pushed.v)
         ledger.sums[_BROKEN] = stepper.ruptures.count
         stepper.other_force, stepper.solution.u = None, stepper.zero  # room for what the loop needs
+        if self._first:
+            return_freed_memory()
+            self._first = False
         done, lost, changed, failed, turned, infeasible, offsets, kinetic, u, touched, log.last, met = self._fused_loop(
             len(due),
             stepper.h,

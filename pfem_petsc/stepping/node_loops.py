@@ -70,8 +70,8 @@ def hold_still(
     """:func:`hold` and :func:`react` for a leapfrog scheme without damping and contact, before its other components.
 
     Writes the increments of the prescribed components [begin, end) to ``held`` (k,) and their reactions to ``support``
-    (owned, 3) [N], and sets their inverse stiffness to zero in ``inverse`` (3 m,). This array and the forces ``f`` (m, 3)
-    are those of the nodes from ``origin`` on.
+    (owned, 3) [N], and sets their inverse stiffness to zero in ``inverse`` (3 m,). This array and the forces ``f`` (m,
+    3) are those of the nodes from ``origin`` on.
     """
     loaded = len(external) > 0
     for k in range(begin, end):

@@ -54,7 +54,7 @@ class Stepper(ABC):
     step_changed : whether the scheme was notified of another step size since the last booking
     totals_at_start, totals_solved : (3, 3) this rank's sums of support, external and damping force [N] at the start,
         and of the balance solved there by a scheme that solves for the next position; None after a restart
-    velocity_solved : (owned, 3) velocity of that balance, on which its damping force depends [m/s]; zero without damping
+    velocity_solved : (owned, 3) velocity of that balance if there is damping, whose force depends on it [m/s]
     walls_at_start, links_at_start : (walls, 3), (tables of links, 3) forces at the start [N]
     renews_forces : each evaluation of the state fills another array ``state.f``, so that the last one is kept
     steady : the loop over many steps (``stepping/fused_loop.py``) makes the same steps, where all else allows it

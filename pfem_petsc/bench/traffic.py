@@ -24,7 +24,8 @@ ASSUMED = {
     "bar in a run": 8,  # rest length 8
     "other bar": 12,  # and the far end 4
     "plastic bar": 16,  # plastic and accumulated plastic strain
-    "explicit node": 6 * _VECTOR + 8,  # x, v, f read and written; mass read
+    "explicit node": 4 * _VECTOR + 8,  # x, v read and written; mass read
+    "kept force": 2 * _VECTOR,  # f written and read
     "node of a row": 2 * _VECTOR,  # velocity and acceleration written
     "residual node": 4 * _VECTOR + 8,  # increment, predictor, known terms read, residual written; mass read
     "linearised bar": 16,  # two stiffnesses
@@ -83,6 +84,9 @@ def bytes_per_step(work: Work) -> float:
     far = (1.0 - work.runs) * (size["other bar"] - size["bar in a run"])
     bar = size["bar in a run"] + far + (size["plastic bar"] if work.plastic else 0)
     total = bars * bar + nodes * (size["explicit node"] + work.rows * size["node of a row"])
+    # forces that no row reads stay in the cache, if all bars go by runs and keep nothing
+    unread = work.runs == 1.0 and not work.plastic and not work.implicit
+    total += nodes * size["kept force"] * (work.rows if unread else 1.0)
     if not work.implicit:
         return float(total)
     evaluation = bars * bar + nodes * size["residual node"]

@@ -37,6 +37,9 @@ def test_explicit_bytes_by_hand():
     nodes = 10 * (2 * 3 * 24 + 8)
     assert bytes_per_step(Work(100, 10)) == 100 * 12 + nodes
     assert bytes_per_step(Work(100, 10, runs=0.75, rows=0.1)) == 75 * 8 + 25 * 12 + nodes + 0.1 * 10 * 48
+    # forces of bars in runs are kept where a row reads them
+    assert bytes_per_step(Work(100, 10, runs=1.0, rows=0.1)) == 100 * 8 + 10 * (104 + 0.1 * (48 + 48))
+    assert bytes_per_step(Work(100, 10, runs=1.0, plastic=True)) == 100 * 24 + nodes
 
 
 def test_a_matrix_moves_more_than_bars():

@@ -197,9 +197,7 @@ def _among_ranks(mesh: DistributedMesh, slab: MeshSlab, section: np.ndarray, own
     directory = to_owner.reply(numbers)
     del to_owner, numbers
 
-    bars, bar_ids, section, groups, fields = _fetch_bars(slab, section, directory, starts, comm)
-    if not keep:
-        slab.bars = slab.bars[:0].copy()
+    bars, bar_ids, section, groups, fields = _fetch_bars(slab, section, directory, starts, comm, keep)
 
     first, last = starts[comm.rank], starts[comm.rank + 1]
     elsewhere = bars[(bars < first) | (bars >= last)]
@@ -229,7 +227,7 @@ def _among_ranks(mesh: DistributedMesh, slab: MeshSlab, section: np.ndarray, own
 
 
 def _fetch_bars(
-    slab: MeshSlab, section: np.ndarray, directory: np.ndarray, starts: np.ndarray, comm: MPI.Comm
+    slab: MeshSlab, section: np.ndarray, directory: np.ndarray, starts: np.ndarray, comm: MPI.Comm, keep: bool
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Return ends (PETSc numbers), mesh numbers, sections, group memberships and fields of bars connected to owned
     nodes."""
@@ -241,16 +239,23 @@ def _fetch_bars(
         asked = asking.send(wanted.astype(np.int64)) - slab.first_node
         numbers[start : start + _PIECE] = asking.reply(directory[asked])[place.reshape(-1, 2)]
 
-    owner = _owner(numbers, starts)
-    both = np.flatnonzero(owner[:, 0] != owner[:, 1])
-    bar = np.concatenate([np.arange(len(numbers)), both])
-    to_owners = Router(comm, np.concatenate([owner[:, 0], owner[both, 1]]))
-    groups = {}
-    for name, members in slab.bar_groups.items():
-        groups[name] = to_owners.send(_membership(members - slab.first_bar, len(slab.bars))[bar])
-    fields = {name: to_owners.send(values[bar]) for name, values in slab.bar_fields.items()}
-    ids, sections = to_owners.send(bar + slab.first_bar), to_owners.send(section[bar])
-    return to_owners.send(numbers[bar]), ids, sections, groups, fields
+    if not keep:
+        slab.bars = slab.bars[:0].copy()
+    n_bars = len(numbers)
+    owner = np.empty(numbers.shape, np.uint16 if comm.size <= np.iinfo(np.uint16).max else np.int32)
+    for start in range(0, n_bars, _PIECE):
+        owner[start : start + _PIECE] = _owner(numbers[start : start + _PIECE], starts)
+    kind = index_type(n_bars)
+    both = np.flatnonzero(owner[:, 0] != owner[:, 1]).astype(kind)
+    rows = np.concatenate([np.arange(n_bars, dtype=kind), both])
+    to_owners = Router(comm, np.concatenate([owner[:, 0], owner[both, 1]]), rows)
+    del owner, both, rows
+    groups = {
+        name: to_owners.send(_membership(members - slab.first_bar, n_bars)) for name, members in slab.bar_groups.items()
+    }
+    fields = {name: to_owners.send(values) for name, values in slab.bar_fields.items()}
+    ids = to_owners.send(np.arange(slab.first_bar, slab.first_bar + n_bars, dtype=index_type(slab.n_bars)))
+    return to_owners.send(numbers), ids, to_owners.send(section), groups, fields
 
 
 def _arrange_bars(

@@ -24,9 +24,11 @@ class Router:
     comm : MPI.Comm
     ranks : (n,) int
         The destination of each row.
+    rows : (n,) int, optional
+        The rows of the arrays that are sent, some of them possibly to several ranks; without :meth:`reply`.
     """
 
-    def __init__(self, comm: MPI.Comm, ranks: np.ndarray) -> None:
+    def __init__(self, comm: MPI.Comm, ranks: np.ndarray, rows: np.ndarray | None = None) -> None:
         self._comm = comm
         if comm.size == 1:
             self._counts = self._arriving = np.array([len(ranks)])
@@ -34,8 +36,10 @@ class Router:
             return
         # 16-bit ranks are sorted by radix, several times faster than wider ones.
         if comm.size <= np.iinfo(np.uint16).max:
-            ranks = ranks.astype(np.uint16)
+            ranks = ranks.astype(np.uint16, copy=False)
         self._order = np.argsort(ranks, kind="stable")
+        if rows is not None:
+            self._order = rows[self._order]
         self._counts = np.bincount(ranks, minlength=comm.size)
         self._arriving = np.empty_like(self._counts)
         comm.Alltoall(self._counts, self._arriving)

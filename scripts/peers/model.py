@@ -75,6 +75,6 @@ def report(times: dict[str, float], bars: int, top: float, **further: float) -> 
 
 
 def arguments() -> tuple[int, str, int, str]:
-    """Cells, mode (explicit, implicit, either with _contact, or static), steps and solver of the command line."""
+    """Cells, mode (explicit, implicit, these with _contact, explicit_long, static), steps and solver of the call."""
     cells, mode, steps = int(sys.argv[1]), sys.argv[2], int(sys.argv[3])
     return cells, mode, steps, sys.argv[4] if len(sys.argv) > 4 else ""

@@ -25,6 +25,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from helpers.launch import OF_A_LAUNCH, environment
+from helpers.selection import refuse_repeated_names, thinned
 from hypothesis import settings
 
 if "PYTEST_XDIST_WORKER" in os.environ:
@@ -60,6 +61,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_configure(config: pytest.Config) -> None:
+    refuse_repeated_names(Path(__file__).parent)
     if AGREEMENT is not None:
         # A folder of its own for each rank: pytest's numbered ones are claimed by several at once.
         config.option.basetemp = tempfile.mkdtemp(prefix=f"pytest-rank{WORLD.rank}-")
@@ -96,27 +98,6 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     items[:] = kept
 
 
-def thinned(items: list[pytest.Item], ranks: int) -> list[pytest.Item]:
-    """Return all tests except the thorough ones, with some of their sets of parameters.
-
-    Tests with several sets run with every tenth of them (eighth on two ranks, twelfth on three), slow tests with a
-    quarter of these. Of the parallel tests one half runs on two ranks, the other on three.
-    """
-    sets: dict[tuple[Path, str], list[pytest.Item]] = {}
-    for item in items:
-        if item.get_closest_marker("thorough") is None:
-            sets.setdefault((item.path, getattr(item, "originalname", item.name)), []).append(item)
-    stride = {1: 10, 2: 8}.get(ranks, 12)
-    chosen: set[pytest.Item] = set()
-    for group in list(sets.values())[ranks % 2 :: 2] if ranks > 1 else list(sets.values()):
-        slow = group[0].get_closest_marker("slow") is not None
-        if len(group) > 1:
-            every = 4 * stride if slow else stride
-            group = group[(ranks - 1) % min(every, len(group)) :: every]
-        chosen |= set(group)
-    return [item for item in items if item in chosen]
-
-
 def pytest_collection_finish(session: pytest.Session) -> None:
     if AGREEMENT is None:
         return
@@ -149,17 +130,18 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]) ->
     return report
 
 
-@pytest.hookimpl(trylast=True)
-def pytest_runtest_logfinish(nodeid: str, location: tuple) -> None:
-    if AGREEMENT is None:
-        return
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item, nextitem: pytest.Item | None) -> Iterator[None]:
+    result = yield
     # PETSc destroys collectively, Python collects whenever it likes: bring the ranks in step between tests.
     gc.collect()
-    # What is alive now is not looked at again: most of it is Numba's, and each look would take as long as a test.
+    # What is alive now is not looked at again: most of it is Numba's, and each look, of which every implicit stepper
+    # takes one, would take as long as a test.
     gc.freeze()
     petsc4py = sys.modules.get("petsc4py.PETSc")
-    if petsc4py is not None and hasattr(petsc4py, "garbage_cleanup"):
+    if AGREEMENT is not None and petsc4py is not None and hasattr(petsc4py, "garbage_cleanup"):
         petsc4py.garbage_cleanup()
+    return result
 
 
 def wait_for_all(what: str, outcome: int, text: str) -> int:

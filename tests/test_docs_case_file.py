@@ -96,6 +96,7 @@ def test_every_key_of_static_methods_is_named():
         assert set(parameters.model_fields) <= named(text), method
 
 
+@pytest.mark.slow
 def test_example_of_stages_runs(tmp_path):
     text = (DOCS / "stages.md").read_text()
     case = Case.from_toml(re.search(r"^```toml\n(.*?)^```$", text, flags=re.MULTILINE | re.DOTALL)[1], tmp_path)

@@ -31,6 +31,7 @@ def folder(tmp_path, monkeypatch):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_commands_run(folder, capfd):
     for line in "".join(blocks("sh")).splitlines():
         words = shlex.split(line)

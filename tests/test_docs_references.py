@@ -73,6 +73,7 @@ def pattern(message: str) -> re.Pattern[str]:
     return re.compile(r"[^\n]*?".join(parts))
 
 
+@pytest.mark.slow
 def test_every_failure_is_listed():
     """A new message of a run that fails needs a row in docs/troubleshooting.md."""
     patterns = [pattern(message) for message in quoted()]

@@ -287,6 +287,7 @@ def guyed_mast(run):
     return history["support_force"][-1, 2]
 
 
+@pytest.mark.few_sets
 @pytest.mark.slow
 @pytest.mark.parametrize("name", built_in_cases())
 def test_promised_numbers(name, run):

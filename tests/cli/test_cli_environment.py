@@ -194,6 +194,7 @@ def script(tmp_path_factory):
     return file
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("line", "expected", "not_expected"),
     [

@@ -17,6 +17,7 @@ def run_collectively(on_ranks, tmp_path, ranks, body, timeout=240.0, debug=False
     return on_ranks(ranks, script, timeout=timeout)
 
 
+@pytest.mark.few_sets
 @pytest.mark.slow
 @pytest.mark.parametrize("ranks", [1, 2])
 @pytest.mark.parametrize(

@@ -144,6 +144,7 @@ def test_petsc_takes_its_options(on_ranks, tmp_path):
     assert "PETSc Performance Summary" in done.stdout
 
 
+@pytest.mark.slow
 def test_one_rank_draws_and_tells(on_ranks, short_run, tmp_path):
     done = on_ranks(2, "-m", "pfem_petsc", "info", short_run, cwd=tmp_path)
     assert done.returncode == 0, done.stderr

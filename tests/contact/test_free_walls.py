@@ -20,6 +20,7 @@ def walls_of(kind):
     return [{"type": "sphere", "point": [0.1, 0.05, -0.12], "radius": 0.1, "mass": 0.03, "velocity": [0.0, 0.1, 1.0]}]
 
 
+@pytest.mark.few_sets
 @pytest.mark.slow
 @pytest.mark.parametrize("integrator, parameters", SCHEMES)
 @pytest.mark.parametrize("kind", ["plane", "corner", "sphere"])

@@ -160,6 +160,7 @@ def test_wilson_beyond_the_explicit_limit_is_always_warned_of(treatment):
     assert warn_of_gain(Case.load("rod_impact", ["time.integrator=houbolt"]), 5.0) == ""
 
 
+@pytest.mark.few_sets
 @pytest.mark.slow
 @pytest.mark.parametrize(("integrator", "parameters"), table.SCHEMES)
 def test_no_combination_gains_without_a_warning(integrator, parameters):

@@ -98,6 +98,7 @@ def test_breaking_loose(integrator, parameters, comm, shared_tmp_path):
         assert row["momentum"][1] == pytest.approx(gained, abs=2.0 * weight * static * 3 * 5e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["newmark", "houbolt", "energy_momentum"])
 def test_oblique_impact(integrator, comm, shared_tmp_path):
     """Thrown flat at the floor: the tangential impulse is mu times the normal one, or what stops the rod."""

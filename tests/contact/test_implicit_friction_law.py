@@ -17,6 +17,7 @@ WALLS = {
 }
 
 
+@pytest.mark.few_sets
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "integrator", "parameters"),

@@ -85,6 +85,7 @@ def test_rods_in_any_direction(time, comm, shared_tmp_path):
         np.testing.assert_allclose(y @ turn, x, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize(
     "solver",
@@ -122,6 +123,7 @@ def test_pairs_that_stick(time, comm, shared_tmp_path):
         assert lost == pytest.approx(0.05 * energy[0], rel=0.03)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("time", [IMPLICIT[2], TRAPEZOID], ids=label)
 def test_pairs_that_do_no_work(time, comm, shared_tmp_path):
     rows = collide(time, comm, shared_tmp_path, treatment="conserving")

@@ -10,6 +10,7 @@ from pfem_petsc.solvers.linear import LinearChoice
 from pfem_petsc.stepping.implicit import ImplicitStepper
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize(
     "solver", [{"operator": "matrix_free"}, {"linear": "gamg"}, {"linear": "gamg", "operator": "matrix_free"}], ids=str
@@ -33,6 +34,7 @@ def test_lattices_in_a_wedge(solver, comm, shared_tmp_path):
         np.testing.assert_allclose(found[1][1] @ turn, found[0][1], atol=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("linear", ["mumps", "gamg"])
 def test_a_wall_while_pairs_are_apart(linear, comm, shared_tmp_path):
     """The first rod springs back to a wall behind it, with the second one far away: few iterations, as for the pair."""

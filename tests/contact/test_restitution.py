@@ -36,6 +36,7 @@ def bar(integrator, parameters, wall, *, velocity=0.0, gravity=G, step=1e-3, end
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("restitution", "treatment"), [(0.5, "scheme"), (0.9, "stick"), (1.0, "scheme")])
 @pytest.mark.parametrize("integrator, parameters", [("central_differences", {}), *SCHEMES])
 def test_heights_of_bounces(integrator, parameters, restitution, treatment, comm, shared_tmp_path):
@@ -93,6 +94,7 @@ def tumbling(integrator, parameters, restitution, end=0.05, walls=None, **tables
     return case
 
 
+@pytest.mark.few_sets
 @pytest.mark.slow
 @pytest.mark.parametrize("restitution", [0.5, 1.0])
 @pytest.mark.parametrize("integrator, parameters", SCHEMES)

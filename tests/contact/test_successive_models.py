@@ -21,6 +21,7 @@ def wall_force(comm, folder, name, *overrides):
     return np.array([step.row["wall/wall/force"][0] for step in simulation])
 
 
+@pytest.mark.slow
 def test_tolerance_on_bounds_is_that_of_the_model(comm, shared_tmp_path):
     """A ring of 46 m takes a node 5e-13 m off its wall for touching; a rod of 1 m after it must not."""
     wall_force(comm, shared_tmp_path / "ring", "ring_impact", "time.step=5e-4", "time.end=0.007")
@@ -35,6 +36,7 @@ def resting(steps, **tables):
     return lattice_case(planes([[0.0, 0.0, 1.0]], [0.0]), step=1e-3, end=1e-3 * steps, **tables)
 
 
+@pytest.mark.slow
 def test_restrictions_to_inactive_unknowns_are_freed(comm, shared_tmp_path):
     """Every Newton iteration in contact makes a matrix of the inactive unknowns: PETSc keeps the last one alone."""
 

@@ -92,6 +92,7 @@ def test_no_mass_beside_ghosts(comm, shared_tmp_path):
     assert len(list(run)) == 5 and np.abs(run.state.v).max(initial=0.0) < 1e-12
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step", [0.01, 0.05])
 @pytest.mark.parametrize("integrator, parameters", [("newmark", TRAPEZOID), ("energy_momentum", {})])
 def test_no_mass_no_spike_implicit(integrator, parameters, step, comm, shared_tmp_path):
@@ -99,6 +100,7 @@ def test_no_mass_no_spike_implicit(integrator, parameters, step, comm, shared_tm
     assert force < 1.35 and energy[-1] == pytest.approx(1.0, abs=3e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator, parameters", [("newmark", TRAPEZOID), ("energy_momentum", {})])
 def test_conserving_keeps_energy(integrator, parameters, comm, shared_tmp_path):
     _, energy, rows = rod("conserving", integrator, comm, shared_tmp_path, **parameters)
@@ -106,6 +108,7 @@ def test_conserving_keeps_energy(integrator, parameters, comm, shared_tmp_path):
     assert abs(rows[-1]["contact_work"]) < 1e-9 * ENERGY
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "integrator, parameters",
     [
@@ -129,6 +132,7 @@ def test_stick_never_gains_energy(integrator, parameters, comm, shared_tmp_path)
         assert rows[-1]["impact_dissipation"] == pytest.approx(0.025 * ENERGY, rel=0.02)
 
 
+@pytest.mark.slow
 def test_own_formulas_of_the_trapezoid_gain_energy(comm, shared_tmp_path):
     """What the other treatments are for: energy grows tenfold, and the run says so before it starts."""
     _, energy, _ = rod("scheme", "newmark", comm, shared_tmp_path, **TRAPEZOID)

@@ -62,6 +62,7 @@ def plastic(integrator, parameters):
     return case
 
 
+@pytest.mark.few_sets
 @pytest.mark.slow
 @pytest.mark.parametrize("integrator", SCHEMES)
 @pytest.mark.parametrize("problem", [rod, ring, plastic], ids=lambda f: f.__name__)

@@ -103,6 +103,7 @@ def test_ball_stays_on_the_surface(integrator, parameters, comm, shared_tmp_path
     assert most >= 1
 
 
+@pytest.mark.few_sets
 @pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["central_differences", "chung_lee", "newmark", "houbolt"])
 @pytest.mark.parametrize("kind", ["planes", "sphere", "motion"])

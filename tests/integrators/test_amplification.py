@@ -105,6 +105,7 @@ def test_radius_in_the_limit():
     assert np.abs(response("chung_lee 28/27", omega_b)).max() == pytest.approx(0.5, rel=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SCHEMES)
 def test_order(name, comm, shared_tmp_path):
     """Error of the position after one period, by full runs with 200 and 400 steps: second order but Hu's."""
@@ -170,6 +171,7 @@ def test_implicit_schemes_have_no_limit(name):
     assert bounded(name, 300.0, steps=100, start=1e-9)  # Wilson's first steps overshoot by Omega^2
 
 
+@pytest.mark.slow
 def test_newmark_with_a_limit_of_its_own():
     """Limit of beta = 0.1, gamma = 1/2: stable to Omega = 1/sqrt(gamma/2 - beta)."""
     limit = 1 / np.sqrt(0.15)
@@ -178,6 +180,7 @@ def test_newmark_with_a_limit_of_its_own():
         assert (np.abs(displacements(it, 600)).max() < 1e-3) == stays
 
 
+@pytest.mark.slow
 def test_wilson_below_its_threshold_has_a_limit():
     """Theta = 1.3: where the program says."""
     case = oscillator.case("wilson", {"theta": 1.3}, h=1e-3)

@@ -140,6 +140,7 @@ def test_damaged_machine_code_is_compiled_anew(module, tmp_path, suffix):
     assert module().outer(3.0) == 7.0
 
 
+@pytest.mark.slow
 def test_every_process_finds_the_machine_code_of_another():
     """The digest of loops does not depend on the order of sets, which is another in every process."""
     program = (
@@ -155,6 +156,7 @@ def test_every_process_finds_the_machine_code_of_another():
     assert len(digests) == 1
 
 
+@pytest.mark.slow
 def test_every_process_finds_the_fused_loop_of_another():
     """Keys of loops that are made of other loops are the same in all processes: a start must not compile them anew."""
     program = (

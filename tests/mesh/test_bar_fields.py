@@ -93,6 +93,7 @@ def test_fused_steps_are_single_steps(tmp_path):
         np.testing.assert_array_equal(found[0][column], found[1][column], err_msg=column)
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("suffix", ["vtu", "vtkhdf"])
 def test_field_of_a_vtk_file(suffix, shared_tmp_path, comm):

@@ -36,6 +36,7 @@ def block(**modes):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("mass", ["lumped", "consistent"])
 def test_files_of_any_number_of_ranks(mass, shared_tmp_path, comm):

@@ -47,6 +47,7 @@ DAMAGES = {
 }
 
 
+@pytest.mark.few_sets
 @pytest.mark.slow
 @pytest.mark.parametrize("name", DAMAGES)
 def test_a_changed_value_is_named_and_not_continued(tmp_path, name):

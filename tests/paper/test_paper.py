@@ -97,6 +97,7 @@ def test_rod_with_consistent_mass(measures):
     assert measures[LIKELY].rod["central_differences"] == measures[LUMPED].rod["central_differences"]
 
 
+@pytest.mark.slow
 def test_run_that_ends_early_is_measured_as_far_as_it_went(runs, measures):
     """Wilson with theta = 1.4 and lumped mass chatters until a bar is driven through zero length."""
     assert runs[RODS[LUMPED, "wilson"]].failure
@@ -104,6 +105,7 @@ def test_run_that_ends_early_is_measured_as_far_as_it_went(runs, measures):
     assert np.isnan(measures[LUMPED].rod["wilson"].mean_rebound)
 
 
+@pytest.mark.slow
 def test_phase_of_the_impact_changes_the_order_of_schemes(runs):
     """What Houbolt's method does in the first steps depends on where in the step the impact falls."""
     excess = {}
@@ -115,6 +117,7 @@ def test_phase_of_the_impact_changes_the_order_of_schemes(runs):
     assert min(excess["wilson", phase] for phase in (0, 5)) > 2.0
 
 
+@pytest.mark.slow
 def test_bars(runs):
     elastic, plastic = (measure_rod(runs[key], exact) for key, exact in zip(BARS, (BAR, PLASTIC_BAR)))
     assert elastic.median == pytest.approx(1.0, abs=5e-3)
@@ -125,12 +128,14 @@ def test_bars(runs):
     assert plastic.whole_rebound > elastic.whole_rebound
 
 
+@pytest.mark.slow
 def test_step_above_the_limit_is_refused_and_said(runs):
     run = runs[REFUSED]
     assert not run.history
     assert "1.91497e-06" in run.failure
 
 
+@pytest.mark.slow
 def test_ring(runs):
     """Explicit schemes and Newmark hit twice, for long; Houbolt leaves after the first step of contact."""
     ring = {scheme: measure_ring(runs[key]) for scheme, key in RINGS.items()}
@@ -147,6 +152,7 @@ def test_ring(runs):
         assert len(ring[scheme].phases) > 2
 
 
+@pytest.mark.slow
 def test_verdicts(measures):
     """Those of section 5.1 under both readings, and that they follow the measurements."""
     verdicts = {reading: [claim.verdict for claim in rod_claims(measures[reading])] for reading in READINGS}
@@ -159,6 +165,7 @@ def test_verdicts(measures):
     assert np.flatnonzero(flipped).tolist() == [2, 9, 10]
 
 
+@pytest.mark.slow
 def test_figure(runs, tmp_path):
     figures.draw_rod(runs, tmp_path / "figure.png", False)
     from PIL import Image
@@ -169,6 +176,7 @@ def test_figure(runs, tmp_path):
     assert (tmp_path / "figure.png").stat().st_size < 150e3
 
 
+@pytest.mark.slow
 def test_document_has_the_measured_numbers(measures):
     text = (ROOT / "docs" / "paper.md").read_text(encoding="utf-8")
     table = text[text.index("| exact | 1 | 1 |") :]

@@ -169,6 +169,7 @@ def test_stable_step_counts_them(scheme, comm, shared_tmp_path):
         assert np.isfinite(kinetic) and kinetic < 1.1 * 2 * 0.5 * MASS * 0.2**2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["central_differences", "energy_momentum"])
 def test_stages_and_restart_are_bitwise(scheme, comm, tmp_path):
     both = SPRING | {"dashpot": [{"between": ["one", "two"], "coefficient": C}]}

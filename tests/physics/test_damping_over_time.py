@@ -48,6 +48,7 @@ def test_decay(scheme, mass, tmp_path):
     assert np.abs(history["energy_imbalance"]).max() < 1e-11 * kinetic[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("scheme", ["central_differences", "wilson"])
 def test_restart_and_factor_one(scheme, comm, shared_tmp_path):

@@ -129,6 +129,7 @@ def test_a_spring_to_the_ground(scheme, tmp_path):
     assert history["external_work"][-1] == pytest.approx(lost, rel=5e-3 if scheme in EXACT else 0.1)
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("scheme", ["central_differences", "generalized_alpha"])
 def test_restart_is_bitwise_with_the_function_and_warns_without(scheme, comm, shared_tmp_path, capfd):
@@ -175,6 +176,7 @@ def test_a_function_that_fails_on_one_rank_ends_all(comm, shared_tmp_path):
         finish(rod("central_differences"), comm, shared_tmp_path / "out", fails)
 
 
+@pytest.mark.slow
 def test_refusals(tmp_path):
     static = rod().to_dict()
     del static["time"]
@@ -208,6 +210,7 @@ def test_the_example_of_the_documentation_runs(tmp_path, monkeypatch):
     assert history["external_work"][2] == 0.0 > -1e-6 > history["external_work"][-1]
 
 
+@pytest.mark.slow
 def test_in_stages(tmp_path):
     """The static stage is without the force, the one in motion begins with it; its time is that of the stage."""
     stages = [

@@ -87,6 +87,7 @@ def test_relative_frame_is_absolute_frame_less_the_ground(scheme, tmp_path):
         assert np.abs(history["energy_imbalance"]).max() < 1e-9 * history["kinetic_energy"].max()
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("frame", ["absolute", "relative"])
 @pytest.mark.parametrize("scheme", ["trapezoid", "central_differences"])
@@ -101,6 +102,7 @@ def test_reactions_are_mass_times_acceleration(scheme, frame, comm, shared_tmp_p
     np.testing.assert_allclose(history["support_force"], inertia, atol=2e-9 * np.abs(inertia).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 def test_free_fall_under_a_table(comm, shared_tmp_path):
     """The velocity is the integral of the table, which is constant outside its rows; smooth ones of their spline."""

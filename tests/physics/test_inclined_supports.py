@@ -166,6 +166,7 @@ def test_stages(analysis, comm, shared_tmp_path):
     plain, turned = both(shared_tmp_path, comm, 1e-10, stage=stages)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", ["central_differences", "energy_momentum"])
 def test_restart_in_a_stage_without_a_removed_support(integrator, comm, tmp_path):
     """A support that an earlier stage has removed stays away, in the turned tower as in the other; and in a restart."""

@@ -161,6 +161,7 @@ def test_fused_steps_are_single_steps(law, strain, tmp_path):
     assert differences(*(tmp_path / str(name) / "result.vtkhdf" for name in (False, True))) == {}
 
 
+@pytest.mark.few_sets
 @pytest.mark.slow
 @pytest.mark.parametrize("strain", ["engineering", "green", "logarithmic"])
 @pytest.mark.parametrize("law", MATERIALS)

@@ -188,6 +188,7 @@ def test_damping_of_backward_differences_only_takes(shared_tmp_path):
     assert np.abs(history["energy_imbalance"]).max() < 1e-10 * history["kinetic_energy"][0]
 
 
+@pytest.mark.slow
 def test_both_ledgers_of_central_differences_agree_at_pairs(tmp_path, monkeypatch):
     """Works as sums over balances and over steps, of bodies that collide; rows at some steps or at all."""
     tables = two_lattices(

@@ -88,6 +88,7 @@ def test_displacement_record(scheme, comm, shared_tmp_path):
 RAMP = [[0.0, 0.0, 0.0, 0.0], [0.1, 0.02, 0.0, 0.0], [0.2, 0.02, 0.0, 0.0]]
 
 
+@pytest.mark.few_sets
 @pytest.mark.slow
 @pytest.mark.parametrize("interpolation", ["smooth", "linear"])
 @pytest.mark.parametrize("scheme", ALL)

@@ -291,6 +291,7 @@ def test_pretension_up_to_yield_is_accepted(tmp_path):
     assert history["plastic_dissipation"][-1] == 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("second", [[[0.0, 3000.0], [1.0, 6000.0]], 6000.0])
 @pytest.mark.parametrize("method", ["newton", "relaxation"])
 def test_a_later_stage_stresses_further(method, second, shared_tmp_path, comm):

@@ -50,6 +50,7 @@ def fall(history):
     return HEIGHT - history["probe/top/position"][:, 0, 2]
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("integrator", ["energy_momentum", "central_differences"])
 @pytest.mark.parametrize("duration, factor", [(0.0, 2.0), (10.0, 1.0)])
@@ -141,6 +142,7 @@ def test_restarts_are_bitwise_while_something_is_removed(what, scheme, comm, tmp
     assert np.abs(whole["energy_imbalance"]).max() < 1e-8 * whole["external_work"].max()
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 def test_what_is_gone_stays_away_in_later_stages(comm, shared_tmp_path):
     """Stages with and without a table [[remove]] go on without what stages before have removed."""

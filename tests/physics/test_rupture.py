@@ -158,6 +158,7 @@ def test_ranks_break_the_same_bars(comm, shared_tmp_path):
         comm.Split(1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scheme", ["central_differences", "newmark"])
 def test_restarts_are_bitwise_before_at_and_after_a_break(scheme, comm, tmp_path):
     time = {"integrator": scheme, "step": 1e-5, "end": 6e-4}

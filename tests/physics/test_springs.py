@@ -59,6 +59,7 @@ def test_period(scheme, mass, tmp_path):
         assert np.abs(history["numerical_dissipation"]).max() < 1e-12 * scale
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("operator", ["assembled", "matrix_free"])
 def test_operators(operator, tmp_path):
     """A chain on springs in large motion: both operators, and explicit steps, find the same motion."""

@@ -82,6 +82,7 @@ def test_damped_nodes_that_start_on_a_wall(integrator, shared_tmp_path):
     assert unexplained(history) < 1e-9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("treatment", ["scheme", "stick", "mass_redistribution", "conserving"])
 @pytest.mark.parametrize("integrator", ["newmark", "houbolt", "energy_momentum"])
 def test_start_on_a_wall_is_an_impact_at_the_start(integrator, treatment, shared_tmp_path):

@@ -37,6 +37,7 @@ def rod(ratio, integrator, step, end, material=(), elements=1, ends=("start",), 
     return Case.from_dict(data | tables)
 
 
+@pytest.mark.few_sets
 @pytest.mark.slow
 @pytest.mark.parametrize("integrator", [*EXPLICIT[:3], "newmark", "generalized_alpha", "energy_momentum"])
 @pytest.mark.parametrize("ratio", [0.02, 0.1])

@@ -134,6 +134,7 @@ def held_bar(folder, comm, law, **tables):
 SHORT = {"integrator": "newmark", "step": 1e-3, "end": 2e-3}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("law", "lost"),
     [

@@ -69,6 +69,7 @@ def test_equilibrium_path_and_limit_load_of_the_bars(tmp_path):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("factor", "snaps"), [(0.98, False), (1.02, True)])
 def test_slow_load_snaps_through_at_the_limit(factor, snaps, tmp_path):
     """A load that grows slowly to 98 % of the limit is borne, to 102 % it is not; damping keeps the motion slow."""

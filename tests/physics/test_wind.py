@@ -37,6 +37,7 @@ def case(scheme="newmark", step=5e-3, end=3.0, **tables):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_falling_bar(scheme, tmp_path):
     """A bar across its way: v = v_t tanh(g t/v_t) with m g = rho C_d d l v_t^2/2; what it loses is the work of drag."""
@@ -152,6 +153,7 @@ def test_bars_that_have_left_have_no_drag(scheme, tmp_path):
     assert np.abs(history["energy_imbalance"]).max() < 1e-9 * history["kinetic_energy"].max()
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("scheme", ["central_differences", "wilson"])
 def test_restart_and_stages(scheme, comm, shared_tmp_path):

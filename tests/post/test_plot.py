@@ -50,6 +50,7 @@ def test_what_a_result_lacks_is_left_out(tmp_path, result):
     assert names == ["energies.csv", "momentum.csv", "solver.csv"]
 
 
+@pytest.mark.slow
 def test_many_terms_that_are_zero_leave_the_width_to_the_curves(tmp_path, result):
     def size(picture):
         """Columns between the first and the last that have a curve, and columns of the picture."""
@@ -183,6 +184,7 @@ def test_colours_are_told_apart_by_colour_blind_eyes():
         assert apart[~np.eye(6, dtype=bool)].min() > 0.1
 
 
+@pytest.mark.slow
 def test_python_of_the_page_runs(tmp_path, monkeypatch):
     page = (Path(__file__).parents[2] / "docs" / "plotting.md").read_text()
     (code,) = re.findall(r"^```python\n(.*?)^```$", page, flags=re.MULTILINE | re.DOTALL)

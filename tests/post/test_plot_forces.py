@@ -25,6 +25,7 @@ def result(tmp_path):
     return SyntheticResult(tmp_path / "result.vtkhdf", *ring())
 
 
+@pytest.mark.slow
 def test_pairs_and_constraints_have_pictures(tmp_path, result):
     force = result.history.pop("wall/wall/force")
     del result.history["wall/wall/contacts"]
@@ -35,6 +36,7 @@ def test_pairs_and_constraints_have_pictures(tmp_path, result):
     assert len(saturated(written["pairs.png"])) > 500
 
 
+@pytest.mark.slow
 def test_walls_without_a_force_take_no_panels(tmp_path, result):
     alone = Image.open(next(path for path in plot(result, tmp_path / "alone") if path.name == "walls.png"))
     result.history[r"wall/far $\bad$/force"] = 0.0 * result.history["wall/wall/force"]
@@ -56,6 +58,7 @@ def test_filter_of_forces_is_named(tmp_path, result):
     assert columns[k] == pytest.approx(cfc(result.history["time"], raw, 60.0))
 
 
+@pytest.mark.slow
 def test_results_over_load_factors_are_not_over_time(tmp_path):
     """The times of a static analysis are load factors, and its force-displacement curve has the closed form."""
     with Simulation(Case.load("von_mises"), output=tmp_path / "r", quiet=True) as simulation:

@@ -118,6 +118,7 @@ def test_wall_is_drawn_where_it_is_then(moves, tmp_path):
     assert faces[1] - faces[0] == pytest.approx(0.4 / 2.2 * (faces[0] - start), abs=2.0)
 
 
+@pytest.mark.slow
 def test_walls_are_drawn_in_the_stages_that_have_them(tmp_path):
     """Pressed by a plate, then let go: the plate is gone from the next stage on, also in pictures of modes."""
     plate = {"name": "plate", "type": "plane", "point": [1.0, 0.0, 0.0], "normal": [-1.0, 0.0, 0.0]}

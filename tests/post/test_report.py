@@ -45,6 +45,7 @@ def run(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_report_of_a_run(run, capsys):
     with (run / "log.txt").open("a") as log:
         log.write("2026-01-01 00:00:00 WARNING something <odd>\n  on two lines\n2026-01-01 00:00:01 INFO    later\n")
@@ -75,6 +76,7 @@ def test_report_of_a_run(run, capsys):
     assert not re.search(r"https?://|url\(", text)
 
 
+@pytest.mark.slow
 def test_reports_that_cannot_be_written_are_refused(run, tmp_path, capsys):
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="is a folder; name a file"):

@@ -60,6 +60,7 @@ def test_page_turns_in_a_browser(tmp_path, result):
     assert (before != initial).any(axis=2).sum() > 500
 
 
+@pytest.mark.slow
 def test_window_moves_the_nodes(tmp_path, result):
     plotter, go_to = plotter_of(result, 0, print, off_screen=True)
     pictures = []

@@ -110,6 +110,7 @@ def test_odd_values_are_told(comm, override, texts):
         assert text in told[0]
 
 
+@pytest.mark.slow
 def test_ground_accelerations_in_other_units_are_told(comm):
     overrides = ["stage.1.support.0.acceleration=[[0.0,0,0,0],[0.5,300.0,0,0],[1.0,0,0,0]]"]
     _, told = Simulation(Case.load("dome_earthquake", overrides), comm, check_only=True).inspect()
@@ -222,6 +223,7 @@ def divided(points, bars, parts):
     return points, divided_bars
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 def test_subdivided_members_are_told(comm, shared_tmp_path):
     """All inner nodes of the members, also where a member's direction is general; not what a support holds."""

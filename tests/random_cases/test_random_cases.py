@@ -37,6 +37,7 @@ def faults_of(seed, comm, folder, restart):
     return told, [fault for fault in told["faults"] if not fault[0].startswith(COUNTED)]
 
 
+@pytest.mark.few_sets
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", SEEDS)
 def test_any_case_holds_what_all_must(seed, tmp_path):
@@ -183,6 +184,7 @@ def test_an_exception_is_found_and_told(monkeypatch, tmp_path):
     assert outcome.faults[0][0] == "internal error"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [8, 9, 10, 14, 22, 24, 28, 35])
 def test_explicit_and_implicit_schemes_agree(seed, tmp_path):
     """At small steps they are apart by no more than halving the step changes, with contact, plasticity and supports."""

@@ -10,6 +10,7 @@ from pfem_petsc.recording.history import History
 from pfem_petsc.recording.snapshots import Snapshots
 
 
+@pytest.mark.few_sets
 @pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("name", CASES)

@@ -1,7 +1,8 @@
 """Files of runs of older versions, kept as they were written: results open, checkpoints are refused.
 
 A rod of two bars flies towards a wall at 1 m/s and meets it after 10 steps of 1 µs; the run of 20 steps has snapshots
-every 10 steps and a row of the history every 5. The files of 0.1.0 are from before it wrote checksums.
+every 10 steps and a row of the history every 5. The files of 0.1.0 are from before it wrote checksums. The attribute
+with the folder of the case was replaced.
 """
 
 import lzma
@@ -60,6 +61,7 @@ def test_case_in_the_results_runs_and_moves_alike(version, tmp_path):
     np.testing.assert_allclose(open_result(tmp_path / "again").positions(-1), result.positions(-1), rtol=1e-14)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("version", VERSIONS)
 def test_info_reads_results_with_checksums_and_refuses_others(version, tmp_path, capsys):
     """A file without checksums cannot be told from a damaged one; the message names the version."""

@@ -48,6 +48,7 @@ def test_no_operator_without_matrix_for_unsymmetric_schemes():
         choose_linear("auto", BIG, 1.0, symmetric=False, operator="matrix_free")
 
 
+@pytest.mark.slow
 def test_a_restart_keeps_the_choice_unless_the_case_asks_for_another(comm, tmp_path):
     """Fewer steps would choose Jacobi: the choice is in the checkpoint."""
 

@@ -172,6 +172,7 @@ def iterations(comm, folder, cells, ratio):
     return linear / newton
 
 
+@pytest.mark.slow
 def test_iterations_do_not_grow(comm, tmp_path):
     """From 10^4 to 10^5 unknowns, at 100 times the explicit limit; Jacobi needs twice as many for the larger one."""
     small, large = (iterations(comm, tmp_path / str(cells), cells, 100.0) for cells in (14, 31))
@@ -199,6 +200,7 @@ def final(simulation):
     return displacements(simulation, simulation.mesh.points[: simulation.mesh.n_owned])
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("scheme", SCHEMES)
 def test_same_motion_as_with_a_factorisation(comm, shared_tmp_path, scheme):

@@ -200,6 +200,7 @@ def test_temperatures_stay_and_change(run):
     np.testing.assert_allclose(x[[2, 4, 6]], [1.001, 1.001 + 1e-3, 1.0], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_wall_with_mass_moves_on(run):
     """A bar and a wall that it pushes have one momentum, over a change of the integrator too."""
     heavy = {**RIGHT, "point": [1.001, 0.0, 0.0], "mass": 2.0}
@@ -215,6 +216,7 @@ def test_a_wall_with_mass_moves_on(run):
     assert np.diff(place)[200] == pytest.approx(1e-4 * history["wall/right/velocity"][200, 0], rel=0.05)
 
 
+@pytest.mark.slow
 def test_ties_stay(run):
     sticky = {**RIGHT, "point": [1.001, 0.0, 0.0], "tied": True}
     stages = [
@@ -229,6 +231,7 @@ def test_ties_stay(run):
     assert np.ptp(x[203:, 0]) > 1e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 def test_pairs_go_on(run):
     """Two bars one after the other, pressed together by a support, held so, and let go."""

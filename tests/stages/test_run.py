@@ -74,6 +74,7 @@ def test_a_later_end_of_the_last_stage_continues_it(comm, shared_tmp_path):
         run(other, comm, continued, restart=True)
 
 
+@pytest.mark.slow
 def test_a_later_stage_that_cannot_run_is_found_before_the_first_step(tmp_path):
     wrong = {"name": "wrong", "time": {"integrator": "central_differences", "step": 1.0, "end": 2.0}}
     with pytest.raises(InputError, match=r"stage\[4\]: time\.step = 1 s is above the limit"):
@@ -103,6 +104,7 @@ def test_paths_in_stages_and_restarts_in_them(tmp_path):
     assert differences(*(tmp_path / name / "result.vtkhdf" for name in ("whole", "stopped"))) == {}
 
 
+@pytest.mark.slow
 def test_modes_are_those_of_the_end_of_the_last_stage(tmp_path):
     gravity = {"gravity": {"acceleration": [0.0, 0.0, -9.81]}, "modes": {"count": 2}}
     weight = {"name": "weight", "static": {"step": 0.5}}
@@ -114,6 +116,7 @@ def test_modes_are_those_of_the_end_of_the_last_stage(tmp_path):
     np.testing.assert_allclose(two, one, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_displacement_of_a_path_counts_from_the_start_of_its_stage(tmp_path):
     path = {**DOME["stage"][0]["static"], "displacement": 1e-3}
     stages = [{**DOME["stage"][0], "name": name, "static": path} for name in ("once", "again")]

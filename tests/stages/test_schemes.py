@@ -16,6 +16,7 @@ from pfem_petsc.registry import choices
 HELD = [{"node_set": "base", "fix": "xyz"}]
 
 
+@pytest.mark.few_sets
 @pytest.mark.slow
 @pytest.mark.parametrize("walls", [False, True])
 @pytest.mark.parametrize("integrator", choices(INTEGRATORS))

@@ -117,6 +117,7 @@ class TestFreeMotions:
         assert "free" not in text
 
 
+@pytest.mark.slow
 def test_factorised_inertia_finds_the_same(tmp_path, monkeypatch):
     """Events of the dome by inertia and inverse iteration are those by all eigenvalues, branch included."""
     case = Case.load(
@@ -133,6 +134,7 @@ def test_factorised_inertia_finds_the_same(tmp_path, monkeypatch):
     np.testing.assert_allclose(found[0]["probe/ring/position"], found[1]["probe/ring/position"], atol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 def test_large_models_have_their_bifurcations_by_mumps(comm, shared_tmp_path, monkeypatch):
     """Multigrid solves for the path, the inertia is that of a factorisation on all ranks; beyond, the log tells."""

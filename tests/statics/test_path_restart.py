@@ -43,6 +43,7 @@ def run_until(case, comm, folder, step):
     simulation.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize(("name", "at"), [("dome_16", 12), ("dome_16", 13), ("von_mises by displacement", 9)])
 def test_restart_is_bitwise(name, at, tmp_path):
@@ -60,6 +61,7 @@ def test_restart_is_bitwise(name, at, tmp_path):
         assert len(whole["event/kind"]) >= 2
 
 
+@pytest.mark.slow
 def test_events_after_the_checkpoint_are_cut_off(tmp_path):
     """A run that was killed after more events than its checkpoint has seen finds them once."""
     case = Case.load("von_mises", ["output.checkpoint_every=5", "output.history_every=3"])
@@ -75,6 +77,7 @@ def test_events_after_the_checkpoint_are_cut_off(tmp_path):
     assert history["event/step"].tolist() == [7, 18]
 
 
+@pytest.mark.slow
 def test_restart_of_a_finished_path_ends_at_once(tmp_path):
     case = Case.load("von_mises", ["output.checkpoint_every=5"])
     Simulation(case, MPI.COMM_SELF, output=tmp_path / "a", quiet=True).run()
@@ -86,6 +89,7 @@ def test_restart_of_a_finished_path_ends_at_once(tmp_path):
         np.testing.assert_array_equal(after[column], values, err_msg=column)
 
 
+@pytest.mark.slow
 def test_damaged_event_is_found(tmp_path):
     """Events have checksums as rows of the history have."""
     from pfem_petsc.output.verify import examine

@@ -179,6 +179,7 @@ def turns(simulation):
     return np.degrees(np.arccos(np.clip(cosines, -1.0, 1.0)))
 
 
+@pytest.mark.slow
 def test_a_pushed_block_is_not_mirrored(comm, shared_tmp_path):
     """1,590 J in a step of a block that has 0.7 mJ: what the guard halves, whatever solves the step."""
     simulation = pushed_block(comm, shared_tmp_path, True)

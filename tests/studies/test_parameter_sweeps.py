@@ -29,6 +29,7 @@ def rod():
     return Case.load("rod_impact", ["time.end=0.3", "output.fields_every=0"])
 
 
+@pytest.mark.slow
 def test_rows_of_all_combinations(rod, tmp_path):
     speeds = [0.3, 1.0]
     vary = {"time.step": [0.01, -1.0, 0.02], "initial.velocity": [np.array([v, 0.0, 0.0]) for v in speeds]}
@@ -52,6 +53,7 @@ def test_rows_of_all_combinations(rod, tmp_path):
     assert rod.time.step == 0.01
 
 
+@pytest.mark.slow
 def test_default_results_and_removed_folders(rod, tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "old").touch()
@@ -66,6 +68,7 @@ def test_default_results_and_removed_folders(rod, tmp_path):
     assert (tmp_path / "out.1" / "old").exists()
 
 
+@pytest.mark.slow
 def test_a_truss_and_what_a_function_raises(tmp_path):
     points = np.array([[0.0, 0, 0], [1, 0, 0], [0.3, 1, 0], [0.3, 0.3, 0.8]])
     bars = [[0, 1], [1, 2], [2, 0], [0, 3], [1, 3], [2, 3]]
@@ -110,6 +113,7 @@ class Killer:
         return exec, ("import os, signal; os.kill(os.getpid(), signal.SIGKILL)",)
 
 
+@pytest.mark.slow
 def test_a_crash_is_a_report_and_others_go_on(rod, tmp_path):
     tasks = [Task(Killer(), tmp_path / "0", None), Task(rod, tmp_path / "1", None)]
     reports = dict(pool.performed(tasks, 1))
@@ -117,6 +121,7 @@ def test_a_crash_is_a_report_and_others_go_on(rod, tmp_path):
     assert reports[0].message == "the process of the run ended by SIGKILL"
 
 
+@pytest.mark.slow
 def test_leaving_ends_the_runs(rod, tmp_path):
     long = rod.copy({"time.end": 1e4})
     runs = pool.performed([Task(rod, tmp_path / "0", None), Task(long, tmp_path / "1", None)], 1)
@@ -158,6 +163,7 @@ def test_environment_is_not_that_of_a_rank(monkeypatch):
     assert "OMPI_COMM_WORLD_RANK" not in found and "PMIX_RANK" not in found and found["OMPI_MCA_btl"] == "self"
 
 
+@pytest.mark.slow
 def test_command_line(tmp_path, capsys):
     words = [
         "sweep",

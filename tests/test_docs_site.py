@@ -16,6 +16,7 @@ from urllib.parse import unquote, urlsplit
 
 import document_case
 import pytest
+from docutils.utils.math import MathError
 
 import pfem_petsc
 from pfem_petsc.case import settings, tables
@@ -108,6 +109,24 @@ def test_every_public_name_is_in_the_reference(site):
 def test_formulas_are_drawn_by_the_browser(site):
     text = next(path for path in site if path.name == "theory.html").read_text()
     assert text.count("<math") > 20 and "$$" not in text
+
+
+@pytest.fixture
+def mathml(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "docs" / "_ext"))
+    return importlib.import_module("mathml").mathml
+
+
+def test_formulas_keep_accents_and_fractions(mathml):
+    """An index of a letter with a dot stands beside it, and fractions have their denominator."""
+    made = re.sub(r"\s+", "", mathml(r"{\dot\varepsilon}_p = \hat{x}_{n+1} + \sum_{k}^n y", True))
+    accent = '<moveraccent="true"><mi>ε</mi><mostretchy="false">˙</mo></mover>'
+    assert f"<msub>{accent}<mi>p</mi></msub>" in made and made.count("<munderover>") == 1  # of the sum
+    assert "<mrow><mi>n</mi><mo>+</mo><mn>1</mn></mrow></msub>" in made
+    half = re.sub(r"\s+", "", mathml(r"\tfrac{1}{2} m", False))
+    assert "<mn>1</mn><mn>2</mn></mfrac>" in half
+    with pytest.raises(MathError, match="in braces"):
+        mathml(r"\tfrac12 m", False)
 
 
 def models() -> Iterator[type[StrictModel]]:

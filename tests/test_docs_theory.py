@@ -31,3 +31,8 @@ def test_nearest_point_of_two_walls():
     normals = np.array([[0.0, 1.0], [-0.6, -0.8]])
     assert theory_figures.nearest(np.array([0.9, -0.35]), normals) == pytest.approx([0.0, 0.0], abs=1e-15)
     assert theory_figures.nearest(np.array([-2.0, -0.35]), normals) == pytest.approx([-2.0, 0.0], abs=1e-15)
+
+
+def test_no_paragraph_is_taken_for_code():
+    """Four spaces after an empty line make a code block; formulas here are LaTeX, and lists are indented by two."""
+    assert re.findall(r"\n\n {4,}\S.*", PAGE.read_text()) == []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 from docutils import nodes
@@ -13,9 +14,32 @@ from sphinx.util import logging
 LOGGER = logging.getLogger(__name__)
 
 
+_WITHOUT_BRACES = re.compile(r"frac\s*\d")  # \tfrac12 would become the number 12
+_ACCENT_AND_INDEX = re.compile(
+    r"<munderover>\s*(?P<base><m[in]>[^<]*</m[in]>)\s*(?P<index><(m\w+)[^>]*>.*?</\3>)\s*"
+    r'(?P<accent><mo stretchy="false">[^<]*</mo>)\s*</munderover>',
+    re.DOTALL,
+)
+"""A letter with an accent and an index, which docutils puts below the letter."""
+
+
+def mathml(formula: str, as_block: bool) -> str:
+    """Return a formula of LaTeX as MathML.
+
+    Raises
+    ------
+    MathError
+        For what cannot be converted.
+    """
+    if _WITHOUT_BRACES.search(formula):
+        raise MathError("give the numbers of a fraction in braces")
+    made = tex2mathml(formula, as_block=as_block)
+    return _ACCENT_AND_INDEX.sub(r'<msub><mover accent="true">\g<base>\g<accent></mover>\g<index></msub>', made)
+
+
 def _mathml(node: nodes.Element, as_block: bool) -> str:
     try:
-        return tex2mathml(node.astext(), as_block=as_block)
+        return mathml(node.astext(), as_block)
     except MathError as error:
         LOGGER.warning("formula %r: %s", node.astext(), error, location=node)
         return ""

@@ -39,7 +39,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--field", default="stress", help="field that colours the bars; default: %(default)s")
     parser.add_argument("--component", help="x, y or z of a vector field; default: its magnitude")
     parser.add_argument(
-        "--frames", metavar="N[,N...]", type=_frames, help="how many snapshots to draw, or their numbers; default: all"
+        "--frames",
+        metavar="N[,N...]",
+        type=_frames,
+        help="how many snapshots to draw, or their numbers (one: 12,); default: all",
     )
     parser.add_argument("--fps", type=float, default=24.0, help="frames per second of the film; default: %(default)g")
     parser.add_argument(
@@ -226,8 +229,11 @@ def _modes(text: str) -> list[int]:
 
 
 def _frames(text: str) -> int | list[int]:
+    parts = text.split(",")
+    if len(parts) == 2 and not parts[1].strip():
+        del parts[1]  # a list of one number: "12,"
     try:
-        numbers = [int(part) for part in text.split(",")]
+        numbers = [int(part) for part in parts]
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is neither a number of frames nor a list like 0,10,20") from None
     return numbers if "," in text else numbers[0]

@@ -36,7 +36,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--processes", metavar="N", type=int, default=1, help="number of runs at a time; default: 1")
     parser.add_argument(
-        "--results", metavar="NAME", nargs="+", help="columns of the history whose last values are in the table"
+        "--results",
+        metavar="NAME",
+        nargs="+",
+        help="columns of the history whose last values are in the table; vectors have a column for each component, "
+        "wall/floor/force.z is one of them",
     )
     parser.add_argument("--remove", action="store_true", help="remove the results of the runs, and keep the table only")
     parser.add_argument("--wall-time", metavar="TIME", type=seconds, help="stop a run after this time")
@@ -66,14 +70,33 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _values(text: str) -> tuple[str, list[Any]]:
-    """Return key and values of ``KEY=VALUE,VALUE``; values are TOML, or else plain texts."""
+    """Return key and values of ``KEY=VALUE,VALUE``; each value is TOML, or else plain text."""
     key, equals, values = text.partition("=")
     if not equals or not values.strip():
         raise InputError(f"--vary {text}: expected KEY=VALUES, like time.step=1e-5,2e-5")
     try:
         found = tomllib.loads(f"values = [{values}]")
     except (ValueError, RecursionError):
-        return key.strip(), [value.strip() for value in values.split(",")]
+        return key.strip(), [_value(part) for part in _parts(values)]
     if len(found) != 1:
         raise InputError(f"--vary {text}: expected KEY=VALUES, like time.step=1e-5,2e-5")
     return key.strip(), found["values"]
+
+
+def _parts(values: str) -> list[str]:
+    """Divide at the commas that are not within a list, a table or a text in quotes."""
+    parts, begun = [], ""
+    for piece in values.split(","):
+        begun = f"{begun},{piece}" if begun else piece
+        if all(begun.count(a) == begun.count(b) for a, b in ("[]", "{}")) and begun.count('"') % 2 == 0:
+            parts.append(begun.strip())
+            begun = ""
+    return [*parts, begun.strip()] if begun else parts
+
+
+def _value(text: str) -> Any:
+    try:
+        found = tomllib.loads(f"value = {text}")
+    except (ValueError, RecursionError):
+        return text
+    return found["value"] if len(found) == 1 else text

@@ -93,7 +93,7 @@ class Table(Mapping[str, np.ndarray]):
             with path.open("w", newline="", encoding="utf-8") as file:
                 writer = csv.writer(file)
                 writer.writerow(self)
-                lists = [values.tolist() for values in self.values()]
+                lists = [[_plain(value) for value in values.tolist()] for values in self.values()]
                 writer.writerows(zip(*lists, strict=True))
         except OSError as error:
             raise InputError(f"{path}: the table cannot be written: {error.strerror}") from error
@@ -149,8 +149,14 @@ def _column(values: Sequence[Any] | np.ndarray) -> np.ndarray:
     if all(isinstance(value, str) for value in values):
         return np.array(values, dtype=np.str_)
     made = np.empty(len(values), dtype=object)
-    made[:] = values
+    for i, value in enumerate(values):
+        made[i] = value  # one by one: lists of one length would be taken for further dimensions
     return made
+
+
+def _plain(value: Any) -> Any:
+    """Return an array as lists, which text has complete and with commas."""
+    return value.tolist() if isinstance(value, np.ndarray) else value
 
 
 def _text(value: Any) -> str:

@@ -238,14 +238,15 @@ class Chart:
             axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.0, handlelength=1.4)
         return factor, shown
 
-    def counts(self, axes: Any, label: str, values: np.ndarray, colour: str = COLOURS[0]) -> None:
-        """Draw integers (n,) as steps into a panel."""
+    def counts(self, axes: Any, label: str, values: np.ndarray, colour: str = COLOURS[0], before: bool = False) -> None:
+        """Draw integers (n,) as steps into a panel; those of an interval (``before``) up to its end."""
         from matplotlib.ticker import MaxNLocator
 
         time, thin = thinned(self.time, np.asarray(values, dtype=float))
         self.record(" ".join(label.split()), np.asarray(values))
-        axes.plot(time * self.factor, thin, color=colour, linewidth=1.0, drawstyle="steps-post")
-        axes.fill_between(time * self.factor, thin, step="post", color=colour, alpha=0.15, linewidth=0)
+        side = "pre" if before else "post"
+        axes.plot(time * self.factor, thin, color=colour, linewidth=1.0, drawstyle=f"steps-{side}")
+        axes.fill_between(time * self.factor, thin, step=side, color=colour, alpha=0.15, linewidth=0)
         axes.yaxis.set_major_locator(MaxNLocator(integer=True, nbins=5))
         axes.set_ylim(0, max(1.0, 1.08 * float(thin.max(initial=0.0))))
         axes.set_ylabel(label)

@@ -48,7 +48,9 @@ def chosen_frames(
         return within
     if isinstance(frames, (int, np.integer)):
         if frames < 1:
-            raise InputError(f"render: frames = {frames} must be positive")
+            raise InputError(f"render: frames = {frames} must be positive; a list of numbers may count from the end")
+        if frames == 1:
+            return within[-1:]  # at the first one, most structures are at rest and look like their mesh
         return [within[int(k)] for k in np.unique(np.linspace(0, count - 1, min(int(frames), count)).round())]
     chosen = [int(k) for k in frames]
     for k in chosen:

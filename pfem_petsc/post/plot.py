@@ -159,7 +159,7 @@ def _solver(history: History, title: str) -> Chart | None:
         return None
     chart = make_chart(history, title, len(names), heights=[0.7] * len(names))
     for number, (axes, name) in enumerate(zip(chart.axes[:, 0], names, strict=True)):
-        chart.counts(axes, labels[name], history[name], COLOURS[number])
+        chart.counts(axes, labels[name], history[name], COLOURS[number], before=name.endswith("_iterations"))
     return chart
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -14,7 +15,7 @@ from ..case.schema import Case
 from ..energies import LOST, STORED, SUPPLIED
 from ..errors import InputError
 from ..output.result import Result, open_result
-from ..output.table import Table
+from ..output.table import Table, flat_columns
 from .pool import performed
 from .progress import SweepProgress
 from .worker import Report, Task
@@ -51,9 +52,10 @@ def sweep(
         last key varying fastest; or a list of changes, each as for :meth:`Case.copy`, one for each run
     processes : number of runs at a time
     results : columns of results: a function of the finished :class:`Result` for each name, or a column of the history,
-        whose last value is used; or one function that returns values by name. Functions are called in this process;
-        an exception becomes the message of the row, whose status is then 1. Default: the last values of time and of the
-        energies that occur [J], and the largest forces of walls and supports [N]
+        whose last value is used (vectors have a column for each component; ``wall/floor/force.z`` is one of them); or
+        one function that returns values by name. Functions are called in this process; an exception becomes the
+        message of the row, whose status is then 1. Default: the last values of time and of the energies that occur
+        [J], and the largest forces of walls and supports [N]
     output : folder of the results, which are in folders ``0000``, ``0001``, ... in it; default:
         ``results/<case name>-sweep``. An existing one is moved aside
     keep : whether the results of the runs are kept; otherwise those with status 0 are removed after their row is made
@@ -151,10 +153,16 @@ def _prepared(folder: Path) -> Path:
 
 
 def _shown(changes: Mapping[str, Any]) -> dict[str, Any]:
-    """The values of a row; those that are no numbers or texts as texts."""
-    return {
-        key: value if isinstance(value, str | int | float | np.number) else str(value) for key, value in changes.items()
-    }
+    """The values of a row: numbers, texts and lists of them; all others as texts."""
+    return {key: _shown_value(value) for key, value in changes.items()}
+
+
+def _shown_value(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, list | tuple):
+        return [_shown_value(part) for part in value]
+    return value if isinstance(value, str | int | float | np.number) else str(value)
 
 
 def _table(rows: list[dict[str, Any]], columns: _Columns) -> Table:
@@ -181,6 +189,7 @@ class _Columns:
             if name in _OWN:
                 raise InputError(f"sweep: results: the table has a column {name!r} already")
         self._results, self.usual = results, results is None
+        self._parts: dict[str, list[str]] = {}  # columns of components, in place of the vectors that were asked for
 
     def of(self, folder: Path, report: Report) -> dict[str, Any]:
         """Return the results of a run by name; none for runs that were not finished."""
@@ -191,6 +200,8 @@ class _Columns:
         except Exception as error:  # noqa: BLE001 - of a user's function; the other runs go on
             text = error.args[0] if isinstance(error, KeyError) and error.args else error
             return {"status": 1, "message": f"results: {type(error).__name__}: {text}"}
+        self.names = [part for name in self.names for part in self._parts.get(name, [name])]
+        self._parts.clear()
         self.names += [name for name in found if name not in self.names]
         return found
 
@@ -199,17 +210,30 @@ class _Columns:
             yield from _default_results(result)
         elif isinstance(self._results, Mapping):
             for name, what in self._results.items():
-                yield name, what(result) if callable(what) else _last(result, what)
+                if callable(what):
+                    yield name, what(result)
+                else:
+                    last = _last(result, name, what)
+                    self._parts[name] = list(last)
+                    yield from last.items()
         else:
             values = self._results(result)
             yield from values.items() if isinstance(values, Mapping) else [("result", values)]
 
 
-def _last(result: Result, name: str) -> Any:
+def _last(result: Result, label: str, name: str) -> dict[str, Any]:
+    """Return the last value of a column as ``label``: all components of a vector, or the one at the end of the name."""
+    whole = name if name in result.history else re.sub(r"(\[\d+\])?\.[xyz]$", "", name)
     try:
-        return result.history[name][-1]
+        values = result.history[whole][-1:]
     except KeyError as error:
         raise InputError(f"sweep: results: {error.args[0]}") from error
+    if whole == name:
+        return {each: column[0] for each, column in flat_columns(label, values).items()}
+    columns = flat_columns(whole, values)
+    if name not in columns:
+        raise InputError(f"sweep: results: {name}: the column {whole} has {', '.join(list(columns)[:6])}")
+    return {label: columns[name][0]}
 
 
 def _default_results(result: Result) -> Iterator[tuple[str, Any]]:

@@ -389,3 +389,17 @@ def test_every_rank_has_its_part_of_the_same_lattice(comm, shared_tmp_path, keys
             np.testing.assert_array_equal(np.sort(getattr(mesh, kind)[group]), members)
     slab.structured, slab.warnings = False, []
     assert check_mesh(slab, comm) == []
+
+
+def test_a_surface_in_millimetres_is_suspected(tmp_path):
+    """A pitch in metres for a file in millimetres takes more cells than can be numbered, or counted."""
+    path = write_stl(tmp_path / "cube.stl", 120.0 * CORNERS, CUBE)
+    told = r"120 x 120 x 120 m \(if its file is in millimetres, set mesh.surface.scale = 0.001\)"
+    with pytest.raises(
+        InputError, match=f"mesh.pitch = 0.003, with cells that cover a surface of {told}: .* nodes have"
+    ):
+        filled(pitch=3e-3, surface={"file": str(path)})
+    with pytest.raises(InputError, match=f"mesh.pitch = 1e-20: too small for a surface of {told}"):
+        filled(pitch=1e-20, surface={"file": str(path)})
+    with pytest.raises(InputError, match=r"a surface of 12 x 12 x 12 m: .* nodes have"):
+        filled(pitch=3e-3, surface={"file": str(path), "scale": 0.1})

@@ -15,7 +15,7 @@ from PIL import Image
 from pfem_petsc import Case, Simulation
 from pfem_petsc.energies import LOST, STORED, SUPPLIED
 from pfem_petsc.errors import InputError
-from pfem_petsc.post.chart import COLOURS
+from pfem_petsc.post.chart import COLOURS, Chart
 from pfem_petsc.post.energies import balance_error, draw_energies
 from pfem_petsc.post.plot import plot
 from pfem_petsc.post.vectors import draw_momentum, draw_probes
@@ -83,6 +83,16 @@ def test_a_picture_is_not_a_panel_of_another(tmp_path, result):
     result.history["wall/other/force"], result.history["wall/other/contacts"] = result.history["wall/wall/force"], other
     result.history["active_contacts"] = result.history["active_contacts"] + other
     assert plot(result, tmp_path, formats=["csv"])[-1].name == "solver.csv"
+
+
+def test_iterations_are_drawn_over_the_step_that_needed_them():
+    chart = Chart(np.array([0.0, 0.25, 1.0]), "t", 2)
+    for axes, before in zip(chart.axes[:, 0], (True, False), strict=True):
+        chart.counts(axes, "n", np.array([0, 2, 1]), before=before)
+    at = [(axes.lines[0].get_drawstyle(), axes.collections[0].get_paths()[0]) for axes in chart.axes[:, 0]]
+    assert [style for style, _ in at] == ["steps-pre", "steps-post"]
+    assert [path.contains_point((0.1, 1.5)) for _, path in at] == [True, False]
+    assert [path.contains_point((0.5, 1.5)) for _, path in at] == [False, True]
 
 
 def test_empty_history_is_refused(tmp_path, result):

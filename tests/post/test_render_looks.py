@@ -12,9 +12,11 @@ from helpers.synthetic import SyntheticResult, lattice, ring
 
 from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.cli.main import main
+from pfem_petsc.cli.render import _frames
 from pfem_petsc.errors import InputError
 from pfem_petsc.post.camera import aim
 from pfem_petsc.post.contrast import GHOST, MARKS, TRAILS
+from pfem_petsc.post.frames import chosen_frames
 from pfem_petsc.post.radii import drawn_radii, radii_of
 from pfem_petsc.post.scene import Layer, Scene, Style
 
@@ -240,8 +242,19 @@ def test_refused_looks(tmp_path, flying, options, message):
 
 
 @pytest.mark.parametrize(
+    ("words", "chosen"), [("1", [11]), ("2", [0, 11]), ("7,", [7]), ("-1,", [11]), ("3,-2", [3, 10])]
+)
+def test_frames_by_number_and_by_index(words, chosen):
+    """A single frame is the last one: at the first, a structure looks like its mesh."""
+    assert chosen_frames(_frames(words), np.arange(12.0), print) == chosen
+    assert chosen_frames(1, np.arange(12.0), print, span=(2.0, 5.5)) == [5]
+
+
+@pytest.mark.parametrize(
     ("words", "text"),
     [
+        (["--frames", "0"], "frames = 0 must be positive"),
+        (["--frames", "3,,"], "neither a number of frames nor a list"),
         (["--view", "1,a,0"], "not a direction"),
         (["--size", "5k"], "720p, 1080p, 4k"),
         (["--html", "--window"], "one of the two"),

@@ -16,6 +16,7 @@ import pytest
 from mpi4py import MPI
 
 from pfem_petsc import Case, InputError, Simulation, Truss, open_result, sweep
+from pfem_petsc.cli import sweep as verb
 from pfem_petsc.cli.main import main
 from pfem_petsc.mechanics.compiled import Compilation
 from pfem_petsc.output.table import Table
@@ -38,7 +39,7 @@ def test_rows_of_all_combinations(rod, tmp_path):
     assert list(table)[:3] == ["run", "time.step", "initial.velocity"]
     assert table["run"].tolist() == list(range(6))
     assert table["time.step"].tolist() == [0.01, 0.01, -1.0, -1.0, 0.02, 0.02]
-    assert table["initial.velocity"][:2].tolist() == ["[0.3 0.  0. ]", "[1. 0. 0.]"]
+    assert table["initial.velocity"][:2].tolist() == [[0.3, 0.0, 0.0], [1.0, 0.0, 0.0]]
     assert table["status"].tolist() == [0, 3, 2, 2, 0, 3]
     assert "bar 19 between nodes 19 and 20" in table["message"][1] and not table["message"][0]
     assert "time.step = -1.0: expected a finite number" in table["message"][2]
@@ -183,6 +184,39 @@ def test_command_line(tmp_path, capsys):
     assert "--vary time.step: expected KEY=VALUES" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("text", "values"),
+    [
+        ("auto,1e-7", ["auto", 1e-7]),
+        ("a.msh,b.msh", ["a.msh", "b.msh"]),
+        ("[1,0,0],[2,0,0]", [[1, 0, 0], [2, 0, 0]]),
+        ("octet, cubic", ["octet", "cubic"]),
+        ('auto,[[1,2],[3,4]],{a=1,b=[2,3]},"x,y",true', ["auto", [[1, 2], [3, 4]], {"a": 1, "b": [2, 3]}, "x,y", True]),
+    ],
+)
+def test_values_of_a_command_line(text, values):
+    assert verb._values(f"key={text}") == ("key", values)
+
+
+def test_vectors_are_columns_of_their_components(rod, tmp_path):
+    asked = ["wall/wall/force", "probe/tip/position[0].x", "kinetic_energy"]
+    vary = {"initial.velocity": [(1.0, 0.0, 0.0), (0.2, 0.0, 0.0)], "time.end": [0.3]}  # the first one fails
+    table = sweep(rod, vary, results={name: name for name in asked}, output=tmp_path / "out", quiet=True)
+    assert list(table)[-5:] == [*(f"wall/wall/force.{axis}" for axis in "xyz"), *asked[1:]]
+    history = open_result(tmp_path / "out" / "0001").history
+    assert table["wall/wall/force.x"][1] == history["wall/wall/force"][-1, 0] and np.isnan(
+        table["wall/wall/force.x"][0]
+    )
+    assert table["probe/tip/position[0].x"][1] == history["probe/tip/position"][-1, 0, 0]
+    chosen = table.where([velocity == [0.2, 0.0, 0.0] for velocity in table["initial.velocity"]])
+    assert chosen["run"].tolist() == [1]
+    rows = list(csv.DictReader((tmp_path / "out" / "sweep.csv").open()))
+    assert rows[1]["initial.velocity"] == "[0.2, 0.0, 0.0]"
+    assert float(rows[1]["wall/wall/force.x"]) == table["wall/wall/force.x"][1]
+    wrong = sweep(rod, [{}], results={"w": "probe/tip/position[4].x"}, output=tmp_path / "wrong", quiet=True)
+    assert "probe/tip/position has probe/tip/position[0].x" in wrong["message"][0]
+
+
 def test_tables(tmp_path):
     table = Table({"a": [1, 2], "b": [0.5, 1 / 3], "c": ["x", "<y>"], "d": [None, 1]})
     assert [values.dtype.kind for values in table.values()] == ["i", "f", "U", "O"]
@@ -191,6 +225,8 @@ def test_tables(tmp_path):
     assert table.to_csv(tmp_path / "a" / "t.csv").read_text().splitlines()[2] == f"2,{1 / 3!r},<y>,1"
     assert "<td>&lt;y&gt;</td>" in table._repr_html_() and str(table).splitlines()[0].split() == list("abcd")
     assert table.where(table["a"] > 1)["c"].tolist() == ["<y>"]
+    arrays = Table({"a": [np.array([0.1, 2.0]), np.array([3.0, 4.0])]})
+    assert arrays.to_csv(tmp_path / "arrays.csv").read_text().splitlines()[1] == '"[0.1, 2.0]"'
     with pytest.raises(KeyError, match="table has no column 'aa', did you mean 'a'"):
         table["aa"]
     with pytest.raises(InputError, match="column 'b' has 1 rows, expected 2"):

@@ -138,11 +138,14 @@ def fit_to_surface(keys: Parameters, surface: Surface) -> Parameters:
         count[axis] = max(np.ceil((high[axis] - origin[axis]) / (edge * factor) - 1e-9) - first, 1.0)
         start[axis] += first * edge * factor
     limit = float(np.iinfo(np.int64).max) / 16.0
+    size = f"a surface of {' x '.join(f'{length:.4g}' for length in high - low)} m"
+    if keys.surface is not None and keys.surface.scale == 1.0:
+        size += " (if its file is in millimetres, set mesh.surface.scale = 0.001)"
     if not (count < limit).all():
-        raise InputError(f"mesh.pitch = {keys.pitch!r}: too small for a surface of {high - low} m")
+        raise InputError(f"mesh.pitch = {keys.pitch!r}: too small for {size}")
     check_size(
         int(np.prod([int(number) for number in count.tolist()], dtype=object)),
-        "mesh.pitch, with cells that cover the surface",
+        f"mesh.pitch = {keys.pitch!r}, with cells that cover {size}",
     )
     cells = tuple((count.astype(np.int64) * np.array(cell.layers)).tolist())
     return keys.model_copy(update={"cells": cells, "origin": tuple(start.tolist())})

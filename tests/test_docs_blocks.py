@@ -1,6 +1,7 @@
 """Commands that pages show are accepted by the command line, and tables that they show by a case.
 
-Blocks that are run: test_docs_python.py, test_docs_tutorial.py, test_readme.py, test_docs_case_file.py, contributing/.
+Blocks that are run: test_docs_python.py, test_docs_pictures.py, test_docs_meshes.py, test_docs_tutorial.py,
+test_readme.py, test_docs_case_file.py, contributing/.
 """
 
 from __future__ import annotations

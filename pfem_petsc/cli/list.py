@@ -1,4 +1,4 @@
-"""List the built-in cases, integrators, mesh generators and formats, walls, constraints and treatments of impact."""
+"""List the built-in cases, integrators, mesh generators and formats, walls, constraints, treatments, static methods."""
 
 from __future__ import annotations
 
@@ -27,6 +27,7 @@ KINDS = {
     "walls": "pfem_petsc.contact.walls",
     "constraints": "pfem_petsc.contact.constraints",
     "treatments of impact": "pfem_petsc.contact.treatments",
+    "methods of static analyses": "pfem_petsc.statics.methods",
 }
 
 

@@ -34,6 +34,7 @@ def test_they_are_listed(examples, capsys):
         ("polygon", "A regular polygon"),
         ("tether", "A bound on the distance of two nodes"),
         ("obj", "Wavefront OBJ files"),
+        ("listed", "Equilibria at listed load factors"),
         ("secant", "Held nodes have the mean normal velocity"),
         ("polygon_spin", "A polygon that spins inside a funnel"),
     ):

@@ -14,7 +14,8 @@ import pytest
 from pfem_petsc import Case, Simulation
 from pfem_petsc.case.materials import LAWS
 from pfem_petsc.mechanics import strips
-from pfem_petsc.mechanics.compiled import Compilation, _variant, code_digest
+from pfem_petsc.mechanics.code_digest import code_digest
+from pfem_petsc.mechanics.compiled import Compilation, _variant
 from pfem_petsc.mechanics.kernels import fused_parts, make_kernels
 from pfem_petsc.mechanics.materials import elastic, elastoplastic
 from pfem_petsc.mechanics.materials._softening import softened
@@ -145,7 +146,7 @@ def test_every_process_finds_the_machine_code_of_another():
     """The digest of loops does not depend on the order of sets, which is another in every process."""
     program = (
         "from pfem_petsc.contact import frames, projection\n"
-        "from pfem_petsc.mechanics.compiled import code_digest\n"
+        "from pfem_petsc.mechanics.code_digest import code_digest\n"
         "print(code_digest(frames._build), code_digest(projection.project))"
     )
     digests = set()

@@ -5,37 +5,19 @@ import math
 
 import numpy as np
 import pytest
-from helpers.laws import DENSITY, KEYS, SOFTENING, YOUNG, Twin, integrated
+from helpers.laws import DENSITY, KEYS, SOFTENING, Twin, integrated
+from helpers.one_bar import AREA, STEP, STEPS, one_bar, pulled
 from helpers.runs import run
 
 from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.cli.main import main
 from pfem_petsc.errors import InputError
 
-AREA, STEP, STEPS = 1e-4, 1e-5, 100
 MASS = 0.5 * DENSITY * AREA  # of a node of the bar of 1 m
 SETS = [
     ("johnson_cook", "green"), ("voce", "engineering"), ("multilinear", "green"), ("cowper_symonds", "logarithmic"),
     ("ludwik", "green"), ("perzyna", "engineering"), ("ramberg_osgood", "logarithmic"), ("voce", "logarithmic"),
 ]  # fmt: skip
-PARAMETERS = {"newmark": {"beta": 0.25, "gamma": 0.5}}  # the trapezoidal rule
-
-
-def one_bar(law, integrator, measure="engineering", speed=70.0, steps=STEPS, elements=1, solver=None, **keys):
-    """A bar of 1 m along x: its foot is held, its tip is thrown."""
-    material = {"law": law, "young_modulus": YOUNG, "density": DENSITY, "strain": measure, **KEYS.get(law, {}), **keys}
-    table = {
-        "mesh": {"generator": "rod", "length": 1.0, "elements": elements},
-        "node_set": {"foot": {"nearest": [0.0, 0.0, 0.0]}, "tip": {"nearest": [1.0, 0.0, 0.0]}},
-        "material": {"it": material},
-        "section": {"it": {"area": AREA, "material": "it"}},
-        "initial": {"on": [{"node_set": "tip", "velocity": [speed, 0.0, 0.0]}]},
-        "support": [{"node_set": "foot", "fix": "xyz"}],
-        "time": {"integrator": integrator, "step": STEP, "end": STEP * steps, **PARAMETERS.get(integrator, {})},
-        "solver": {"rtol": 1e-13, **(solver or {})},
-        "output": {"fields_every": steps, "fields": ["stress"], "probe": [{"name": "tip", "node_set": "tip"}]},
-    }
-    return table
 
 
 def force_of(measure, x):
@@ -137,18 +119,6 @@ def test_restart_is_bitwise(law, integrator, comm, shared_tmp_path):
         assert np.abs(first.field(name, -1)).max() > 0.0, name
 
 
-def pulled(law, strain, method="newton", **keys):
-    """A bar whose tip is moved, in a static analysis."""
-    case = one_bar(law, "newmark", **keys)
-    for key in ("time", "initial"):
-        del case[key]
-    case["static"] = {"method": method, "step": 0.2}
-    case["node_set"]["all"] = {"all": True}
-    moved = {"node_set": "tip", "fix": "x", "motion": [[0.0, 0.0, 0.0, 0.0], [1.0, strain, 0.0, 0.0]]}
-    case["support"] = [{"node_set": "foot", "fix": "x"}, {"node_set": "all", "fix": "yz"}, moved]
-    return case
-
-
 @pytest.mark.slow
 @pytest.mark.parallel
 @pytest.mark.parametrize("method", ["newton", "relaxation"])
@@ -180,58 +150,6 @@ def test_overstress_relaxes_in_a_static_stage(tmp_path):
     static = integrated("perzyna", [0.01], [1e300])[0, 0]
     assert reaction[20] > 1.3 * static
     assert reaction[-1] == pytest.approx(static, rel=1e-2)  # a is larger by the plastic strain of the overstress
-
-
-@pytest.mark.slow
-@pytest.mark.parallel
-def test_softened_elastic_bar_keeps_its_energy_while_heated(comm, shared_tmp_path):
-    """Heat supplies what softening and expansion take; nothing is lost, in steps of a tenth of a period."""
-    case = one_bar("elastic", "energy_momentum", steps=80, elements=2, softening=SOFTENING, thermal_expansion=1.2e-5)
-    case["temperature"] = [{"table": [[0.0, 0.0], [8e-4, 400.0]]}]
-    case["time"] |= {"step": 1e-5}
-    history = run(Case.from_dict(case), shared_tmp_path / "out")
-    start = history["kinetic_energy"][0]
-    assert abs(history["numerical_dissipation"]).max() < 1e-12 * start
-    assert abs(history["thermal_work"]).max() > 1e-2 * start
-    total = history["kinetic_energy"] + history["elastic_energy"] - history["thermal_work"]
-    assert np.ptp(total) < 1e-12 * start
-
-
-@pytest.mark.slow
-def test_heated_bar_with_a_rate_keeps_its_balance(tmp_path):
-    """While it flows and expands by heat, in the scheme that conserves energy."""
-    case = one_bar("perzyna", "energy_momentum", steps=60, elements=2, thermal_expansion=1.2e-5)
-    case["temperature"] = [{"table": [[0.0, 0.0], [6e-4, 400.0]]}]
-    history = run(Case.from_dict(case), tmp_path / "out")
-    start = history["kinetic_energy"][0]
-    assert history["plastic_heat"][-1] > 0.3 * start and abs(history["thermal_work"]).max() > 1e-2 * start
-    assert abs(history["numerical_dissipation"]).max() < 1e-11 * start
-
-
-@pytest.mark.slow
-def test_restrained_bar_that_softens(tmp_path):
-    """Held at both ends: the stress follows -E(T) alpha T until it yields at s_Y(T)."""
-    for law, keys in (("elastic", {}), ("elastoplastic", {"yield_stress": 250e6})):
-        case = pulled(law, 0.0, softening=SOFTENING, thermal_expansion=1.2e-5, **keys)
-        case["temperature"] = [{"table": [[0.0, 0.0], [1.0, 250.0]]}]
-        history = run(Case.from_dict(case), tmp_path / law)
-        stress = -0.75 * YOUNG * 1.2e-5 * 250.0
-        stress = max(stress, -0.55 * 250e6) if keys else stress
-        assert history["probe/tip/reaction"][-1, 0, 0] == pytest.approx(stress * AREA, rel=1e-9)
-
-
-@pytest.mark.thorough
-def test_thermal_work_of_laws_that_yield_while_heated(tmp_path):
-    """What is no heat, energy of the bars or thermal work vanishes with the square of the step."""
-    left = []
-    for parts in (1, 2, 4):
-        case = one_bar("voce", "newmark", steps=60 * parts, softening=SOFTENING, thermal_expansion=1.2e-5)
-        case["temperature"] = [{"table": [[0.0, 0.0], [6e-4, 300.0]]}]
-        case["time"] |= {"step": STEP / parts}
-        case["time"]["end"] = 6e-4
-        history = run(Case.from_dict(case), tmp_path / str(parts))
-        left.append(abs(history["numerical_dissipation"][-1]) / history["kinetic_energy"][0])
-    assert left[2] < 1e-3 and left[2] < 0.6 * left[0]
 
 
 def rod(law, speed, **keys):

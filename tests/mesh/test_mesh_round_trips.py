@@ -1,7 +1,6 @@
 """A truss that is written in any format and read back is the same truss; so are files of other programs."""
 
 import re
-import tracemalloc
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,7 +12,6 @@ from pfem_petsc.errors import InputError
 from pfem_petsc.mesh import load_slab
 from pfem_petsc.mesh.readers import read_whole
 from pfem_petsc.mesh.readers import suffixes as read_suffixes
-from pfem_petsc.mesh.whole import WholeMesh
 from pfem_petsc.mesh.writers import suffixes as written_suffixes
 from pfem_petsc.mesh.writers import write_whole
 
@@ -195,47 +193,6 @@ def test_gmsh_data_with_one_thing_wrong(tmp_path, old, new, text):
         read_whole(path)
 
 
-def test_tables_as_spreadsheets_save_them(tmp_path):
-    """Semicolons and decimal commas, units, texts as names of nodes, comments, a byte order mark."""
-    (tmp_path / "Nodes tower.csv").write_bytes(
-        "\ufeff# from a spreadsheet\r\nNode;X [m];Y [m];Groups\r\nA;0,0;0;feet\r\n".encode()
-        + b'B;1,5;0;"feet; right"\r\n\r\nC;0;2;\r\n'
-    )
-    (tmp_path / "Bars tower.csv").write_bytes(
-        b"Member;Node 1;Node 2;Area [m2];Note\r\n1;A;B;1,5e-4;short\r\n2;B;C;2e-4;long\r\n"
-    )
-    with pytest.raises(InputError, match="there is no such file, the other table"):
-        read_whole(tmp_path / "Bars tower.csv")
-    (tmp_path / "Nodes tower.csv").rename(tmp_path / "nodes tower.csv")
-    (tmp_path / "Bars tower.csv").rename(tmp_path / "bars tower.csv")
-    mesh = read_whole(tmp_path / "bars tower.csv")
-    assert mesh.points.tolist() == [[0, 0, 0], [1.5, 0, 0], [0, 2, 0]]
-    assert mesh.bars.tolist() == [[0, 1], [1, 2]]
-    assert mesh.bar_fields["area"].tolist() == [1.5e-4, 2e-4]
-    assert {name: members.tolist() for name, members in mesh.node_groups.items()} == {"feet": [0, 1], "right": [1]}
-    assert mesh.warnings == [f"{tmp_path}/bars tower.csv: left out column 'Note', which has text other than numbers"]
-
-
-@pytest.mark.parametrize(
-    ("nodes", "bars", "text"),
-    [
-        ("x,y,z\n0,0,0\n1,0,zero\n", "a,b\n0,1\n", "nodes.csv: line 3: column 'z': 'zero' is not a number"),
-        ("x,z\n0,0\n", "a,b\n0,1\n", "nodes.csv: line 1: there is no column 'y'; it has 'x', 'z'"),
-        ("x,y\n0,0\n1,1\n", "a,b\n0,2\n", "bars.csv: line 2: there is no node '2' in t_nodes.csv"),
-        ("x,y\n0,0\n1\n", "a,b\n0,1\n", "nodes.csv: line 3: 1 entries; expected 2"),
-        ("node,x,y\n7,0,0\n7,1,0\n", "a,b\n7,7\n", "nodes.csv: line 3: node '7' is listed more than once"),
-        ("", "a,b\n0,1\n", "nodes.csv: is empty"),
-        ('x,y\n"0,0\n1,1\n', "a,b\n0,1\n", "nodes.csv"),
-        (b"\xff\xfe\x00", "a,b\n0,1\n", "nodes.csv: cannot be read"),
-    ],
-)
-def test_tables_with_one_thing_wrong(tmp_path, nodes, bars, text):
-    (tmp_path / "t_nodes.csv").write_bytes(nodes if isinstance(nodes, bytes) else nodes.encode())
-    (tmp_path / "t_bars.csv").write_text(bars)
-    with pytest.raises(InputError, match=text):
-        read_whole(tmp_path / "t_nodes.csv")
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_odd_names(tmp_path, name):
     """Of groups and numbers of bars; only what a format cannot have is replaced."""
@@ -286,12 +243,6 @@ def test_names_with_slashes(tmp_path, name):
         assert {key: members.tolist() for key, members in truss.bar_groups.items()} == {"a_b_": [1], "a_b": [2]}
 
 
-def test_a_table_without_a_pair(tmp_path):
-    (tmp_path / "t.csv").write_text("x,y\n")
-    with pytest.raises(InputError, match="is a pair of files, t_nodes.csv and t_bars.csv: name one of them"):
-        read_whole(tmp_path / "t.csv")
-
-
 @pytest.mark.parametrize("suffix", ["inp", "stl", "3mf"])
 @pytest.mark.parametrize("content", [b"", b"\0" * 1000, b"$", b"*", b"<VTKFile", b"PK\3\4" + b"\xff" * 500])
 def test_garbage_is_refused(tmp_path, capfd, suffix, content):
@@ -309,17 +260,3 @@ def test_what_cannot_be_written_leaves_the_earlier_file(tmp_path):
     with pytest.raises(InputError, match="3MF needs a radius"):
         Truss([[0, 0, 0], [1, 0, 0]], [[0, 1]]).write(path)
     assert path.read_bytes() == before and [file.name for file in tmp_path.iterdir()] == ["a.3mf"]
-
-
-def test_tables_have_their_entries_once_in_memory(tmp_path):
-    """The most memory while a table is read: below 600 bytes a bar, of four columns with short texts."""
-    random = np.random.default_rng(0)
-    n, many = 2000, 10000
-    ends = np.stack([np.arange(many) % n, random.integers(n, 2 * n, many)], axis=1)
-    groups, areas = {"legs": np.arange(many)}, {"area": np.full(many, 1e-4)}
-    write_whole(tmp_path / "m_bars.csv", WholeMesh(random.random((2 * n, 3)), ends, {}, groups, areas))
-    tracemalloc.start()
-    mesh = read_whole(tmp_path / "m_bars.csv")
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert mesh.bars.tolist() == ends.tolist() and peak < 600 * many

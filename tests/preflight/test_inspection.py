@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from helpers.counted import CUBE, CUBE_EDGES, TRUSSES
 from helpers.mesh_files import case_of
 
 from pfem_petsc import Case, Simulation
@@ -11,45 +12,6 @@ from pfem_petsc.preflight.parts import count_parts
 from pfem_petsc.preflight.rigidity import global_rigidity, unbraced_nodes
 
 pytestmark = pytest.mark.parallel
-CUBE = [[x, y, z] for z in (0.0, 1.0) for y in (0.0, 1.0) for x in (0.0, 1.0)]
-CUBE_EDGES = [(a, b) for a in range(8) for b in range(a + 1, 8) if bin(a ^ b).count("1") == 1]
-TRUSSES = {
-    # points, bars, fixed nodes; free unknowns, rigid motions, mechanisms, states of self-stress, unbraced nodes
-    "triangle": ([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [(0, 1), (1, 2), (2, 0)], [], (6, 3, 0, 0, 0)),
-    "square": ([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [(0, 1), (1, 2), (2, 3), (3, 0)], [], (8, 3, 1, 0, 0)),
-    "square, both diagonals": (
-        [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]],
-        [(0, 1), (1, 2), (2, 3), (3, 0), (0, 2), (1, 3)],
-        [],
-        (8, 3, 0, 1, 0),
-    ),
-    "square with a whip": (
-        [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [3, 1, 0]],
-        [(0, 1), (1, 2), (2, 3), (3, 0), (0, 2), (2, 4)],
-        [],
-        (10, 3, 1, 0, 1),
-    ),
-    "hinged square": (
-        [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]],
-        [(0, 1), (1, 2), (2, 3), (3, 0), (0, 2)],
-        [0, 1],
-        (4, 0, 0, 1, 0),
-    ),
-    "tetrahedron": (
-        [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]],
-        [(0, 1), (0, 2), (0, 3), (1, 2), (2, 3), (3, 1)],
-        [],
-        (12, 6, 0, 0, 0),
-    ),
-    "cube of edges": (CUBE, CUBE_EDGES, [], (24, 6, 6, 0, 0)),
-    "tetrahedron, one bar short": (
-        [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]],
-        [(0, 1), (0, 2), (0, 3), (1, 2), (2, 3)],
-        [],
-        (12, 6, 1, 0, 2),
-    ),
-    "chain": ([[0, 0, 0], [1, 0, 0], [2, 0, 0]], [(0, 1), (1, 2)], [], (3, 1, 0, 0, 0)),
-}
 
 
 @pytest.mark.parametrize("name", TRUSSES)
@@ -209,48 +171,6 @@ def test_jumps_of_velocity_are_warned_of_where_they_stay(comm, scheme, warns):
         told = warnings_before(simulation.case, simulation.model, simulation.plan)
         found = [line for line in told if "velocity jumps at each of the 2 rows" in line]
         assert len(found) == (warns and interpolation == "linear")
-
-
-def divided(points, bars, parts):
-    """A truss as a mesh generator leaves it: each bar in so many parts."""
-    points, divided_bars = [list(point) for point in points], []
-    for a, b in bars:
-        start, way = np.array(points[a]), np.subtract(points[b], points[a])
-        inner = range(len(points), len(points) + parts - 1)
-        points += [(start + way * k / parts).tolist() for k in range(1, parts)]
-        chain = [a, *inner, b]
-        divided_bars += list(zip(chain[:-1], chain[1:]))
-    return points, divided_bars
-
-
-@pytest.mark.slow
-@pytest.mark.parallel
-def test_subdivided_members_are_told(comm, shared_tmp_path):
-    """All inner nodes of the members, also where a member's direction is general; not what a support holds."""
-    points, bars, _, _ = TRUSSES["tetrahedron"]
-    points = np.array(points) @ np.linalg.qr(np.random.default_rng(2).normal(size=(3, 3)))[0]
-    for parts in (1, 2, 5):
-        mesh = divided(points, bars, parts)
-        fixed = [] if parts == 1 else [len(points)]
-        simulation = Simulation(case_of(shared_tmp_path, comm, *mesh, fixed), comm, check_only=True)
-        told = warnings_before(simulation.case, simulation.model, simulation.plan)
-        found = [text for text in told if "Transfinite Curve {:} = 2" in text]
-        if parts == 1:
-            assert found == []
-            continue
-        count = len(bars) * (parts - 1) - 1
-        assert found[0].startswith(f"{count} nodes are only connected to two collinear bars")
-        assert not any("can move freely" in text for text in told)
-
-
-@pytest.mark.parallel
-def test_a_rod_and_a_bent_chain_are_no_subdivided_truss(comm, shared_tmp_path):
-    for bend in (0.0, 0.2):
-        points = [[0.1 * k, bend * 0.1 * k * k, 0.0] for k in range(8)]
-        bars = [[k, k + 1] for k in range(7)]
-        simulation = Simulation(case_of(shared_tmp_path, comm, points, bars), comm, check_only=True)
-        told = warnings_before(simulation.case, simulation.model, simulation.plan)
-        assert not any("collinear" in text for text in told)
 
 
 @pytest.mark.parametrize(

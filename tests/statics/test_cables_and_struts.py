@@ -7,10 +7,11 @@ import math
 import numpy as np
 import pytest
 from helpers.cables import funicular
+from helpers.last_state import run
 from helpers.mesh_files import case_of
 from helpers.strut_twin import Strut, solid
 
-from pfem_petsc import Case, Simulation, open_result, write_mesh
+from pfem_petsc import Case, Simulation, write_mesh
 from pfem_petsc.errors import InputError, SimulationFailure
 
 pytestmark = pytest.mark.parallel
@@ -18,18 +19,6 @@ pytestmark = pytest.mark.parallel
 SQUARE = [[0, 0, 0], [0, 0, 1], [1, 0, 1], [1, 0, 0]]
 CABLE = {"law": "cable", "young_modulus": 2e11, "density": 7850.0}
 FEET = np.array([[0, 0, 0], [20, 0, -5.56], [30, 0, -5], [45, 0, 5.83], [60, 0, 20.0]])
-
-
-def run(case, comm, folder):
-    """Run a case; its history and the fields of its last snapshot, the same on all ranks."""
-    with Simulation(case, comm, output=folder, quiet=True) as simulation:
-        assert simulation.run() == 0
-    found = None
-    if comm.rank == 0:
-        result = open_result(folder)
-        history = {name: np.asarray(result.history[name]) for name in result.history}
-        found = history, {name: result.field(name, -1) for name in result.cell_fields}
-    return comm.bcast(found)
 
 
 @pytest.mark.parametrize("method", [{"step": 0.5}, {"method": "relaxation"}])
@@ -171,60 +160,6 @@ def test_load_control_ends_at_the_peak(comm, shared_tmp_path):
         with pytest.raises(SimulationFailure):
             simulation.run()
         assert 0.6 < simulation.state.time < 1.0 / 1.5
-
-
-def octet_strength(area, cells, comm, folder):
-    """Largest force [N] on octet cells of round struts of an area, pressed by 1.2 % between frictionless plates."""
-    side, height = 0.01 * cells[0], 0.01 * cells[2]
-    case = Case.from_dict(
-        {
-            "mesh": {"generator": "lattice", "kind": "octet", "cells": cells, "pitch": 0.01},
-            "node_set": {
-                "bottom": {"group": "bottom"},
-                "top": {"group": "top"},
-                "corner": {"nearest": [0.0, 0.0, 0.0]},
-                "beside": {"nearest": [side, 0.0, 0.0]},
-            },
-            "material": {"m": {"law": "strut", "young_modulus": 70e9, "density": 2700.0, "yield_stress": 200e6}},
-            "section": {"s": {"area": area, "material": "m", "shape": "round"}},
-            "support": [
-                {"node_set": "bottom", "fix": "z"},
-                {"node_set": "corner", "fix": "xy"},
-                {"node_set": "beside", "fix": "y"},
-                {
-                    "node_set": "top",
-                    "fix": "z",
-                    "motion": [[0, 0, 0, 0], [1, 0, 0, -0.012 * height]],
-                    "interpolation": "linear",
-                },
-            ],
-            "static": {"step": 0.05},
-            "output": {"fields_every": 0, "probe": [{"name": "top", "node_set": "top"}]},
-        }
-    )
-    history, _ = run(case, comm, folder)
-    return -history["probe/top/reaction"][:, :, 2].sum(axis=1).min()
-
-
-@pytest.mark.slow
-def test_strength_of_an_octet_cell_follows_yield_and_euler(comm, shared_tmp_path):
-    """Areas over 16 to 1: with the area where struts yield, with its square where they buckle."""
-    areas = 4.5e-8 * 4.0 ** np.arange(3)  # slendernesses of 118, 59 and 30; 58.8 is that of both
-    forces = np.array([octet_strength(area, [1, 1, 1], comm, shared_tmp_path / "out") for area in areas])
-    slopes = np.diff(np.log(forces)) / np.log(4.0)
-    assert slopes == pytest.approx([2.0, 1.0], abs=0.02)
-    length = 0.01 / math.sqrt(2.0)
-    euler = 0.25 * math.pi * 70e9 * areas[0] ** 2 / length**2
-    # in both, the same multiple of the strength of a bar
-    assert forces[0] / euler == pytest.approx(forces[2] / (200e6 * areas[2]), rel=0.03)
-
-
-@pytest.mark.thorough
-def test_strength_of_octet_cells_at_many_areas(comm, shared_tmp_path):
-    areas = 4.5e-8 * 2.0 ** np.linspace(0.0, 4.0, 9)
-    forces = np.array([octet_strength(area, [1, 1, 1], comm, shared_tmp_path / "out") for area in areas])
-    slopes = np.diff(np.log(forces)) / np.diff(np.log(areas))
-    assert slopes[:4] == pytest.approx(2.0, abs=0.1) and slopes[4:] == pytest.approx(1.0, abs=0.1)
 
 
 @pytest.mark.parametrize("law", ["cable", "strut", "damage"])

@@ -1,0 +1,95 @@
+"""Files that are no case: syntax errors, missing files, values where tables are expected."""
+
+import pytest
+
+from pfem_petsc.case.schema import Case
+from pfem_petsc.errors import InputError
+
+
+@pytest.mark.parametrize("brackets", [1, 100_000])
+def test_syntax_error_names_the_place(tmp_path, brackets):
+    path = tmp_path / "broken.toml"
+    path.write_text("[mesh]\nlength = " + "[" * brackets + "\n")
+    with pytest.raises(InputError) as refused:
+        Case.load(path)
+    message = str(refused.value)
+    assert message.startswith(f"{path}: ")
+    assert "nested too deep" in message if brackets > 1 else "TOML" in message
+
+
+def test_syntax_error_names_line_and_column(tmp_path):
+    path = tmp_path / "broken.toml"
+    path.write_text("[mesh]\nlength = = 1\n")
+    with pytest.raises(InputError, match=r"broken\.toml: .*line 2, column 10"):
+        Case.load(path)
+
+
+def test_file_that_cannot_be_read(tmp_path):
+    with pytest.raises(InputError, match=r"rod_impct: .*did you mean 'rod_impact'"):
+        Case.load("rod_impct")
+    with pytest.raises(InputError, match=r"nothing\.toml: .*built-in cases are .*rod_impact"):
+        Case.load(tmp_path / "nothing.toml")
+    with pytest.raises(InputError, match=r"this is a folder; name a case file .* results by -o"):
+        Case.load(tmp_path)
+    with pytest.raises(InputError, match="cannot be read"):
+        Case.load("zero\0byte")
+    latin = tmp_path / "latin.toml"
+    latin.write_bytes(b'title = "\xe9"\n')
+    with pytest.raises(InputError, match=r"line 1: this is not UTF-8 text"):
+        Case.load(latin)
+
+
+def test_mesh_file_takes_no_generator_keys(case_text):
+    text = case_text.replace('generator = "rod"', 'file = "a.msh"')
+    with pytest.raises(InputError, match=r"mesh\.length: .*a mesh from a file takes no other keys"):
+        Case.from_toml(text)
+
+
+def test_parameter_of_another_scheme_is_refused_with_the_way_out():
+    data = Case.load("rod_impact", ["time.integrator=newmark", "time.beta=0.25"]).to_dict()
+    with pytest.raises(
+        InputError, match=r"time.beta: a key of chung_lee, newmark, not of houbolt, .*; --set time.beta= removes it"
+    ):
+        Case.from_dict(data, overrides=["time.integrator=houbolt"])
+    taken_out = ["time.integrator=houbolt", "time.beta=", "time.gamma="]
+    assert Case.from_dict(data, overrides=taken_out).time.integrator == "houbolt"
+    data["time"]["integrator"] = "houbolt"
+    with pytest.raises(
+        InputError, match=r"time.beta: a key of chung_lee, newmark, not of houbolt, which takes no parameters(\n|$)"
+    ):
+        Case.from_dict(data)
+
+
+@pytest.mark.parametrize("given", ["rod_impact", "mesh = 1", [1.0], None, 3])
+def test_what_is_no_table_is_refused_with_what_reads_it(given):
+    with pytest.raises(InputError, match=r"^case: expected nested tables, got .*; Case\.load reads a case file"):
+        Case.from_dict(given)
+
+
+@pytest.mark.parametrize("given", ["rod_impact", {"title": "a table"}, None])
+def test_a_simulation_is_of_a_case(given):
+    from pfem_petsc import Simulation
+
+    with pytest.raises(InputError, match=r"expected a Case, got .*Case\.load .*Case\.from_dict"):
+        Simulation(given)
+
+
+def test_numbers_as_keys_of_a_table_are_refused_with_the_table():
+    case = {"support": [{"node_set": "every", "fix": "x", "motion": {1: 2}}]}
+    with pytest.raises(InputError, match=r"support\[0\].motion = {1 = 2}"):
+        Case.from_dict(case)
+
+
+def test_ranges_stand_for_lists():
+    data = Case.load("rod_impact").to_dict()
+    data["node_set"]["tip"] = {"indices": range(2, 8, 2)}
+    assert Case.from_dict(data).node_set["tip"].indices == (2, 4, 6)
+
+
+def test_set_makes_the_first_of_a_list_of_constraints():
+    """``constraint.0`` where the case has none is refused for its kind, not for the key."""
+    with pytest.raises(
+        InputError,
+        match=r"constraint\[0\]\.kind = \"thether\" \(given by --set\): unknown value; none is built in, CONTR",
+    ):
+        Case.load("rod_impact", ["constraint.0.kind=thether"])

@@ -1,0 +1,67 @@
+"""Strength of octet lattices whose struts yield or buckle."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from helpers.last_state import run
+
+from pfem_petsc import Case
+
+pytestmark = pytest.mark.parallel
+
+
+def octet_strength(area, cells, comm, folder):
+    """Largest force [N] on octet cells of round struts of an area, pressed by 1.2 % between frictionless plates."""
+    side, height = 0.01 * cells[0], 0.01 * cells[2]
+    case = Case.from_dict(
+        {
+            "mesh": {"generator": "lattice", "kind": "octet", "cells": cells, "pitch": 0.01},
+            "node_set": {
+                "bottom": {"group": "bottom"},
+                "top": {"group": "top"},
+                "corner": {"nearest": [0.0, 0.0, 0.0]},
+                "beside": {"nearest": [side, 0.0, 0.0]},
+            },
+            "material": {"m": {"law": "strut", "young_modulus": 70e9, "density": 2700.0, "yield_stress": 200e6}},
+            "section": {"s": {"area": area, "material": "m", "shape": "round"}},
+            "support": [
+                {"node_set": "bottom", "fix": "z"},
+                {"node_set": "corner", "fix": "xy"},
+                {"node_set": "beside", "fix": "y"},
+                {
+                    "node_set": "top",
+                    "fix": "z",
+                    "motion": [[0, 0, 0, 0], [1, 0, 0, -0.012 * height]],
+                    "interpolation": "linear",
+                },
+            ],
+            "static": {"step": 0.05},
+            "output": {"fields_every": 0, "probe": [{"name": "top", "node_set": "top"}]},
+        }
+    )
+    history, _ = run(case, comm, folder)
+    return -history["probe/top/reaction"][:, :, 2].sum(axis=1).min()
+
+
+@pytest.mark.slow
+def test_strength_of_an_octet_cell_follows_yield_and_euler(comm, shared_tmp_path):
+    """Areas over 16 to 1: with the area where struts yield, with its square where they buckle."""
+    areas = 4.5e-8 * 4.0 ** np.arange(3)  # slendernesses of 118, 59 and 30; 58.8 is that of both
+    forces = np.array([octet_strength(area, [1, 1, 1], comm, shared_tmp_path / "out") for area in areas])
+    slopes = np.diff(np.log(forces)) / np.log(4.0)
+    assert slopes == pytest.approx([2.0, 1.0], abs=0.02)
+    length = 0.01 / math.sqrt(2.0)
+    euler = 0.25 * math.pi * 70e9 * areas[0] ** 2 / length**2
+    # in both, the same multiple of the strength of a bar
+    assert forces[0] / euler == pytest.approx(forces[2] / (200e6 * areas[2]), rel=0.03)
+
+
+@pytest.mark.thorough
+def test_strength_of_octet_cells_at_many_areas(comm, shared_tmp_path):
+    areas = 4.5e-8 * 2.0 ** np.linspace(0.0, 4.0, 9)
+    forces = np.array([octet_strength(area, [1, 1, 1], comm, shared_tmp_path / "out") for area in areas])
+    slopes = np.diff(np.log(forces)) / np.diff(np.log(areas))
+    assert slopes[:4] == pytest.approx(2.0, abs=0.1) and slopes[4:] == pytest.approx(1.0, abs=0.1)

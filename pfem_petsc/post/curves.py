@@ -30,6 +30,8 @@ __all__ = [
 
 History = Mapping[str, np.ndarray]
 
+_DISPLACEMENT = "/displacement"  # of probes, whose columns have positions
+
 DASHES: tuple[Any, ...] = ("-", (0, (6, 2)), (0, (2, 1.5)), (0, (7, 2, 1.5, 2)))
 
 
@@ -55,7 +57,7 @@ def column(history: History, name: str) -> dict[str, np.ndarray]:
     """Return the curves (n,) of a name: a column, or ``.x``, ``.y``, ``.z``, ``.norm`` of one.
 
     Columns of nodes are the mean over the nodes, of reactions the sum. A vector without component gives those that are
-    not zero up to rounding.
+    not zero up to rounding. ``probe/NAME/displacement`` is the position relative to that of the first row.
 
     Raises
     ------
@@ -65,6 +67,9 @@ def column(history: History, name: str) -> dict[str, np.ndarray]:
     whole, _, part = name.rpartition(".")
     if name in list(history) or part not in ("x", "y", "z", "norm"):
         whole, part = name, ""
+    if whole not in list(history) and (position := _position(whole)) in list(history):
+        values = read(history, position)
+        history = {whole: values - values[:1]}
     if whole not in list(history) or whole.startswith("event/"):
         known = [each for each in history if not each.startswith("event/")]
         raise InputError(f"plot: the history holds no column '{whole}'{nearest(whole, known)}")
@@ -84,8 +89,14 @@ def column(history: History, name: str) -> dict[str, np.ndarray]:
     return {f"{whole}.{'xyz'[k]}": values[:, k] for k in kept or range(3)}
 
 
+def _position(name: str) -> str:
+    """Return the name of the positions that displacements of a probe are made of; others as they are."""
+    is_displacement = name.startswith("probe/") and name.endswith(_DISPLACEMENT)
+    return name.removesuffix(_DISPLACEMENT) + "/position" if is_displacement else name
+
+
 def usual_curves(results: Sequence[Any]) -> list[str]:
-    """Return what is compared of several results: energies, forces of walls, positions of probes, if all have them."""
+    """Return what is compared of results: energies, forces of walls, displacements of probes, if all have them."""
     common = [name for name in results[0].history if all(name in result.history for result in results)]
     energies = [name for name in (*STORED, *LOST, *SUPPLIED) if name in common]
     sizes = {name: max(float(np.abs(read(r.history, name)).max()) for r in results) for name in energies}
@@ -93,11 +104,25 @@ def usual_curves(results: Sequence[Any]) -> list[str]:
     chosen = [name for name in energies if sizes[name] > 1e-3 * largest]
     forces = [name for name in common if name.startswith("wall/") and name.endswith("/force")]
     chosen += [name for name in forces if any(np.any(result.history[name]) for result in results)]
-    chosen += [name for name in common if name.startswith("probe/") and name.endswith("/position")]
-    chosen += ["load_factor"] if "load_factor" in common and results[0].axis is not TIME else []
+    for name in common:
+        if name.startswith("probe/") and name.endswith("/position"):
+            moved = name.removesuffix("/position") + _DISPLACEMENT
+            chosen += [moved] if any(largest_of(column(r.history, moved)) > 0.0 for r in results) else []
+    # over load factors, the load factor is a straight line; it is a curve over the points of a path
+    paths = "load_factor" in common and results[0].axis is not TIME
+    chosen += ["load_factor"] if paths and not all(_is_axis(r.history, "load_factor") for r in results) else []
     if not chosen:
         raise InputError("plot: the results have no columns in common that change; name some as curves")
     return chosen
+
+
+def largest_of(curves: Mapping[str, np.ndarray]) -> float:
+    """Return the largest magnitude of all curves."""
+    return max((largest(values) for values in curves.values()), default=0.0)
+
+
+def _is_axis(history: History, name: str) -> bool:
+    return np.array_equal(read(history, name), read(history, "time"))
 
 
 def draw_curves(
@@ -143,8 +168,7 @@ def draw_curves(
     every = [[column(result.history, name) for result in results] for name in names]
     sizes: dict[str, list[float]] = {}
     for name, found in zip(names, every, strict=True):
-        parts = (values for curves in found for values in curves.values())
-        sizes.setdefault(unit_of_curve(name), []).append(max(largest(values) for values in parts))
+        sizes.setdefault(unit_of_curve(name), []).append(max(largest_of(curves) for curves in found))
     for unit, magnitudes in sizes.items():
         chart.share(unit, unit, magnitudes)
     for axes, name, found in zip(chart.axes[:, 0], names, every, strict=True):
@@ -159,6 +183,7 @@ def draw_curves(
 
 def unit_of_curve(name: str) -> str:
     """Return the SI unit of a column or a component of one."""
+    name = name.replace(_DISPLACEMENT, "/position")
     return unit_of(name.rpartition(".")[0] or name) or unit_of(name)
 
 
@@ -190,6 +215,7 @@ def _panel(
             chart.record(f"{part}: {label}" if several else part, filtered, unit, (along, place))
     label = words(name.rsplit("/", 1)[-1])
     axes.set_ylabel(f"{label} [{shown}]" if shown else label)
+    name = parts[0] if len(parts) == 1 else name  # which component it is
     axes.set_title(literal(name if chosen is None or chosen.name == AS_COMPUTED else f"{name}: {chosen.name}"))
 
 
@@ -197,10 +223,10 @@ def _draw_exact(chart: Chart, axes: Any, exact: Any, found: dict[str, np.ndarray
     """Add the closed form of the curves of a panel."""
     for part in found:
         whole, _, component = part.rpartition(".")
-        values = exact.columns.get(part, exact.columns.get(whole))
+        values = exact.columns.get(part, exact.columns.get(_position(whole)))
         if values is None:
             continue
-        values = column({whole or part: values}, part)[part]
+        values = column({_position(whole) or part: values}, part)[part]
         axes.plot(place * chart.factor, values * axes.pfem_factor, label="closed form", **REFERENCE)
         chart.record(f"{part} closed form", values, unit_of(whole or part), (chart._over, place))
 

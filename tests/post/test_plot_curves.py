@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 from helpers.charts import saturated, table_columns
 from helpers.synthetic import SyntheticResult, ring
+from mpi4py import MPI
 
+from pfem_petsc import Case, Simulation, Truss, open_result
 from pfem_petsc.errors import InputError
 from pfem_petsc.post.chart import thinned
 from pfem_petsc.post.filters import window_mean
@@ -110,6 +112,33 @@ def test_several_results_are_drawn_over_each_other(tmp_path, result):
     assert len(rows) == 260 and [bool(row[3]) for row in rows].count(True) == 100
     (picture,) = plot([result, other], tmp_path / "both")
     assert len(saturated(picture)) > 500
+
+
+def test_displacements_are_compared_and_not_positions(tmp_path):
+    """A probe far from the origin that moves little; and no picture of the load factor over itself."""
+    results = []
+    for folder, area in (("thin", 1e-4), ("thick", 2e-4)):
+        case = Case(
+            mesh=Truss([[50.0, 0, 0], [51, 0, 0], [50.5, 0, 1]], [[0, 2], [1, 2], [0, 1]], node_groups={"top": [2]}),
+            node_set={"top": {"group": "top"}, "feet": {"box": [[0, -1, -0.1], [60, 1, 0.1]]}, "all": {"all": True}},
+            material={"m": {"young_modulus": 2e11, "density": 1.0}},
+            section={"s": {"area": area, "material": "m"}},
+            support=[{"node_set": "feet", "fix": "xyz"}, {"node_set": "all", "fix": "y"}],
+            load=[{"node_set": "top", "force": [0.0, 0.0, -1e4]}],
+            static={"step": 0.5},
+            output={"probe": [{"name": "top", "node_set": "top"}, {"name": "feet", "node_set": "feet"}]},
+        )
+        with Simulation(case, MPI.COMM_SELF, output=tmp_path / folder, quiet=True) as simulation:
+            simulation.run()
+        results.append(tmp_path / folder)
+    (file,) = plot(results, tmp_path, formats=["csv"])
+    head, columns = table_columns(file)
+    names = [name.partition(": ")[0] for name in head]
+    assert names[0] == "load factor" and "probe/top/displacement.z" in names
+    assert not {"probe/top/position.z", "load_factor", "probe/feet/displacement.z"} & set(names)
+    thin, thick = (column for name, column in zip(names, columns, strict=True) if name == "probe/top/displacement.z")
+    z = open_result(results[0]).history["probe/top/position"][:, 0, 2]
+    assert thin == pytest.approx(z - z[0], abs=1e-15) and thick[-1] == pytest.approx(0.5 * thin[-1], rel=1e-2)
 
 
 def test_spectra_have_the_amplitude(tmp_path, result):

@@ -83,15 +83,44 @@ def test_fused_steps_with_pairs_of_several_tables(tmp_path):
         assert np.abs(history[f"pair/{name}/impulse"][-1]).max() > 0.01
 
 
+SQUEEZED = {
+    "mesh": {
+        "generator": "lattice",
+        "kind": "cubic",
+        "cells": [1, 11, 4],
+        "pitch": 0.01,
+    },  # whole planes of nodes for a rank
+    "node_set": {"left": {"group": "left"}, "right": {"group": "right"}, "held": {"nearest": [0.0, 0.0, 0.0]}},
+    "material": {"it": {"young_modulus": 110e9, "density": 4500.0}},
+    "section": {"it": {"area": 1e-6, "material": "it"}},
+    "initial": {
+        "velocity": [0.0, 1.0, 0.0],
+        "on": [{"node_set": "left", "velocity": [20.0, 0, 0]}, {"node_set": "right", "velocity": [-15.0, 2.0, 0]}],
+    },
+    "contact_pair": [{"name": "faces", "first": "left", "second": "right", "direction": [1, 0, 0], "gap": 0.00999}],
+    "time": {"integrator": "central_differences", "step": 2e-7, "end": 4e-5},
+    "output": {"fields_every": 0, "history_every": 3},
+}
+
+
 @pytest.mark.parallel
-@pytest.mark.parametrize("name", ["free", "held", "many blocks"])
-def test_ranks_make_the_same_steps_with_pairs(name, comm, shared_tmp_path):
-    tables = case(shared_tmp_path, **CASES[name])
+@pytest.mark.parametrize("supports", [[], [{"node_set": "held", "fix": "xyz"}]], ids=["free", "held"])
+def test_ranks_make_fused_steps_with_pairs_of_their_own(supports, comm, shared_tmp_path):
+    tables = SQUEEZED | {"support": supports}
     one, count = made(tables, comm, shared_tmp_path / "one", False)
     many, fewer = made(tables, comm, shared_tmp_path / "many", True)
     cut = comm.allreduce(int((~one.model.pairs.mine).sum()))
-    assert fewer == count if cut else fewer < count / 5  # pairs between ranks need single steps
-    compare(one, many, shared_tmp_path)
+    assert cut == 0 or comm.size > 2
+    assert fewer == count if cut else fewer < count / 5
+    history = compare(one, many, shared_tmp_path)
+    assert history["active_contacts"].max() > 8 and np.ptp(history["active_contacts"]) > 8
+
+
+@pytest.mark.parallel
+def test_pairs_between_ranks_take_single_steps(comm, shared_tmp_path):
+    simulation, count = made(case(shared_tmp_path, end=0.004), comm, shared_tmp_path / "out", True)
+    cut = comm.allreduce(int((~simulation.model.pairs.mine).sum()))
+    assert count == 20 if cut else count < 10
 
 
 @pytest.mark.parametrize("what", ["in several pairs", "with walls"])

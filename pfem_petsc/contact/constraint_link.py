@@ -44,6 +44,8 @@ class ConstraintLink:
         on all ranks that have a row
     """
 
+    lender = None  # the gradients of rows turn
+
     def __init__(
         self, case: Case, nodes: dict[str, np.ndarray], mesh: DistributedMesh, fixed: np.ndarray, contact: Contact
     ) -> None:

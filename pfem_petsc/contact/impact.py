@@ -17,6 +17,7 @@ import numpy as np
 from mpi4py import MPI
 
 from ..tolerances import ON_BOUND
+from .fixed_rows import close_rows
 from .impact_loops import join_nodes, plane_gaps, stop_nodes, unpressed
 
 if TYPE_CHECKING:
@@ -203,12 +204,5 @@ class Impacts:
         if len(at) == 0:
             return 0.0
         ends = pairs.gather_of(at, of_nodes)
-        normals = pairs.normals[at]
-        parts = (ends[1, :, k : k + 3] - ends[0, :, k : k + 3] for k in (0, 3, 6))
-        distance, speed, pull = (np.einsum("pi,pi->p", normals, part) for part in parts)
-        distance -= pairs.gaps[at]
-        pairs.closed[at] |= parted[at] & (distance <= self.slack)
-        square = np.maximum(speed * speed - 2.0 * pull * np.maximum(distance, 0.0), 0.0)
-        closing = fresh[at] & (speed < 0.0) & pairs.mine[1, at]
-        energy = 0.5 * pairs.reduced(ends[:, :, 9], at) * square
-        return float(energy[closing].sum())
+        mine = pairs.mine[1]
+        return close_rows(at, ends, pairs.normals, pairs.gaps, pairs.along, mine, self.slack, pairs.force, pairs.closed)

@@ -16,6 +16,7 @@ from petsc4py import PETSc
 from ..errors import SimulationFailure
 from ..integrators.base import Balance, State
 from ..parallel.natural import NaturalOrder
+from .fixed_rows import NoRows, RowLender
 from .frames import NodalFrames
 
 if TYPE_CHECKING:
@@ -31,10 +32,15 @@ class Link(Protocol):
     ----------
     columns : of its tables in the history, like ``pair/NAME``
     numbers : mesh numbers of the nodes of its rows, at least of those whose nodes this rank owns
+    lender : lends its rows to loops over many steps; None if such loops cannot solve them on this rank
     """
 
     columns: list[str]
     numbers: np.ndarray
+
+    @property
+    def lender(self) -> RowLender | None:
+        """See above."""
 
     def explicit(
         self,
@@ -213,6 +219,13 @@ class Links:
         if failure is not None:
             raise failure
         return contact if pressed else none
+
+    @property
+    def lender(self) -> RowLender | None:
+        """See :class:`Link`; the rows of one link at most."""
+        if not self.members:
+            return NoRows()
+        return self.members[0].lender if len(self.members) == 1 else None
 
     def count_held(self, nodes: np.ndarray, owned: int) -> int:
         """How many of the owned nodes are among those (k,) that walls hold, or held by links."""

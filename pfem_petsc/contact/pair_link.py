@@ -10,6 +10,7 @@ from petsc4py import PETSc
 from ..errors import NotConverged
 from ..integrators.base import Balance, State
 from ..parallel.natural import NaturalOrder
+from .fixed_rows import FixedRows
 from .frames import NodalFrames
 from .links import BlocksOf
 from .pair_checks import check_scheme, check_start
@@ -29,6 +30,8 @@ class PairLink:
     def __init__(self, pairs: ContactPairs) -> None:
         self.pairs = pairs
         self.columns = [f"pair/{name}" for name in pairs.names]
+        self._rows: FixedRows | None = None  # for nodes of the stiffness
+        self._rows_of = np.empty(0)
 
     @property
     def numbers(self) -> np.ndarray:
@@ -46,6 +49,22 @@ class PairLink:
     ) -> bool:
         """See :class:`~pfem_petsc.contact.links.Link`, here and below."""
         return self.pairs.explicit(balance.predictor, u, stiffness, contact, balance.time, tolerance)
+
+    @property
+    def lender(self) -> PairLink | None:
+        pairs = self.pairs
+        independent = not pairs.coupled.any and not pairs.coupled.contact.any
+        return self if independent and pairs.partners.alone else None
+
+    def lend_rows(self, stiffness: np.ndarray) -> FixedRows:
+        pairs = self.pairs
+        if self._rows is None or stiffness is not self._rows_of:
+            self._rows, self._rows_of = pairs.rows(stiffness), stiffness
+        self._rows.force[self._rows.place], self._rows.closed[self._rows.place] = pairs.force, pairs.closed
+        return self._rows
+
+    def take_rows(self, rows: FixedRows) -> None:
+        self.pairs.force, self.pairs.closed = rows.force[rows.place], rows.closed[rows.place]
 
     def coordinates(self) -> PairLinkCoordinates:
         return PairLinkCoordinates(self.pairs)

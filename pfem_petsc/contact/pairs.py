@@ -22,6 +22,7 @@ from mpi4py import MPI
 from ..mesh.exchange import swap
 from ..parallel.agreement import agreed
 from .coupled import CoupledPairs
+from .fixed_rows import FixedRows, make_rows
 from .pair_loops import (
     compliances,
     leaving_rows,
@@ -54,6 +55,7 @@ class ContactPairs:
     mine, local : (2, p) bool, ends that this rank owns, and their local indices, else 0
     partners : GhostExchange for values at ends that other ranks own
     coupled : CoupledPairs
+    along : (2, p) compliance factors of the ends along the directions
     free : (2, p, 3) 1.0 where a component of an end may move, 0.0 where a support prescribes it
     force : (p,) force of each pair in the last step, positive in compression [N]; equal on all ranks that have the pair
     closed : (p,) bool, pairs that have closed and not opened since
@@ -77,7 +79,7 @@ class ContactPairs:
         self.mine = self.where >= 0
         self.local = np.maximum(self.where, 0)
         self.free = self.gather(np.where(fixed, 0.0, 1.0))
-        self._along = np.einsum("epi,pi->ep", self.free, self.normals**2)  # compliance factors
+        self.along = np.einsum("epi,pi->ep", self.free, self.normals**2)  # compliance factors
         self._held = (self.free == 0.0).any(axis=2)
         self._none = np.empty((0, 3))
         self._nodes = np.empty(int(self.mine.sum()), dtype=np.int64)
@@ -128,6 +130,14 @@ class ContactPairs:
             self.force = self._part(predictor, u, stiffness, contact)
         return bool(self.force.any())
 
+    def rows(self, stiffness: np.ndarray) -> FixedRows:
+        """Return the pairs as rows for loops over many steps, without forces; ``stiffness`` (owned,) [N/m].
+
+        Pairs must be independent of each other, with both nodes on this rank.
+        """
+        rows = self.where, self.normals, self.gaps, self._axes, self.free, self.along, self.table
+        return make_rows(*rows, len(self.names), stiffness)
+
     def pressed(self) -> tuple[np.ndarray, np.ndarray]:
         """Return owned nodes (k,) of pairs in contact, and the directions (k, 3) of their pairs."""
         if not self.force.any():
@@ -157,7 +167,7 @@ class ContactPairs:
         far = np.empty((0, 1))
         if not self.partners.alone:
             far = self.partners.bring(1.0 / stiffness[self.partners.rows, None])
-        compliances(self.where, stiffness, far[:, 0], self._along, self._soft)
+        compliances(self.where, stiffness, far[:, 0], self.along, self._soft)
 
     def _part(self, predictor: np.ndarray, u: np.ndarray, stiffness: np.ndarray, load: np.ndarray) -> np.ndarray:
         force, axes, far = np.empty(len(self.table)), self._axes, np.empty((0, len(self._axes)))
@@ -209,7 +219,7 @@ class ContactPairs:
 
     def reduced(self, mass: np.ndarray, at: np.ndarray | slice) -> np.ndarray:
         """Return the reduced masses (k,) [kg] of pairs ``at``, from the masses of their ends (2, k)."""
-        gives = (self._along[:, at] / mass).sum(axis=0)
+        gives = (self.along[:, at] / mass).sum(axis=0)
         return 1.0 / np.maximum(gives, 1e-300)
 
     def keep(self, values: np.ndarray, of_pairs: np.ndarray) -> None:
@@ -227,7 +237,7 @@ class ContactPairs:
         far, force, rows = np.empty((0, 4)), np.empty(len(self.table)), self.partners.rows
         if not self.partners.alone:
             far = self.partners.bring(np.column_stack([x[rows], 1.0 / stiffness[rows]]))
-        needed_forces(self.where, x, stiffness, far, self.normals, self._along, least, force)
+        needed_forces(self.where, x, stiffness, far, self.normals, self.along, least, force)
         return force
 
     def _move(self, u: np.ndarray, force: np.ndarray, stiffness: np.ndarray, load: np.ndarray | None = None) -> None:

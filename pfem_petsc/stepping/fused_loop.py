@@ -36,6 +36,7 @@ from .balance_loops import (
 )
 from .book_loops import WORKS, new_lanes
 from .fused_blocks import advance_block, finish_block, join_block, move_block, solve_block, split_block
+from .fused_links import finish_rows, pass_block, sum_rows
 from .fused_rows import complete, fill_row, push_particles, stop_at_walls
 from .fused_walls import find_pressed, mark_blocks, new_pressed, press_block
 from .ghost_loops import finish_positions, start_positions
@@ -111,6 +112,7 @@ def make_fused_loop(
         bars,
         nodes,
         walls,
+        rows,
         probes,
         messages,
         state,
@@ -130,7 +132,8 @@ def make_fused_loop(
         eta = 0.5 / h
         supported, loaded = len(nodes.support_nodes) > 0, len(nodes.external) > 0
         damped = len(nodes.damping) > 0
-        plain = n_walls == 0 and not damped  # forces alone determine increments
+        linked = len(rows.ready) > 0
+        plain = n_walls == 0 and not damped and not linked  # forces alone determine increments
         increments, factors, inverses = np.empty(3 * NODE_BLOCK), np.empty(3 * NODE_BLOCK), np.empty(n)
         for i in range(n):
             inverses[i] = 1.0 / (alpha * nodes.mass[i] + (eta * nodes.damping[i] if damped else 0.0))
@@ -148,6 +151,8 @@ def make_fused_loop(
         n_blocks = (n + NODE_BLOCK - 1) // NODE_BLOCK
         # blocks whose forces alone determine their increments; blocks with nodes that touch walls or have touched them
         alone, on_walls = np.ones(n_blocks, dtype=np.bool_), np.zeros(n_blocks, dtype=np.bool_)
+        for block in range(n_blocks if linked else 0):
+            alone[block] = not (damped or rows.near[block])
         # fields that loops over blocks would count references to
         planes, pulls, parts, chunks = bars.planes, bars.pulls, bars.columns.parts, bars.sweep.parts
         room_for, reach = len(planes) // 3, bars.reach
@@ -155,6 +160,7 @@ def make_fused_loop(
         turned = -1
         infeasible = -1
         changed = 0
+        touching = 0
         done = 0
         kinetic = 0.0
         several = len(x) > n or messages.count > 0
@@ -189,8 +195,8 @@ def make_fused_loop(
                     gather_history(bars.sweep, bars.columns, bars.history)
                 spread = light
             # Forces that nothing reads stay in the cache. The check of shortened bars reads them, as the next one is
-            # likely to; those of laws with history could not be computed again.
-            brief = light and not shortened and len(bars.history) == 0
+            # likely to; those of laws with history could not be computed again. Blocks that wait for rows need them.
+            brief = light and not shortened and len(bars.history) == 0 and not linked
             forces = pulled if brief else f
             shortened = False
             if several:
@@ -200,6 +206,9 @@ def make_fused_loop(
             waiting = several
             clear_energies(work)
             count_near = 0
+            finished, pressing, altered = 0, 0, 0  # blocks; rows with a force, and rows whose force begins or ends
+            if linked:
+                clear_sums(lanes[CONTACT], n)
             if n_walls > 0:
                 pressed.force[:], pressed.contacts[:], pressed.moment[:] = 0.0, 0, 0.0
                 mark_blocks(on_walls, touched, True)
@@ -270,6 +279,33 @@ def make_fused_loop(
                         lanes,
                     )
                     continue
+                if linked:
+                    finished, pressing, more = pass_block(
+                        block,
+                        finished,
+                        pressing,
+                        rows,
+                        alone,
+                        nodes,
+                        x,
+                        f,
+                        half,
+                        h,
+                        alpha,
+                        eta,
+                        inverses,
+                        factors,
+                        speeds,
+                        u,
+                        load,
+                        held,
+                        drag,
+                        contact,
+                        support,
+                        lanes,
+                    )
+                    altered += more
+                    continue
                 first, last = NODE_BLOCK * block, min(NODE_BLOCK * (block + 1), n)
                 free, here = speeds[: 3 * (last - first)], increments[: 3 * (last - first)]
                 given = (block, nodes, x, forces, start, half)
@@ -304,9 +340,13 @@ def make_fused_loop(
                 add_sparse_powers(near, contact, v, lanes[CONTACT])
             if len(touched) > 0 or len(met) > 0:
                 impact, met = stop_at_walls(x, half, nodes, walls, alpha, eta, u, v, a, contact, touched, met)
+            if altered > 0:
+                impact += finish_rows(rows, altered, walls.slack, x, half, nodes, alpha, eta, u, v, a, contact)
+            sum_rows(rows, pressing)
+            touching = len(near) + 2 * pressing
             after[:] = powers
-            sum_balance(lanes, n, h, supported, loaded, len(near) > 0, damped, totals, after)
-            push_particles(totals, pressed.force, alpha, h, impulses, push_u)
+            sum_balance(lanes, n, h, supported, loaded, touching > 0, damped, totals, after)
+            push_particles(totals, pressed.force, rows.totals, alpha, h, impulses, push_u)
             ledger[_IMPACT] += impact
             if n_walls > 0:
                 row[_HEAD] = changes
@@ -343,7 +383,8 @@ def make_fused_loop(
                     impulses,
                     push_u,
                     (pressed.force, pressed.moment, pressed.contacts, walls.releases),
-                    len(near),
+                    rows.totals,
+                    touching,
                     powers,
                     row_lanes,
                     room,
@@ -376,6 +417,7 @@ def make_fused_loop(
             ),
             touched,
             met,
+            touching,
         )
 
     return fused_loop

@@ -16,7 +16,7 @@ from ..output.sums import HEAD
 from .balance_loops import book_row
 from .impulses import WALLS, fill_impulses
 from .node_loops import accelerations, explicit_increments
-from .sum_loops import add_totals, fill_bars, fill_probes, fill_walls, fill_works
+from .sum_loops import add_totals, fill_bars, fill_links, fill_probes, fill_walls, fill_works
 
 __all__ = ["complete", "fill_row", "push_particles", "stop_at_walls"]
 
@@ -62,15 +62,18 @@ def stop_at_walls(x, half, nodes, walls, alpha, eta, u, v, a, contact, touched, 
 
 
 @kernel
-def push_particles(totals, force, alpha, h, impulses, u):
-    """Advance the particles of the impulses by a step; ``totals`` (6, 3) and ``force`` (walls, 3) [N]; their increments
-    are written to ``u`` (rows, 3)."""
+def push_particles(totals, force, links, alpha, h, impulses, u):
+    """Advance the particles of the impulses by a step; ``totals`` (6, 3), ``force`` of walls (walls, 3) and ``links``
+    (tables, 3) [N]; their increments are written to ``u`` (rows, 3)."""
+    first = WALLS + len(force)
     for k in range(len(u)):
         for c in range(3):
             if k < WALLS:
                 load = totals[3 + k, c]
+            elif k < first:
+                load = force[k - WALLS, c]
             else:  # the last rows are those of jumps, which need Python
-                load = force[k - WALLS, c] if k < WALLS + len(force) else 0.0
+                load = links[k - first, c] if k < first + len(links) else 0.0
             u[k, c] = load / alpha
     kick(u.reshape(-1), alpha, h, impulses.half.reshape(-1))
 
@@ -116,6 +119,7 @@ def fill_row(
     impulses,
     push_u,
     wall_sums,
+    link_sums,
     touching,
     powers,
     lanes,
@@ -128,8 +132,8 @@ def fill_row(
     """Fill the ledger's sums and the row of a step whose state is complete; return the kinetic energy [J].
 
     ``push_u``: see :func:`push_particles`; ``wall_sums``: forces, moments, contacts and releases of the walls;
-    ``touching``: number of nodes with wall forces; ``powers``: of the balances before; ``lanes``, ``room``, ``ends``
-    are workspace.
+    ``link_sums``: forces of the tables of links; ``touching``: number of nodes with contact forces; ``powers``: of the
+    balances before; ``lanes``, ``room``, ``ends`` are workspace.
     """
     n, energies = len(state.v), state.energies
     stored = 0.0
@@ -169,6 +173,7 @@ def fill_row(
     force, moment, contacts, releases = wall_sums
     if len(force) > 0:
         at = fill_walls(row, _HEAD + 1, force, moment, impulses.v, contacts, releases)
+    at = fill_links(row, at, link_sums, impulses.v, WALLS + len(force))
     reaction = state.support if len(nodes.support_nodes) > 0 else np.empty((0, 3))
     fill_probes(row, at, probes.nodes, probes.places, probes.counts, x, state.v, state.a, state.contact, reaction)
     return kinetic

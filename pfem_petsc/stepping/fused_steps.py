@@ -56,7 +56,7 @@ class Batch:
         model = stepper.model
         self.model = model
         block = model.bars.blocks[0]
-        self._fused_loop = make_fused_loop(*fused_parts(block.kernels))
+        self._loop = make_fused_loop(*fused_parts(block.kernels))
         bars = model.bars
         law = (bars.far, bars.rest, bars.watched, bars.heat, block.parameters, block.area, block.history)
         counted = block.counted - block.start
@@ -91,6 +91,10 @@ class Batch:
         self._walls = WallArrays(*walls, PROJECTED * model.length, *work, *impact)
         self._probes = ProbeArrays(*recorder.probed())
         self._messages = model.mesh.messages()
+        self._lender = model.links.lender
+        alpha, eta = 1.0 / (stepper.h * stepper.h), 0.5 / stepper.h
+        stiffness = alpha * inertia.mass + (eta * inertia.damping if inertia.damped else 0.0)
+        self._stiffness = stiffness if model.links else np.empty(0)
         self.sums = np.zeros((MOST, recorder.width))
         self._first = True
 
@@ -170,7 +174,8 @@ class Batch:
         if self._first:
             return_freed_memory()
             self._first = False
-        done, lost, changed, failed, turned, infeasible, offsets, kinetic, u, touched, log.last, met = self._fused_loop(
+        rows = self._lender.lend_rows(self._stiffness)
+        done, lost, changed, failed, turned, infeasible, offsets, kinetic, u, touched, log.last, met, held = self._loop(
             len(due),
             stepper.h,
             state.x,
@@ -179,6 +184,7 @@ class Batch:
             self._bars,
             self._nodes,
             self._walls,
+            rows,
             self._probes,
             self._messages,
             arrays,
@@ -190,13 +196,14 @@ class Batch:
             due,
             self.sums,
         )
+        self._lender.take_rows(rows)
         if lost:
             raise MPI.Exception(lost)
         state.support = support if self.model.supports.any else stepper.zero
-        state.contact = contact if len(touched[3]) else stepper.zero
+        state.contact = contact if held else stepper.zero
         stepper.energy = StrainEnergy(tuple(energies.tolist()), failed)
         nothing = self.model.contact.nothing
-        stepper.solution = Solution(u, state.f, WallForces(*touched) if walls else nothing, contacts=len(touched[3]))
+        stepper.solution = Solution(u, state.f, WallForces(*touched) if walls else nothing, contacts=held)
         state.step, state.time = begin + done - 1, (begin + done) * stepper.h
         stepper.balance = scheme.balance(state, stepper.h)
         if changed:

@@ -172,7 +172,7 @@ class Model:
     @property
     def steady(self) -> bool:
         """Whether the model is constant in time, and the fused loop supports its bars and contact."""
-        return self.constant and not self.links
+        return self.constant and self.links.lender is not None
 
     def initial_velocity(self) -> np.ndarray:
         """Return initial velocities (owned, 3) [m/s]; later ``[initial]`` tables override earlier ones. Collective."""

@@ -8,11 +8,11 @@ from __future__ import annotations
 
 from ..energies import BAR_ENERGIES
 from ..mechanics.compiled import kernel
-from ..output.sums import HEAD, WALL
+from ..output.sums import HEAD, PAIR, WALL
 from .book_loops import WORKS
 from .impulses import WALLS
 
-__all__ = ["add_totals", "add_works", "fill_bars", "fill_probes", "fill_walls", "fill_works"]
+__all__ = ["add_totals", "add_works", "fill_bars", "fill_links", "fill_probes", "fill_walls", "fill_works"]
 
 _BARS = tuple(HEAD.first(name) for name in BAR_ENERGIES)
 _EXTERNAL, _CONTACT = HEAD.first("external_work"), HEAD.first("contact_work")
@@ -22,6 +22,8 @@ _NUMERICAL, _TOTALS = HEAD.first("numerical_dissipation"), HEAD.first("momentum"
 _WALL = WALL.width
 _FORCE, _MOMENT, _IMPULSE = WALL.first("force"), WALL.first("moment"), WALL.first("impulse")
 _TOUCHED, _RELEASES = WALL.first("contacts"), WALL.first("releases")
+_PAIR, _PUSH = PAIR.width, PAIR.first("force")
+_LINK_IMPULSE, _JUMP = PAIR.first("impulse"), PAIR.first("jump_impulse")
 _BY_EXTERNAL, _BY_CONTACT, _BY_DAMPING, _BY_INERTIA, _BY_BARS = range(len(WORKS))
 
 
@@ -91,6 +93,19 @@ def fill_walls(row, at, force, moment, v, contacts, releases) -> int:
         row[at + _IMPULSE : at + _IMPULSE + 3] = v[WALLS + k]
         row[at + _TOUCHED], row[at + _RELEASES] = contacts[k], releases[k]
         at += _WALL
+    return at
+
+
+@kernel
+def fill_links(row, at, force, v, first) -> int:
+    """Write sums of the tables of links from index ``at`` of a row; return the next index. ``v``: of the particles of
+    impulses, of which that of the first table is ``first``."""
+    jumps = len(v) - len(force)
+    for k in range(len(force)):
+        row[at + _PUSH : at + _PUSH + 3] = force[k]
+        row[at + _LINK_IMPULSE : at + _LINK_IMPULSE + 3] = v[first + k]
+        row[at + _JUMP : at + _JUMP + 3] = v[jumps + k]
+        at += _PAIR
     return at
 
 

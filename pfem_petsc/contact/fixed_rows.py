@@ -12,14 +12,11 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from ..mechanics.compiled import borrowing, inlined, kernel
+from ..mechanics.compiled import borrowing, kernel
 from ..mesh.ordering import NODE_BLOCK
 from .pair_loops import compliances
 
 __all__ = ["FixedRows", "NoRows", "RowLender", "close_rows", "make_rows", "solve_rows"]
-
-# sums of NumPy: numbers added side by side, of a part, and of a chunk; room for halves of a chunk
-_EIGHT, _PART, _CHUNK, _DEEP = 8, 128, 8192, 64
 
 
 class FixedRows(NamedTuple):
@@ -209,7 +206,7 @@ def close_rows(at, ends, normals, least, along, counted, slack, force, closed):
     slack : distance at which a row has opened [m]
     closed : (p,) bool, updated
     """
-    energies, count = np.empty(len(at)), 0
+    energy = 0.0
     parts = np.empty(3)
     for m in range(len(at)):
         p = at[m]
@@ -224,56 +221,5 @@ def close_rows(at, ends, normals, least, along, counted, slack, force, closed):
         if fresh and speed < 0.0 and counted[p]:
             square = max(speed * speed - 2.0 * pull * max(distance, 0.0), 0.0)
             gives = along[0, p] / ends[0, m, 9] + along[1, p] / ends[1, m, 9]
-            energies[count] = 0.5 * (1.0 / max(gives, 1e-300)) * square
-            count += 1
-    return _add_up(energies[:count])
-
-
-@kernel
-def _add_up(values):
-    """Return the sum of numbers in the order of NumPy, which divides them into chunks, and halves these to parts."""
-    total = 0.0
-    for begin in range(0, len(values), _CHUNK):
-        total += _add_chunk(values[begin : begin + _CHUNK])
-    return total
-
-
-@kernel
-def _add_chunk(values):
-    """Return the sum of a chunk."""
-    begins, ends, sums = np.empty(_DEEP, dtype=np.int64), np.empty(_DEEP, dtype=np.int64), np.empty(_DEEP)
-    begins[0], ends[0] = 0, len(values)
-    waiting, known = 1, 0
-    while waiting > 0:
-        waiting -= 1
-        begin, end = begins[waiting], ends[waiting]
-        if end < 0:  # both halves are known
-            known -= 1
-            sums[known - 1] += sums[known]
-        elif end - begin <= _PART:
-            sums[known] = _add_part(values[begin:end])
-            known += 1
-        else:
-            half = (end - begin) // 2
-            middle = begin + half - half % _EIGHT
-            ends[waiting] = -1
-            begins[waiting + 1], ends[waiting + 1] = middle, end
-            begins[waiting + 2], ends[waiting + 2] = begin, middle
-            waiting += 3
-    return sums[0]
-
-
-@inlined
-def _add_part(values):
-    """Return the sum of a part."""
-    total, first = 0.0, 0
-    if len(values) >= _EIGHT:
-        first = len(values) - len(values) % _EIGHT
-        sums = values[:_EIGHT].copy()
-        for k in range(_EIGHT, first, _EIGHT):
-            for j in range(_EIGHT):
-                sums[j] += values[k + j]
-        total = ((sums[0] + sums[1]) + (sums[2] + sums[3])) + ((sums[4] + sums[5]) + (sums[6] + sums[7]))
-    for k in range(first, len(values)):
-        total += values[k]
-    return total
+            energy += 0.5 * square / max(gives, 1e-300)
+    return energy

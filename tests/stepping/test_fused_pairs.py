@@ -6,7 +6,6 @@ from helpers.bodies import two_lattices
 from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation, open_result
-from pfem_petsc.contact.fixed_rows import _add_up
 from pfem_petsc.errors import EarlyStop
 from pfem_petsc.mesh.ordering import NODE_BLOCK
 
@@ -148,9 +147,3 @@ def test_a_stopped_run_with_pairs_goes_on_to_the_same_end(tmp_path):
     for _ in rest.batches(min_steps=1):
         pass
     compare(whole, rest, tmp_path)
-
-
-@pytest.mark.parametrize("count", [0, 1, 7, 8, 9, 128, 129, 300, 8192, 8193, 40000])
-def test_energies_of_closing_pairs_are_added_as_numpy_does(count):
-    values = np.random.default_rng(count).random(count)
-    assert _add_up(values) == values.sum()

@@ -215,11 +215,7 @@ class ContactPairs:
 
     def reduced_mass(self, mass: np.ndarray) -> np.ndarray:
         """Return 1/(1/m_1 + 1/m_2) (p,) [kg] along the directions, from masses of owned nodes (owned,). Collective."""
-        return self.reduced(self.gather(mass), slice(None))
-
-    def reduced(self, mass: np.ndarray, at: np.ndarray | slice) -> np.ndarray:
-        """Return the reduced masses (k,) [kg] of pairs ``at``, from the masses of their ends (2, k)."""
-        gives = (self.along[:, at] / mass).sum(axis=0)
+        gives = (self.along / self.gather(mass)).sum(axis=0)
         return 1.0 / np.maximum(gives, 1e-300)
 
     def keep(self, values: np.ndarray, of_pairs: np.ndarray) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from ..mechanics.columns import Columns
 from ..mechanics.sweep import Sweep
 
-__all__ = ["BarArrays", "ImpulseArrays", "NodeArrays", "ProbeArrays", "StateArrays", "WallArrays"]
+__all__ = ["BarArrays", "BlockArrays", "ImpulseArrays", "NodeArrays", "ProbeArrays", "StateArrays", "WallArrays"]
 
 
 class BarArrays(NamedTuple):
@@ -66,6 +66,29 @@ class WallArrays(NamedTuple):
     closed: np.ndarray
     restitution: np.ndarray
     slack: float
+
+
+class BlockArrays(NamedTuple):
+    """What the passes over blocks of nodes share: numbers of the scheme, see
+    :mod:`~pfem_petsc.integrators._leapfrog`; positions ``x`` (local, 3) and velocities at half steps ``half`` (n, 3);
+    ``inverses`` (n,) of the stiffness; ``factors``, ``speeds`` and ``drag``
+    (3 NODE_BLOCK,) buffers of a block, the last one empty without damping; for prescribed components the increments
+    ``held`` (k,) [m] and ``load`` (k,), the forces that would move them [N]; reactions ``support`` (n, 3) [N]; and
+    ``lanes``, the sums of the balance, see :mod:`~pfem_petsc.stepping.balance_loops`."""
+
+    h: float
+    alpha: float
+    eta: float
+    x: np.ndarray
+    half: np.ndarray
+    inverses: np.ndarray
+    factors: np.ndarray
+    speeds: np.ndarray
+    drag: np.ndarray
+    held: np.ndarray
+    load: np.ndarray
+    support: np.ndarray
+    lanes: np.ndarray
 
 
 class ImpulseArrays(NamedTuple):

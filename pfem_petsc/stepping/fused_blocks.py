@@ -1,9 +1,9 @@
 """The passes of the fused loop over a block of nodes: move it, solve its balances, and finish its step.
 
-``nodes`` are a :class:`~pfem_petsc.stepping.fused_arrays.NodeArrays`; ``alpha``, ``eta`` and ``h`` are the scheme's,
-see :mod:`~pfem_petsc.integrators._leapfrog`; ``lanes`` are the sums of the balance, see
-:mod:`~pfem_petsc.stepping.balance_loops`. Other arrays have a row for each owned node, except buffers of a block; the
-internal forces ``f`` begin at node ``start``, because steps whose forces nothing reads keep those of one block only.
+``nodes`` are a :class:`~pfem_petsc.stepping.fused_arrays.NodeArrays`, ``shared`` a
+:class:`~pfem_petsc.stepping.fused_arrays.BlockArrays`. Other arrays have a row for each owned node, except buffers of a
+block; the internal forces ``f`` begin at node ``start``, because steps whose forces nothing reads keep those of one
+block only.
 """
 
 from __future__ import annotations
@@ -54,19 +54,17 @@ def join_block(block, n, pulls, base, f, start):
 
 
 @borrowing
-def advance_block(block, nodes, x, f, start, half, h, alpha, eta, inverses, factors, speeds, held, support, lanes):
-    """Finish the step of a block without walls and damping in one pass: forces alone determine its increments.
-
-    ``inverses`` (n,) of the stiffness; ``factors`` and ``speeds`` (3 NODE_BLOCK,) buffers; the increments of prescribed
-    components are written to ``held`` (k,), their reactions to ``support``.
-    """
+def advance_block(block, nodes, shared, f, start):
+    """Finish the step of a block without walls and damping in one pass: forces alone determine its increments."""
+    h, alpha, eta, half, held, support = shared.h, shared.alpha, shared.eta, shared.half, shared.held, shared.support
+    lanes = shared.lanes
     first = NODE_BLOCK * block
     last = min(first + NODE_BLOCK, len(half))
     begin, end = nodes.support_starts[block], nodes.support_starts[block + 1]
     components = nodes.support_components
-    here, factor = speeds[: 3 * (last - first)], factors[: 3 * (last - first)]
+    here, factor = shared.speeds[: 3 * (last - first)], shared.factors[: 3 * (last - first)]
     forces = f[first - start : last - start]
-    spread(inverses[first:last], factor)
+    spread(shared.inverses[first:last], factor)
     hold_still(
         begin,
         end,
@@ -77,7 +75,7 @@ def advance_block(block, nodes, x, f, start, half, h, alpha, eta, inverses, fact
         nodes.mass,
         nodes.external,
         forces,
-        x,
+        shared.x,
         half,
         h,
         alpha,
@@ -98,17 +96,15 @@ def advance_block(block, nodes, x, f, start, half, h, alpha, eta, inverses, fact
 
 
 @borrowing
-def solve_block(block, nodes, x, f, start, half, h, alpha, eta, inverses, factors, free, u, load, held):
-    """Compute the increments ``u`` (3 m,) of a block without contact, and its ``free`` positions (3 m,); for its
-    prescribed components the increments ``held`` (k,) [m] and ``load`` (k,), the forces that would move them [N].
-
-    ``inverses`` (n,) of the stiffness; ``factors`` (3 NODE_BLOCK,) is a buffer.
-    """
+def solve_block(block, nodes, shared, f, start, free, u):
+    """Compute the increments ``u`` (3 m,) of a block without contact, and its ``free`` positions (3 m,); those of its
+    prescribed components are written to ``shared`` too."""
+    h, alpha, eta = shared.h, shared.alpha, shared.eta
     first = NODE_BLOCK * block
-    last = min(first + NODE_BLOCK, len(half))
-    where, speed = x[first:last].reshape(-1), half[first:last].reshape(-1)
+    last = min(first + NODE_BLOCK, len(shared.half))
+    where, speed = shared.x[first:last].reshape(-1), shared.half[first:last].reshape(-1)
     force = f[first - start : last - start].reshape(-1)
-    factor = factors[: len(u)]
+    factor = shared.factors[: len(u)]
     damped = len(nodes.damping) > 0
     if len(nodes.external) > 0:
         given = nodes.external[first:last].reshape(-1)
@@ -121,39 +117,40 @@ def solve_block(block, nodes, x, f, start, half, h, alpha, eta, inverses, factor
         spread(nodes.damping[first:last], factor)
         for j in range(len(u)):
             u[j] -= factor[j] * speed[j]
-    spread(inverses[first:last], factor)
+    spread(shared.inverses[first:last], factor)
     for j in range(len(u)):
         u[j] *= factor[j]
         free[j] = where[j] + h * speed[j]
     for k in range(nodes.support_starts[block], nodes.support_starts[block + 1]):
         i = nodes.support_nodes[k]
         j = 3 * (i - first) + nodes.support_components[k]
-        load[k] = (alpha * nodes.mass[i] + (eta * nodes.damping[i] if damped else 0.0)) * u[j]
-        u[j] = held[k] = nodes.support_positions[k] - free[j]
+        shared.load[k] = (alpha * nodes.mass[i] + (eta * nodes.damping[i] if damped else 0.0)) * u[j]
+        u[j] = shared.held[k] = nodes.support_positions[k] - free[j]
     for j in range(len(u)):
         free[j] += u[j]
 
 
 @borrowing
-def finish_block(block, nodes, f, start, half, h, alpha, eta, contact, u, load, speeds, drag, support, lanes):
+def finish_block(block, nodes, shared, f, start, contact, u):
     """Finish the step of a block from its increments ``u`` (3 m,): reactions, velocities half a step later, and powers.
 
-    ``speeds`` and ``drag`` (3 NODE_BLOCK,) are buffers, the latter empty without damping.
+    The velocities of the balance remain in ``shared.speeds``.
     """
+    alpha, eta, support, lanes = shared.alpha, shared.eta, shared.support, shared.lanes
     first = NODE_BLOCK * block
-    last = min(first + NODE_BLOCK, len(half))
+    last = min(first + NODE_BLOCK, len(shared.half))
     begin, end = nodes.support_starts[block], nodes.support_starts[block + 1]
-    damped = len(drag) > 0
+    damped = len(shared.drag) > 0
     for k in range(begin, end):
         i, c = nodes.support_nodes[k], nodes.support_components[k]
         stiffness = alpha * nodes.mass[i] + (eta * nodes.damping[i] if damped else 0.0)
-        support[i, c] = stiffness * u[3 * (i - first) + c] - load[k] - contact[i, c]
-    ahead, here = half[first:last].reshape(-1), speeds[: len(u)]
-    kick(u, alpha, h, ahead)
+        support[i, c] = stiffness * u[3 * (i - first) + c] - shared.load[k] - contact[i, c]
+    ahead, here = shared.half[first:last].reshape(-1), shared.speeds[: len(u)]
+    kick(u, alpha, shared.h, ahead)
     centre(u, eta, ahead, here)
     add_powers(f[first - start : last - start].reshape(-1), here, lanes[INTERNAL])
     add_sparse_forces(begin, end, nodes.support_nodes, nodes.support_components, support, lanes[REACTIONS])
     if len(nodes.external) > 0:
         add_loads(nodes.external[first:last].reshape(-1), here, lanes)
     if damped:
-        add_drags(nodes.damping[first:last], here, drag, lanes)
+        add_drags(nodes.damping[first:last], here, shared.drag, lanes)

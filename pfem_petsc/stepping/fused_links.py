@@ -23,56 +23,31 @@ __all__ = ["finish_rows", "pass_block", "sum_rows"]
 
 
 @borrowing
-def pass_block(
-    block,
-    finished,
-    pressing,
-    rows,
-    alone,
-    nodes,
-    x,
-    f,
-    half,
-    h,
-    alpha,
-    eta,
-    inverses,
-    factors,
-    speeds,
-    u,
-    load,
-    held,
-    drag,
-    contact,
-    support,
-    lanes,
-):
+def pass_block(block, finished, pressing, rows, alone, nodes, shared, f, u, contact):
     """Solve a block and the rows of its nodes whose other node is in it or in a block before; finish all blocks that
     wait for no other rows.
 
     ``alone`` (blocks,) bool: whether forces alone determine the increments of a block. ``finished`` blocks were
     finished before, ``pressing`` rows have a force. Returns both numbers, and that of rows whose force begins or ends.
     """
-    n = len(half)
+    n = len(shared.half)
     if not alone[block]:
         first = NODE_BLOCK * block
         last = min(first + NODE_BLOCK, n)
-        here, free = u[first:last].reshape(-1), speeds[: 3 * (last - first)]
-        solve_block(block, nodes, x, f, 0, half, h, alpha, eta, inverses, factors, free, here, load, held)
-    count, changed = solve_rows(block, rows, x, h, half, nodes.mass, nodes.damping, alpha, eta, u, contact)
+        solve_block(block, nodes, shared, f, 0, shared.speeds[: 3 * (last - first)], u[first:last].reshape(-1))
+    count, changed = solve_rows(
+        block, rows, shared.x, shared.h, shared.half, nodes.mass, nodes.damping, shared.alpha, shared.eta, u, contact
+    )
     pressing += count
     while finished < len(rows.ready) and rows.ready[finished] <= block:
         if alone[finished]:
-            advance_block(
-                finished, nodes, x, f, 0, half, h, alpha, eta, inverses, factors, speeds, held, support, lanes
-            )
+            advance_block(finished, nodes, shared, f, 0)
         else:
             first = NODE_BLOCK * finished
             last = min(first + NODE_BLOCK, n)
-            here = u[first:last].reshape(-1)
-            finish_block(finished, nodes, f, 0, half, h, alpha, eta, contact, here, load, speeds, drag, support, lanes)
+            finish_block(finished, nodes, shared, f, 0, contact, u[first:last].reshape(-1))
             if pressing > 0:
-                _add_pushes(finished, rows, contact, speeds, lanes[CONTACT])
+                _add_pushes(finished, rows, contact, shared.speeds, shared.lanes[CONTACT])
         finished += 1
     return finished, pressing, changed
 

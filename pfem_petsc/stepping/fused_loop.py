@@ -35,6 +35,7 @@ from .balance_loops import (
     sum_balance,
 )
 from .book_loops import WORKS, new_lanes
+from .fused_arrays import BlockArrays
 from .fused_blocks import advance_block, finish_block, join_block, move_block, solve_block, split_block
 from .fused_links import finish_rows, pass_block, sum_rows
 from .fused_rows import complete, fill_row, push_particles, stop_at_walls
@@ -66,18 +67,18 @@ def make_fused_loop(
     :func:`~pfem_petsc.mechanics.kernels.make_kernels`.
 
     Its arguments are the maximum number of steps; the step [s]; positions, positions of the previous step, which are
-    computed for the last step alone, and velocities at half steps (n, 3); arrays of bars, nodes, walls, probes,
-    messages, and of the state; nodes (m,) that touch walls; nodes (k,) that have touched walls and not left them; the
-    ledger's sums and its works of balances; its particles; whether a row of the history is ``due`` (count,) after each
-    step; and ``sums`` (count, width), which receives the sums of the rows that are due, and for each step the changes
-    of contacts. Velocities, accelerations, momenta and energies are computed only where a row is due, and after the
-    last step.
+    computed for the last step alone, and velocities at half steps (n, 3); arrays of bars, nodes, walls, rows between
+    nodes, probes, messages, and of the state; nodes (m,) that touch walls; nodes (k,) that have touched walls and not
+    left them; the ledger's sums and its works of balances; its particles; whether a row of the history is ``due``
+    (count,) after each step; and ``sums`` (count, width), which receives the sums of the rows that are due, and for
+    each step the changes of contacts. Velocities, accelerations, momenta and energies are computed only where a row is
+    due, and after the last step.
 
     It returns the number of steps made, and MPI's error code; for the last step, which is the last one too if bars
     change their state of rupture there, the number of these bars, the first bar that collapsed and the first that went
     through zero length, or -1, and the infeasible node, or -1, with the offsets of its planes; the kinetic energy [J];
-    increments (n, 3); the results of :func:`~pfem_petsc.contact.flat.press_planes` for nodes and walls; and the nodes
-    that touch walls, and those that have touched them.
+    increments (n, 3); the results of :func:`~pfem_petsc.contact.flat.press_planes` for nodes and walls; the nodes
+    that touch walls, and those that have touched them; and the number of nodes with contact forces.
     """
 
     @borrowing
@@ -143,6 +144,8 @@ def make_fused_loop(
         speeds, drag = np.empty(3 * NODE_BLOCK), np.empty(3 * NODE_BLOCK if damped else 0)
         ends, totals, lanes, room = np.empty(len(WORKS)), np.zeros((6, 3)), new_sums(), new_lanes()
         row_lanes, after = new_sums(), np.empty(len(WORKS))
+        numbers, buffers = (h, alpha, eta), (factors, speeds, drag)
+        shared = BlockArrays(*numbers, x, half, inverses, *buffers, held, load, support, lanes)
         work, columns_work = np.empty(work_rows * CHUNK), new_rows(column_rows)
         pulled = np.empty((NODE_BLOCK, 3))  # forces of a block
         push_u = np.empty(impulses.v.shape)
@@ -261,62 +264,23 @@ def make_fused_loop(
                     shortened = shortened or short
                     changed += broke
                 if plain:
-                    advance_block(
-                        block,
-                        nodes,
-                        x,
-                        forces,
-                        start,
-                        half,
-                        h,
-                        alpha,
-                        eta,
-                        inverses,
-                        factors,
-                        speeds,
-                        held,
-                        support,
-                        lanes,
-                    )
+                    advance_block(block, nodes, shared, forces, start)
                     continue
                 if linked:
                     finished, pressing, more = pass_block(
-                        block,
-                        finished,
-                        pressing,
-                        rows,
-                        alone,
-                        nodes,
-                        x,
-                        f,
-                        half,
-                        h,
-                        alpha,
-                        eta,
-                        inverses,
-                        factors,
-                        speeds,
-                        u,
-                        load,
-                        held,
-                        drag,
-                        contact,
-                        support,
-                        lanes,
+                        block, finished, pressing, rows, alone, nodes, shared, f, u, contact
                     )
                     altered += more
                     continue
                 first, last = NODE_BLOCK * block, min(NODE_BLOCK * (block + 1), n)
                 free, here = speeds[: 3 * (last - first)], increments[: 3 * (last - first)]
-                given = (block, nodes, x, forces, start, half)
-                solve_block(*given, h, alpha, eta, inverses, factors, free, here, load, held)
+                solve_block(block, nodes, shared, forces, start, free, here)
                 found = find_pressed(block, walls, free) if n_walls > 0 else 0
                 if found > 0:
                     at = press_block(block, found, nodes, walls, free, here, alpha, eta, contact, pressed, count_near)
                     infeasible = at if infeasible < 0 else infeasible
                     count_near += found
-                ahead = (block, nodes, forces, start, half)
-                finish_block(*ahead, h, alpha, eta, contact, here, load, speeds, drag, support, lanes)
+                finish_block(block, nodes, shared, forces, start, contact, here)
                 alone[block] = not (damped or on_walls[block] or found > 0)
                 if not alone[block]:
                     kept = u[first:last].reshape(-1)

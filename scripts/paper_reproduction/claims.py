@@ -46,6 +46,7 @@ __all__ = [
     "listed",
     "measure_all",
     "pick",
+    "verdict",
 ]
 
 REPRODUCED, PARTLY, NOT, OPEN = "reproduced", "partly", "not reproduced", "not checkable"
@@ -146,3 +147,9 @@ def listed(values: dict[str, float], form: str = ".2f", unit: str = "") -> str:
 def pick(measures: dict, schemes: Iterable[str], name: str) -> dict[str, float]:
     """Return one measure of some schemes."""
     return {scheme: getattr(measures[scheme], name) for scheme in schemes}
+
+
+def verdict(parts: Iterable[bool]) -> str:
+    """Return the verdict on a statement from those on its parts, which are its claims, schemes or steps."""
+    found = list(parts)
+    return REPRODUCED if all(found) else PARTLY if any(found) else NOT

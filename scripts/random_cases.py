@@ -7,8 +7,9 @@ Cases are drawn over all documented keys and their combinations, one per seed. E
 one process for many cases; every third one is also stopped in the middle and continued. Checks: status 0, 2 or 3, with
 a message unless it is 0; no node beyond a wall; finite results; energy balance and growth; dissipations; momentum;
 agreement between numbers of ranks to 1e-9; bitwise identical continued runs; with `--schemes-every` also convergence of
-an explicit and an implicit scheme to the same motion. Cases that crash or hang are reported and skipped. Status 0 if
-there are no faults.
+an explicit and an implicit scheme to the same motion; with `--copies-every` that copies of a case which are moved by 1
+and 1000 km, turned, renumbered, and in other units give the same results. Cases that crash or hang are reported and
+skipped. Status 0 if there are no faults.
 """
 
 from __future__ import annotations
@@ -46,6 +47,7 @@ def main() -> int:
     parser.add_argument("--ranks", type=int, default=3, metavar="N", help="beside one (default: 3; 1: none)")
     parser.add_argument("--restart-every", type=int, default=3, metavar="N", help="continue every N-th; 0: none")
     parser.add_argument("--schemes-every", type=int, default=0, metavar="N", help="both kinds of schemes; 0: none")
+    parser.add_argument("--copies-every", type=int, default=0, metavar="N", help="moved, turned ... ones; 0: none")
     parser.add_argument("--jobs", type=int, default=1, metavar="N", help="processes at a time (default: 1)")
     parser.add_argument("--patience", type=float, default=60.0, metavar="S", help="longest time of a case [s]")
     parser.add_argument("--keep", type=Path, metavar="DIR", help="where the cases with a fault are put, as TOML files")
@@ -116,11 +118,11 @@ class Study:
             for seed, told in self._work("judge", both, 1).items():
                 for cause, detail in told["faults"]:
                     self._fault(seed, cause, detail)
-        if self.arguments.schemes_every > 0:
-            chosen = [seed for seed in ended if seed % self.arguments.schemes_every == 0]
-            for seed, told in self._work("schemes", chosen, 1).items():
+        for mode, every in (("copies", self.arguments.copies_every), ("schemes", self.arguments.schemes_every)):
+            chosen = [seed for seed in ended if every > 0 and seed % every == 0]
+            for seed, told in (self._work(mode, chosen, 1) if chosen else {}).items():
                 with self._lock:
-                    self.statuses[f"schemes: {told.get('verdict', 'no answer')}"] += 1
+                    self.statuses[f"{mode}: {told.get('verdict', 'compared')}"] += 1
                 for cause, detail in told["faults"]:
                     self._fault(seed, cause, detail)
         for seed in seeds:
@@ -168,7 +170,7 @@ class Study:
                 raise SystemExit(f"the workers do not start: {ending}")
             # where it ended between two cases, the one before
             culprit = at if at is not None else max(set(left) & set(told), key=left.index)
-            if mode in ("judge", "schemes"):
+            if mode in ("judge", "schemes", "copies"):
                 told[culprit] = {"faults": [("comparison ends", ending)]}
             else:
                 cause = "hangs" if ending.startswith("no answer") else "process ends"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from collections.abc import Iterable
 from dataclasses import asdict
@@ -13,6 +14,7 @@ from mpi4py import MPI
 from pfem_petsc import open_result
 
 from .compare import bitwise, distance
+from .copies import judge_copies
 from .oracle import check_result
 from .running import case_text, clear, run_case, run_in_two_parts
 from .schemes import judge_schemes
@@ -82,7 +84,7 @@ def work(mode: str, seeds: Iterable[int], folder: Path, every_restart: int, sour
     """Process the cases of a worker. Collective.
 
     ``mode``: "check" runs and checks, "run" only runs, "judge" compares the results of both and removes them, "schemes"
-    compares explicit and implicit schemes.
+    compares explicit and implicit schemes, "copies" the copies of a case.
     """
     comm = MPI.COMM_WORLD
     from .draw import draw_case
@@ -102,6 +104,11 @@ def work(mode: str, seeds: Iterable[int], folder: Path, every_restart: int, sour
         elif mode == "schemes":
             verdict, faults = judge_schemes(table or _table(text), seed, place, source)
             told = {"verdict": verdict, "faults": faults}
+        elif mode == "copies":
+            table = table or _table(text)
+            whole = place / "1/whole"
+            amplified = functools.partial(amplification, text, whole, place, source)
+            told = {"faults": judge_copies(table, seed, whole, place, amplified)}
         elif mode == "run":
             told = check_case(text, comm, place / "n", source, False)
         else:

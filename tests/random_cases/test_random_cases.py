@@ -8,6 +8,7 @@ import tomllib
 import numpy as np
 import pytest
 from mpi4py import MPI
+from random_trusses.copies import KINDS, judge_copies
 from random_trusses.draw import draw_case
 from random_trusses.laws import LAWS
 from random_trusses.loading import Loaded
@@ -208,3 +209,15 @@ def test_schemes_that_tend_to_other_motions_are_found():
     assert _compare(energies, "both")[0] == "differ"
     chaotic = agree | {("explicit", 1): measures(0.5)}
     assert _compare(chaotic, "both") == ("vague", [])
+
+
+@pytest.mark.slow
+def test_copies_give_the_results_of_their_case(tmp_path):
+    """A copy is the case moved, turned, renumbered or in other units; another speed in it is found."""
+    seed = 5  # a flight into a plane with a pair, a load, gravity and a support
+    table, whole = draw_case(seed), tmp_path / "whole"
+    assert run_case(case_text(table), MPI.COMM_SELF, whole).status == 0
+    assert judge_copies(table, seed, whole, tmp_path, lambda: 0.0) == []
+    table["initial"]["velocity"][0] *= 1.001
+    found = {cause for cause, _ in judge_copies(table, seed, whole, tmp_path, lambda: 0.0)}
+    assert found == {f"{kind}: another result" for kind in KINDS}

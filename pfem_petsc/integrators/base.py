@@ -123,8 +123,17 @@ class Scheme(ABC):
     def __init__(self, parameters: StrictModel) -> None:
         self.parameters = parameters
 
-    def limit(self, damping_ratio: float = 0.0) -> float:
-        """Return the largest stable Omega = omega h at a damping ratio; infinite if unconditionally stable."""
+    @property
+    def rates_follow(self) -> bool:
+        """Whether the strain rates at the end of a step are those of its velocities; else they are those of the balance
+        for it, or extrapolated if the scheme :attr:`solves_next_position`."""
+        if self.explicit:
+            return not self.solves_next_position
+        return self.discrete_gradient or not self.solves_end
+
+    def limit(self, damping_ratio: float = 0.0, viscous_ratio: float = 0.0) -> float:
+        """Return the largest stable Omega = omega h at a damping ratio, and at one of viscous bars; infinite if
+        unconditionally stable."""
         return np.inf
 
     def expected_move(self, state: State, h: float) -> np.ndarray:

@@ -13,7 +13,7 @@ import numpy as np
 
 from ._leapfrog import drift
 from ._leapfrog import finish as finish_step
-from .base import Balance, ExplicitScheme, NoParameters, State
+from .base import Balance, ExplicitScheme, NoParameters, State, lagged_limit
 
 __all__ = ["Parameters", "Scheme"]
 
@@ -28,9 +28,11 @@ class Scheme(ExplicitScheme):
     remembers = ("half_velocity",)
     dissipates = False
 
-    def limit(self, damping_ratio: float = 0.0) -> float:
-        """Return 2 for any damping ratio, because damping is centred."""
-        return 2.0
+    def limit(self, damping_ratio: float = 0.0, viscous_ratio: float = 0.0) -> float:
+        """Return 2 for any damping ratio, because damping is centred; that of viscous bars, whose rate is extrapolated
+        from the half steps before, reduces it to the root of Omega^2 + 8 xi Omega = 4, as the method of Chung and
+        Lee."""
+        return lagged_limit(0.0, 1.0, 1.5, viscous_ratio)
 
     def start(self, state: State, h: float) -> None:
         state.memory["half_velocity"] = state.v - (0.5 * h) * state.a

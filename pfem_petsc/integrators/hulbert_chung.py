@@ -61,8 +61,8 @@ class Scheme(ExplicitScheme):
         self.beta = (5.0 - 3.0 * rho) / ((1.0 + rho) ** 2 * (2.0 - rho))
         self.gamma = 1.5 - self.alpha_m
 
-    def limit(self, damping_ratio: float = 0.0) -> float:
-        return lagged_limit(self.alpha_m, self.beta, self.gamma, damping_ratio)
+    def limit(self, damping_ratio: float = 0.0, viscous_ratio: float = 0.0) -> float:
+        return lagged_limit(self.alpha_m, self.beta, self.gamma, damping_ratio + viscous_ratio)
 
     def balance(self, state: State, h: float) -> Balance:
         x, v, a = (array.reshape(-1) for array in (state.position, state.v, state.a))

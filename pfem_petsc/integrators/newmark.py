@@ -36,7 +36,7 @@ class Scheme(Base):
         super().__init__(parameters)
         self.dissipates = parameters.gamma > 0.5
 
-    def limit(self, damping_ratio: float = 0.0) -> float:
+    def limit(self, damping_ratio: float = 0.0, viscous_ratio: float = 0.0) -> float:
         """Return infinity for 2 beta >= gamma >= 1/2; else Omega with Omega^2 (gamma/2 - beta) = 1 (undamped)."""
         beta, gamma = self.parameters.beta, self.parameters.gamma
         if gamma < 0.5:

@@ -40,7 +40,7 @@ class Scheme(Base):
     balance_at_endpoints = False
     solves_end = False
 
-    def limit(self, damping_ratio: float = 0.0) -> float:
+    def limit(self, damping_ratio: float = 0.0, viscous_ratio: float = 0.0) -> float:
         """Return infinity for theta >= (1 + sqrt 3)/2; below, the eigenvalue -1 appears at Omega^2 =
         12 (2 theta - 1)/(6 theta^2 - 4 theta^3 - 1) (undamped)."""
         theta = self.parameters.theta

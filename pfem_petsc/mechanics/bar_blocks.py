@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 __all__ = ["BarBlock", "laws_of", "make_blocks"]
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class BarBlock:
     """Local bars [start, stop) of one section, of which [start, counted) are counted on this rank.
 

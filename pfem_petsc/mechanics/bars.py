@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -61,6 +63,8 @@ class Bars:
     internal : name and unit of the internal variables of all laws of the case
     kept_names : names of all data that laws keep from step to step, the same on all ranks
     blocks : bars by section
+    viscous : whether bars of the case have a viscous stress, the same on all ranks
+    viscous_blocks : those of them on this rank
     springs : from nodes to the ground, whose forces and stiffness are added to those of the bars; None without
     """
 
@@ -78,8 +82,10 @@ class Bars:
         self.step = 0.0
         self.internal = internal_variables(case.material)
         self.blocks = make_blocks(mesh, case, self.mesh_lengths)
+        self.viscous_blocks = [block for block in self.blocks if block.law.known_rate >= 0]
         laws = laws_of(case).values()
         self.can_break = any(law.rupture >= 0 for law in laws)
+        self.viscous = any(law.known_rate >= 0 for law in laws)
         self._watched = np.empty(len(mesh.bars) if self.can_break else 0)
         self.kept_names = list(dict.fromkeys(name for law in laws for name, _ in law.rows))
         # loops over diagonal runs know the ends from those of the first bar
@@ -137,6 +143,34 @@ class Bars:
         if self.springs is not None:
             energies[_OF_SPRINGS] = self.springs.add_forces(x, f)
         return StrainEnergy(tuple(energies.tolist()), failed, shortened, changed)
+
+    def set_rates(self, x0: np.ndarray, x: np.ndarray, v: np.ndarray, eta: float) -> None:
+        """Give viscous bars the strain rate at the positions x + dx with the velocities v + eta dx, linear in the
+        strain; all (local nodes, 3), with ghosts, and ``x0`` at the start of the step. ``x`` is held fixed for eta = 0.
+        """
+        for block in self.viscous_blocks:
+            geometry = (self.ends, self.rest, self.heat)
+            block.kernels.rates(x0, x, v, *geometry, eta, self.step, block.history, block.start, block.stop)
+            if self.step > 0.0:
+                block.parameters = (*block.parameters[:-1], eta * self.step)
+
+    @contextmanager
+    def without_rates(self) -> Iterator[None]:
+        """Evaluate bars at rest: laws with a rate have the step zero, and there is no viscous stress."""
+        step, kept = self.step, [block.history[block.law.known_rate].copy() for block in self.viscous_blocks]
+        self.step = 0.0
+        self.forget_rates()
+        try:
+            yield
+        finally:
+            self.step = step
+            for block, rates in zip(self.viscous_blocks, kept, strict=True):
+                block.history[block.law.known_rate] = rates
+
+    def forget_rates(self) -> None:
+        """Set the known strain rates of viscous bars to zero."""
+        for block in self.viscous_blocks:
+            block.history[block.law.known_rate] = 0.0
 
     def keep_start(self) -> None:
         """Store temperatures and rest lengths as those of the start of the next step."""

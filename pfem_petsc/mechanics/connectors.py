@@ -17,7 +17,7 @@ from ..case.tables import Section
 from ..errors import InputError
 from ..mesh.slab import MeshSlab, index_type
 from ..mesh.slab_rows import with_bars
-from .materials._stiffness_damping import damped
+from .materials._stiffness_damping import EXTRAPOLATED, damped
 from .materials.base import Law, MaterialKeys
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ class _Viscous(MaterialKeys):
     """A material without stiffness and with the viscosity ``young_modulus`` [Pa s]."""
 
     def numbers(self) -> tuple[Any, ...]:
-        return (0.0,), float(self.young_modulus)
+        return (0.0,), float(self.young_modulus), EXTRAPOLATED
 
     def choose(self, law: Law) -> Law:
         return damped(law)

@@ -23,7 +23,7 @@ __all__ = ["fused_parts", "make_kernels"]
 @cache
 def make_kernels(law: Law, measure: Callable) -> SimpleNamespace:
     """Make the kernels of a law and strain measure: ``forces``, ``tangents``, ``product``, ``linearise``, ``fields``,
-    ``densities``.
+    ``densities``, ``rates``.
 
     Common arguments: ``x`` (local nodes, 3) [m]; ``bars`` (b, 2) local ends; ``rest`` (b,) rest lengths [m]; ``heat``
     (2, b) thermal strains and temperatures [K], or (2, 0) for none; ``p`` the law's parameters; ``area`` [m2], a number

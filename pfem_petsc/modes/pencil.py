@@ -61,8 +61,7 @@ def bar_stiffness(model: Model, x: np.ndarray) -> np.ndarray:
     vibrations about the state do not yield further. The strain rate has no effect.
     """
     bars = model.bars
-    step, bars.step = bars.step, 0.0
-    try:
+    with bars.without_rates():
         stored = _linearised(model, x)
         if bars.kept_names:
             around = [_linearised(model, (1.0 + sign * _LOADING) * x) for sign in (-1.0, 1.0)]
@@ -70,8 +69,6 @@ def bar_stiffness(model: Model, x: np.ndarray) -> np.ndarray:
             larger = np.maximum(*(each[3] + each[4] for each in around))
             kink = larger - tangent > _KINK * np.abs(larger)
             stored[3, kink] = (larger - stored[4])[kink]
-    finally:
-        bars.step = step
     return stored
 
 

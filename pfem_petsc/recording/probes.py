@@ -62,11 +62,11 @@ class Probes:
         """Return where this rank's nodes begin in its share (m,) int64."""
         return _NUMBERS * np.arange(len(self.nodes), dtype=np.int64)
 
-    def fill(self, share: np.ndarray, state: State, acceleration: np.ndarray) -> None:
-        """Write this rank's share (size,), with the acceleration (owned, 3) to record."""
+    def fill(self, share: np.ndarray, state: State, acceleration: np.ndarray, support: np.ndarray) -> None:
+        """Write this rank's share (size,), with acceleration and forces of supports (owned, 3) to record."""
         values, nodes = share.reshape(-1, len(PROBED), 3), self.nodes
         values[:, 0], values[:, 1], values[:, 2] = state.x[nodes], state.v[nodes], acceleration[nodes]
-        values[:, 3] = state.support[nodes] + state.contact[nodes]
+        values[:, 3] = support[nodes] + state.contact[nodes]
 
     def unite(self, share: np.ndarray, out: np.ndarray) -> None:
         """Write the numbers of all probes (width,), as a row has them, from the shares (size,). Collective."""

@@ -141,8 +141,13 @@ class Recorder:
         if self._contact.size:
             self._contact.fill(sums[walls:links], solution.walls, ledger.impulses)
         ledger.impulses.fill_links(sums[links:at].reshape(-1, PAIR.width))
-        if self.probe_nodes:
-            self._probes.fill(sums[at:], state, stepper.acceleration())
+        held = self.model.supports.any or self.model.bars.springs is not None
+        reacts = held and not stepper.scheme.balance_at_endpoints
+        if self.probe_nodes or reacts:
+            acceleration, support = stepper.recorded()
+            self._probes.fill(sums[at:], state, acceleration, support)
+            if reacts:
+                sums[HEAD["support_force"]] = stepper.support_force(support)
 
     def _unpack(self, sums: np.ndarray) -> np.ndarray:
         """Return the values of a row from the sums over ranks."""

@@ -103,9 +103,9 @@ class StaticStepper(ImplicitStepper):
         self.scheme.start(state, self.h)
         model.contact.motion.start(self.h)
 
-    def acceleration(self) -> np.ndarray:
-        """See :class:`~pfem_petsc.stepping.stepper.Stepper`; zero."""
-        return np.zeros_like(self.state.a)
+    def recorded(self) -> tuple[np.ndarray, np.ndarray]:
+        """See :class:`~pfem_petsc.stepping.stepper.Stepper`; without acceleration."""
+        return np.zeros_like(self.state.a), self.state.support
 
     def step(self) -> None:
         """Find the equilibrium at the next load factor.

@@ -197,6 +197,8 @@ class ImplicitStepper(HalvedSteps):
         model, state = self.model, self.state
         if model.bars_vary:
             model.change_bars(balance.time)
+        if model.bars.viscous and balance.weight and self.scheme.inertial and not balance.discrete_gradient:
+            self._set_rates(balance)
         tolerance = self.accuracy * residual_tolerance(model, state, balance, self.part)
         active_set = ActiveSet(model, self.state, balance, self.held, self.links, self.remedy)
         candidates, links = self._candidates(active_set, balance), active_set.links
@@ -243,6 +245,15 @@ class ImplicitStepper(HalvedSteps):
         state.support = model.supports.part(g - state.contact)
         internal = problem.f if balance.weight else state.f
         return Solution(u, internal, walls, newton, linear, held)
+
+    def _set_rates(self, balance: Balance) -> None:
+        """Give viscous bars the strain rates of a balance, affine in its unknowns like the velocities. Collective.
+
+        The internal force is w f(x_u) + (1 - w) f(x_n), and the velocity of the balance is divided in the same way.
+        """
+        state, w = self.state, balance.weight
+        v = balance.v_hat if w == 1.0 else (balance.v_hat - (1.0 - w) * state.v) / w
+        self.model.bars.set_rates(state.x, self.on_all(balance.predictor), self.on_all(v), balance.eta / w)
 
     def _candidates(self, active_set: ActiveSet, balance: Balance) -> Candidates:
         """Return the nodes that walls may stop, for the first solve. Collective."""

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Plan", "dashpot_rate", "make_plan"]
 
+_LEAST = 1e-6  # ratio of frequency and rate of damping below which the frequency no longer changes the stable step
 _MOST_STEPS = 2.0**53  # beyond this, consecutive steps do not have distinct times
 
 
@@ -115,15 +116,14 @@ def make_plan(model: Model, recorded: Mapping[str, Any] | None = None) -> Plan:
     )
     limit = scheme.limit(min(ratio, 1e3))
     local = dashpot_rate(model) / (2.0 * max(frequency.lower, 1e-300))  # of single nodes, not of all modes
-    safe = scheme.limit(min(ratio + local, 1e3)) if local else limit
     if limit == 0.0:
         raise InputError(
             f"{case.source}: time: {time.integrator} with these parameters is unstable at any step; use gamma >= 1/2"
         )
     betas = [case.material[section.material].stiffness_damping for section in case.section.values()]
     viscous = viscous_rate(case, model.bars, model.inertia.mass, model.inertia.consistent)
-    critical = _stable_step(scheme, safe, frequency.upper, max(betas), viscous)
-    certain = _stable_step(scheme, limit, frequency.lower, min(betas))
+    critical = _stable_step(scheme, min(ratio + local, 1e3), frequency.upper, max(betas), viscous)
+    certain = _stable_step(scheme, min(ratio, 1e3), frequency.lower, min(betas))
     if recorded is not None:
         step = float(recorded["step"])
         steps = _steps_to(time.end, step, case.source)
@@ -181,21 +181,16 @@ def dashpot_rate(model: Model) -> float:
     return factor * model.comm.allreduce(float((inertia.points.damping / inertia.mass).max(initial=0.0)), op=MPI.MAX)
 
 
-def _stable_step(scheme: Scheme, limit: float, frequency: float, beta: float, viscous: float = 0.0) -> float:
-    """Return the stable step [s] at an angular frequency [rad/s], from the limit of Omega without damping C = beta K.
+def _stable_step(scheme: Scheme, ratio: float, frequency: float, beta: float, viscous: float = 0.0) -> float:
+    """Return the stable step [s] at an angular frequency [rad/s] and a damping ratio, with damping C = beta K of bars.
 
     ``viscous`` is the largest eigenvalue of other damping C over M by rates of strain [1/s], like beta w^2.
-
-    In explicit steps the rate of strain is that of the step before. Schemes become unstable by an eigenvalue -1, with
-    which this rate is 2/h times the strain: as with the stiffness K (1 + 2 beta/h), hence h^2 + 2 beta h = (limit/w)^2.
     """
+    if scheme.explicit:
+        frequency = max(frequency, _LEAST * viscous)
     if not frequency > 0.0:
-        return 0.5 * limit * limit / viscous if viscous and scheme.explicit else np.inf
-    step = limit / frequency
-    beta += viscous / (frequency * frequency)
-    if not scheme.explicit or not beta:
-        return step
-    return step * step / (beta + float(np.hypot(beta, step)))
+        return np.inf
+    return scheme.limit(ratio, 0.5 * (beta * frequency + viscous / frequency)) / frequency
 
 
 def _check_laws(case: Case, scheme: Scheme) -> None:

@@ -137,7 +137,7 @@ class Removals:
 
     def _remove_support(self, entry: Remove, now: float) -> None:
         column = self._columns[entry.supports]
-        freed = self._model.supports.freed([entry.supports], self._stepper.state.support)
+        freed = self._model.supports.freed([entry.supports], self._stepper.recorded()[1])
         self.released[:, column : column + 3] = freed
         self._replace(entry, now)
         self.gone.append(entry.supports)

@@ -89,8 +89,9 @@ def hand_over(old: Stepper, new: Stepper) -> None:
     new.before[:] = before.x
     state.v = before.v.copy()
     if not new.scheme.inertial:  # others find the forces of their start
-        state.support, state.contact = before.support.copy(), before.contact.copy()
+        state.support, state.contact = old.recorded()[1].copy(), before.contact.copy()
     new.model.bars.put_history(old.model.bars.history())
+    new.model.bars.forget_rates()
     new.removals.follow(old.removals)
     new.ruptures.begin()
     new.model.temperatures.hold(old.model.bars.heat)

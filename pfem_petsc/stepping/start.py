@@ -9,6 +9,7 @@ import numpy as np
 
 from ..contact.initial_equilibrium import start_at_rest
 from ..errors import SimulationFailure
+from ..mechanics.materials._stiffness_damping import EXTRAPOLATED
 from ..tolerances import BEYOND
 from .loading import load_now
 from .phases import solve_and_finish
@@ -56,6 +57,9 @@ def start_in_motion(stepper: Stepper) -> None:
     stepper.walls_at_start = stepper.solution.walls.force
     stepper.links_at_start = model.links.totals()
     stepper.scheme.start(state, stepper.h)
+    if model.bars.viscous and stepper.scheme.solves_next_position:  # the rate half a step before, to extrapolate from
+        half = stepper.on_all(state.memory["half_velocity"])
+        model.bars.set_rates(state.x, state.x - (0.5 * stepper.h) * half, (1.0 - EXTRAPOLATED) * half, 0.0)
     motion = model.contact.motion
     motion.start(stepper.h)
     if stepper.scheme.solves_next_position:

@@ -135,35 +135,49 @@ class Stepper(ABC):
         start_at_zero(self)
 
     def acceleration(self) -> np.ndarray:
-        """Acceleration (owned, 3) to record [m/s2]; collective with consistent mass.
+        """Acceleration (owned, 3) to record [m/s2], see :meth:`recorded`. Collective."""
+        return self.recorded()[0]
 
-        If the balance holds at the ends of steps, it is that of the scheme. For other schemes that is of first order or
-        holds at another time, so free nodes get the acceleration by the forces at the end of the step.
+    def recorded(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return acceleration [m/s2] and forces of supports [N] to record, (owned, 3). Collective.
+
+        If the balance holds at the ends of steps, they are those of the scheme. For other schemes these are of first
+        order or hold at another time, so free nodes get the acceleration by the forces at the end of the step, and
+        supports the forces that the balance requires there.
         """
         state, model, scheme = self.state, self.model, self.scheme
-        if scheme.balance_at_endpoints or state.step == 0:
-            return state.a
+        if scheme.balance_at_endpoints or state.time == 0.0:
+            return state.a, state.support
         load = -state.f[: len(state.a)]
         if model.external.active:
             load += load_now(self, state.time)
+        model.inertia.change(state.time)
         if model.inertia.damped:
             load -= model.inertia.damping_times(state.v, np.empty_like(load))
+        held = load + state.contact
         touched = (state.contact != 0.0).any(axis=1)[:, None]
         known = np.where(touched, state.a, model.supports.part(state.a))
         if model.inertia.consistent:
             load += state.contact - model.inertia.mass_times(known, np.empty_like(load))
         a = self.accelerate(load)
         model.supports.put(a, model.supports.get(known))
-        return np.where(touched, state.a, a)
+        a = np.where(touched, state.a, a)
+        if not model.supports.any:
+            return a, state.support
+        return a, model.supports.part(model.inertia.mass_times(a, np.empty_like(a)) - held)
 
     def totals(self) -> np.ndarray:
         """Return this rank's sums (3, 3) of support, external and damping force [N] at the state."""
         state, inertia = self.state, self.model.inertia
         damping = -inertia.damping_times(state.v, np.empty_like(state.v))
-        support = state.support.sum(axis=0)
-        if self.model.bars.springs is not None:
-            support -= state.f[: len(state.v)].sum(axis=0)
-        return np.array([support, state.external.sum(axis=0), damping.sum(axis=0)])
+        return np.array([self.support_force(state.support), state.external.sum(axis=0), damping.sum(axis=0)])
+
+    def support_force(self, support: np.ndarray) -> np.ndarray:
+        """Return this rank's sum (3,) of forces of supports (owned, 3) and of springs to the ground [N]."""
+        total = support.sum(axis=0)
+        if self.model.bars.springs is not None:  # the forces of bars cancel in the sum over all ranks
+            total -= self.state.f[: len(support)].sum(axis=0)
+        return total
 
     def arrived(self) -> str:
         """The step whose end the state is at, complete or not, and its time, for messages."""
@@ -261,16 +275,25 @@ class Stepper(ABC):
 
     def evaluate(self, commit: bool) -> None:
         """Evaluate internal force and energies at the state's positions; a collapsed bar becomes a fault."""
-        state, mesh = self.state, self.model.mesh
-        mesh.update_ghosts(state.x)
-        self.energy = self.model.bars.forces(state.x, state.f, commit)
+        state, bars, scheme = self.state, self.model.bars, self.scheme
+        self.model.mesh.update_ghosts(state.x)
+        if bars.viscous and scheme.inertial and (bars.step == 0.0 or scheme.rates_follow):
+            bars.set_rates(self.before, state.x, self.on_all(state.v), 0.0)
+        self.energy = bars.forces(state.x, state.f, commit)
         if commit and self.energy.changed:
             self.ruptures.note()
         failed = self.energy.failed
         if failed < 0 and self.energy.shortened:
-            failed = self.model.bars.first_inverted(state.x, self.before)
+            failed = bars.first_inverted(state.x, self.before)
         if failed >= 0 and self.fault is None:
             self.fault = SimulationFailure(self.collapse(failed))
+
+    def on_all(self, values: np.ndarray) -> np.ndarray:
+        """Return values (owned, 3) of nodes with those of ghosts, (local, 3). Collective."""
+        every = np.empty_like(self.state.x)
+        every[: len(values)] = values
+        self.model.mesh.update_ghosts(every)
+        return every
 
     def collapse(self, bar: int) -> str:
         """Return the message about a bar (local index) that failed in the current step."""

@@ -18,7 +18,7 @@ from ...case.base import Finite, NonNegativeFloat, PositiveFloat, StrictModel, l
 from ...case.rupture import Rupture
 from ...energies import BAR_ENERGIES
 from ._softening import Softening, softened
-from ._stiffness_damping import damped
+from ._stiffness_damping import EXTRAPOLATED, damped
 
 __all__ = ["BarShapes", "Law", "MaterialKeys", "UnsuitableBarError"]
 
@@ -101,7 +101,8 @@ class MaterialKeys(StrictModel):
     def numbers(self) -> tuple[Any, ...]:
         """Return what the response of :meth:`choose` reads as ``p``."""
         own = self.pack() if self.softening is None else (self.pack(), np.array(self.softening, dtype=float))
-        return own if not self.stiffness_damping else (own, self.young_modulus * self.stiffness_damping)
+        beta = self.stiffness_damping
+        return (own, self.young_modulus * beta, EXTRAPOLATED) if beta else own
 
     def choose(self, law: Law) -> Law:
         """Return the variant of the law that the keys select: the law itself, softened by temperature, or with damping
@@ -162,6 +163,8 @@ class Law:
     no_mean_stress : why there is no ``mean_stress``, for the message
     rupture : index of the internal variable with the fraction of a bar that has left the model, see
         :mod:`~pfem_petsc.mechanics.rupture`; -1 for laws whose bars cannot break
+    known_rate : index of the internal variable with the known part of the strain rate of a viscous stress, whose factor
+        is the last packed parameter, see ``_stiffness_damping.py``; -1 for laws without
     whole : the law of intact bars from which this one is derived, if any
     """
 
@@ -179,6 +182,7 @@ class Law:
     modulus: Callable[[tuple[Any, ...], np.ndarray], np.ndarray] | None = None
     no_mean_stress: str = ""
     rupture: int = -1
+    known_rate: int = -1
     whole: Law | None = None
 
     def __post_init__(self) -> None:

@@ -130,9 +130,9 @@ class ActiveSet:
         contact, time = self.contact, self.balance.time
         frames, tied = NodalFrames(candidates.nodes, len(contact.walls)), contact.ties.nobody
         if candidates.anywhere:
-            applicable = candidates.without(contact.ties.held).applicable
             least = MIN_VOLUME if self._iterations < _PATIENCE else _SMALL_VOLUME
-            frames = contact.frames(candidates.nodes, x, time, applicable, candidates.priority, least)
+            untied = candidates.without(contact.ties.held)
+            frames = contact.frames(untied, x, time, least, self.balance.acting)
             tied = contact.ties.pin(frames, x, time)
             self.friction.apply(frames, x)
         met = frames if candidates.anywhere else None
@@ -226,7 +226,8 @@ class ActiveSet:
             normal_forces = self.friction.check(frames, x[at], pull, normal_forces, noise, tolerance)
         left = np.union1d(joined, self.friction.unsettled)
         unsettled = is_misaligned(frames, normal_forces)
-        unsettled = unsettled or is_off_surface(contact, self._displacements, frames, normal_forces, x, slack)
+        part = self.balance.acting
+        unsettled = unsettled or is_off_surface(contact, self._displacements, frames, normal_forces, x, slack, part)
         if self.model.comm.allreduce(int(unsettled or len(left) > 0), op=MPI.MAX):
             self._iterations += 1
             if self._iterations >= _ITERATIONS:

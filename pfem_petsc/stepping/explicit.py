@@ -99,7 +99,8 @@ class ExplicitStepper(Stepper):
         if model.contact.any:
             # also after a failure of links: with walls with mass this call is collective
             with self._faults(balance):
-                nodes, force, walls = model.contact.explicit(balance.predictor, u, stiffness, balance.time, tolerance)
+                arguments = balance.predictor, u, stiffness, balance.time, tolerance, balance.acting
+                nodes, force, walls = model.contact.explicit(*arguments)
                 if len(nodes):
                     if state.contact is self.zero:
                         state.contact = np.zeros_like(u)

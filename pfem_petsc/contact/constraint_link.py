@@ -163,7 +163,7 @@ class ConstraintLink:
             )
         values = rows.values(rows.gather(model.mesh.points[: model.mesh.n_owned]))
         deepest = (np.inf,)
-        if len(values) and not values.min() >= -ON_BOUND * model.length:
+        if len(values) and not values.min() >= -ON_BOUND * model.size:
             row = int(np.argmin(values))
             at = ", ".join(str(n) for n in rows.numbers[rows.ends[row][rows.ends[row] >= 0]])
             deepest = (float(values[row]), int(rows.source[row]), int(rows.ids[row]), at)

@@ -12,7 +12,7 @@ from mpi4py import MPI
 from ..errors import SimulationFailure
 from ..parallel.agreement import agreed
 from ..registry import lookup
-from ..tolerances import BEYOND, ON_BOUND
+from ..tolerances import BEYOND, ON_BOUND, resolvable
 from .explicit import ExplicitContact
 from .forces import WallForces
 from .frames import MIN_VOLUME, NodalFrames, build_frames
@@ -46,6 +46,7 @@ class Contact:
     restitution, friction, static_friction : (walls,); has_friction : whether any wall has friction
     ties : Ties
     plain : whether all walls are flat and without further features
+    size : length that tolerances are relative to [m], see :mod:`~pfem_petsc.tolerances`
     rebounds : whether restitution is a bound on the next position, for schemes that solve for the next position
     state : of the nodes, for walls that need their previous positions; set by the stepper
     """
@@ -94,7 +95,9 @@ class Contact:
         self.plain = self._explicit.plain
         ends = np.stack([-mesh.points.min(axis=0, initial=np.inf), mesh.points.max(axis=0, initial=-np.inf)])
         mesh.comm.Allreduce(MPI.IN_PLACE, ends, op=MPI.MAX)
-        self.length = float(ends.sum(axis=0).max())
+        centres = np.array([wall.centre for wall in self.walls])
+        coordinates = float(np.abs(ends).max()), float(np.abs(centres).max(initial=0.0))
+        self.size = resolvable(float(ends.sum(axis=0).max()), *coordinates)
 
     @property
     def special(self) -> np.ndarray:
@@ -173,7 +176,7 @@ class Contact:
                 if wall.partial:
                     # a node in contact may lie beyond the wall, because the balance need not hold at its position
                     held = state.contact[nodes] @ wall.normal > 0.0
-                    slack = np.where(held, 0.1 * wall.half.min(), BEYOND * self.length)
+                    slack = np.where(held, 0.1 * wall.half.min(), BEYOND * self.size)
                     applicable[:, k] &= wall.stops(before - earlier[k], x - displacements[k], slack)
         return applicable
 
@@ -293,7 +296,7 @@ class Contact:
         normals, offsets = self.planes(candidates.applicable, at, displacements, acting)
         if rank is None:
             rank = np.einsum("iwk,ik->iw", normals, at) - offsets
-        tolerance = ON_BOUND * self.length
+        tolerance = ON_BOUND * self.size
         frames = build_frames(nodes, self.fixed[nodes], normals, offsets, rank, tolerance, at, least)
         with agreed(self.mesh.comm):
             if frames.contradiction >= 0:
@@ -320,7 +323,7 @@ class Contact:
             touching = (row >= 0) & (active[every, safe] == -sign)
             # of almost parallel walls that share a row, take the nearest
             bound = np.where(sign > 0.0, frames.lower[every, safe], frames.upper[every, safe])
-            touching &= sign * (bound - frames.bounds[:, k]) <= ON_BOUND * self.length
+            touching &= sign * (bound - frames.bounds[:, k]) <= ON_BOUND * self.size
             strengths[touching, k] = np.abs(left[every[touching], safe[touching]])
             left[every[touching], safe[touching]] = 0.0  # where walls share a bound, the first takes the force
         return strengths

@@ -108,7 +108,7 @@ class ExplicitContact:
                 np.add.at(slope, at, gives[:, :, None] * np.eye(3))
             return walls.force[free.at], slope[free.at]
 
-        found = free.solve(forces, FIXED_POINT * self.contact.length)
+        found = free.solve(forces, FIXED_POINT * self.contact.size)
         if failure is not None:
             raise failure
         if not found:
@@ -252,7 +252,7 @@ class ExplicitContact:
         before, fixed = state.position[nodes], self.contact.fixed[nodes]
         normals, offsets, acting = planes
         applicable = offsets > -np.inf
-        tolerance = PROJECTED * self.contact.length
+        tolerance = PROJECTED * self.contact.size
         for _ in range(_CURVED_ROUNDS):
             at, normal_forces, drag = moved.copy(), strength.copy(), np.zeros(normals.shape)
             unsettled = add_friction(

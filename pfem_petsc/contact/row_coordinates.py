@@ -148,7 +148,7 @@ class RowCoordinates:
         rows, here = self.rows, self.rows.here
         nowhere = np.full(len(rows.numbers), -1), np.empty((0, 0, 3)), np.empty((0, 0))
         k, x = rows.gather(stiffness), rows.gather(predictor + u)
-        tolerance = PROJECTED * self.link.contact.length
+        tolerance = PROJECTED * self.link.contact.size
         start = self._start if self._part == 0.0 else None
         with agreed(self.comm):
             force, jacobian = rows.project(x, tolerance, _NOWHERE, lambda: (k, start, nowhere))

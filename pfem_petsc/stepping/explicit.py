@@ -93,7 +93,7 @@ class ExplicitStepper(Stepper):
                 others = self._hold(balance, stiffness, u)
             positions = supports.positions(balance.time)[: len(supports.nodes)]
             hold(0, len(load), 0, supports.nodes, supports.components, positions, balance.predictor, stiffness, u, load)
-        walls, held, tolerance = model.contact.nothing, self._nobody, PROJECTED * model.length
+        walls, held, tolerance = model.contact.nothing, self._nobody, PROJECTED * model.size
         with self._faults(balance):
             state.contact = model.links.explicit(balance, state, u, stiffness, self.zero, tolerance)
         if model.contact.any:

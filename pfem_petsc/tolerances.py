@@ -38,8 +38,8 @@ ON_BOUND = 1e-12
 """relative to L, wave speeds or directions: a node within this distance of a bound, or with less than this velocity
 away from it, is on it; ten times the error of a projection"""
 BEYOND = 1e-9
-"""relative to L: depth beyond a wall that is a failure, at least 2e5 roundings, and the margin by which nodes search for
-walls beyond their motion in a step. Steps satisfy walls to 1e-12; almost parallel walls, walls with mass, and nodes
+"""relative to L: depth beyond a wall that is a failure, at least 2e5 roundings, and the margin by which nodes search
+for walls beyond their motion in a step. Steps satisfy walls to 1e-12; almost parallel walls, walls with mass, and nodes
 tied to one wall and moved along another to 1e-9; observed losses of contact are at least 1e-4"""
 
 FREE_PART = 1e-12

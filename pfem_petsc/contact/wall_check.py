@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..tolerances import ON_BOUND
+from ..tolerances import ON_BOUND, PROJECTED
 from .candidates import Candidates
 from .frames import NodalFrames
 from .free_parts import held_by_supports
@@ -89,7 +89,10 @@ def is_off_surface(
         if passed.any() and (contact.gap(k, x[at[passed]], displacements) < -tolerance).any():
             return True
         if pressed.any():
-            turn = np.abs(normals[pressed, k] - frames.normals[pressed, k])
-            if np.abs(contact.gap(k, x[at[pressed]], displacements)).max() > tolerance or turn.max() > ON_BOUND:
+            turn = np.abs(normals[pressed, k] - frames.normals[pressed, k]).max(axis=1)
+            # far from the origin, the rounding of positions turns normals by more
+            moved = np.abs(x[at[pressed]] - frames.places[pressed]).max(axis=1)
+            turned = (turn > ON_BOUND) & (moved > PROJECTED * contact.size)
+            if np.abs(contact.gap(k, x[at[pressed]], displacements)).max() > tolerance or turned.any():
                 return True
     return False

@@ -118,7 +118,7 @@ class Simulation(WithEquations):
             self._reached = finished(case, self.comm, self.folder, self.plan.end)
         self.mesh = self.model.mesh
         if number == 0:
-            check_start(self.model.contact, self.mesh.points[: self.mesh.n_owned], self.model.length)
+            check_start(self.model.contact, self.mesh.points[: self.mesh.n_owned], self.model.size)
         minutes = case.output.checkpoint_minutes
         interval = 60.0 * minutes if minutes else None
         synchroniser = Synchroniser(self.comm, self.analysis, stop, lock, interval)

@@ -115,7 +115,7 @@ class ActiveSet:
         kind = NoStepFriction if self.contact.symmetric else StepFriction
         self.friction = kind(model, state, balance)
         self.candidates = expected_candidates(model, state, balance, held, self._displacements)
-        move, slack = (balance.time - state.time) * state.v, BEYOND * model.length
+        move, slack = (balance.time - state.time) * state.v, BEYOND * model.size
         self._all_links = tuple(links)
         self.links = tuple(link for link in links if link.reached(state, move, slack))
 
@@ -130,9 +130,9 @@ class ActiveSet:
         contact, time = self.contact, self.balance.time
         frames, tied = NodalFrames(candidates.nodes, len(contact.walls)), contact.ties.nobody
         if candidates.anywhere:
-            applicable = candidates.without(contact.ties.held).applicable
             least = MIN_VOLUME if self._iterations < _PATIENCE else _SMALL_VOLUME
-            frames = contact.frames(candidates.nodes, x, time, applicable, candidates.priority, least)
+            untied = candidates.without(contact.ties.held)
+            frames = contact.frames(untied, x, time, least, self.balance.acting)
             tied = contact.ties.pin(frames, x, time)
             self.friction.apply(frames, x)
         met = frames if candidates.anywhere else None
@@ -151,7 +151,7 @@ class ActiveSet:
         at = frames.nodes
         x = self.balance.predictor[at] + u[at]
         moved, multipliers = x.copy(), np.zeros(frames.offsets.shape)
-        project(moved, fixed[at], frames.normals, frames.offsets, PROJECTED * self.model.length, multipliers)
+        project(moved, fixed[at], frames.normals, frames.offsets, PROJECTED * self.model.size, multipliers)
         u[at] += moved - x
         tied, _, places = trial.tied
         nodes = at[tied]
@@ -213,7 +213,7 @@ class ActiveSet:
         """
         contact, frames, candidates = self.contact, trial.frames, trial.candidates
         x, at = self.balance.predictor + u, trial.candidates.nodes
-        slack = ON_BOUND * self.model.length
+        slack = ON_BOUND * self.model.size
         settled, links, g = self._check_links(trial, bounds, w, x, g, noise, slack)
         normal_forces, pull = np.zeros((len(at), len(contact.walls))), np.where(contact.fixed[at], 0.0, g[at])
         if not contact.any:
@@ -226,12 +226,13 @@ class ActiveSet:
             normal_forces = self.friction.check(frames, x[at], pull, normal_forces, noise, tolerance)
         left = np.union1d(joined, self.friction.unsettled)
         unsettled = is_misaligned(frames, normal_forces)
-        unsettled = unsettled or is_off_surface(contact, self._displacements, frames, normal_forces, x, slack)
+        part = self.balance.acting
+        unsettled = unsettled or is_off_surface(contact, self._displacements, frames, normal_forces, x, slack, part)
         if self.model.comm.allreduce(int(unsettled or len(left) > 0), op=MPI.MAX):
             self._iterations += 1
             if self._iterations >= _ITERATIONS:
                 raise NotConverged(self._why(left, x))
-            rank = PROJECTED * self.model.length
+            rank = PROJECTED * self.model.size
             candidates = candidates.join(contact, self._displacements, joined, broken, x, normal_forces, rank)
             settled = False
         return Outcome(settled, candidates, links, trial, normal_forces, pull)

@@ -49,7 +49,7 @@ def check_positions(stepper: Stepper) -> None:
         x, time = balance.predictor + stepper.solution.u, balance.time
     gaps = contact.gaps(x, time)
     gaps[:, [wall.partial for wall in contact.walls]] = np.inf
-    tolerance = BEYOND * max(model.length, model.reach)
+    tolerance = BEYOND * max(model.size, model.reach)
     # a NaN has its own message elsewhere
     suspects = np.flatnonzero((gaps < -tolerance).any(axis=1))
     if comm.allreduce(len(suspects), op=MPI.MAX) == 0:
@@ -115,7 +115,7 @@ class CarriedNodes:
 
     def crossing(self, x: np.ndarray, time: float, where: str) -> str | None:
         """Return the message about nodes that have crossed a rectangle since :meth:`start`, None if there are none."""
-        contact, tolerance = self._contact, BEYOND * self._contact.length
+        contact, tolerance = self._contact, BEYOND * self._contact.size
         after = self._places(x, time)
         for k, nodes in self.of.items():
             wall = contact.walls[k]

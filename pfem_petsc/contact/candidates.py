@@ -87,7 +87,7 @@ def expected_candidates(
     if not contact.any:
         return nobody
     move = (balance.time - state.time) * state.v
-    reach = 0.5 * np.linalg.norm(move, axis=1) + BEYOND * model.length
+    reach = 0.5 * np.linalg.norm(move, axis=1) + BEYOND * model.size
     near = held | contact.near(state.position + move, displacements, reach) | contact.ties.held
     if model.comm.allreduce(int(near.any()), op=MPI.MAX) == 0:
         return nobody
@@ -104,7 +104,7 @@ def _within_reach(
     contact = model.contact
     applicable = contact.applicable(nodes, x, displacements)
     within = np.zeros_like(applicable)
-    starts = state.position[nodes], contact.motion.displacements(state.time), BEYOND * model.length
+    starts = state.position[nodes], contact.motion.displacements(state.time), BEYOND * model.size
     for place, there, distance in ((x, displacements, reach[:, None]), starts):
         normals, offsets = contact.planes(applicable, place, there)
         within |= np.einsum("mwi,mi->mw", normals, place) - offsets < distance

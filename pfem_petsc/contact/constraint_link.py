@@ -91,7 +91,7 @@ class ConstraintLink:
         near = self._near(x, balance.time)
 
         def given() -> tuple[np.ndarray, np.ndarray | None, Planes]:
-            start = rows.spread(state.position, far[:, 4:7]) if acts_at_start(balance, state) else None
+            start = rows.spread(state.position, far[:, 4:7]) if balance.acting < 1.0 else None
             free_stiffness(rows.where, stiffness, far, self._hard)
             return self._hard, start, self._planes(near, x, far[:, 7:] > 0.0, displacements)
 
@@ -163,7 +163,7 @@ class ConstraintLink:
             )
         values = rows.values(rows.gather(model.mesh.points[: model.mesh.n_owned]))
         deepest = (np.inf,)
-        if len(values) and not values.min() >= -ON_BOUND * model.length:
+        if len(values) and not values.min() >= -ON_BOUND * model.size:
             row = int(np.argmin(values))
             at = ", ".join(str(n) for n in rows.numbers[rows.ends[row][rows.ends[row] >= 0]])
             deepest = (float(values[row]), int(rows.source[row]), int(rows.ids[row]), at)
@@ -217,11 +217,6 @@ class ConstraintLink:
             self.force = every
         else:
             self.jacobian = every
-
-
-def acts_at_start(balance: Balance, state: State) -> bool:
-    """Return whether the forces of a balance act at the state's positions, not at the positions solved for."""
-    return all(time == state.time for _, time in balance.loads)
 
 
 def _source(file: str, parameters: ConstraintKeys, nodes: dict[str, np.ndarray], mesh: DistributedMesh) -> Constraint:

@@ -12,7 +12,7 @@ from mpi4py import MPI
 from ..errors import SimulationFailure
 from ..parallel.agreement import agreed
 from ..registry import lookup
-from ..tolerances import BEYOND, ON_BOUND
+from ..tolerances import BEYOND, ON_BOUND, resolvable
 from .explicit import ExplicitContact
 from .forces import WallForces
 from .frames import MIN_VOLUME, NodalFrames, build_frames
@@ -24,11 +24,13 @@ from .tied import FreshTies, NoTies, Ties
 if TYPE_CHECKING:
     from ..case.schema import Case
     from ..mesh.distribution import DistributedMesh
+    from .candidates import Candidates
     from .walls.base import WallKeys
 
 __all__ = ["Contact"]
 
 _ZERO = np.zeros(1)
+_TURN = 0.8  # cosine between normals in a step, below which forces act along that at the new position
 
 
 class Contact:
@@ -44,6 +46,7 @@ class Contact:
     restitution, friction, static_friction : (walls,); has_friction : whether any wall has friction
     ties : Ties
     plain : whether all walls are flat and without further features
+    size : length that tolerances are relative to [m], see :mod:`~pfem_petsc.tolerances`
     rebounds : whether restitution is a bound on the next position, for schemes that solve for the next position
     state : of the nodes, for walls that need their previous positions; set by the stepper
     """
@@ -92,7 +95,9 @@ class Contact:
         self.plain = self._explicit.plain
         ends = np.stack([-mesh.points.min(axis=0, initial=np.inf), mesh.points.max(axis=0, initial=-np.inf)])
         mesh.comm.Allreduce(MPI.IN_PLACE, ends, op=MPI.MAX)
-        self.length = float(ends.sum(axis=0).max())
+        centres = np.array([wall.centre for wall in self.walls])
+        coordinates = float(np.abs(ends).max()), float(np.abs(centres).max(initial=0.0))
+        self.size = resolvable(float(ends.sum(axis=0).max()), *coordinates)
 
     @property
     def special(self) -> np.ndarray:
@@ -132,8 +137,7 @@ class Contact:
 
     def gap(self, k: int, x: np.ndarray, displacements: np.ndarray) -> np.ndarray:
         """Return distances (m,) [m] of positions (m, 3) from wall k."""
-        normals, offsets = self.walls[k].planes(x - displacements[k])
-        return np.einsum("ij,ij->i", normals, x - displacements[k]) - offsets
+        return self.walls[k].gaps(x - displacements[k])
 
     @property
     def steady(self) -> bool:
@@ -172,22 +176,59 @@ class Contact:
                 if wall.partial:
                     # a node in contact may lie beyond the wall, because the balance need not hold at its position
                     held = state.contact[nodes] @ wall.normal > 0.0
-                    slack = np.where(held, 0.1 * wall.half.min(), BEYOND * self.length)
+                    slack = np.where(held, 0.1 * wall.half.min(), BEYOND * self.size)
                     applicable[:, k] &= wall.stops(before - earlier[k], x - displacements[k], slack)
         return applicable
 
-    def planes(self, applicable: np.ndarray, x: np.ndarray, displacements: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return planes (m, w, 3), (m, w) at positions (m, 3), with offset -inf for walls that do not apply."""
+    def planes(
+        self, applicable: np.ndarray, x: np.ndarray, displacements: np.ndarray, acting: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return planes (m, w, 3), (m, w) at positions (m, 3), with offset -inf for walls that do not apply.
+
+        ``acting`` : result of :meth:`acting`. Planes of curved walls then have these normals, at the same distance.
+        """
         normals = np.empty((len(x), len(self.walls), 3))
         offsets = np.empty((len(x), len(self.walls)))
         for k, wall in enumerate(self.walls):
             normals[:, k], offsets[:, k] = wall.planes(x - displacements[k])
             offsets[:, k] += normals[:, k] @ displacements[k]
+            if not wall.flat:
+                if acting is not None:
+                    other = acting[:, k].any(axis=1)
+                    normals[other, k] = acting[other, k]
+                offsets[:, k] = np.einsum("mi,mi->m", normals[:, k], x) - self.gap(k, x, displacements)
         offsets[~applicable] = -np.inf
         return normals, offsets
 
+    def acting(self, nodes: np.ndarray, x: np.ndarray, displacements: np.ndarray, part: float) -> np.ndarray | None:
+        """Return the directions (m, w, 3) in which curved walls push nodes (m,) that move to (m, 3) in a step.
+
+        These are the normals where the forces of the step's balance act, at the fraction ``part`` of the way
+        (:attr:`~pfem_petsc.integrators.base.Balance.acting`). None: all are the normals at the end. So are those that
+        are zero in the result: of flat walls, and where the normal turns by more than 37 degrees on the way, because a
+        force along the earlier normal may not reach the surface.
+
+        ``displacements`` (w, 3) : of the walls at the end [m]
+        """
+        if part == 1.0 or self.flat.all():
+            return None
+        earlier, start = self.motion.displacements(self.state.time), self.state.position[nodes]
+        acting = np.zeros((len(x), len(self.walls), 3))
+        for k in np.flatnonzero(~self.flat):
+            end, before = x - displacements[k], start - earlier[k]
+            there, _ = self.walls[k].planes(before + part * (end - before))
+            turn = np.einsum("mi,mi->m", there, self.walls[k].planes(end)[0])
+            acting[:, k] = np.where((turn > _TURN)[:, None], there, 0.0)
+        return acting
+
     def explicit(
-        self, predictor: np.ndarray, u: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float
+        self,
+        predictor: np.ndarray,
+        u: np.ndarray,
+        stiffness: np.ndarray,
+        time: float,
+        tolerance: float,
+        part: float = 1.0,
     ) -> tuple[np.ndarray, np.ndarray, WallForces]:
         """Correct increments ``u`` (owned, 3), in place, so that the positions predictor + u satisfy the walls.
 
@@ -196,12 +237,13 @@ class Contact:
         predictor, u : (owned, 3); their sum is the position at ``time`` without walls [m]
         stiffness : (owned,) alpha m + eta c: force for a displacement of the node [N/m]
         tolerance : [m]
+        part : see :meth:`acting`; other parts than 1 need the state
 
         Returns
         -------
         (nodes (m,), force (m, 3) [N] by the walls, WallForces)
         """
-        return self._explicit.press(predictor, u, stiffness, time, tolerance)
+        return self._explicit.press(predictor, u, stiffness, time, tolerance, part)
 
     def sums(
         self, nodes: np.ndarray, force: np.ndarray, x: np.ndarray, touching: np.ndarray, friction: float = 0.0
@@ -242,29 +284,24 @@ class Contact:
         )
 
     def frames(
-        self,
-        candidates: np.ndarray,
-        x: np.ndarray,
-        time: float,
-        applicable: np.ndarray,
-        rank: np.ndarray | None = None,
-        least: float = MIN_VOLUME,
+        self, candidates: Candidates, x: np.ndarray, time: float, least: float = MIN_VOLUME, part: float = 1.0
     ) -> NodalFrames:
-        """Build coordinates and bounds of candidate nodes from their planes at positions (owned, 3). Collective.
+        """Build coordinates and bounds of candidates from their planes at positions (owned, 3). Collective.
 
-        ``applicable`` (m, walls) marks the walls that can stop a candidate; ``rank`` (m, walls) is the order in which
-        planes are taken, by default nearest first; ``least``: see :func:`~pfem_petsc.contact.frames.build_frames`.
+        ``least``: see :func:`~pfem_petsc.contact.frames.build_frames`; ``part``: see :meth:`acting`.
         """
-        at = x[candidates]
-        normals, offsets = self.planes(applicable, at, self.motion.displacements(time))
+        nodes, rank = candidates.nodes, candidates.priority
+        at, displacements = x[nodes], self.motion.displacements(time)
+        acting = self.acting(nodes, at, displacements, part)
+        normals, offsets = self.planes(candidates.applicable, at, displacements, acting)
         if rank is None:
             rank = np.einsum("iwk,ik->iw", normals, at) - offsets
-        tolerance = ON_BOUND * self.length
-        frames = build_frames(candidates, self.fixed[candidates], normals, offsets, rank, tolerance, at, least)
+        tolerance = ON_BOUND * self.size
+        frames = build_frames(nodes, self.fixed[nodes], normals, offsets, rank, tolerance, at, least)
         with agreed(self.mesh.comm):
             if frames.contradiction >= 0:
                 node = frames.contradiction
-                raise SimulationFailure(self.infeasible_message(candidates[node], offsets[node]))
+                raise SimulationFailure(self.infeasible_message(nodes[node], offsets[node]))
         return frames
 
     def strengths(self, frames: NodalFrames, residual: np.ndarray, active: np.ndarray) -> np.ndarray:
@@ -286,7 +323,7 @@ class Contact:
             touching = (row >= 0) & (active[every, safe] == -sign)
             # of almost parallel walls that share a row, take the nearest
             bound = np.where(sign > 0.0, frames.lower[every, safe], frames.upper[every, safe])
-            touching &= sign * (bound - frames.bounds[:, k]) <= ON_BOUND * self.length
+            touching &= sign * (bound - frames.bounds[:, k]) <= ON_BOUND * self.size
             strengths[touching, k] = np.abs(left[every[touching], safe[touching]])
             left[every[touching], safe[touching]] = 0.0  # where walls share a bound, the first takes the force
         return strengths

@@ -35,13 +35,20 @@ class ExplicitContact:
         self.contact = contact
         plain = contact.flat.all() and not (contact.has_friction or contact.partial or contact.ties.any)
         self.plain = bool(plain and not contact.restitution.any())
+        self._part = 1.0  # see Contact.acting
         self._room = np.empty(len(contact.members) if plain else 0, dtype=np.int64)
 
     def press(
-        self, predictor: np.ndarray, u: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float
+        self,
+        predictor: np.ndarray,
+        u: np.ndarray,
+        stiffness: np.ndarray,
+        time: float,
+        tolerance: float,
+        part: float,
     ) -> tuple[np.ndarray, np.ndarray, WallForces]:
         """See :meth:`~pfem_petsc.contact.contact.Contact.explicit`."""
-        contact = self.contact
+        contact, self._part = self.contact, part
         if contact.motion.free is not None:
             self.push_walls(predictor + u, stiffness, time, tolerance)
         if self.plain:
@@ -85,7 +92,9 @@ class ExplicitContact:
             except SimulationFailure as met:  # raised once all ranks have left the iteration
                 failure = failure or met
                 return np.zeros((len(free.at), 3)), np.zeros((len(free.at), 3, 3))
-            normals, _ = self.contact.planes(walls.touching, walls.places, self.contact.motion.displacements(time))
+            displacements = self.contact.motion.displacements(time)
+            acting = self.contact.acting(nodes, x[nodes], displacements, self._part)
+            normals, _ = self.contact.planes(walls.touching, walls.places, displacements, acting)
             touching = walls.touching
             if self.contact.ties.any:
                 touching = touching & ~self.contact.ties.held[nodes][:, None]
@@ -99,7 +108,7 @@ class ExplicitContact:
                 np.add.at(slope, at, gives[:, :, None] * np.eye(3))
             return walls.force[free.at], slope[free.at]
 
-        found = free.solve(forces, FIXED_POINT * self.contact.length)
+        found = free.solve(forces, FIXED_POINT * self.contact.size)
         if failure is not None:
             raise failure
         if not found:
@@ -147,8 +156,9 @@ class ExplicitContact:
         at = free
         rebounds = self._returning()[nodes] if self.contact.rebounds else np.zeros(len(nodes), dtype=bool)
         pull = self._pull(nodes, free, time) if self.contact.rebounds else free
+        acting = self.contact.acting(nodes, free, displacements, self._part)
         for _ in range(_CURVED_ROUNDS):
-            normals, offsets = self.contact.planes(applicable, at, displacements)
+            normals, offsets = self.contact.planes(applicable, at, displacements, acting)
             if rebounds.any():
                 offsets[rebounds] += self._rebound(nodes[rebounds], normals[rebounds], pull[rebounds])
             moved, multipliers = free.copy(), np.zeros(offsets.shape)
@@ -170,7 +180,7 @@ class ExplicitContact:
         friction = 0.0
         if self.contact.has_friction:
             moved, force, friction = self._apply_friction(
-                nodes, free, displacements, (normals, offsets), stiffness[nodes], moved, strength, time
+                nodes, free, displacements, (normals, offsets, acting), stiffness[nodes], moved, strength
             )
         if booked and self.contact.rebounds:
             self._remember_impacts(nodes, free, moved, pull, displacements, normals, strength)
@@ -228,22 +238,21 @@ class ExplicitContact:
         nodes: np.ndarray,
         free: np.ndarray,
         displacements: np.ndarray,
-        planes: tuple[np.ndarray, np.ndarray],
+        planes: tuple[np.ndarray, np.ndarray, np.ndarray | None],
         stiffness: np.ndarray,
         moved: np.ndarray,
         strength: np.ndarray,
-        time: float,
     ) -> tuple[np.ndarray, np.ndarray, float]:
         """Return positions (m, 3) and forces (m, w, 3) with friction, and the energy that it dissipates [J].
 
-        Curved walls are represented by their tangent planes at the result.
+        Curved walls are represented by planes at the result, along the directions of ``acting``.
         """
         contact, state = self.contact, self.contact.state
         way = displacements - self.contact.motion.displacements(state.time)
         before, fixed = state.position[nodes], self.contact.fixed[nodes]
-        normals, offsets = planes
+        normals, offsets, acting = planes
         applicable = offsets > -np.inf
-        tolerance = PROJECTED * self.contact.length
+        tolerance = PROJECTED * self.contact.size
         for _ in range(_CURVED_ROUNDS):
             at, normal_forces, drag = moved.copy(), strength.copy(), np.zeros(normals.shape)
             unsettled = add_friction(
@@ -267,10 +276,11 @@ class ExplicitContact:
                 )
             if self.contact.flat.all():
                 break
-            normals_there, offsets = self.contact.planes(applicable, at, displacements)
-            if np.abs(normals_there - normals).max() <= 1e-14:
+            there, distances = self.contact.planes(applicable, at, displacements, acting)
+            apart = np.abs(distances[applicable] - offsets[applicable]).max(initial=0.0)
+            if np.abs(there - normals).max() <= 1e-14 and apart <= tolerance:
                 break
-            normals = normals_there
+            normals, offsets = there, distances
             moved, multipliers = free.copy(), np.zeros(offsets.shape)
             project(moved, fixed, normals, offsets, tolerance, multipliers)
             strength = multipliers * stiffness[:, None]

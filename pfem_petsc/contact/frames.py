@@ -30,6 +30,7 @@ class NodalFrames:
     Attributes
     ----------
     nodes : (m,) owned local indices
+    places : (m, 3) expected positions of the nodes, where planes were taken [m]
     basis, inverse : (m, 3, 3): y = B x
     lower, upper : (m, 3) bounds on y [m], infinite where there is no bound
     rows : (m, w) int8: the coordinate (0, 1, 2) that wall k bounds at the node, -1 for none
@@ -45,6 +46,7 @@ class NodalFrames:
     def __init__(self, nodes: np.ndarray, walls: int) -> None:
         m = len(nodes)
         self.nodes = nodes
+        self.places = np.zeros((m, 3))
         self.basis = np.zeros((m, 3, 3))
         self.inverse = np.zeros((m, 3, 3))
         self.lower = np.full((m, 3), -np.inf)
@@ -88,13 +90,15 @@ def build_frames(
     least : volume of the rows below which a plane is deferred
     """
     frames = NodalFrames(nodes, offsets.shape[1])
+    if places is not None:
+        frames.places = places
     frames.oblique, frames.contradiction = _build(
         fixed,
         normals,
         offsets,
         rank,
         tolerance,
-        np.zeros((len(nodes), 3)) if places is None else places,
+        frames.places,
         least,
         frames.basis,
         frames.inverse,

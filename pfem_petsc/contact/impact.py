@@ -46,7 +46,7 @@ class Impacts:
         if free is not None:
             self.counted[free.at] = False
         self._free_rates = free.state.v if free is not None else None  # at the start of the step
-        self.slack = ON_BOUND * self.model.length
+        self.slack = ON_BOUND * self.model.size
         treatment = stepper.treatment
         # nothing is lost if nodes have no mass along the normal, or if a treatment restores the work of contact
         self.elastic = treatment is not None and treatment.elastic

@@ -130,7 +130,7 @@ class StepFriction:
         before = self._sticks.copy(), self._slips.copy()
         apart = stiffness * np.linalg.norm(moved - x[at], axis=1)
         # rounding of positions, and of the frames' coordinates on the way to them
-        floor = 2e-14 * stiffness * (np.abs(x[at]).sum(axis=1) + contact.length)
+        floor = 2e-14 * stiffness * (np.abs(x[at]).sum(axis=1) + contact.size)
         kept = apart <= np.maximum(max(tolerance, 2.0 * noise), floor)
         wrong = np.flatnonzero(~kept)
         if len(wrong):
@@ -237,7 +237,7 @@ class StepFriction:
         place += (frames.offsets[at, wall] - np.einsum("ki,ki->k", n, place))[:, None] * n
         held = np.einsum("kij,kj->ki", frames.basis[at], place)
         which = ~self.contact.fixed[nodes] & (np.arange(3) != row[:, None])
-        slack = ON_BOUND * self.contact.length
+        slack = ON_BOUND * self.contact.size
         fits = (held >= frames.lower[at] - slack) & (held <= frames.upper[at] + slack)
         # another wall pushes the node along, or its wall has no row: it cannot stick
         possible = (fits | ~which).all(axis=1) & (row >= 0)

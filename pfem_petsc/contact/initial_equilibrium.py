@@ -56,7 +56,7 @@ def start_at_rest(
     contact, comm, mass = model.contact, model.comm, model.inertia.mass
     x, v = state.position, state.v
     displacements, rates = contact.motion.displacements(state.time), contact.motion.rates(state.time, ahead=True)
-    slack = ON_BOUND * model.length
+    slack = ON_BOUND * model.size
     nodes = np.flatnonzero(contact.near(x, displacements, np.array([slack])))
     applicable = contact.members[nodes]
     normals, offsets = contact.planes(applicable, x[nodes], displacements)

@@ -66,7 +66,7 @@ def solve_locally(
     fixed = contact.fixed[nodes]
     moved = x - np.where(fixed, 0.0, reaction) / stiffness[:, None]
     normal_forces, drag = np.zeros(offsets.shape), np.zeros(normals.shape)
-    project(moved, fixed, normals, offsets, PROJECTED * contact.length, normal_forces)
+    project(moved, fixed, normals, offsets, PROJECTED * contact.size, normal_forces)
     normal_forces *= stiffness[:, None]
     for group, static in ((slipping, contact.friction), (~slipping, contact.static_friction)):
         part = np.flatnonzero(group)

@@ -84,7 +84,7 @@ class PairLink:
     def check(self, model: Model, on_its_own: bool) -> None:
         treatment = model.case.contact.treatment
         check_scheme(self.pairs, on_its_own, treatment)
-        check_start(self.pairs, model.mesh.points[: model.mesh.n_owned], model.length, model.case.source)
+        check_start(self.pairs, model.mesh.points[: model.mesh.n_owned], model.size, model.case.source)
 
     def resting(self, x: np.ndarray, v: np.ndarray, slack: float, still: float) -> np.ndarray:
         return self.pairs.resting(x, v, slack, still)

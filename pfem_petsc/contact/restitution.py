@@ -142,7 +142,7 @@ class Treatment(Base):
             return np.zeros(touching.shape, dtype=bool)
         slip = self._moved(nodes)
         slip -= np.einsum("mwi,mwi->mw", slip, normals)[:, :, None] * normals
-        still = np.linalg.norm(slip, axis=2) <= STILL * model.length
+        still = np.linalg.norm(slip, axis=2) <= STILL * model.size
         return touching & still & (model.contact.static_friction > 0.0)
 
     def _moved(self, nodes: np.ndarray) -> np.ndarray:

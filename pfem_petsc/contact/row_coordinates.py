@@ -8,8 +8,8 @@ pivoting. With s the size of a row's gradient and N all other components,
 
 so that the row is a lower bound on w_P. The gradient follows: g_N <- g_N - J_N^T q, g_P <- s q with q = J_P^-T g_P, and
 q are the rows' forces then. What supports prescribe is no part of J: it moves the bound. Rows that are not linear are
-taken again at the solution, until it keeps them and their gradients are those of the solve. Groups of the same
-shape are worked on together, and all ranks that have a group do the same.
+taken again at the solution, until it keeps them and their gradients are those where the forces of the balance act.
+Groups of the same shape are worked on together, and all ranks that have a group do the same.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class RowCoordinates:
     def __init__(self, link: ConstraintLink) -> None:
         self.link, self.rows, self.comm = link, link.rows, link.rows.mesh.comm
         n = len(self.rows.numbers)
-        self._start: np.ndarray | None = None
+        self._start, self._part = np.empty((n, 3)), 1.0
         points = self.rows.gather(self.rows.mesh.points[: self.rows.mesh.n_owned])
         self._place(self.rows.gradients(points), np.tile(np.eye(3), (n, 1, 1)), np.ones((n, 3), dtype=bool))
 
@@ -74,10 +74,14 @@ class RowCoordinates:
             data[frames.nodes, :9] = frames.inverse.reshape(-1, 9)
             data[frames.nodes, 9:] = np.isfinite(frames.lower) | np.isfinite(frames.upper)
         data = rows.gather(data)
-        at_start = all(time == state.time for _, time in balance.loads)
-        self._start = rows.gather(state.position) if at_start else None
-        jacobian = rows.gradients(rows.gather(x) if self._start is None else self._start)
+        self._part = balance.acting
+        self._start = rows.gather(state.position) if self._part < 1.0 else self._start
+        jacobian = rows.gradients(self._acting(rows.gather(x)))
         self._place(jacobian, data[:, :9].reshape(-1, 3, 3), data[:, 9:] == 0.0)
+
+    def _acting(self, x: np.ndarray) -> np.ndarray:
+        """Places (n, 3) where the forces of the balance act, for nodes that move to (n, 3)."""
+        return x if self._part == 1.0 else self._start + self._part * (x - self._start)
 
     def _place(self, jacobian: np.ndarray, inverse: np.ndarray, room: np.ndarray) -> None:
         """Choose the pivots. ``jacobian`` (r, k, 3) by x; of the nodes: ``inverse`` (n, 3, 3) of their frames' bases,
@@ -144,9 +148,10 @@ class RowCoordinates:
         rows, here = self.rows, self.rows.here
         nowhere = np.full(len(rows.numbers), -1), np.empty((0, 0, 3)), np.empty((0, 0))
         k, x = rows.gather(stiffness), rows.gather(predictor + u)
-        tolerance = PROJECTED * self.link.contact.length
+        tolerance = PROJECTED * self.link.contact.size
+        start = self._start if self._part == 0.0 else None
         with agreed(self.comm):
-            force, jacobian = rows.project(x, tolerance, _NOWHERE, lambda: (k, self._start, nowhere))
+            force, jacobian = rows.project(x, tolerance, _NOWHERE, lambda: (k, start, nowhere))
         u[here] += (rows.forces(jacobian, force) * rows.free / k[:, None])[rows.mine]
 
     def forward(self, w: np.ndarray) -> None:
@@ -256,8 +261,8 @@ class RowCoordinates:
                     f"{self.link.names[rows.source[blocked[0]]]!r}; use an explicit integrator"
                 )
         lost = (values[self._placed] < -slack).any() or (np.abs(values[pressed]) > slack).any()
-        if self._start is None:
-            turn = np.abs(rows.gradients(every) - self.jacobian).max(axis=(1, 2), initial=0.0)
+        if self._part > 0.0:
+            turn = np.abs(rows.gradients(self._acting(every)) - self.jacobian).max(axis=(1, 2), initial=0.0)
             lost = lost or (turn[pressed] > _TURN).any()
         return not self._any(lost)
 

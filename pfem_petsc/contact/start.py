@@ -42,7 +42,7 @@ def adjust_start(case: Case, nodes: dict[str, np.ndarray], mesh: DistributedMesh
     moved = np.empty(0, dtype=np.int64)
     with agreed(mesh.comm):
         try:
-            moved, *_ = contact.explicit(points, way, np.ones(owned), 0.0, PROJECTED * contact.length)
+            moved, *_ = contact.explicit(points, way, np.ones(owned), 0.0, PROJECTED * contact.size)
         except SimulationFailure as failure:
             raise InputError(f"{case.source}: wall.adjust: {failure}") from failure
     points += way
@@ -50,7 +50,7 @@ def adjust_start(case: Case, nodes: dict[str, np.ndarray], mesh: DistributedMesh
     a, b = mesh.bars.T
     length = np.linalg.norm(mesh.points[b] - mesh.points[a], axis=1)
     with agreed(mesh.comm):
-        if len(length) and length.min() <= BEYOND * contact.length:
+        if len(length) and length.min() <= BEYOND * contact.size:
             bar = int(np.argmin(length))
             ends = mesh.node_ids[[a[bar], b[bar]]]
             raise InputError(

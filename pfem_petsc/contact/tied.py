@@ -128,13 +128,13 @@ class Ties:
         gaps = np.einsum("mwi,mi->mw", normals, places) - offsets
         gaps[held_by_supports(contact.fixed[nodes][:, None, :], normals)] = np.inf
         node, other = np.unravel_index(np.argmin(gaps), gaps.shape)
-        if gaps[node, other] < -BEYOND * contact.length and other == walls[node]:
+        if gaps[node, other] < -BEYOND * contact.size and other == walls[node]:
             raise SimulationFailure(
                 f"node {contact.mesh.node_ids[nodes[node]]} is tied to wall {contact.names[other]!r} and its supports "
                 f"move it {-gaps[node, other]:.3g} m beyond the wall; free these components, move the wall with the "
                 "supports, or do not tie the node"
             )
-        if gaps[node, other] < -BEYOND * contact.length:
+        if gaps[node, other] < -BEYOND * contact.size:
             raise SimulationFailure(
                 f"node {contact.mesh.node_ids[nodes[node]]}, tied to wall {contact.names[walls[node]]!r}, is moved "
                 f"{-gaps[node, other]:.3g} m beyond wall {contact.names[other]!r}; keep the walls "

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..tolerances import ON_BOUND
+from ..tolerances import ON_BOUND, PROJECTED
 from .candidates import Candidates
 from .frames import NodalFrames
 from .free_parts import held_by_supports
@@ -73,21 +73,26 @@ def is_off_surface(
     strengths: np.ndarray,
     x: np.ndarray,
     tolerance: float,
+    part: float,
 ) -> bool:
-    """Return whether a node in contact with a curved wall is off its surface or used the plane of another point.
+    """Return whether a node in contact with a curved wall is off its surface or used the normal of another point.
 
-    A node without contact force may satisfy the plane of another point and still lie beyond the wall.
+    A node without contact force may satisfy the plane of another point and still lie beyond the wall. ``part``: see
+    :meth:`~pfem_petsc.contact.contact.Contact.acting`.
     """
     at = frames.nodes
+    acting = contact.acting(at, x[at], displacements, part)
+    normals, _ = contact.planes(strengths > 0.0, x[at], displacements, acting)
     for k in np.flatnonzero(~contact.flat):
         pressed = strengths[:, k] > 0.0
         passed = ~pressed & (frames.rows[:, k] >= 0)
         if passed.any() and (contact.gap(k, x[at[passed]], displacements) < -tolerance).any():
             return True
         if pressed.any():
-            place = x[at[pressed]] - displacements[k]
-            normals, offsets = contact.walls[k].planes(place)
-            gap = np.einsum("ij,ij->i", normals, place) - offsets
-            if np.abs(gap).max() > tolerance or np.abs(normals - frames.normals[pressed, k]).max() > ON_BOUND:
+            turn = np.abs(normals[pressed, k] - frames.normals[pressed, k]).max(axis=1)
+            # far from the origin, the rounding of positions turns normals by more
+            moved = np.abs(x[at[pressed]] - frames.places[pressed]).max(axis=1)
+            turned = (turn > ON_BOUND) & (moved > PROJECTED * contact.size)
+            if np.abs(contact.gap(k, x[at[pressed]], displacements)).max() > tolerance or turned.any():
                 return True
     return False

@@ -78,6 +78,12 @@ class Balance:
     weight: float
     discrete_gradient: bool = False
 
+    @property
+    def acting(self) -> float:
+        """Where the forces of the balance act, those of walls and links as well as internal ones: x_n + acting (x_u -
+        x_n). Their directions are those at this place, else they do work of first order along surfaces that turn."""
+        return 0.5 if self.discrete_gradient else self.weight
+
 
 class NoParameters(StrictModel):
     """Parameters of schemes without parameters."""

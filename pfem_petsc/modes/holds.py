@@ -166,7 +166,7 @@ class _Walls:
         applicable = contact.applicable(nodes, x, displacements)
         normals, offsets = contact.planes(applicable, x, displacements)
         gaps = np.einsum("mwi,mi->mw", normals, x) - offsets
-        touched = np.abs(gaps) <= 10.0 * BEYOND * contact.length
+        touched = np.abs(gaps) <= 10.0 * BEYOND * contact.size
         unknown = nodes[~touched.any(axis=1) & ~tied[nodes]]
         if len(unknown):
             what = f"node {model.mesh.node_ids[unknown[0]]} has a contact force, but there is no wall"

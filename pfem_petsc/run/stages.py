@@ -221,7 +221,7 @@ class Stages:
             model.begin_stage(end_of_stage(old.stepper))
             for function in self.functions if stage.time is not None else ():
                 model.external.call(function)
-            check_start(model.contact, old.state.position, model.length)
+            check_start(model.contact, old.state.position, model.size)
             analysis = make_analysis(model, self.plan.plans[number].record())
         except InputError as error:
             raise SimulationFailure(f"{where}: {error}") from error

@@ -95,7 +95,7 @@ class PseudoMotion:
         reach = np.full(local, np.inf)
         shortest_bars(mesh.bars, model.bars.rest, _REACH, reach)
         self._reach = reach[:owned].copy()
-        self._tolerance = PROJECTED * model.length
+        self._tolerance = PROJECTED * model.size
         self._failure: SimulationFailure | None = None
         self._external_norm = 0.0
 

@@ -93,13 +93,14 @@ class ExplicitStepper(Stepper):
                 others = self._hold(balance, stiffness, u)
             positions = supports.positions(balance.time)[: len(supports.nodes)]
             hold(0, len(load), 0, supports.nodes, supports.components, positions, balance.predictor, stiffness, u, load)
-        walls, held, tolerance = model.contact.nothing, self._nobody, PROJECTED * model.length
+        walls, held, tolerance = model.contact.nothing, self._nobody, PROJECTED * model.size
         with self._faults(balance):
             state.contact = model.links.explicit(balance, state, u, stiffness, self.zero, tolerance)
         if model.contact.any:
             # also after a failure of links: with walls with mass this call is collective
             with self._faults(balance):
-                nodes, force, walls = model.contact.explicit(balance.predictor, u, stiffness, balance.time, tolerance)
+                arguments = balance.predictor, u, stiffness, balance.time, tolerance, balance.acting
+                nodes, force, walls = model.contact.explicit(*arguments)
                 if len(nodes):
                     if state.contact is self.zero:
                         state.contact = np.zeros_like(u)

@@ -88,7 +88,7 @@ class Batch:
         room = np.empty(len(inertia.mass), dtype=np.int64)
         work = (room, log.touching, log.present, log.releases)
         impact = (stepper.closed, contact.restitution, ledger.impacts.slack)
-        self._walls = WallArrays(*walls, PROJECTED * model.length, *work, *impact)
+        self._walls = WallArrays(*walls, PROJECTED * model.size, *work, *impact)
         self._probes = ProbeArrays(*recorder.probed())
         self._messages = model.mesh.messages()
         self._lender = model.links.lender

@@ -75,7 +75,7 @@ class ImplicitStepper(HalvedSteps):
             self.lagged.inner.couple(self.links)
         bounded = choice if model.contact.symmetric else unsymmetric(choice)
         most = model.case.solver.max_newton
-        self.newton = NewtonSolver(model.mesh, self.hessian, choice, bounded, most, model.length, self.lagged)
+        self.newton = NewtonSolver(model.mesh, self.hessian, choice, bounded, most, model.size, self.lagged)
         self.newton.prepare(model.can_touch)
         self._mass: MassSolver | None = None
 
@@ -188,7 +188,7 @@ class ImplicitStepper(HalvedSteps):
             found.append(self._solve(balance, found[-1].u if found else guess))
             return found[-1].walls.force[bodies.at], None
 
-        if not bodies.solve(forces, ON_BOUND * self.model.length):
+        if not bodies.solve(forces, ON_BOUND * self.model.size):
             raise NotConverged(f"{self.when(balance)}: {self.model.contact.unsettled_message()}")
         newton, linear = sum(s.newton for s in found), sum(s.linear for s in found)
         return replace(found[-1], newton=newton, linear=linear)
@@ -227,7 +227,7 @@ class ImplicitStepper(HalvedSteps):
                 remedy = self.remedy if exact else f'{self.remedy}, or set solver.linear = "mumps"'
                 text = failure_message(problem, w, bounds.arrays, report, tolerance, remedy)
                 raise NotConverged(f"{self.when(balance)}: {text}")
-            bounds.project(w, 2.0 * zero_tolerance(model.length))
+            bounds.project(w, 2.0 * zero_tolerance(model.size))
             u = problem.increment(w).copy()
             g = np.empty_like(u)
             problem.imbalance(u, g)

@@ -66,7 +66,7 @@ class MasslessNodes:
             # with a bar perpendicular to the normal, forces within rounding may leave the position undetermined
             open_way = np.minimum(np.abs(step), np.abs(force) / elastic)
             largest = model.comm.allreduce(float(open_way.max(initial=0.0)), op=MPI.MAX)
-            if largest <= ROUNDING * model.length:
+            if largest <= ROUNDING * model.size:
                 break
         model.mesh.update_ghosts(x)
         if model.bars_vary:
@@ -86,7 +86,7 @@ class MasslessNodes:
         moved, contact = self.moved, self.model.contact
         n, nodes = moved.normals, moved.nodes
         strength = -np.einsum("mi,mi->m", load[nodes], n)
-        touching = self.gaps(x, time) <= ON_BOUND * self.model.length
+        touching = self.gaps(x, time) <= ON_BOUND * self.model.size
         strength = np.where(touching, np.maximum(strength, 0.0), 0.0) / moved.across
         full = contact.normals[moved.walls]
         force = np.zeros_like(load)

@@ -53,6 +53,7 @@ class Model:
     mesh, nodes, bars, inertia, external, supports, temperatures, rest_lengths, contact
     length : largest extent of the mesh [m]
     reach : largest coordinate magnitude [m], which sets the rounding of positions
+    size : length that tolerances are relative to [m], see :mod:`~pfem_petsc.tolerances`
     nodal_stiffness : (owned,) sum of E A/l0 of a node's bars [N/m]
     rounding : 2-norm of the residual due to rounding of positions [N]
     warnings : about the mesh
@@ -97,6 +98,7 @@ class Model:
         self.low, self.high = low, high
         self.length = float((high - low).max())
         self.reach = float(max(np.abs(low).max(), np.abs(high).max()))
+        self.size = self.contact.size
         stiffness = np.zeros(mesh.n_local)
         for block in self.bars.blocks:
             axial = block.area * block.modulus

@@ -31,7 +31,7 @@ def start_in_motion(stepper: Stepper) -> None:
         supports.put(state.v, supports.rates(0.0, 0.0)[0])
     if model.external.state_forces:
         model.external.follow(state.position, state.v)
-    if stepper.massless is not None and stepper.massless.settle(state.x, 0.0, 0.0) > BEYOND * model.length:
+    if stepper.massless is not None and stepper.massless.settle(state.x, 0.0, 0.0) > BEYOND * model.size:
         stepper.fault = SimulationFailure(
             "step 0, t = 0 s: contact nodes without mass found no equilibrium; use another contact.treatment"
         )

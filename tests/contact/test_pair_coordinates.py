@@ -6,6 +6,7 @@ from helpers.bodies import two_lattices
 from helpers.lattices import planes
 
 from pfem_petsc import Case
+from pfem_petsc.contact.candidates import Candidates
 from pfem_petsc.contact.pair_coordinates import PairCoordinates
 from pfem_petsc.contact.transform import Transform
 from pfem_petsc.solvers.matrix import HessianMatrix
@@ -111,7 +112,7 @@ def framed(model, pairs):
     x = model.mesh.points[: model.mesh.n_owned]
     nodes = np.flatnonzero((x[:, 2] < 0.02) | (x[:, 2] > 0.08))
     applicable = np.stack([np.ones(len(nodes), dtype=bool), x[nodes, 2] > 0.05], axis=1)
-    frames = model.contact.frames(nodes, x, 0.0, applicable)
+    frames = model.contact.frames(Candidates(nodes, applicable), x, 0.0)
     pairs.place(frames)
     return frames
 

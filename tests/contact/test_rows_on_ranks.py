@@ -84,7 +84,7 @@ def press(model, at_start):
     u[model.supports.fixed] = 0.0
     state = SimpleNamespace(position=predictor.copy(), time=0.0, contact=np.zeros_like(u))
     model.contact.state = state
-    balance = SimpleNamespace(predictor=predictor, time=1e-6, loads=[(1.0, 0.0 if at_start else 1e-6)])
+    balance = SimpleNamespace(predictor=predictor, time=1e-6, acting=0.0 if at_start else 1.0)
     contact = np.zeros_like(u)
     pressed = link.explicit(balance, state, u, stiffness, contact, 1e-15)
     return link, predictor + u, contact, pressed

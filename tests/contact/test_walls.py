@@ -172,8 +172,9 @@ def test_walls_that_leave_no_room(integrator, parameters, comm, shared_tmp_path)
 
 
 def test_curved_walls_that_leave_no_room(comm, shared_tmp_path):
-    """A node in a bowl of no size that another wall cuts: smaller steps are not the only way out that is told."""
-    bowl = {"type": "sphere", "side": "inside", "point": [0.0, 0.0, 0.0], "radius": 1e-9, "node_set": "corner"}
+    """A node in a small bowl that carries it into another wall: smaller steps are not the only way out that is told."""
+    bowl = {"type": "sphere", "side": "inside", "point": [0.0, 0.0, 0.0], "radius": 1e-6, "node_set": "corner"}
+    bowl["velocity"] = [-1.0, 0.0, 0.0]
     post = {"type": "cylinder", "axis": [0.0, 0.3, 1.0], "point": [-0.5, 0.0, 0.0], "radius": 0.5, "node_set": "corner"}
     case = lattice_case([bowl, post], node_set={"corner": {"nearest": [0.0, 0.0, 0.0]}}, velocity=[-1.0, 0.5, 0.0])
     with pytest.raises(SimulationFailure, match=r"node 0 on curved walls .* infeasible together; move the walls apart"):

@@ -80,7 +80,7 @@ class Treatment(Restitution):
         slip = self._moved(nodes)
         slip -= np.einsum("mwi,mwi->mw", slip, normals)[:, :, None] * normals
         size = np.linalg.norm(slip, axis=2)
-        slips = touching & (size > STILL * stepper.model.length) & (contact.friction > 0.0)
+        slips = touching & (size > STILL * stepper.model.size) & (contact.friction > 0.0)
         slips[self.sticking(nodes, touching, normals).any(axis=1)] = False
         at = np.flatnonzero(slips.any(axis=1))
         if len(at) == 0:

@@ -92,6 +92,12 @@ class BaseWall(ABC):
         The allowed region is n . x >= d; n . x - d is the distance of x from the surface, negative beyond it.
         """
 
+    def gaps(self, x: np.ndarray) -> np.ndarray:
+        """Return the distances (m,) of positions (m, 3) from the surface [m], n . x - d. Curved walls far from the
+        origin lose digits in that difference, and compute it from positions relative to their centre."""
+        normals, offsets = self.planes(x)
+        return np.einsum("ij,ij->i", normals, x) - offsets
+
     def stops(self, before: np.ndarray, x: np.ndarray, tolerance: float) -> np.ndarray:
         """Return (m,) bool: nodes that the wall stops between ``before`` (m, 3) and ``x`` (m, 3); for partial walls."""
         return np.ones(len(x), dtype=bool)

@@ -49,6 +49,10 @@ class Wall(BaseWall):
         along = np.multiply.outer(arm @ self.axis, self.axis)
         return radial_planes(arm - along, self.centre + along, self.radius, self.sign, self.across)
 
+    def gaps(self, x: np.ndarray) -> np.ndarray:
+        arm = x - self.centre
+        return self.sign * (np.linalg.norm(arm - np.multiply.outer(arm @ self.axis, self.axis), axis=1) - self.radius)
+
 
 def _across(axis: np.ndarray) -> np.ndarray:
     across = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])

@@ -49,6 +49,9 @@ class Wall(BaseWall):
         centres = np.broadcast_to(self.centre, x.shape)
         return radial_planes(x - self.centre, centres, self.radius, self.sign, np.array([0.0, 0.0, 1.0]))
 
+    def gaps(self, x: np.ndarray) -> np.ndarray:
+        return self.sign * (np.linalg.norm(x - self.centre, axis=1) - self.radius)
+
 
 def surface(parameters: Parameters, bounds: np.ndarray) -> Surface:
     """Return the sphere for pictures."""

@@ -10,8 +10,8 @@ with e times the velocity of its approach and loses (1 - e^2) of that energy; se
 
 The momentum that stops a node is m v_n in all. What the force of the step falls short of it, or exceeds it by, depends
 on where in the step the impact falls; the jump makes up for it. Friction follows the momentum: a node that slips is
-dragged by mu times the jump as well, no farther than to rest, so that an impact takes mu m v_n along the wall whatever
-the step.
+dragged by mu times the jump as well. An impact takes mu m v_n along the wall whatever the step, but no more than what
+stops the slip: the momentum that the force has taken beyond is given back.
 """
 
 from __future__ import annotations
@@ -83,6 +83,10 @@ class Treatment(Restitution):
         displacements = contact.motion.displacements(state.time)
         normals, _ = contact.planes(touching, state.position[nodes], displacements)
         slip = self._moved(nodes)
+        if not stepper.scheme.solves_end:  # friction acts along the slip to the position solved for, if any
+            solved = self._moved_to_solution(nodes)
+            solved -= np.einsum("mwi,mwi->mw", solved, normals)[:, :, None] * normals
+            slip = np.where(np.linalg.norm(solved, axis=2)[:, :, None] > STILL * stepper.model.length, solved, slip)
         slip -= np.einsum("mwi,mwi->mw", slip, normals)[:, :, None] * normals
         size = np.linalg.norm(slip, axis=2)
         slips = touching & (size > STILL * stepper.model.length) & (contact.friction > 0.0)
@@ -104,8 +108,10 @@ class Treatment(Restitution):
         # the forces of the balance on walls; nodes may stick at t + theta h and slip at the end of the step
         coefficient = np.where(moves, contact.friction, 0.0)
         force = state.contact[owned] / mass[:, None]
-        pressed = np.maximum(np.einsum("kiw,ki->kw", inverse, force), 0.0)
-        drag = np.clip(-np.einsum("kwi,ki->kw", way, force), 0.0, contact.static_friction * pressed)
+        apart = np.linalg.pinv(beside @ beside.swapaxes(1, 2), rcond=RANK)
+        drag = np.maximum(-np.einsum("kwu,kui,ki->kw", apart, beside, force), 0.0)
+        pressed = np.einsum("kiw,ki->kw", inverse, force + np.einsum("kw,kwi->ki", drag, way))
+        pressed = np.maximum(pressed, 0.0)
         change_v, change_a = v[at] - state.v[owned], a[at] - state.a[owned]
         relative = state.v[owned][:, None, :] - contact.motion.rates(state.time)
         speed = np.einsum("kwi,kwi->kw", slip, relative + change_v[:, None, :])
@@ -136,8 +142,8 @@ class Treatment(Restitution):
         a[at] -= np.einsum("kw,kwi->ki", jump_a, beside)
         mean = np.einsum("kwi,kwi->kw", way, relative + 0.5 * (v[at] - state.v[owned])[:, None, :])
         # what the force dragged too much was booked with the slip of the step
-        mean = np.where(jump < 0.0, np.minimum(mean, self._booked_rate(owned, way, size)), mean)
-        return v, a, float((mass[:, None] * jump * mean).sum())
+        booked = stepper.part * drag * self._booked_rate(owned, way, size)
+        return v, a, float((mass[:, None] * np.maximum(jump * mean, -booked)).sum())
 
     def _response_of(self) -> tuple[float, float]:
         """Return velocity [s] and acceleration at the end of this part for a unit force on a unit mass, at rest."""
@@ -158,11 +164,14 @@ class Treatment(Restitution):
         stepper = self.stepper
         if stepper.scheme.solves_end:
             return size / stepper.part
-        balance, motion = stepper.balance, stepper.model.contact.motion
-        span = balance.time - self._time
-        moved = (balance.predictor + stepper.solution.u)[nodes] - self._place[nodes]
-        slip = moved[:, None, :] - (motion.displacements(balance.time) - motion.displacements(self._time))
-        return np.maximum(np.einsum("kwi,kwi->kw", way, slip), 0.0) / span
+        slip = self._moved_to_solution(nodes)
+        return np.maximum(np.einsum("kwi,kwi->kw", way, slip), 0.0) / (stepper.balance.time - self._time)
+
+    def _moved_to_solution(self, nodes: np.ndarray) -> np.ndarray:
+        """Return displacements of nodes (m,) to the position solved for, relative to the walls (m, w, 3) [m]."""
+        balance, motion = self.stepper.balance, self.stepper.model.contact.motion
+        moved = (balance.predictor + self.stepper.solution.u)[nodes] - self._place[nodes]
+        return moved[:, None, :] - (motion.displacements(balance.time) - motion.displacements(self._time))
 
     def _pairs_let_go(self) -> tuple[np.ndarray, np.ndarray]:
         """Return ends (m,) of pairs that opened in this step, and their velocities (m, 3); see :meth:`_let_go`.

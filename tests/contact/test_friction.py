@@ -245,3 +245,90 @@ def test_wedge_that_locks_itself(integrator, comm, shared_tmp_path):
         SimulationFailure, match=r"step \d+, .*jams node 0: .*'slope'.* 0\.577 or more, and it is 0\.6;"
     ):
         list(run)
+
+
+PHASES = (np.arange(10) + 0.5) / 10.0
+FRAME = np.linalg.qr([[0.3, 2.0, 1.0], [-0.5, 0.5, 1.0], [0.8, 1.0, -1.0]])[0].T  # normal and tangents of a wall
+LATE = [  # schemes whose velocity at the end of a step is not that of its motion
+    ("chung_lee", {}),
+    ("hulbert_chung", {"rho_b": 1.0}),
+    ("souza_moura", {}),
+    ("newmark", {"beta": 0.25, "gamma": 0.5}),
+    ("newmark", {}),
+    ("houbolt", {}),
+    ("wilson", {"theta": 1.0}),
+    ("wilson", {"theta": 1.4}),
+    ("generalized_alpha", {}),
+    ("energy_momentum", {}),
+]
+
+
+def thrown(integrator, parameters, relative, wall, *, gravity=(0.0, 0.0, 0.0), step=1e-3, steps=12):
+    """Bars that meet an oblique wall flat, each at another phase of a step; axes of FRAME."""
+    n, t, b = FRAME * np.sign(FRAME[0] @ [0.3, -0.5, 0.8])
+    start = [-relative[0] * step * (3.0 + p) * n + 3.0 * k * t for k, p in enumerate(PHASES)]
+    points = np.array([[x, x + b] for x in start]).reshape(-1, 3)
+    walls = {"type": "plane", "name": "wall", "point": [0.0] * 3, "normal": n.tolist()} | wall
+    velocity = np.array(relative) @ [n, t, b] + walls.get("velocity", np.zeros(3))
+    return {
+        "mesh": {
+            "generator": "arrays",
+            "points": points.tolist(),
+            "bars": np.arange(len(points)).reshape(-1, 2).tolist(),
+        },
+        "material": {"m": {"young_modulus": 1e-3, "density": 1000.0}},
+        "section": {"s": {"area": 1e-3, "material": "m"}},
+        "initial": {"velocity": velocity.tolist()},
+        "gravity": {"acceleration": (np.array(gravity) @ [n, t, b]).tolist()},
+        "wall": [walls],
+        "contact": {"treatment": "stick"},
+        "time": {"integrator": integrator, "step": step, "end": steps * step, **parameters},
+        "solver": {"rtol": 1e-12, "linear": "mumps"},
+        "output": {"fields_every": 0},
+    }, (n, t, b)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("moving", [False, True])
+@pytest.mark.parametrize("friction", [0.2, 0.9])
+@pytest.mark.parametrize(("integrator", "parameters"), LATE)
+def test_friction_does_not_turn_the_motion_round(integrator, parameters, friction, moving, comm, shared_tmp_path):
+    """A particle that meets a wall with v_n = 6 and v_t = 3 keeps max(v_t - mu v_n, 0) in any phase of a step."""
+    wall = {"friction": friction} | ({"velocity": [1.0, 2.0, -0.5]} if moving else {})
+    case, axes = thrown(integrator, parameters, (-6.0, 2.4, -1.8), wall)
+    run = simulation(case, comm, shared_tmp_path)
+    rows, along = [], []
+    for step in run:
+        rows.append(step.row)
+        relative = (run.state.v - wall.get("velocity", np.zeros(3))) @ np.transpose(axes)
+        along.append(relative @ [0.0, 0.8, -0.6])
+    assert np.min(along, initial=0.0) > -1e-9
+    left = max(3.0 - 6.0 * friction, 0.0)
+    np.testing.assert_allclose(relative, left * np.array([[0.0, 0.8, -0.6]] * len(relative)), atol=1e-9)
+    mass, dissipated = run.model.total_mass, np.array([row["friction_dissipation"] for row in rows])
+    assert (np.diff(dissipated) >= -1e-12 * mass).all()
+    if integrator == "energy_momentum" and friction == 0.2:  # no node sticks in the step of the impact
+        assert dissipated[-1] == pytest.approx(0.5 * mass * (9.0 - left**2), rel=1e-9)
+    assert np.abs([row["energy_imbalance"] for row in rows]).max() < 1e-10 * mass
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("integrator", "parameters"), LATE)
+def test_friction_that_a_slope_reverses(integrator, parameters, comm, shared_tmp_path):
+    """Thrown up a slope, a particle is stopped by friction and weight, and slides down again by the difference."""
+    g, friction, step, steps, speed = 100.0, 0.3, 1e-3, 60, 2.0
+    along, across = g * np.sin(ANGLE), g * np.cos(ANGLE)
+    wall = {"friction": friction}
+    case, axes = thrown(
+        integrator, parameters, (-1.0, -speed, 0.0), wall, gravity=(-across, along, 0.0), step=step, steps=steps
+    )
+    run = simulation(case, comm, shared_tmp_path)
+    rows = [each.row for each in run]
+    met = (np.sqrt(1.0 + 2.0 * across * step * (3.0 + PHASES)) - 1.0) / across
+    after = -speed + along * met + friction * (1.0 + across * met)
+    stop = met - after / (along + friction * across)
+    exact = (along - friction * across) * (steps * step - stop)
+    assert after.max() < 0.0 and stop.max() < 0.5 * steps * step
+    bars = run.mesh.node_ids[: run.mesh.n_owned] // 2
+    np.testing.assert_allclose(run.state.v @ axes[1], exact[bars], atol=0.5 * g * step)
+    assert (np.diff([row["friction_dissipation"] for row in rows]) >= -1e-12 * run.model.total_mass).all()

@@ -10,8 +10,8 @@ with e times the velocity of its approach and loses (1 - e^2) of that energy; se
 
 The momentum that stops a node is m v_n in all. What the force of the step falls short of it, or exceeds it by, depends
 on where in the step the impact falls; the jump makes up for it. Friction follows the momentum: a node that slips is
-dragged by mu times the jump as well, no farther than to rest, so that an impact takes mu m v_n along the wall whatever
-the step.
+dragged by mu times the jump as well. An impact takes mu m v_n along the wall whatever the step, but no more than what
+stops the slip: the momentum that the force has taken beyond is given back.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from __future__ import annotations
 import numpy as np
 from mpi4py import MPI
 
+from ...integrators.base import State
 from ...tolerances import FREE_PART, RANK
 from ..restitution import STILL
 from ..restitution import Treatment as Restitution
@@ -37,6 +38,8 @@ class Treatment(Restitution):
     def before(self) -> None:
         """Also record the positions and forces of pairs in contact."""
         super().before()
+        if self.stepper.model.contact.has_friction:
+            self._response = self._response_of()
         state, pairs = self.stepper.state, self.stepper.model.pairs
         self._pressed = None
         if self._frees and pairs is not None and pairs.any_pressed():
@@ -67,8 +70,10 @@ class Treatment(Restitution):
     def _dragged(self, nodes: np.ndarray, v: np.ndarray, a: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
         """Velocities and accelerations (m, 3) of held nodes with friction of jumps, and its dissipation [J].
 
-        With the free parts F of the normals N and the directions s of the slip, the jumps are D lambda, D = F - mu s,
-        as large along the normals as without friction.
+        The momentum T that friction takes in a step along the direction s of the slip is that of its force plus that of
+        the jump: mu times that of the normal force and jump, but no more than what stops the slip. If other forces
+        reverse the slip, T is zero, for friction takes nothing beyond rest. Momenta are per mass of the node; jumps
+        along the normals N are given, with their free parts F, so friction acts beside the span of F.
         """
         stepper, state = self.stepper, self.stepper.state
         contact = stepper.model.contact
@@ -78,6 +83,10 @@ class Treatment(Restitution):
         displacements = contact.motion.displacements(state.time)
         normals, _ = contact.planes(touching, state.position[nodes], displacements)
         slip = self._moved(nodes)
+        if not stepper.scheme.solves_end:  # friction acts along the slip to the position solved for, if any
+            solved = self._moved_to_solution(nodes)
+            solved -= np.einsum("mwi,mwi->mw", solved, normals)[:, :, None] * normals
+            slip = np.where(np.linalg.norm(solved, axis=2)[:, :, None] > STILL * stepper.model.length, solved, slip)
         slip -= np.einsum("mwi,mwi->mw", slip, normals)[:, :, None] * normals
         size = np.linalg.norm(slip, axis=2)
         slips = touching & (size > STILL * stepper.model.size) & (contact.friction > 0.0)
@@ -85,38 +94,65 @@ class Treatment(Restitution):
         at = np.flatnonzero(slips.any(axis=1))
         if len(at) == 0:
             return v, a, 0.0
-        held = ~stepper.model.supports.fixed[nodes[at]][:, None, :] & touching[at][:, :, None]
+        owned, size, slips = nodes[at], size[at], slips[at]
+        mass = stepper.model.inertia.mass[owned]
+        held = ~stepper.model.supports.fixed[owned][:, None, :] & touching[at][:, :, None]
         free = np.where(held, normals[at], 0.0)
         free[(free * free).sum(axis=2) <= FREE_PART] = 0.0
-        way = np.where(held & slips[at][:, :, None], slip[at] / np.maximum(size[at], _TINY)[:, :, None], 0.0)
-        old_v, old_a = state.v[nodes[at]], state.a[nodes[at]]
+        inverse = np.linalg.pinv(free, rcond=RANK)
+        slip = np.where(slips[:, :, None], slip[at] / np.maximum(size, _TINY)[:, :, None], 0.0)
+        way = np.where(held, slip, 0.0)
+        beside = way - way @ inverse @ free
+        moves = (beside * beside).sum(axis=2) > FREE_PART
+        way[~moves], beside[~moves] = 0.0, 0.0
+        # the forces of the balance on walls; nodes may stick at t + theta h and slip at the end of the step
+        coefficient = np.where(moves, contact.friction, 0.0)
+        force = state.contact[owned] / mass[:, None]
+        apart = np.linalg.pinv(beside @ beside.swapaxes(1, 2), rcond=RANK)
+        drag = np.maximum(-np.einsum("kwu,kui,ki->kw", apart, beside, force), 0.0)
+        pressed = np.einsum("kiw,ki->kw", inverse, force + np.einsum("kw,kwi->ki", drag, way))
+        pressed = np.maximum(pressed, 0.0)
+        change_v, change_a = v[at] - state.v[owned], a[at] - state.a[owned]
+        relative = state.v[owned][:, None, :] - contact.motion.rates(state.time)
+        speed = np.einsum("kwi,kwi->kw", slip, relative + change_v[:, None, :])
+        stopping, coupling = slip @ beside.swapaxes(1, 2), (way @ inverse).swapaxes(1, 2)
 
-        def jumps(change: np.ndarray, friction: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            """Jumps (k, 3), as large along the normals as a change (k, 3), and their lambda (k, walls)."""
-            along = free - friction[:, :, None] * way
-            matrix = np.einsum("kwi,kui->kwu", free, along)
-            push = np.einsum("kwu,kui,ki->kw", np.linalg.pinv(matrix, rcond=RANK), free, change)
-            return np.einsum("kw,kwi->ki", push, along), push
+        def jumps(change: np.ndarray, rate: np.ndarray, ratio: np.ndarray, effect: float) -> np.ndarray:
+            """Jumps (k, walls) by friction: what ``ratio`` times the normal forces and jumps exceed the drag by, or
+            what ends the rate of slip. ``effect``: of a force, see :meth:`_response_of`."""
+            matrix = np.where(stops[:, :, None], stopping, np.eye(len(contact.friction)) - ratio[:, :, None] * coupling)
+            normal = np.einsum("kiw,ki->kw", inverse, change)
+            known = np.where(stops, rate, ratio * normal + effect * (ratio * pressed - drag))
+            return np.einsum("kwu,ku->kw", np.linalg.pinv(matrix, rcond=RANK), known)
 
-        smooth = np.zeros(size[at].shape)
-        # what the force has dragged beside pressing: less than the law's where the node sticks at t + theta h
-        force = state.contact[nodes[at]]
-        dragged = -np.einsum("kwi,ki->kw", way, force) / np.maximum(np.einsum("kwi,ki->kw", free, force), _TINY)
-        dragged = np.clip(dragged, 0.0, contact.friction)
-        relative = old_v[:, None, :] - contact.motion.rates(state.time)
-        speed = np.maximum(np.einsum("kwi,kwi->kw", way, relative), 0.0)
-        _, push = jumps(v[at] - old_v, smooth)
-        most = np.where(push > 0.0, speed / np.maximum(push, _TINY), dragged)
-        friction = np.minimum(smooth + contact.friction, most)
-        change, push = jumps(v[at] - old_v, friction)
-        mean = np.einsum("kwi,kwi->kw", way, relative + 0.5 * change[:, None, :])
-        # what the force dragged too much was booked with the slip of the step
-        mean = np.where(push < 0.0, np.minimum(mean, self._booked_rate(nodes[at], way, size[at])), mean)
-        taken = (friction * push * mean).sum(axis=1)
+        of_v, of_a = self._response
+        stops, returns = np.zeros(size.shape, dtype=bool), np.zeros(size.shape, dtype=bool)
+        while True:
+            jump = jumps(change_v, speed, np.where(returns, 0.0, coefficient), of_v)
+            negative = moves & ~returns & (jump < -of_v * drag)
+            reversed_ = moves & ~returns & ~stops & (speed - np.einsum("kwu,ku->kw", stopping, jump) < 0.0)
+            if not (negative | reversed_).any():
+                break
+            returns |= negative
+            stops = (stops | reversed_) & ~returns
+        ratio = np.where(returns, 0.0, drag / np.maximum(pressed, _TINY))
+        jump_a = jumps(change_a, np.einsum("kwi,ki->kw", slip, a[at]), ratio, of_a)
         v, a = v.copy(), a.copy()
-        v[at] = old_v + change
-        a[at] = old_a + jumps(a[at] - old_a, dragged)[0]
-        return v, a, float((stepper.model.inertia.mass[nodes[at]] * taken).sum())
+        v[at] -= np.einsum("kw,kwi->ki", jump, beside)
+        a[at] -= np.einsum("kw,kwi->ki", jump_a, beside)
+        mean = np.einsum("kwi,kwi->kw", way, relative + 0.5 * (v[at] - state.v[owned])[:, None, :])
+        # what the force dragged too much was booked with the slip of the step
+        booked = stepper.part * drag * self._booked_rate(owned, way, size)
+        return v, a, float((mass[:, None] * np.maximum(jump * mean, -booked)).sum())
+
+    def _response_of(self) -> tuple[float, float]:
+        """Return velocity [s] and acceleration at the end of this part for a unit force on a unit mass, at rest."""
+        scheme, part = self.stepper.scheme, self.stepper.part
+        memory = {name: np.zeros((1, 3)) for name in self.stepper.state.memory}
+        particle = State(*(np.zeros((1, 3)) for _ in range(7)), memory=memory)
+        balance = scheme.balance(particle, part)
+        scheme.finish(particle, balance, np.full((1, 3), 1.0 / balance.alpha), part)
+        return float(particle.v[0, 0]), float(particle.a[0, 0])
 
     def _booked_rate(self, nodes: np.ndarray, way: np.ndarray, size: np.ndarray) -> np.ndarray:
         """Return the rates of slip (k, walls) [m/s] with which the solve has booked the friction of nodes (k,).
@@ -128,11 +164,14 @@ class Treatment(Restitution):
         stepper = self.stepper
         if stepper.scheme.solves_end:
             return size / stepper.part
-        balance, motion = stepper.balance, stepper.model.contact.motion
-        span = balance.time - self._time
-        moved = (balance.predictor + stepper.solution.u)[nodes] - self._place[nodes]
-        slip = moved[:, None, :] - (motion.displacements(balance.time) - motion.displacements(self._time))
-        return np.maximum(np.einsum("kwi,kwi->kw", way, slip), 0.0) / span
+        slip = self._moved_to_solution(nodes)
+        return np.maximum(np.einsum("kwi,kwi->kw", way, slip), 0.0) / (stepper.balance.time - self._time)
+
+    def _moved_to_solution(self, nodes: np.ndarray) -> np.ndarray:
+        """Return displacements of nodes (m,) to the position solved for, relative to the walls (m, w, 3) [m]."""
+        balance, motion = self.stepper.balance, self.stepper.model.contact.motion
+        moved = (balance.predictor + self.stepper.solution.u)[nodes] - self._place[nodes]
+        return moved[:, None, :] - (motion.displacements(balance.time) - motion.displacements(self._time))
 
     def _pairs_let_go(self) -> tuple[np.ndarray, np.ndarray]:
         """Return ends (m,) of pairs that opened in this step, and their velocities (m, 3); see :meth:`_let_go`.

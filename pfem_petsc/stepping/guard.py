@@ -13,20 +13,20 @@ motion, and the available energy, so they apply to time steps and load steps ali
    plus the work of loads, supports and walls.
 3. **Barriers.** Between the positions before and after, the bars store more energy than at either, and more than was
    available: the kinetic energy at the start plus the work up to that point. No motion can follow such a path. The
-   lower of two paths counts: the straight line, and the parabola that starts as predicted, which matches a rotation up
-   to 0.003 phi^4. Only this check finds shallow arches and domes that snap through.
+   lowest of three paths counts: the straight line, the parabola that starts as predicted, and the lower of both after
+   its nodes have given way, see below. Only this check finds shallow arches and domes that snap through.
 
-The middle of the straight line shortens a bar that turns by phi by phi^2/8 of its length, whatever moves with it, and the
-parabola by 0.003 phi^4 if the velocities are those of the rotation; those of stiff bars contain the noise of their
-vibration. This energy grows with the stiffness of the bar and says nothing about the path: nodes that are free to do so
-go around on an arc. The third path lets them. Its positions at mid-path minimise
+A bar that turns by phi is shorter by phi^2/8 of its length at the middle of the straight line. On the parabola it is so
+by 0.003 phi^4 if the velocities are those of the rotation; those of stiff bars contain the noise of their vibration.
+This energy grows with the stiffness of the bar, although nodes that are free to do so go around on an arc. The third
+path lets them: its displacements w at mid-path minimise
 
-    sum of k [(n . w - (mean length - length))^2 + e w . w],    e = :data:`SIDEWAYS`
+    sum of k [(n . d - (mean length - length))^2 + e d . d],    e = :data:`SIDEWAYS`
 
-over the displacements of the nodes, with the difference w of both ends of a bar, its stiffness k and direction n. A bar
-on an arc gets its mean length; the bars of a flat arch, in line with each other, cannot. The second term prevents that
-nodes slide down from the barrier: it limits the way by which a bar of inclination s is lengthened by turning to s/(s^2 + e)
-of what it lacks. Since the term slows down the correction of an arc as well, to e/(1 + e), it is repeated.
+with the difference d of the displacements of both ends of a bar, its stiffness k and direction n. A bar on an arc gets
+the mean of its lengths before and after; the bars of a flat arch, in line with each other, cannot. The second term
+prevents that nodes slide down from the barrier: a bar of inclination s gets s^2/(s^2 + e) of the length that it lacks
+by turning. As this term also slows down the correction on an arc, by e/(1 + e), the minimisation is repeated.
 
 Energies are evaluated only if the unpredicted change of a bar exceeds :data:`NOTICEABLE` times its length.
 

@@ -52,7 +52,14 @@ class SimulationFailure(PfemError):
 
 
 class NotConverged(SimulationFailure):
-    """A solve failed before the state was changed, so a smaller step may succeed. Raised on all ranks."""
+    """A solve failed before the state was changed, so a smaller step may succeed. Raised on all ranks.
+
+    ``kind``: what failures of the same kind have in common, for messages that count them.
+    """
+
+    def __init__(self, message: str, kind: str = "no convergence") -> None:
+        super().__init__(message)
+        self.kind = kind
 
 
 class EarlyStop(PfemError):

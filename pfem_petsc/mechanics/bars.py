@@ -302,6 +302,14 @@ class Bars:
         np.copyto(self._watched, np.where(np.abs(self.rupture()) >= 1.0, 0.0, self.rest))
         return self._watched
 
+    @property
+    def stiffness(self) -> np.ndarray:
+        """Largest axial stiffness (b,) of all local bars [N/m]; zero for bars that have left the model."""
+        rest, axial = self.watched, np.empty(len(self.ends))
+        for block in self.blocks:
+            axial[block.start : block.stop] = block.area * block.modulus
+        return np.divide(axial, rest, out=np.zeros_like(axial), where=rest > 0.0)
+
     def put_history(self, history: np.ndarray) -> None:
         """Restore the result of :meth:`history`."""
         for block in self.blocks:

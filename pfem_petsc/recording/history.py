@@ -59,8 +59,8 @@ class History(Observer):
         self._stepper, self._synchroniser, self._model = stepper, synchroniser, model
         self.ledger = make_ledger(stepper)
         self.recorder = Recorder(stepper, self.ledger)
-        self.blow_up = BlowUp(model)
         inertial = stepper.scheme.inertial
+        self.blow_up = BlowUp(model, inertial)
         self.contact_watch = ContactWatch(model, warn, plan) if inertial else NoContactWatch()
         self.row: dict[str, Any] | None = None
         self.writer: ResultWriter | None = None
@@ -82,8 +82,9 @@ class History(Observer):
         recorder.start_energy, recorder.energy_scale = before.start_energy, before.energy_scale
         self.rows.begin(last)
         self.row, self.writer = last, earlier.writer
-        self.blow_up.load_state(earlier.blow_up.kept())
-        self.contact_watch.check(self.rows.fill(recorder.row()))
+        first = self.rows.fill(recorder.row())
+        self.blow_up.check(first, self._stepper.state)
+        self.contact_watch.check(first)
 
     def stage(self) -> dict[str, Any] | None:
         """What a checkpoint must hold of the stages before; None for a case without stages."""

@@ -16,7 +16,7 @@ Where the data are stored:
 - ``free_walls``: walls with mass, including their last increment. Forces of constraints: arrays of their rows. Forces
   of pairs and which of them are closed: arrays at their second nodes.
 - ``ranks``: works and energies. Recorder: energy at the start, largest energy, iterations since the last row.
-  ``blow_up``: number of rows, suspicious rows, and energy input. Contact log: contact times and impulses.
+  ``blow_up``: suspicious rows, energy input, energies of the first row. Contact log: contact times and impulses.
 - Attributes (plan): time step and linear solver.
 
 Newton's method, Krylov methods, candidates for contact and friction start from scratch in each step. Data that depend

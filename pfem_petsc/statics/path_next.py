@@ -94,4 +94,4 @@ def _suspect(stepper: PathStepper, point: Point, guess: np.ndarray) -> None:
     energy = 0.5 * float(((forces + np.abs(state.support)) * np.abs(point.u)).sum())
     reason = stepper.guard.check(state.x, after, state.position + guess, energy)
     if reason is not None:
-        raise NotConverged(f"{stepper.points.place}: {reason}; {stepper.remedy}")
+        raise NotConverged(f"{stepper.points.place}: {reason}; {stepper.remedy}", reason.partition(":")[0])

@@ -139,7 +139,7 @@ class PathStepper(StaticStepper):
         text = f"the path ended at point {state.step}, load factor {state.time:.9g}"
         if self.direction is not None:
             text += f", displacement {self.direction.at(state.position):.6g} m"
-        return [f"{text}: {reached}"]
+        return [f"{text}: {reached}", *super().remarks()]
 
     def start(self) -> None:
         """See :class:`StaticStepper`. Collective."""
@@ -169,7 +169,7 @@ class PathStepper(StaticStepper):
                 if 0.5 * size < self.keys.smallest:
                     raise self._no_path(failure) from failure
                 size *= 0.5
-                self.message(f"{failure}; halving the length of the step, to {size:.4g}")
+                self.tell_failure(failure, f"halving the length of the step, to {size:.4g}")
         broke, parted = self._accept(point, size)
         self.turning, self._turn = 0 if broke else self._turn, 0
         self.events, self.outcome = events, reached or parted

@@ -23,6 +23,7 @@ class Equilibrium(Scheme):
     Attributes
     ----------
     releases : whether the balance is that of the state's own load factor, without viscosity
+    creeps : whether it is so with viscosity
     """
 
     inertial = False
@@ -31,7 +32,7 @@ class Equilibrium(Scheme):
 
     def __init__(self, lack: np.ndarray | None = None) -> None:
         super().__init__(NoParameters())
-        self.lack, self.releases = lack, False
+        self.lack, self.releases, self.creeps = lack, False, False
 
     def start(self, state: State, h: float) -> None:
         state.memory["rate"] = np.zeros_like(state.v)
@@ -40,7 +41,7 @@ class Equilibrium(Scheme):
         return h * state.memory["rate"]
 
     def balance(self, state: State, h: float) -> Balance:
-        end = state.time if self.releases else state.time + h
+        end = state.time if self.releases or self.creeps else state.time + h
         return Balance(
             alpha=0.0,
             eta=0.0 if self.lack is None or self.releases or not h else 1.0 / h,
@@ -54,7 +55,7 @@ class Equilibrium(Scheme):
 
     def finish(self, state: State, balance: Balance, u: np.ndarray, h: float) -> None:
         state.position[:] = balance.predictor + u
-        if not self.releases:
+        if not self.releases and not self.creeps:
             state.memory["rate"] = u / h
         # the viscous force is what equilibrium lacks: the ledger books it as inertia
         state.a = self.lack[:, None] * (u * balance.eta) if balance.eta else np.zeros_like(u)

@@ -26,7 +26,16 @@ __all__ = ["StaticStepper"]
 
 _FEW = 5  # maximum number of Newton iterations after which the next increment is larger
 _GROWTH = 1.5
+_LEAST = 1e-3  # of ``stabilise``: viscosity of increments that converge without more
+_STRONGER = 10.0  # factor on the viscosity where an increment fails
+_TRIED = 0.1  # of an increment, to which it is halved before the viscosity grows
+_WEAKER = 0.5  # the same after an increment
+_RELEASES = 20  # attempts to find the equilibrium at the end
 _RESISTANCE = 1e-3  # viscosity over stiffness with which a truss that nothing holds yet is moved against walls
+_EXCEEDED = (
+    "nodes moved far without load, as in a snap-through, and forces from there on contain the viscous force; compare "
+    "with a smaller static.stabilise, or use a dynamic stage"
+)
 
 
 class Increments(Protocol):
@@ -42,33 +51,39 @@ class StaticStepper(ImplicitStepper):
     """Advances the equilibrium from one load factor to the next; the state's time is the load factor.
 
     An increment that does not converge, or that the guard rejects, is halved; after an increment with few Newton
-    iterations the next one is larger, up to ``largest``.
+    iterations the next one is larger, up to ``largest``. With ``stabilise``, the viscosity is a thousandth of this. If
+    an increment fails down to a tenth of its size, it grows up to this value, and decreases again from then on.
 
     Parameters
     ----------
     model : Model
     choice : LinearChoice
     limits : first, smallest and largest increment of the load factor, and the last load factor
-    stabilise : viscosity of the nodes over their stiffness
+    stabilise : largest viscosity of the nodes over their stiffness
+    share : largest share of the viscosity in the energy that the truss has absorbed, beyond which users are warned
 
     Attributes
     ----------
     increment : the next increment
+    viscosity : of the next increment, relative to ``stabilise``
     dissipated : energy dissipated by the viscosity of ``stabilise`` [J]
+    exceeded : whether its share has exceeded the largest
     """
 
-    kept_numbers = (*ImplicitStepper.kept_numbers, "increment", "dissipated")
+    kept_numbers = (*ImplicitStepper.kept_numbers, "increment", "viscosity", "dissipated", "exceeded")
     columns = ("load_factor",)
     remedy = "reduce static.step"
 
-    def __init__(self, model: Model, choice: LinearChoice, limits: Increments, stabilise: float = 0.0) -> None:
-        viscosity = stabilise * model.nodal_stiffness
-        model.inertia.damp(viscosity)  # that of materials has no meaning without time
-        lack = viscosity / model.inertia.mass if stabilise else None
+    def __init__(
+        self, model: Model, choice: LinearChoice, limits: Increments, stabilise: float = 0.0, share: float = 1.0
+    ) -> None:
+        model.inertia.damp(stabilise * model.nodal_stiffness)  # that of materials has no meaning without time
+        lack = np.empty_like(model.inertia.mass) if stabilise else None
         super().__init__(model, Equilibrium(lack), limits.step, choice)
         model.bars.step = np.inf  # laws that depend on the rate are at their limit of slow loading
         self.prescribed = NoRates(self)
-        self.stabilise, self.dissipated = stabilise, 0.0
+        self.stabilise, self.share = stabilise, share
+        self.viscosity, self.dissipated, self.exceeded = _LEAST, 0.0, False
         self.limits, self.increment, self.end = limits, limits.step, limits.end
 
     @property
@@ -117,11 +132,12 @@ class StaticStepper(ImplicitStepper):
         """
         state, reached = self.state, min(self.end, self.removals.ends())
         left = reached - state.time
-        size = self.increment if self.increment < left * (1.0 - TIME) else left
+        size = first = self.increment if self.increment < left * (1.0 - TIME) else left
         while True:
             self._set_part(size)
             self.smallest = size
             end = reached if size == left else state.time + size
+            self._resist(self.viscosity)
             try:
                 self._make_part(end)
                 break
@@ -129,17 +145,22 @@ class StaticStepper(ImplicitStepper):
                 if self.model.bars_vary:
                     # the failed solve has applied the temperatures and rest lengths of its end
                     self.model.change_bars(state.time)
-                if 0.5 * size < self.limits.smallest:
+                smallest = 0.5 * size < self.limits.smallest
+                if self.stabilise and self.viscosity < 1.0 and (smallest or size < first * _TRIED):
+                    self.viscosity = min(_STRONGER * self.viscosity, 1.0)
+                    continue
+                if smallest:
                     raise self._no_further(failure) from failure
                 size *= 0.5
-                self.message(f"{failure}; halving the increment, to {size:.4g}")
+                self.tell_failure(failure, f"halving the increment, to {size:.4g}")
         self.increment = size
         if self.solution.newton <= _FEW:
             self.increment = max(size, min(_GROWTH * size, self.limits.largest))
         if self.stabilise:
             self._count_dissipation(size)
+            self.viscosity = max(_WEAKER * self.viscosity, _LEAST)
             if self.done:
-                self._release()
+                self._release(size)
         self.leave()
         state.step += 1
 
@@ -180,31 +201,74 @@ class StaticStepper(ImplicitStepper):
             hold_detached(self)
             self.lagged_count, self.lagged_place, self.lagged_history = kept
 
+    def _resist(self, viscosity: float) -> None:
+        """Set the viscosity of nodes, relative to that of ``stabilise``; in place, as the ledger uses the array."""
+        if self.stabilise:
+            inertia = self.model.inertia
+            np.multiply(viscosity * self.stabilise, self.model.nodal_stiffness, out=inertia.damping)
+            np.divide(inertia.damping, inertia.mass, out=self.scheme.lack)
+
     def _count_dissipation(self, size: float) -> None:
+        """Add the dissipation of an increment, and warn once if its share is too large. Collective."""
         u = self.solution.u
         local = float((self.model.inertia.damping[:, None] * u * u).sum()) / size
         self.dissipated += self.model.comm.allreduce(local)
+        share = self._share()
+        if share > self.share and not self.exceeded:
+            self.exceeded = True
+            self.message(
+                f"step {self.number + 1}, load factor {self.state.time:.6g}: static.stabilise has dissipated "
+                f"{self.dissipated:.3g} J, {100.0 * share:.3g} % of the energy that the truss has absorbed, more than "
+                f"static.stabilise_share = {self.share:g}: {_EXCEEDED}"
+            )
 
-    def _release(self) -> None:
-        """Find the equilibrium at the last load factor without the viscosity. Collective."""
-        self.scheme.releases = True
+    def _share(self) -> float:
+        """Return the share of the viscosity in the energy that bars and viscosity have absorbed. Collective."""
+        absorbed = self.model.comm.allreduce(self.energy.total) + self.dissipated
+        return self.dissipated / absorbed if absorbed > 0.0 else 0.0
+
+    def _release(self, size: float) -> None:
+        """Find the equilibrium at the last load factor without the viscosity. Collective.
+
+        If there is none close to the state, the truss moves on against the viscous force, as in an increment of this
+        size in which the loads stay.
+        """
+        for _ in range(_RELEASES):
+            try:
+                self._stay("releases", 0.0)
+                return
+            except NotConverged as failure:
+                reason = failure
+            try:
+                self._stay("creeps", self.viscosity)
+                self._count_dissipation(size)
+            except NotConverged:
+                self.viscosity = min(_STRONGER * self.viscosity, 1.0)
+        raise SimulationFailure(
+            f"load factor {self.end:.6g} was reached with static.stabilise, but there is no equilibrium "
+            f"nearby without it: reduce static.stabilise or static.step. The last attempt: {reason}"
+        ) from reason
+
+    def _stay(self, how: str, viscosity: float) -> None:
+        """Solve at the load factor of the state with a viscosity relative to ``stabilise``. Collective."""
+        setattr(self.scheme, how, True)
+        self._resist(viscosity)
         try:
             self._make_part(self.end)
-        except NotConverged as failure:
-            raise SimulationFailure(
-                f"load factor {self.end:.6g} was reached with static.stabilise, but there is no equilibrium "
-                f"nearby without it: reduce static.stabilise or static.step. The last attempt: {failure}"
-            ) from failure
         finally:
-            self.scheme.releases = False
+            setattr(self.scheme, how, False)
 
     def remarks(self) -> list[str]:
-        """Return what the viscosity has dissipated. Collective."""
+        """Return what the viscosity has dissipated, and how many solves failed. Collective."""
+        failures = super().remarks()
         if not self.stabilise:
-            return []
-        stored = self.model.comm.allreduce(self.energy.total)
-        share = f", {100.0 * self.dissipated / stored:.3g} % of the energy of the bars" if stored > 0.0 else ""
-        return [f"static.stabilise has dissipated {self.dissipated:.6g} J{share} (damping_dissipation)"]
+            return failures
+        share = 100.0 * self._share()
+        text = f"static.stabilise has dissipated {self.dissipated:.6g} J (damping_dissipation)"
+        text += f", {share:.3g} % of the energy that the truss has absorbed"
+        if self.exceeded:
+            text += f"; static.stabilise_share = {self.share:g} was exceeded: {_EXCEEDED}"
+        return [text, *failures]
 
     def settle(self) -> None:
         """Solve once more at the load factor that is reached, to rounding: motion that begins there begins at rest."""

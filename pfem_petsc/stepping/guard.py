@@ -13,8 +13,20 @@ motion, and the available energy, so they apply to time steps and load steps ali
    plus the work of loads, supports and walls.
 3. **Barriers.** Between the positions before and after, the bars store more energy than at either, and more than was
    available: the kinetic energy at the start plus the work up to that point. No motion can follow such a path. The
-   lower of two paths counts: the straight line, and the parabola that starts as predicted, which matches a rotation up
-   to 0.003 phi^4. Only this check finds shallow arches and domes that snap through.
+   lowest of three paths counts: the straight line, the parabola that starts as predicted, and the lower of both after
+   its nodes have given way, see below. Only this check finds shallow arches and domes that snap through.
+
+A bar that turns by phi is shorter by phi^2/8 of its length at the middle of the straight line. On the parabola it is so
+by 0.003 phi^4 if the velocities are those of the rotation; those of stiff bars contain the noise of their vibration.
+This energy grows with the stiffness of the bar, although nodes that are free to do so go around on an arc. The third
+path lets them: its displacements w at mid-path minimise
+
+    sum of k [(n . d - (mean length - length))^2 + e d . d],    e = :data:`SIDEWAYS`
+
+with the difference d of the displacements of both ends of a bar, its stiffness k and direction n. A bar on an arc gets
+the mean of its lengths before and after; the bars of a flat arch, in line with each other, cannot. The second term
+prevents that nodes slide down from the barrier: a bar of inclination s gets s^2/(s^2 + e) of the length that it lacks
+by turning. As this term also slows down the correction on an arc, by e/(1 + e), the minimisation is repeated.
 
 Energies are evaluated only if the unpredicted change of a bar exceeds :data:`NOTICEABLE` times its length.
 
@@ -46,6 +58,18 @@ GAIN = 4.0
 """Largest energy gain of the bars relative to that available up to mid-path; the trapezoidal rule from rest has 2."""
 OVER = 1.0
 """Largest accepted height of a barrier relative to the available energy."""
+SIDEWAYS = 0.05
+"""Stiffness of a bar, relative to that along it, against the displacements of nodes that give way at mid-path."""
+_ROUNDS = 4  # of corrections of mid-path
+_ITERATIONS = 200  # of conjugate gradients for each of them
+_SOLVED = 1e-8  # reduction of the residual, squared
+
+
+def _along(bars: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return directions (b, 3) and lengths (b,) [m] of bars at positions (local, 3)."""
+    vectors = x[bars[:, 1]] - x[bars[:, 0]]
+    lengths = np.linalg.norm(vectors, axis=1)
+    return vectors / np.maximum(lengths, 1e-300)[:, None], lengths
 
 
 class _Worst(NamedTuple):
@@ -80,6 +104,25 @@ def _largest_miss(bars, rest, before, after, predicted):
             if value != value:
                 break
     return worst, at
+
+
+@kernel
+def _pull(bars, axes, lacking, w, out):
+    """Add to ``out`` the forces on nodes (n, 3) by bars that lack lengths (b,) and turn by displacements w (n, 3).
+
+    ``axes`` (b, 3): directions times the root of the stiffness.
+    """
+    for k in range(len(bars)):
+        a, b = bars[k, 0], bars[k, 1]
+        along = stiffness = 0.0
+        for c in range(3):
+            along += axes[k, c] * (w[b, c] - w[a, c])
+            stiffness += axes[k, c] * axes[k, c]
+        along -= np.sqrt(stiffness) * lacking[k]
+        for c in range(3):
+            force = along * axes[k, c] + SIDEWAYS * stiffness * (w[b, c] - w[a, c])
+            out[a, c] += force
+            out[b, c] -= force
 
 
 class StepGuard:
@@ -153,14 +196,69 @@ class StepGuard:
                 f"the solution has gained energy without a source: the bars hold {end:.3g} J instead of {start:.3g} J "
                 f"before, and {2.0 * energy:.3g} J were available"
             )
-        top = min(straight, curved)
-        height = top - max(start, end)
-        if not height > OVER * energy:
+        if straight < curved:
+            np.add(before, after, out=middle)
+            middle *= 0.5
+        top, allowed = min(straight, curved), max(start, end) + OVER * energy
+        for _ in range(_ROUNDS):
+            if not top > allowed:
+                return None
+            self._give_way(before, after)
+            top = min(top, self.model.comm.allreduce(self._stored(middle)))
+        if not top > allowed:
             return None
         return (
             f"the solution lies beyond an energy barrier: on the way there the bars hold {top:.3g} J, before and after "
             f"{start:.3g} and {end:.3g} J, and {energy:.3g} J were available to pass it"
         )
+
+    def _give_way(self, before: np.ndarray, after: np.ndarray) -> None:
+        """Move the nodes at mid-path so that bars keep the mean of their lengths before and after. Collective.
+
+        Supports hold nodes, and walls those in contact, along the contact force. Conjugate gradients need not converge:
+        any path will do.
+        """
+        model, middle, bars = self.model, self._middle, self.model.mesh.bars
+        owned = model.mesh.n_owned
+        axes, lengths = _along(bars, middle)
+        lacking = 0.5 * (_along(bars, before)[1] + _along(bars, after)[1]) - lengths
+        axes *= np.sqrt(model.bars.stiffness)[:, None]
+        push = model.contact.state.contact
+        held = np.linalg.norm(push, axis=1, keepdims=True)
+        push = push / np.where(held > 0.0, held, 1.0)
+
+        def forces(w: np.ndarray, lacking: np.ndarray) -> np.ndarray:
+            """Return the forces on owned nodes along their free directions, by displacements of owned nodes."""
+            shift = np.zeros_like(middle)
+            shift[:owned] = w
+            model.mesh.update_ghosts(shift)
+            out = np.zeros_like(middle)
+            _pull(bars, axes, lacking, shift, out)
+            free = out[:owned]
+            free -= push * (free * push).sum(axis=1, keepdims=True)
+            model.supports.clear(free)
+            return free
+
+        def product(a: np.ndarray, b: np.ndarray) -> float:
+            return model.comm.allreduce(float((a * b).sum()))
+
+        w = np.zeros((owned, 3))
+        none, inverse = np.zeros_like(lacking), 1.0 / np.maximum(model.nodal_stiffness, 1e-300)[:, None]
+        residual = forces(w, lacking)
+        ahead = inverse * residual
+        size = first = product(residual, ahead)
+        for _ in range(_ITERATIONS):
+            if not size > _SOLVED * first:
+                break
+            image = -forces(ahead, none)
+            step = size / product(ahead, image)
+            w += step * ahead
+            residual -= step * image
+            scaled = inverse * residual
+            size, last = product(residual, scaled), size
+            ahead = scaled + (size / last) * ahead
+        middle[:owned] += w
+        model.mesh.update_ghosts(middle)
 
     def _stored(self, x: np.ndarray) -> float:
         """Return the energy of this rank's bars, including plastic dissipation [J]; infinite if a bar has no length."""

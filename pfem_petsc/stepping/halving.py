@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
@@ -24,6 +25,7 @@ class HalvedSteps(Stepper):
     ----------
     level : the next step is made in 2**level parts
     message : receives what users are told during a step
+    failures : number of failed solves of each kind in this run
     """
 
     kept_numbers = (*Stepper.kept_numbers, "level")
@@ -32,6 +34,20 @@ class HalvedSteps(Stepper):
         super().__init__(model, scheme, h)
         self.level = 0
         self.message: Callable[[str], None] = lambda text: None
+        self.failures: Counter[str] = Counter()
+
+    def tell_failure(self, failure: NotConverged, remedy: str) -> None:
+        """Tell the first failure of each kind and what is done about it; others are counted."""
+        self.failures[failure.kind] += 1
+        if self.failures[failure.kind] == 1:
+            self.message(f"{failure}; {remedy} (later ones of this kind are counted at the end)")
+
+    def remarks(self) -> list[str]:
+        """Return how many solves failed, if some were not told. Collective."""
+        if max(self.failures.values(), default=0) < 2:
+            return []
+        kinds = "; ".join(f"{kind}: {count}" for kind, count in self.failures.items())
+        return [f"{self.failures.total()} solves failed and were repeated with smaller steps ({kinds}); {self.remedy}"]
 
     def step(self) -> None:
         """Advance by one step; a part that does not converge is bisected, and parts grow again from step to step.
@@ -58,7 +74,7 @@ class HalvedSteps(Stepper):
                     self.model.change_bars(self.state.time)
                 size //= 2
                 self.level += 1
-                self.message(f"{failure}; bisecting the step, to {self.h * size / ticks:.4g} s")
+                self.tell_failure(failure, f"bisecting the step, to {self.h * size / ticks:.4g} s")
                 continue
             done += size
         self.level = max(self.level - 1, 0)

@@ -154,7 +154,7 @@ class ImplicitStepper(HalvedSteps):
                 reason = self._suspicion(balance, solution)
                 if reason is not None:
                     remedy = f"{self.remedy}; if such jumps are intended, set solver.guard = false"
-                    raise NotConverged(f"{self.when(balance)}: {reason}; {remedy}")
+                    raise NotConverged(f"{self.when(balance)}: {reason}; {remedy}", reason.partition(":")[0])
         except NotConverged:
             state.contact, state.support, self.held, forces = kept
             links.restore(forces)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from helpers.last_state import run
 
-from pfem_petsc import Case
+from pfem_petsc import Case, Simulation, open_result
 
 pytestmark = pytest.mark.parallel
 
@@ -65,3 +65,59 @@ def test_strength_of_octet_cells_at_many_areas(comm, shared_tmp_path):
     forces = np.array([octet_strength(area, [1, 1, 1], comm, shared_tmp_path / "out") for area in areas])
     slopes = np.diff(np.log(forces)) / np.diff(np.log(areas))
     assert slopes[:4] == pytest.approx(2.0, abs=0.1) and slopes[4:] == pytest.approx(1.0, abs=0.1)
+
+
+def crush(comm, folder, viscosity, strain, **keys):
+    """Peak force [N] of a clamped octet cell that is pressed by a strain, in increments of 0.25 % strain."""
+    case = Case.from_dict(
+        {
+            "mesh": {"generator": "lattice", "kind": "octet", "cells": [1, 1, 1], "pitch": 0.005},
+            "node_set": {"bottom": {"group": "bottom"}, "top": {"group": "top"}},
+            "material": {"m": {"law": "strut", "young_modulus": 190e9, "density": 7900.0, "yield_stress": 400e6}},
+            "section": {"s": {"area": 2e-7, "material": "m", "shape": "round"}},
+            "support": [
+                {"node_set": "bottom", "fix": "xyz"},
+                {
+                    "node_set": "top",
+                    "fix": "xyz",
+                    "motion": [[0, 0, 0, 0], [1, 0, 0, -0.005 * strain]],
+                    "interpolation": "linear",
+                },
+            ],
+            "static": {"step": 0.0025 / strain, "stabilise": viscosity, **keys},
+            "output": {"fields_every": 0, "probe": [{"name": "top", "node_set": "top"}]},
+        }
+    )
+    with Simulation(case, comm, output=folder, quiet=True) as simulation:
+        simulation.run()
+        remarks = simulation.stepper.remarks()
+    with open_result(folder / "result.vtkhdf") as result:
+        history = dict(result.history)
+    return -history["probe/top/reaction"][:, :, 2].sum(axis=1).min(), history, remarks
+
+
+@pytest.mark.slow
+def test_peak_of_a_crush_does_not_depend_on_stabilise(comm, shared_tmp_path):
+    """The peak is that of increments without viscosity, for viscosities over 100 to 1 and motions over 4 to 1."""
+    exact = crush(comm, shared_tmp_path / "0", 0.0, 0.05)[0]
+    for viscosity, strain, error in ((1e-4, 0.05, 1e-3), (1e-2, 0.05, 5e-3), (1e-3, 0.2, 5e-3)):
+        peak, history, remarks = crush(comm, shared_tmp_path / f"{viscosity}_{strain}", viscosity, strain)
+        assert peak == pytest.approx(exact, rel=error)
+        absorbed = history["elastic_energy"] + history["plastic_dissipation"] + history["damping_dissipation"]
+        assert 0.0 < history["damping_dissipation"][-1] < 0.05 * absorbed[-1]
+        assert "static.stabilise_share" not in remarks[0] and "% of the energy" in remarks[0]
+
+
+@pytest.mark.slow
+def test_share_of_stabilise_is_told_once(comm, shared_tmp_path):
+    """A smaller largest share is exceeded: one warning, and its number again at the end."""
+    _, history, remarks = crush(comm, shared_tmp_path / "it", 1e-2, 0.05, stabilise_share=1e-4)
+    share = history["damping_dissipation"][-1] / (
+        history["elastic_energy"][-1] + history["plastic_dissipation"][-1] + history["damping_dissipation"][-1]
+    )
+    assert share > 1e-4
+    told = float(remarks[0].partition("(damping_dissipation), ")[2].partition(" %")[0])
+    assert told == pytest.approx(100.0 * share, rel=0.01)
+    if comm.rank == 0:
+        log = (shared_tmp_path / "it" / "log.txt").read_text()
+        assert log.count("more than static.stabilise_share = 0.0001") == 1

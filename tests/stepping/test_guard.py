@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from pfem_petsc import Case, Simulation
+from pfem_petsc import Case, Simulation, Truss
 from pfem_petsc.errors import NotConverged, SimulationFailure
 from pfem_petsc.stepping.guard import LARGEST, NOTICEABLE, StepGuard
 
@@ -125,6 +125,76 @@ def test_rotations_pass(angle, comm, shared_tmp_path):
     assert 0.5 * angle**2 < LARGEST and (angle < 0.15 or 0.5 * angle**2 > NOTICEABLE)
     energy = 10.0 * angle**8 / comm.size  # of the step; the parabola is 0.003 angle^4 off a circle
     assert guard.check(x, turned, predicted, energy) is None
+
+
+def guard_of(comm, folder, points, bars, feet, fix="xyz", modulus=1e8):
+    """A guard, the positions (local, 3) of bars with EA = ``modulus``, and their mesh."""
+    case = {
+        "node_set": {"feet": {"indices": feet}},
+        "material": {"m": {"young_modulus": modulus, "density": 1.0}},
+        "section": {"s": {"area": 1.0, "material": "m"}},
+        "support": [{"node_set": "feet", "fix": fix}],
+        "time": {"integrator": "newmark", "step": 1e-3, "end": 1e-2},
+    }
+    case = Case.from_dict(case, mesh=Truss(np.array(points, dtype=float), bars))
+    model = Simulation(case, comm, output=folder / "it", quiet=True, check_only=True).model
+    return StepGuard(model), model.mesh.points.copy(), model.mesh
+
+
+@pytest.mark.parametrize("degrees", [10.0, 30.0])
+def test_stiff_bars_that_turn_pass_whatever_their_stiffness(degrees, comm, shared_tmp_path):
+    """Two bars of 10^8 N turn about their joints by an angle and twice that, with the noise of vibrating bars in the
+    prediction, and nothing but the energy of a slow motion: the lengths at the ends are those at rest."""
+    guard, x, mesh = guard_of(comm, shared_tmp_path, [[0, 0, 0], [1, 0, 0], [2, 0, 0]], [[0, 1], [1, 2]], [0])
+    angle = np.radians(degrees)
+    ways = np.array([[0, 0, 0], *np.cumsum([[np.cos(a), np.sin(a), 0.0] for a in (angle, -0.5 * angle)], axis=0)])
+    noise = 0.1 * angle * np.array([[0, 0, 0], [1, 0, 0], [-1, 0, 0]])
+    speeds = np.array([[0, 0, 0], [0, angle, 0], [0, 0.5 * angle, 0]])
+    after = ways[mesh.node_ids]
+    predicted = x[: mesh.n_owned] + (speeds + noise)[mesh.node_ids[: mesh.n_owned]]
+    energy = angle**2 / comm.size  # of the motion in 1 s; the chord of the first bar stores 8e5 angle^4
+    assert guard.check(x, after, predicted, energy) is None
+
+
+@pytest.mark.parametrize(("share", "told"), [(0.8, True), (1.1, False)])
+def test_a_shallow_arch_keeps_its_barrier(share, told, comm, shared_tmp_path):
+    """Flat bars cannot give way: the barrier of two bars that rise by a tenth is EA l (strain)^2. The end is not the
+    mirror image, so that the middle of the path is beside the top of the barrier."""
+    guard, x, mesh = guard_of(comm, shared_tmp_path, [[-1, 0, 0], [0, 0, 0.1], [1, 0, 0]], [[0, 1], [1, 2]], [0, 2])
+    strain = 1.0 - 1.0 / np.hypot(1.0, 0.1)
+    barrier = 1e8 * np.hypot(1.0, 0.1) * strain**2
+    after = x.copy()
+    after[mesh.node_ids == 1, 2] = -0.094
+    predicted = x[: mesh.n_owned].copy()
+    predicted[mesh.node_ids[: mesh.n_owned] == 1, 2] = -0.06
+    text = guard.check(x, after, predicted, share * barrier / comm.size)
+    assert told == (text is not None and "barrier" in text)
+
+
+@pytest.mark.parametrize("integrator", ["newmark", "houbolt", "wilson", "generalized_alpha", "energy_momentum"])
+@pytest.mark.parametrize("degrees", [1.0, 10.0])
+def test_a_stiff_pendulum_is_not_bisected(degrees, integrator, comm, shared_tmp_path):
+    """It falls from the horizontal, at most by the angle a step: every step is accepted by the guard."""
+    step = np.radians(degrees) / np.sqrt(2.0 * 9.81)
+    case = {
+        "node_set": {"pin": {"indices": [0]}},
+        "material": {"m": {"young_modulus": 1e8, "density": 2.0}},
+        "section": {"s": {"area": 1.0, "material": "m"}},
+        "support": [{"node_set": "pin", "fix": "xyz"}],
+        "gravity": {"acceleration": [0.0, 0.0, -9.81]},
+        "time": {"integrator": integrator, "step": step, "end": 12 * step, "mass": "lumped"},
+        "output": {"fields_every": 0},
+    }
+    case = Case.from_dict(case, mesh=Truss(np.array([[0.0, 0, 0], [1, 0, 0]]), [[0, 1]]))
+    simulation = Simulation(case, comm, output=shared_tmp_path / "out", quiet=True)
+    told = []
+    simulation.start()
+    simulation.stepper.message = told.append
+    row = last_of(simulation)
+    assert not [text for text in told if "guard" in text]
+    # the energy of the fall of the free end, as far as the scheme keeps it
+    fallen = -9.81 * (row["centre_of_mass"][2]) * 2.0
+    assert 0.0 < row["kinetic_energy"] < 1.05 * fallen
 
 
 @pytest.mark.parametrize("integrator", ["newmark", "generalized_alpha", "energy_momentum", "houbolt"])

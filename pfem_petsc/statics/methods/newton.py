@@ -32,7 +32,9 @@ class Parameters(StrictModel):
     """largest increment, up to which increments grow after few Newton iterations; default: ``step``"""
 
     stabilise: NonNegativeFloat = 0.0
-    """viscosity of the nodes over their stiffness; 0: none. Carries the truss over limit points"""
+    """largest viscosity of the nodes over their stiffness; 0: none. Carries the truss over limit points"""
+    stabilise_share: PositiveFloat = 0.05
+    """share of the viscosity in the energy that the truss absorbs, beyond which the run warns"""
 
     @property
     def smallest(self) -> float:
@@ -57,4 +59,4 @@ def make_stepper(model: Model, parameters: Parameters, choice: LinearChoice) -> 
     """Create the stepper of a case. Collective."""
     from ..stepper import StaticStepper
 
-    return StaticStepper(model, choice, parameters, parameters.stabilise)
+    return StaticStepper(model, choice, parameters, parameters.stabilise, parameters.stabilise_share)

@@ -1,0 +1,90 @@
+"""Divergence ends a run at the first certain sign, and messages of one kind are told once."""
+
+import numpy as np
+import pytest
+
+from pfem_petsc import Case, Simulation, Truss
+from pfem_petsc.energies import ENERGIES
+from pfem_petsc.errors import SimulationFailure
+from pfem_petsc.recording.blowup import BlowUp
+
+pytestmark = pytest.mark.parallel
+
+
+def pendulum(comm, folder, integrator, degrees, modulus=1e8, steps=30, **keys):
+    """A bar about its end, spinning by an angle a step at first, or falling by it where it is fastest."""
+    rate = np.sqrt(2.0 * 9.81)
+    step = np.radians(degrees) / rate
+    case = {
+        "node_set": {"pin": {"indices": [0]}},
+        "material": {"m": {"young_modulus": modulus, "density": 2.0}},
+        "section": {"s": {"area": 1.0, "material": "m"}},
+        "support": [{"node_set": "pin", "fix": "xyz"}],
+        "time": {"integrator": integrator, "step": step, "end": steps * step, "mass": "lumped"},
+        "output": {"fields_every": 0},
+        **keys,
+    }
+    case = Case.from_dict(case, mesh=Truss(np.array([[0.0, 0, 0], [1, 0, 0]]), [[0, 1]]))
+    return Simulation(case, comm, output=folder, quiet=True)
+
+
+def row_of(number, **energies):
+    """A row of the history with some energies [J]."""
+    return {"step": number, "time": 0.1 * number, **dict.fromkeys((e.name for e in ENERGIES), 0.0), **energies}
+
+
+def test_energy_created_is_compared_with_what_moves_the_truss_in_its_stage(comm, shared_tmp_path):
+    """Works of earlier stages (1 MJ), what their quadrature lost, and prestress (0.5 MJ) do not hide that 20 J of
+    motion become 200 J: the third row beyond ten times the 20 J is the last, also after a restart between them."""
+    simulation = pendulum(comm, shared_tmp_path / "it", "newmark", 1.0)
+    simulation.start()
+    state, start = simulation.state, {"elastic_energy": 5e5, "external_work": 1e6, "numerical_dissipation": 5e5}
+    watch = BlowUp(simulation.model)
+    watch.check(row_of(100, **start), state)
+    for number, created in enumerate([0.0, 1.0, 50.0, 150.0, 199.0, 250.0, 150.0, 300.0, 400.0]):
+        moved = {"external_work": 1e6 + 20.0, "kinetic_energy": 20.0 + created}
+        watch.check(row_of(101 + number, **{**start, **moved, "numerical_dissipation": 5e5 - created}), state)
+    again = BlowUp(simulation.model)
+    again.load_state(watch.kept())
+    last = {**start, "external_work": 1e6 + 20.0, "kinetic_energy": 520.0, "numerical_dissipation": 5e5 - 500.0}
+    with pytest.raises(SimulationFailure, match=r"step 110, t = 11 s: .* created 500 J, but only 20 J .*time\.step"):
+        again.check(row_of(110, **last), state)
+    simulation.close()
+
+
+def test_released_energy_may_move_the_truss(comm, shared_tmp_path):
+    """What prestressed bars release is energy supplied: a hundred times the work of loads is no divergence."""
+    simulation = pendulum(comm, shared_tmp_path / "it", "newmark", 1.0)
+    simulation.start()
+    watch = BlowUp(simulation.model)
+    for number in range(20):
+        energies = {"elastic_energy": 1000.0 - 50.0 * number, "kinetic_energy": 60.0 * number}
+        watch.check(row_of(number, **energies, numerical_dissipation=-10.0 * number), simulation.state)
+    simulation.close()
+
+
+def test_a_scheme_that_makes_energy_ends_the_run(comm, shared_tmp_path):
+    """Wilson's scheme at 20 degrees a step turns the kinetic energy of a stiff spin into a thousand times this."""
+    spin = {"angular_velocity": [0.0, 0.0, np.sqrt(2.0 * 9.81)], "centre": [0.0, 0.0, 0.0]}
+    simulation = pendulum(comm, shared_tmp_path / "it", "wilson", 20.0, initial=spin)
+    rows = []
+    with pytest.raises(SimulationFailure, match="step .*, t = .* created .* J, but only 9.81 J were supplied"):
+        rows.extend(step.row for step in simulation)
+    energy = np.array([row["kinetic_energy"] + row["elastic_energy"] for row in rows])
+    # it has gone on for two rows beyond ten times the energy supplied
+    assert (energy > 11.0 * 9.81).sum() <= 3
+
+
+def test_failures_of_one_kind_are_told_once_and_counted(comm, shared_tmp_path):
+    """A fall at 60 degrees a step is rejected again and again: the log has one message, and the number at the end."""
+    gravity = {"acceleration": [0.0, 0.0, -9.81]}
+    simulation = pendulum(comm, shared_tmp_path / "it", "newmark", 60.0, gravity=gravity)
+    rows = [step.row for step in simulation]
+    remarks = simulation.stepper.remarks()
+    bisected = sum(row["step_size"] < 0.99 * simulation.stepper.h for row in rows)
+    failed = simulation.stepper.failures
+    assert bisected > 3 and failed.total() >= bisected
+    if comm.rank == 0:
+        log = (shared_tmp_path / "it" / "log.txt").read_text()
+        assert log.count("bisecting the step") == len(failed) < failed.total()
+        assert log.count(f"{failed.total()} solves failed") == 1 and remarks[0] in log

@@ -11,6 +11,7 @@ from mpi4py import MPI
 from ..errors import NotConverged, SimulationFailure
 from ..integrators.base import Balance
 from ..solvers.linear import LinearChoice
+from ..solvers.newton import Tolerance
 from ..stepping.implicit import ImplicitStepper
 from ..stepping.prescribed import NoRates
 from ..stepping.solution import Solution
@@ -69,6 +70,7 @@ class StaticStepper(ImplicitStepper):
         model.bars.step = np.inf  # laws that depend on the rate are at their limit of slow loading
         self.prescribed = NoRates(self)
         self.stabilise, self.dissipated = stabilise, 0.0
+        self._external = self.state.external  # of the last load factor
         self.limits, self.increment, self.end = limits, limits.step, limits.end
 
     @property
@@ -116,6 +118,7 @@ class StaticStepper(ImplicitStepper):
             On all ranks, if the smallest increment does not converge.
         """
         state, reached = self.state, min(self.end, self.removals.ends())
+        self._external = state.external
         left = reached - state.time
         size = self.increment if self.increment < left * (1.0 - TIME) else left
         while True:
@@ -162,6 +165,13 @@ class StaticStepper(ImplicitStepper):
         finally:
             inertia.damp(damping)
         return super()._solve(balance, approach.u)
+
+    def _tolerance(self, required: float) -> Tolerance:
+        """As for implicit steps; the guess must also be accurate relative to the load that the increment adds, which
+        may be much smaller than the forces of a prestress."""
+        change = self.model.comm.allreduce(float(((self.state.external - self._external) ** 2).sum()))
+        guess = self.model.case.solver.rtol * float(np.sqrt(change)) if change else required
+        return super()._tolerance(required)._replace(guess=min(guess, required))
 
     def _untouched(self) -> bool:
         """Return whether contact is possible and nothing is in contact at the start of the increment. Collective."""

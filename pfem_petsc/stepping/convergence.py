@@ -14,18 +14,25 @@ if TYPE_CHECKING:
     from ..solvers.newton import NewtonReport
     from .model import Model
 
-__all__ = ["failure_message", "residual_tolerance"]
+__all__ = ["Resolution", "failure_message", "force_scale", "residual_tolerance"]
 
 _MASS_RTOL = 1e-3  # factor on solver.rtol for systems with the mass matrix only
+_DOUBTFUL = 1e-3  # share of the forces in a residual due to rounding, from which on users are told
 
 
-def residual_tolerance(model: Model, state: State, balance: Balance, step: float) -> float:
-    """Return the tolerance of the residual's 2-norm [N] in a step of the given size [s]. Collective.
+def residual_tolerance(model: Model, balance: Balance, scale: float) -> float:
+    """Return the tolerance of the residual's 2-norm [N]: ``solver.rtol`` times the scale of forces [N], but not below
+    ``solver.atol``."""
+    solver = model.case.solver
+    # an explicit scheme's balance is a well-conditioned linear system, and its residual would act as an impulse
+    rtol = solver.rtol if balance.weight else _MASS_RTOL * solver.rtol
+    return max(rtol * scale, solver.atol or 0.0)
 
-    It is ``solver.rtol`` times the largest of momentum per step, loads and internal forces, but not below
-    ``solver.atol``.
+
+def force_scale(model: Model, state: State, step: float) -> float:
+    """Return the largest 2-norm [N] of momentum per step of the given size [s], loads and internal forces. Collective.
     """
-    solver, owned = model.case.solver, model.mesh.n_owned
+    owned = model.mesh.n_owned
     sums = np.array(
         [
             ((model.inertia.mass[:, None] * state.v) ** 2).sum() / step**2 if state.v.any() else 0.0,
@@ -34,9 +41,36 @@ def residual_tolerance(model: Model, state: State, balance: Balance, step: float
         ]
     )
     model.comm.Allreduce(MPI.IN_PLACE, sums)
-    # an explicit scheme's balance is a well-conditioned linear system, and its residual would act as an impulse
-    rtol = solver.rtol if balance.weight else _MASS_RTOL * solver.rtol
-    return max(rtol * float(np.sqrt(sums.max())), solver.atol or 0.0)
+    return float(np.sqrt(sums.max()))
+
+
+class Resolution:
+    """Whether the forces of a run are larger than what rounding of positions leaves of them out of balance.
+
+    Attributes
+    ----------
+    numbers : largest 2-norms [N] so far, of forces and of residuals that rounding has left
+    """
+
+    def __init__(self) -> None:
+        self.numbers = [0.0, 0.0]
+
+    def note(self, scale: float, residual: float) -> None:
+        """Take account of a balance: the scale of its forces, and the residual beyond the tolerance or zero [N]."""
+        self.numbers = [max(self.numbers[0], scale), max(self.numbers[1], residual)]
+
+    def doubts(self, model: Model) -> list[str]:
+        """Return a text if the residuals are a noticeable share of the forces."""
+        forces, residual = self.numbers
+        if not residual > _DOUBTFUL * forces:
+            return []
+        share = f"{100.0 * residual / forces:.2g} % of" if forces else "all"
+        return [
+            f"forces of {forces:.3g} N are balanced to {residual:.2g} N only, {share} the forces: coordinates of "
+            f"{model.reach:.3g} m are rounded to {np.finfo(float).eps * model.reach:.1g} m, which strains the stiffest "
+            "bars as much as the forces do, and smaller displacements are not resolved. Scale the forces up, replace very "
+            "stiff bars by constraints or less stiff ones, or move the truss to the origin"
+        ]
 
 
 def failure_message(

@@ -54,7 +54,7 @@ class Model:
     length : largest extent of the mesh [m]
     reach : largest coordinate magnitude [m], which sets the rounding of positions
     nodal_stiffness : (owned,) sum of E A/l0 of a node's bars [N/m]
-    rounding : 2-norm of the residual due to rounding of positions [N]
+    node_rounding, rounding : (owned,) residual of a node due to rounding of positions [N], and the 2-norm over all nodes
     warnings : about the mesh
     links : pairs and constraints that couple nodes to nodes, see :mod:`pfem_petsc.contact.links`
     can_touch : whether nodes can touch walls or each other
@@ -103,8 +103,9 @@ class Model:
             _node_stiffness(mesh.bars, self.bars.rest, block.start, block.stop, axial, stiffness)
         self.nodal_stiffness = stiffness[: mesh.n_owned].copy()
         with np.errstate(over="ignore"):  # stiffness that overflows is refused by the plan
+            self.node_rounding = 4.0 * np.finfo(float).eps * self.reach * self.nodal_stiffness
             squares = comm.allreduce(float((self.nodal_stiffness**2).sum()))
-        self.rounding = 4.0 * np.finfo(float).eps * self.reach * np.sqrt(squares)
+            self.rounding = 4.0 * np.finfo(float).eps * self.reach * np.sqrt(squares)
         self.total_mass = comm.allreduce(float(self.inertia.mass.sum()))
         speeds = [np.sqrt(m.upper_modulus() / m.density) for m in case.material.values()]
         self.wave_speed = max(speeds)

@@ -23,9 +23,10 @@ from .reasons import is_failed_factorisation, linear_reason, newton_reason
 if TYPE_CHECKING:
     from ..mesh.distribution import DistributedMesh
 
-__all__ = ["NewtonReport", "NewtonSolver", "Problem", "Tolerance", "zero_tolerance"]
+__all__ = ["STAGNATION", "NewtonReport", "NewtonSolver", "Problem", "Tolerance", "zero_tolerance"]
 
-_STAGNATION = 100.0  # a residual within this many rounding errors that no longer falls has converged
+STAGNATION = 100.0
+"""A residual within this many rounding errors that no longer falls has converged."""
 
 
 def zero_tolerance(length: float) -> float:
@@ -52,8 +53,11 @@ class Tolerance(NamedTuple):
     nodes: np.ndarray
     rounding: float
 
-    def allows(self, g: np.ndarray, factor: float, comm: MPI.Comm) -> bool:
-        """Return whether residuals (owned, 3) exceed ``factor`` times rounding by the required one only. Collective."""
+    def rounded(self, norm: float, g: np.ndarray, factor: float, comm: MPI.Comm) -> bool:
+        """Return whether residuals (owned, 3) of a 2-norm [N] are due to rounding, up to a factor, and to the required
+        one beyond that. Collective."""
+        if not norm <= factor * self.rounding:
+            return False
         beyond = np.maximum(np.linalg.norm(g, axis=1) - factor * self.nodes, 0.0)
         return comm.allreduce(float((beyond**2).sum())) <= self.residual**2
 
@@ -203,7 +207,7 @@ class NewtonSolver:
             return report
         reason = snes.getConvergedReason()
         norm = snes.getFunctionNorm()
-        converged = reason > 0 or self._rounded(norm, _STAGNATION)
+        converged = reason > 0 or self._rounded(norm, STAGNATION)
         why = ""
         if not converged:
             why = newton_reason(reason)
@@ -292,18 +296,15 @@ class NewtonSolver:
             self._first, self._suffices = norm, norm <= tolerance.residual
         if norm <= (tolerance.residual if iteration else tolerance.guess):
             return PETSc.SNES.ConvergedReason.CONVERGED_FNORM_ABS
-        if iteration and (self._rounded(norm, 1.0) or (norm > 0.5 * previous and self._rounded(norm, _STAGNATION))):
+        if iteration and (self._rounded(norm, 1.0) or (norm > 0.5 * previous and self._rounded(norm, STAGNATION))):
             return PETSc.SNES.ConvergedReason.CONVERGED_SNORM_RELATIVE
         return PETSc.SNES.ConvergedReason.ITERATING
 
     def _rounded(self, norm: float, factor: float) -> bool:
         """Return whether the last residual, of the given 2-norm [N], is due to rounding up to a factor. Collective."""
-        tolerance = self._tolerance
-        if not norm <= factor * tolerance.rounding:
-            return False
-        g = self._g.array.reshape(self.mesh.n_owned, 3).copy()
-        if self._bounds is not None:
-            w = self._u.array.reshape(g.shape)
-            near = zero_tolerance(self.length)
-            g[((w <= self._bounds[0] + near) & (g > 0.0)) | ((w >= self._bounds[1] - near) & (g < 0.0))] = 0.0
-        return tolerance.allows(g, factor, self.mesh.comm)
+        g = self._g.array.reshape(self.mesh.n_owned, 3)
+        if self._bounds is not None:  # forces on active bounds are not part of the residual
+            w, near = self._u.array.reshape(g.shape), zero_tolerance(self.length)
+            lower, upper = self._bounds
+            g = np.where(((w <= lower + near) & (g > 0.0)) | ((w >= upper - near) & (g < 0.0)), 0.0, g)
+        return self._tolerance.rounded(norm, g, factor, self.mesh.comm)

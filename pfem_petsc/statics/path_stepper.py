@@ -193,8 +193,17 @@ class PathStepper(StaticStepper):
         g = np.empty_like(point.u)
         self.system.imbalance(point.u, point.load_factor, g)
         self.state.support = self.model.supports.part(g)
+        self._note(point, g - self.state.support)
         walls = self.model.contact.nothing
         return Solution(point.u, self.system.problem.f, walls, point.newton, self.system.linear)
+
+    def _note(self, point: Point, g: np.ndarray) -> None:
+        """Take account of what rounding leaves of the residual (owned, 3) [N] at a point. Collective."""
+        internal = self.system.problem.f[: len(g)]
+        sums = np.array([(array**2).sum() for array in (g, self.system.external(point.load_factor), internal)])
+        norm, *forces = np.sqrt(self.model.comm.allreduce(sums))
+        required = self.points.tolerance(point.u, point.load_factor, 0.0).residual
+        self.resolution.note(float(max(forces)), float(norm) if norm > required else 0.0)
 
     def _begin_path(self) -> bool:
         """Take the first point; return whether a step was made, because the start was not in equilibrium."""

@@ -161,6 +161,8 @@ class RelaxationStepper(StaticStepper):
         pushed = (motion.contact[motion.held] != 0.0).any(axis=1)
         self.held = np.zeros_like(self.held)
         self.held[motion.held[pushed]] = True
+        lacking = motion.norm > self.parameters.tolerance * motion.load
+        self.resolution.note(motion.load, motion.norm if lacking else 0.0)
         u = motion.x[:owned] - balance.predictor
         return Solution(u, motion.f.copy(), motion.walls, contacts=int(pushed.sum()))
 
@@ -170,7 +172,7 @@ class RelaxationStepper(StaticStepper):
         size, node = motion.worst()
         return SimulationFailure(
             f"load factor {motion.time:.6g}: relaxation has not converged in {most} pseudo-steps: residual "
-            f"{motion.norm:.3g} N, required {motion.required(self.parameters.tolerance):.3g} N; worst at node {node} "
+            f"{motion.norm:.3g} N, required {self.parameters.tolerance * motion.load:.3g} N; worst at node {node} "
             f"({size:.3g} N). Increase static.max_iterations or static.tolerance; if the residual does not fall, "
             "nothing balances the load there"
         )

@@ -30,8 +30,7 @@ def residual_tolerance(model: Model, balance: Balance, scale: float) -> float:
 
 
 def force_scale(model: Model, state: State, step: float) -> float:
-    """Return the largest 2-norm [N] of momentum per step of the given size [s], loads and internal forces. Collective.
-    """
+    """Return the largest 2-norm [N] of momentum per step of the given size [s], loads and internal forces. Collective."""
     owned = model.mesh.n_owned
     sums = np.array(
         [
@@ -68,8 +67,8 @@ class Resolution:
         return [
             f"forces of {forces:.3g} N are balanced to {residual:.2g} N only, {share} the forces: coordinates of "
             f"{model.reach:.3g} m are rounded to {np.finfo(float).eps * model.reach:.1g} m, which strains the stiffest "
-            "bars as much as the forces do, and smaller displacements are not resolved. Scale the forces up, replace very "
-            "stiff bars by constraints or less stiff ones, or move the truss to the origin"
+            "bars as much as the forces do, and smaller displacements are not resolved. Scale the forces up, make very "
+            "stiff bars less stiff, or move the truss to the origin"
         ]
 
 

@@ -54,7 +54,7 @@ class Model:
     length : largest extent of the mesh [m]
     reach : largest coordinate magnitude [m], which sets the rounding of positions
     nodal_stiffness : (owned,) sum of E A/l0 of a node's bars [N/m]
-    node_rounding, rounding : (owned,) residual of a node due to rounding of positions [N], and the 2-norm over all nodes
+    node_rounding, rounding : residuals of nodes (owned,) due to rounding of positions [N], and their 2-norm
     warnings : about the mesh
     links : pairs and constraints that couple nodes to nodes, see :mod:`pfem_petsc.contact.links`
     can_touch : whether nodes can touch walls or each other

@@ -54,7 +54,6 @@ class PathStepper(StaticStepper):
         *StaticStepper.kept_numbers,
         "arc",
         "slope",
-        "negatives",
         "weight",
         "scale",
         "ended",
@@ -139,7 +138,15 @@ class PathStepper(StaticStepper):
         text = f"the path ended at point {state.step}, load factor {state.time:.9g}"
         if self.direction is not None:
             text += f", displacement {self.direction.at(state.position):.6g} m"
-        return [f"{text}: {reached}"]
+        text = f"{text}: {reached}"
+        if self.negatives > 0:
+            text += f"; the equilibrium there is unstable, with {int(self.negatives)} negative eigenvalue"
+            text += "s" * (self.negatives > 1) + " of the stiffness under constant loads"
+        return [text]
+
+    def doubts(self) -> list[str]:
+        """See :class:`~pfem_petsc.stepping.stepper.Stepper`; unstable parts of a path are no doubt, but in a remark."""
+        return self.resolution.doubts(self.model)
 
     def start(self) -> None:
         """See :class:`StaticStepper`. Collective."""

@@ -11,6 +11,7 @@ from ..contact.active_set import ActiveSet
 from ..contact.candidates import Candidates, expected_candidates
 from ..errors import InputError, NotConverged, SimulationFailure
 from ..integrators.base import Balance
+from ..stepping.implicit import ImplicitStepper
 from ..stepping.solution import Solution
 from ..tolerances import TIME
 from .minimum import MinimumCheck
@@ -101,9 +102,15 @@ class RelaxationStepper(StaticStepper):
             if parameters.newton:
                 solution = self._polish(balance)
                 if solution is not None:
+                    if self.minimum.refusal is not None and self._ends(balance):
+                        self.negatives = self._falling(balance, solution)
                     return solution
         solution = self._relaxed(balance)
-        self._look_at_stability(solution)
+        if self._ends(balance) or (self.minimum is not None and self.minimum.refusal is None):
+            self.negatives = self._falling(balance, solution)
+            if not self._ends(balance):
+                for text in self._instability(balance.time):
+                    self.message(text)
         return solution
 
     @property
@@ -113,19 +120,6 @@ class RelaxationStepper(StaticStepper):
             return ()
         return _HANDOVERS if self.minimum.refusal is None else _HANDOVERS[-1:]
 
-    def _look_at_stability(self, solution: Solution) -> None:
-        """Warn about an unstable equilibrium. Collective."""
-        if self.minimum is None or self.minimum.refusal is not None:
-            return
-        motion = self.motion
-        count = self.minimum.falling(motion.x, solution.walls, motion.time)
-        if count > 0:
-            self.message(
-                f"load factor {motion.time:.6g}: the equilibrium is unstable, with {count} negative "
-                f"eigenvalue{'s' * (count > 1)} of the stiffness: nothing perturbs it, as from a "
-                "symmetric start; add a small perturbing load"
-            )
-
     def _polish(self, balance: Balance) -> Solution | None:
         """Return the solution of Newton's method from the relaxed positions, None if none is near. Collective."""
         state, model, motion = self.state, self.model, self.motion
@@ -133,7 +127,7 @@ class RelaxationStepper(StaticStepper):
         self.held = np.zeros_like(self.held)
         self.held[motion.held] = True
         try:
-            solution = super().solve(balance)
+            solution = ImplicitStepper.solve(self, balance)
         except NotConverged:
             state.contact, state.support, self.held = kept
             return None
@@ -145,8 +139,10 @@ class RelaxationStepper(StaticStepper):
         there, _ = motion.potential(x, energy)
         reached, collapsed = max(model.comm.allgather(float(away))), model.comm.allgather(energy.failed >= 0)
         failed = reached > _NEAR * model.length or there > here + _DOWN * size or sum(collapsed) > 0
+        self.negatives = -1
         if not failed and self.minimum.refusal is None:
-            failed = self.minimum.falling(after, solution.walls, balance.time) > 0
+            self.negatives = self.minimum.falling(after, solution.walls, balance.time)
+            failed = self.negatives > 0
         if failed:
             state.contact, state.support, self.held = kept
             return None

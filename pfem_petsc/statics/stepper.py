@@ -8,17 +8,21 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from mpi4py import MPI
 
+from ..contact.transform import Transform
 from ..errors import NotConverged, SimulationFailure
 from ..integrators.base import Balance
 from ..solvers.linear import LinearChoice
 from ..solvers.newton import Tolerance
 from ..stepping.implicit import ImplicitStepper
 from ..stepping.prescribed import NoRates
+from ..stepping.problem import StepProblem
 from ..stepping.solution import Solution
 from ..tolerances import TIME
 from .free_motions import free_motions
+from .minimum import MinimumCheck, held_nodes, is_indefinite
 from .redistribution import hold_detached, redistribute
 from .scheme import Equilibrium
+from .stability import LARGEST, LARGEST_WITH_MUMPS
 
 if TYPE_CHECKING:
     from ..stepping.model import Model
@@ -27,6 +31,8 @@ __all__ = ["StaticStepper"]
 
 _FEW = 5  # maximum number of Newton iterations after which the next increment is larger
 _GROWTH = 1.5
+UNCOUNTED = -2
+"""Of negative eigenvalues: there are some, whose number is unknown."""
 _RESISTANCE = 1e-3  # viscosity over stiffness with which a truss that nothing holds yet is moved against walls
 
 
@@ -56,9 +62,10 @@ class StaticStepper(ImplicitStepper):
     ----------
     increment : the next increment
     dissipated : energy dissipated by the viscosity of ``stabilise`` [J]
+    negatives : number of negative eigenvalues of the stiffness at the last load factor, -1 if unknown, UNCOUNTED
     """
 
-    kept_numbers = (*ImplicitStepper.kept_numbers, "increment", "dissipated")
+    kept_numbers = (*ImplicitStepper.kept_numbers, "increment", "dissipated", "negatives")
     columns = ("load_factor",)
     remedy = "reduce static.step"
 
@@ -70,6 +77,7 @@ class StaticStepper(ImplicitStepper):
         model.bars.step = np.inf  # laws that depend on the rate are at their limit of slow loading
         self.prescribed = NoRates(self)
         self.stabilise, self.dissipated = stabilise, 0.0
+        self.negatives = -1
         self._external = self.state.external  # of the last load factor
         self.limits, self.increment, self.end = limits, limits.step, limits.end
 
@@ -145,6 +153,53 @@ class StaticStepper(ImplicitStepper):
                 self._release()
         self.leave()
         state.step += 1
+
+    def solve(self, balance: Balance) -> Solution:
+        """See :meth:`~pfem_petsc.stepping.stepper.Stepper.solve`."""
+        solution = super().solve(balance)
+        if self._ends(balance):
+            self.negatives = self._falling(balance, solution)
+        return solution
+
+    def _ends(self, balance: Balance) -> bool:
+        """Return whether the solution of a balance is that at the last load factor."""
+        return balance.time >= self.end * (1.0 - TIME) and not balance.eta
+
+    def _falling(self, balance: Balance, solution: Solution) -> int:
+        """Return the number of directions in which the potential falls at a solution that is not committed yet, when
+        bars that yield still have the tangent of loading: see :attr:`negatives`. Collective."""
+        model, direct = self.model, self._choice.krylov == "preonly"
+        x = self.with_ghosts(balance.predictor + solution.u)
+        check = MinimumCheck(model, LARGEST_WITH_MUMPS if direct else LARGEST)
+        try:
+            if check.refusal is None:
+                return check.falling(x, solution.walls, balance.time)
+        finally:
+            check.destroy()
+        if direct:
+            return -1
+        problem = StepProblem(model, self.state, balance, self.state.external, Transform(model))
+        self.hessian.update(problem, solution.u)
+        held = held_nodes(model, solution.walls)
+        held[solution.walls.nodes[solution.walls.touching.any(axis=1)]] = True
+        return UNCOUNTED if is_indefinite(model, self.hessian, self.lagged, held) else -1
+
+    def doubts(self) -> list[str]:
+        """See :class:`~pfem_petsc.stepping.stepper.Stepper`."""
+        return [*super().doubts(), *self._instability(self.state.time)]
+
+    def _instability(self, load_factor: float) -> list[str]:
+        """Return what to tell about an unstable equilibrium."""
+        count = int(self.negatives)
+        if count in (-1, 0):
+            return []
+        many = "at least one" if count == UNCOUNTED else str(count)
+        return [
+            f"load factor {load_factor:.6g}: the equilibrium is unstable, with {many} negative "
+            f"eigenvalue{'s' * (count > 1)} of the stiffness: nothing perturbs the truss, which would not rest there "
+            "under constant loads. A bifurcation or limit point lies before it, which static.method = "
+            '"arc_length" locates; add a small perturbing load to reach a stable equilibrium'
+        ]
 
     def _solve(self, balance: Balance, guess: np.ndarray) -> Solution:
         """Solve; a truss that nothing holds before contact forces act is first moved against walls and links.

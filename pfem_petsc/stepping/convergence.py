@@ -30,7 +30,7 @@ def residual_tolerance(model: Model, balance: Balance, scale: float) -> float:
 
 
 def force_scale(model: Model, state: State, step: float) -> float:
-    """Return the largest 2-norm [N] of momentum per step of the given size [s], loads and internal forces. Collective."""
+    """Return the largest 2-norm [N] of momentum per step of a size [s], loads and internal forces. Collective."""
     owned = model.mesh.n_owned
     sums = np.array(
         [

@@ -116,17 +116,23 @@ class MinimumCheck:
             self.refusal = self._stability.refusal
         self._scale = max(model.comm.allgather(float(model.nodal_stiffness.max(initial=0.0))))
 
-    def falling(self, x: np.ndarray, walls: WallForces, time: float) -> int:
+    def falling(self, x: np.ndarray, walls: WallForces, time: float, bars: np.ndarray | None = None) -> int:
         """Number of negative eigenvalues of the stiffness at positions (local, 3), -1 where it cannot be factorised.
 
-        ``walls`` says which nodes walls push, ``time`` where the walls are. Collective.
+        ``walls`` says which nodes walls push, ``time`` where the walls are; ``bars`` (5, b) is their stiffness if not
+        the tangent, see ``Bars.linearise``. Collective.
         """
         nodes, blocks = self._held(walls, time)
         model, matrix = self.model, self._matrix
 
         def add(values: np.ndarray) -> None:
             matrix.add_lumped(np.full(model.mesh.n_owned, _ZERO * self._scale), values)
-            model.bars.tangents(x, 1.0, model.inertia.coefficients(0.0, 0.0), matrix.pattern, values)
+            if bars is None:
+                model.bars.tangents(x, 1.0, model.inertia.coefficients(0.0, 0.0), matrix.pattern, values)
+            else:
+                matrix.add_bars(bars, values)
+                if model.bars.springs is not None:
+                    model.bars.springs.add_tangents(1.0, matrix.pattern, values)
             matrix.add_blocks(nodes, _RIGID * self._scale * blocks, values)
             matrix.constrain(self._scale, values)
 

@@ -206,11 +206,10 @@ class PathStepper(StaticStepper):
 
     def _note(self, point: Point, g: np.ndarray) -> None:
         """Take account of what rounding leaves of the residual (owned, 3) [N] at a point. Collective."""
-        internal = self.system.problem.f[: len(g)]
-        sums = np.array([(array**2).sum() for array in (g, self.system.external(point.load_factor), internal)])
-        norm, *forces = np.sqrt(self.model.comm.allreduce(sums))
+        sums = np.array([(array**2).sum() for array in (g, self.system.external(point.load_factor))])
+        norm, force = np.sqrt(self.model.comm.allreduce(sums))
         required = self.points.tolerance(point.u, point.load_factor, 0.0).residual
-        self.resolution.note(float(max(forces)), float(norm) if norm > required else 0.0)
+        self.resolution.note(self.model, self.system.problem.x, float(force), float(norm), required)
 
     def _begin_path(self) -> bool:
         """Take the first point; return whether a step was made, because the start was not in equilibrium."""

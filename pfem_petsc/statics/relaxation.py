@@ -11,7 +11,6 @@ from ..contact.active_set import ActiveSet
 from ..contact.candidates import Candidates, expected_candidates
 from ..errors import InputError, NotConverged, SimulationFailure
 from ..integrators.base import Balance
-from ..stepping.implicit import ImplicitStepper
 from ..stepping.solution import Solution
 from ..tolerances import TIME
 from .minimum import MinimumCheck
@@ -102,15 +101,12 @@ class RelaxationStepper(StaticStepper):
             if parameters.newton:
                 solution = self._polish(balance)
                 if solution is not None:
-                    if self.minimum.refusal is not None and self._ends(balance):
-                        self.negatives = self._falling(balance, solution)
                     return solution
         solution = self._relaxed(balance)
-        if self._ends(balance) or (self.minimum is not None and self.minimum.refusal is None):
-            self.negatives = self._falling(balance, solution)
-            if not self._ends(balance):
-                for text in self._instability(balance.time):
-                    self.message(text)
+        if self.minimum is not None and self.minimum.refusal is None and balance.time < self.end * (1.0 - TIME):
+            self.negatives = self.minimum.falling(motion.x, solution.walls, motion.time)
+            for text in self._instability(motion.time):
+                self.message(text)
         return solution
 
     @property
@@ -127,7 +123,7 @@ class RelaxationStepper(StaticStepper):
         self.held = np.zeros_like(self.held)
         self.held[motion.held] = True
         try:
-            solution = ImplicitStepper.solve(self, balance)
+            solution = super().solve(balance)
         except NotConverged:
             state.contact, state.support, self.held = kept
             return None
@@ -139,10 +135,8 @@ class RelaxationStepper(StaticStepper):
         there, _ = motion.potential(x, energy)
         reached, collapsed = max(model.comm.allgather(float(away))), model.comm.allgather(energy.failed >= 0)
         failed = reached > _NEAR * model.length or there > here + _DOWN * size or sum(collapsed) > 0
-        self.negatives = -1
         if not failed and self.minimum.refusal is None:
-            self.negatives = self.minimum.falling(after, solution.walls, balance.time)
-            failed = self.negatives > 0
+            failed = self.minimum.falling(after, solution.walls, balance.time) > 0
         if failed:
             state.contact, state.support, self.held = kept
             return None
@@ -157,8 +151,7 @@ class RelaxationStepper(StaticStepper):
         pushed = (motion.contact[motion.held] != 0.0).any(axis=1)
         self.held = np.zeros_like(self.held)
         self.held[motion.held[pushed]] = True
-        lacking = motion.norm > self.parameters.tolerance * motion.load
-        self.resolution.note(motion.load, motion.norm if lacking else 0.0)
+        self.resolution.note(model, motion.x, motion.load, motion.norm, self.parameters.tolerance * motion.load)
         u = motion.x[:owned] - balance.predictor
         return Solution(u, motion.f.copy(), motion.walls, contacts=int(pushed.sum()))
 

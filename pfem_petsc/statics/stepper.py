@@ -154,34 +154,33 @@ class StaticStepper(ImplicitStepper):
         self.leave()
         state.step += 1
 
-    def solve(self, balance: Balance) -> Solution:
-        """See :meth:`~pfem_petsc.stepping.stepper.Stepper.solve`."""
-        solution = super().solve(balance)
-        if self._ends(balance):
-            self.negatives = self._falling(balance, solution)
-        return solution
+    def leave(self) -> None:
+        """See :func:`~pfem_petsc.statics.redistribution.redistribute`. Collective."""
+        redistribute(self)
+        if self.done:
+            self.negatives = self._falling()
 
-    def _ends(self, balance: Balance) -> bool:
-        """Return whether the solution of a balance is that at the last load factor."""
-        return balance.time >= self.end * (1.0 - TIME) and not balance.eta
+    def _falling(self) -> int:
+        """Return the number of directions in which the potential falls at the state, see :attr:`negatives`. Collective.
 
-    def _falling(self, balance: Balance, solution: Solution) -> int:
-        """Return the number of directions in which the potential falls at a solution that is not committed yet, when
-        bars that yield still have the tangent of loading: see :attr:`negatives`. Collective."""
-        model, direct = self.model, self._choice.krylov == "preonly"
-        x = self.with_ghosts(balance.predictor + solution.u)
+        Bars that yield resist with the stiffness of unloading, so that only the geometry and softening elastic laws
+        are found.
+        """
+        model, state, walls = self.model, self.state, self.solution.walls
+        direct, bars = self._choice.krylov == "preonly", model.bars.state_stiffness(state.x)
         check = MinimumCheck(model, LARGEST_WITH_MUMPS if direct else LARGEST)
         try:
             if check.refusal is None:
-                return check.falling(x, solution.walls, balance.time)
+                return check.falling(state.x, walls, state.time, bars)
         finally:
             check.destroy()
         if direct:
             return -1
-        problem = StepProblem(model, self.state, balance, self.state.external, Transform(model))
-        self.hessian.update(problem, solution.u)
-        held = held_nodes(model, solution.walls)
-        held[solution.walls.nodes[solution.walls.touching.any(axis=1)]] = True
+        balance = Equilibrium().balance(state, 0.0)
+        problem = StepProblem(model, state, balance, state.external, Transform(model))
+        self.hessian.put(problem, bars)
+        held = held_nodes(model, walls)
+        held[walls.nodes[walls.touching.any(axis=1)]] = True
         return UNCOUNTED if is_indefinite(model, self.hessian, self.lagged, held) else -1
 
     def doubts(self) -> list[str]:
@@ -232,10 +231,6 @@ class StaticStepper(ImplicitStepper):
         """Return whether contact is possible and nothing is in contact at the start of the increment. Collective."""
         model = self.model
         return model.can_touch and not model.comm.allreduce(int(self.state.contact.any()), op=MPI.MAX)
-
-    def leave(self) -> None:
-        """See :func:`~pfem_petsc.statics.redistribution.redistribute`. Collective."""
-        redistribute(self)
 
     def resume(self) -> None:
         """See :class:`~pfem_petsc.stepping.stepper.Stepper`. Collective."""

@@ -54,9 +54,15 @@ class Resolution:
     def __init__(self) -> None:
         self.numbers = [0.0, 0.0]
 
-    def note(self, scale: float, residual: float) -> None:
-        """Take account of a balance: the scale of its forces, and the residual beyond the tolerance or zero [N]."""
-        self.numbers = [max(self.numbers[0], scale), max(self.numbers[1], residual)]
+    def note(self, model: Model, x: np.ndarray, scale: float, residual: float, tolerance: float) -> None:
+        """Take account of a balance at local positions (nodes, 3), with a scale of its forces, the 2-norm of its
+        residual, and the tolerance of that [N]. Collective."""
+        forces, left = self.numbers
+        lacking = residual if residual > tolerance else 0.0
+        if lacking > _DOUBTFUL * max(scale, forces):  # the forces of bars may balance each other
+            bars = model.bars.state_stiffness(x)[4] * model.bars.lengths(x)
+            scale = max(scale, float(np.sqrt(model.comm.allreduce(float((bars[model.mesh.counted] ** 2).sum())))))
+        self.numbers = [max(forces, scale), max(left, lacking)]
 
     def doubts(self, model: Model) -> list[str]:
         """Return a text if the residuals are a noticeable share of the forces."""

@@ -254,11 +254,8 @@ class ImplicitStepper(HalvedSteps):
         held = model.links.count_held(np.flatnonzero(self.held), len(u))
         state.support = model.supports.part(g - state.contact)
         internal = problem.f if balance.weight else state.f
-        if report.norm > tolerance and self.accuracy:
-            inner = model.comm.allreduce(float((internal[: len(u)] ** 2).sum()))
-            self.resolution.note(max(scale, float(np.sqrt(inner))), report.norm)
-        else:
-            self.resolution.note(scale, 0.0)
+        if self.accuracy:
+            self.resolution.note(model, problem.x, scale, report.norm, tolerance)
         return Solution(u, internal, walls, newton, linear, held)
 
     def _tolerance(self, required: float) -> Tolerance:

@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 
 __all__ = ["Bars", "StrainEnergy"]
 
+_LOADING = 1e-8  # relative change of all lengths that distinguishes the tangents of loading and unloading
+_KINK = 1e-6  # relative difference of these tangents above which the bar is at a kink of its law
+
 _OF_SPRINGS = BAR_ENERGIES.index("spring_energy")
 
 
@@ -209,6 +212,24 @@ class Bars:
         without springs."""
         for block in self.blocks:
             block.kernels.linearise(*self._arguments(x, block), block.start, block.stop, weight, stored)
+
+    def state_stiffness(self, x: np.ndarray) -> np.ndarray:
+        """Return the stiffness of the bars (5, b) in the state at ``x``, as :meth:`linearise`.
+
+        If the law has a kink at the state, as on the yield surface, dN/dl is the larger one, that of unloading: small
+        motions about the state do not yield further. The strain rate has no effect.
+        """
+        stored, *around = np.zeros((3 if self.kept_names else 1, 5, len(self.rest)))
+        with self.without_rates():
+            self.linearise(x, 1.0, stored)
+            for sign, side in zip((-1.0, 1.0), around, strict=False):
+                self.linearise((1.0 + sign * _LOADING) * x, 1.0, side)
+        if around:
+            tangent = stored[3] + stored[4]
+            larger = np.maximum(*(side[3] + side[4] for side in around))
+            kink = larger - tangent > _KINK * np.abs(larger)
+            stored[3, kink] = (larger - stored[4])[kink]
+        return stored
 
     def stiffnesses(self, x: np.ndarray, weight: float, stored: np.ndarray) -> None:
         """Fill ``stored`` (2, b) with c = (dN/dl - N/l)/l^2 [N/m3] and g = N/l [N/m], times ``weight``: the stiffness

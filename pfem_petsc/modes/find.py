@@ -13,7 +13,7 @@ from petsc4py import PETSc
 from ..errors import SimulationFailure
 from .choice import choose, solver_module
 from .holds import Holds
-from .pencil import Pencil, StateMatrices, bar_stiffness, buckling_bars, join
+from .pencil import Pencil, StateMatrices, buckling_bars, join
 from .shapes import Basis, same
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ def find_modes(model: Model, state: State, settings: Settings, consistent: bool)
 def _vibration(
     model: Model, state: State, holds: Holds, matrices: StateMatrices, name: str, count: int, free: int
 ) -> Found:
-    bars = bar_stiffness(model, state.x)
+    bars = model.bars.state_stiffness(state.x)
     low, high = matrices.bounds(bars, holds.curvature)
     top = 2.0 * high + abs(low)
     stiffness = matrices.stiffness(bars, top * matrices.inertia.mass, holds.curvature)

@@ -24,10 +24,7 @@ from .holds import Holds
 if TYPE_CHECKING:
     from ..stepping.model import Model
 
-__all__ = ["Pencil", "StateMatrices", "bar_stiffness", "buckling_bars", "join"]
-
-_LOADING = 1e-8  # relative change of all lengths that distinguishes the tangents of loading and unloading
-_KINK = 1e-6  # relative difference of these tangents above which the bar is at a kink of its law
+__all__ = ["Pencil", "StateMatrices", "buckling_bars", "join"]
 
 
 @dataclass
@@ -54,39 +51,22 @@ class Pencil:
             matrix.destroy()
 
 
-def bar_stiffness(model: Model, x: np.ndarray) -> np.ndarray:
-    """Return the stiffness of the bars (5, b) at local positions (nodes, 3): direction, dN/dl - N/l, N/l [N/m].
-
-    If the law has a kink at the state, as on the yield surface, dN/dl is the larger one, that of unloading: small
-    vibrations about the state do not yield further. The strain rate has no effect.
-    """
-    bars = model.bars
-    with bars.without_rates():
-        stored = _linearised(model, x)
-        if bars.kept_names:
-            around = [_linearised(model, (1.0 + sign * _LOADING) * x) for sign in (-1.0, 1.0)]
-            tangent = stored[3] + stored[4]
-            larger = np.maximum(*(each[3] + each[4] for each in around))
-            kink = larger - tangent > _KINK * np.abs(larger)
-            stored[3, kink] = (larger - stored[4])[kink]
-    return stored
-
-
 def buckling_bars(model: Model, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the bars (5, b) of K0 and Kg, both on the geometry of the mesh; see :func:`bar_stiffness`.
+    """Return the bars (5, b) of K0 and Kg, both on the geometry of the mesh; see ``Bars.state_stiffness``.
 
     K0: dN/dl of the unstressed bars with their virgin material, along the bar. Kg: N/l0 across it, where N is the
     axial force at the local positions ``x``.
     """
     bars, points = model.bars, model.mesh.points
     lengths = bars.lengths(x)
-    force = bar_stiffness(model, x)[4] * lengths
+    force = bars.state_stiffness(x)[4] * lengths
     history, heat, rest = bars.history(), bars.heat, bars.rest
     step, bars.step = bars.step, 0.0
     try:
         bars.put_history(np.zeros_like(history))
         bars.heat, bars.rest = np.zeros_like(heat), bars.mesh_lengths
-        unloaded = _linearised(model, points)
+        unloaded = np.zeros((5, len(model.mesh.bars)))
+        bars.linearise(points, 1.0, unloaded)
     finally:
         bars.put_history(history)
         bars.heat, bars.rest, bars.step = heat, rest, step
@@ -97,12 +77,6 @@ def buckling_bars(model: Model, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     geometric[4] = force / bars.mesh_lengths
     geometric[3] = -geometric[4]
     return unloaded, geometric
-
-
-def _linearised(model: Model, x: np.ndarray) -> np.ndarray:
-    stored = np.zeros((5, len(model.mesh.bars)))
-    model.bars.linearise(x, 1.0, stored)
-    return stored
 
 
 class StateMatrices:

@@ -274,10 +274,12 @@ class Outputs:
         record_modes(self._analysis.stepper, self._writer, self._folder, self.progress)
 
     def tell_remarks(self) -> None:
-        """Report the observers' remarks, such as walls that were never touched. Collective."""
+        """Report the observers' remarks, such as walls that were never touched, and doubtful results. Collective."""
         for observer in self._observers:
             for text in observer.remarks():
                 self.progress.message(text)
+        for text in self._analysis.stepper.doubts():
+            self.progress.warning(text)
 
     def close(self, outcome: str) -> None:
         """Close the result file; the progress report stays open. Collective."""

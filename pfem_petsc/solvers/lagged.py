@@ -75,6 +75,11 @@ class LaggedPreconditioner:
         self._right = PETSc.Vec().createMPI((3 * mesh.n_owned, 3 * mesh.n_nodes), bsize=3, comm=mesh.comm)
         self._left = self._right.duplicate()
 
+    @property
+    def is_set_up(self) -> bool:
+        """Whether there is a preconditioner to apply."""
+        return self._problem is not None
+
     def drop(self) -> None:
         """Require a set-up in the next Newton iteration."""
         self._problem = None

@@ -206,6 +206,11 @@ class HessianMatrix:
         if problem.transform.bounded:
             self._change_coordinates(problem.transform)
 
+    def put(self, problem: StepProblem, bars: np.ndarray) -> None:
+        """Assemble at the predictor of a problem, with the stiffness (5, b) of ``Bars.linearise``. Collective."""
+        problem.place(np.zeros_like(problem.u))
+        self.fill(lambda values: problem.hessian_here(self, values, bars))
+
     def _change_coordinates(self, transform: Transform) -> None:
         """Compute ``bounded`` from ``mat``. Collective."""
         last = self.mat

@@ -66,6 +66,11 @@ class MatrixFreeHessian:
         self.x[:] = problem.x
         self.model.bars.stiffnesses(self.x, problem.balance.weight, self.stored)
 
+    def put(self, problem: StepProblem, bars: np.ndarray) -> None:
+        """Linearise at the predictor of a problem, with the stiffness (5, b) of ``Bars.linearise``. Collective."""
+        self.update(problem, np.zeros_like(problem.u))
+        self.stored[0], self.stored[1] = bars[3] / self.model.bars.lengths(self.x) ** 2, bars[4]
+
     def make_definite(self) -> None:
         """Drop negative eigenvalues of the bars' stiffness, due to compression or softening laws."""
         drop_negative(self.mesh.bars, self.x, self.stored)

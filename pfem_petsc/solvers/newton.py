@@ -5,9 +5,10 @@ from __future__ import annotations
 import re
 import weakref
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
+from mpi4py import MPI
 from petsc4py import PETSc
 
 from ..errors import InputError
@@ -22,14 +23,43 @@ from .reasons import is_failed_factorisation, linear_reason, newton_reason
 if TYPE_CHECKING:
     from ..mesh.distribution import DistributedMesh
 
-__all__ = ["NewtonReport", "NewtonSolver", "Problem", "zero_tolerance"]
+__all__ = ["STAGNATION", "NewtonReport", "NewtonSolver", "Problem", "Tolerance", "zero_tolerance"]
 
-_STAGNATION = 100.0  # a residual within this many rounding floors that no longer falls has converged
+STAGNATION = 100.0
+"""A residual within this many rounding errors that no longer falls has converged."""
 
 
 def zero_tolerance(length: float) -> float:
     """Return the distance from a bound [m] that counts as zero for a model of ``length`` [m]: rounding of positions."""
     return ROUNDING * length
+
+
+class Tolerance(NamedTuple):
+    """When a solve ends.
+
+    The 2-norm of the residual is required to be ``residual``. What rounding of positions leaves beyond that is accepted
+    after an iteration, node by node: a stiff bar must not hide that the load on a soft one is not balanced.
+
+    Attributes
+    ----------
+    residual : required 2-norm of the residual [N]
+    guess : the same of the guess, below which no iteration is made [N]
+    nodes : (owned,) residual of each node due to rounding [N]
+    rounding : 2-norm of these over all nodes [N]
+    """
+
+    residual: float
+    guess: float
+    nodes: np.ndarray
+    rounding: float
+
+    def rounded(self, norm: float, g: np.ndarray, factor: float, comm: MPI.Comm) -> bool:
+        """Return whether residuals (owned, 3) of a 2-norm [N] are due to rounding, up to a factor, and to the required
+        one beyond that. Collective."""
+        if not norm <= factor * self.rounding:
+            return False
+        beyond = np.maximum(np.linalg.norm(g, axis=1) - factor * self.nodes, 0.0)
+        return comm.allreduce(float((beyond**2).sum())) <= self.residual**2
 
 
 class Problem(Protocol):
@@ -98,8 +128,7 @@ class NewtonSolver:
         self,
         problem: Problem,
         u: np.ndarray,
-        tolerance: float,
-        floor: float,
+        tolerance: Tolerance,
         bounds: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> NewtonReport:
         """Solve in place. Collective.
@@ -109,14 +138,13 @@ class NewtonSolver:
         problem : Problem
         u : (owned, 3) float64
             Guess on entry, solution on exit [m].
-        tolerance, floor : float
-            Required 2-norm of the residual [N], and the norm that rounding allows.
+        tolerance : Tolerance
         bounds : pair of (owned, 3) arrays, optional
             Lower and upper bounds on u [m]; infinite where there is no bound.
         """
         snes = self._solver(bounds is not None)
         self.problem = problem
-        self._tolerance, self._floor = max(tolerance, floor), floor
+        self._tolerance, self._bounds, self._suffices = tolerance, bounds, False
         if bounds is not None:
             lower, upper = bounds
             self._lower.array[:] = np.maximum(lower, PETSc.NINFINITY).ravel()
@@ -124,6 +152,9 @@ class NewtonSolver:
             snes.setVariableBounds(self._lower, self._upper)
         start = u.copy()
         report = self._attempt(snes, start)
+        if not report.converged and self._suffices:
+            # the iteration that was to improve a sufficient guess failed, as where the stiffness is singular
+            return NewtonReport(True, report.newton, report.linear, self._first, "")
         if not report.converged and self.lagged is not None and self.lagged.carried:
             self.lagged.drop()
             snes = self._solver(bounds is not None)
@@ -176,7 +207,7 @@ class NewtonSolver:
             return report
         reason = snes.getConvergedReason()
         norm = snes.getFunctionNorm()
-        converged = reason > 0 or norm <= _STAGNATION * self._floor
+        converged = reason > 0 or self._rounded(norm, STAGNATION)
         why = ""
         if not converged:
             why = newton_reason(reason)
@@ -260,8 +291,20 @@ class NewtonSolver:
         previous, self._previous = self._previous, norm
         if not np.isfinite(norm):
             return PETSc.SNES.ConvergedReason.DIVERGED_FNORM_NAN
-        if norm <= self._tolerance:
+        tolerance = self._tolerance
+        if iteration == 0:
+            self._first, self._suffices = norm, norm <= tolerance.residual
+        if norm <= (tolerance.residual if iteration else tolerance.guess):
             return PETSc.SNES.ConvergedReason.CONVERGED_FNORM_ABS
-        if iteration >= 1 and norm > 0.5 * previous and norm <= _STAGNATION * self._floor:
+        if iteration and (self._rounded(norm, 1.0) or (norm > 0.5 * previous and self._rounded(norm, STAGNATION))):
             return PETSc.SNES.ConvergedReason.CONVERGED_SNORM_RELATIVE
         return PETSc.SNES.ConvergedReason.ITERATING
+
+    def _rounded(self, norm: float, factor: float) -> bool:
+        """Return whether the last residual, of the given 2-norm [N], is due to rounding up to a factor. Collective."""
+        g = self._g.array.reshape(self.mesh.n_owned, 3)
+        if self._bounds is not None:  # forces on active bounds are not part of the residual
+            w, near = self._u.array.reshape(g.shape), zero_tolerance(self.length)
+            lower, upper = self._bounds
+            g = np.where(((w <= lower + near) & (g > 0.0)) | ((w >= upper - near) & (g < 0.0)), 0.0, g)
+        return self._tolerance.rounded(norm, g, factor, self.mesh.comm)

@@ -56,7 +56,8 @@ def first_point(stepper: PathStepper) -> tuple[Point, bool]:
     state, system, points, u = stepper.state, stepper.system, stepper.points, np.zeros_like(stepper.zero)
     comm, newton, g = stepper.model.comm, 0, np.empty_like(u)
     system.residual(u, state.time, g)
-    moved = float(np.sqrt(dot(comm, g, g))) > points.tolerance(u, state.time, 0.0)
+    norm, tolerance = float(np.sqrt(dot(comm, g, g))), points.tolerance(u, state.time, 0.0)
+    moved = not (norm <= tolerance.residual or tolerance.rounded(norm, g, 1.0, comm))
     if moved:
         u, _, newton = points.newton(LoadFactor(0.0, stepper.keys.step), u, state.time)
     system.linearise(u)

@@ -54,7 +54,6 @@ class PathStepper(StaticStepper):
         *StaticStepper.kept_numbers,
         "arc",
         "slope",
-        "negatives",
         "weight",
         "scale",
         "ended",
@@ -139,7 +138,15 @@ class PathStepper(StaticStepper):
         text = f"the path ended at point {state.step}, load factor {state.time:.9g}"
         if self.direction is not None:
             text += f", displacement {self.direction.at(state.position):.6g} m"
-        return [f"{text}: {reached}", *super().remarks()]
+        text = f"{text}: {reached}"
+        if self.negatives > 0:
+            text += f"; the equilibrium there is unstable, with {int(self.negatives)} negative eigenvalue"
+            text += "s" * (self.negatives > 1) + " of the stiffness under constant loads"
+        return [text, *super().remarks()]
+
+    def doubts(self) -> list[str]:
+        """See :class:`~pfem_petsc.stepping.stepper.Stepper`; unstable parts of a path are no doubt, but in a remark."""
+        return self.resolution.doubts(self.model)
 
     def start(self) -> None:
         """See :class:`StaticStepper`. Collective."""
@@ -193,8 +200,16 @@ class PathStepper(StaticStepper):
         g = np.empty_like(point.u)
         self.system.imbalance(point.u, point.load_factor, g)
         self.state.support = self.model.supports.part(g)
+        self._note(point, g - self.state.support)
         walls = self.model.contact.nothing
         return Solution(point.u, self.system.problem.f, walls, point.newton, self.system.linear)
+
+    def _note(self, point: Point, g: np.ndarray) -> None:
+        """Take account of what rounding leaves of the residual (owned, 3) [N] at a point. Collective."""
+        sums = np.array([(array**2).sum() for array in (g, self.system.external(point.load_factor))])
+        norm, force = np.sqrt(self.model.comm.allreduce(sums))
+        required = self.points.tolerance(point.u, point.load_factor, 0.0).residual
+        self.resolution.note(self.model, self.system.problem.x, float(force), float(norm), required)
 
     def _begin_path(self) -> bool:
         """Take the first point; return whether a step was made, because the start was not in equilibrium."""

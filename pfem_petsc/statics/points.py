@@ -9,6 +9,7 @@ import numpy as np
 
 from ..errors import NotConverged
 from ..solvers.matrix import HessianMatrix
+from ..solvers.newton import STAGNATION, Tolerance
 from .path_constraints import dot
 from .stability import Stability
 
@@ -23,7 +24,6 @@ __all__ = ["Point", "PointSolver"]
 _MOST = 20  # Newton iterations of a point: more are no sign of a path
 _CLOSE = 1e-10  # value of the constraint, over the length of the step
 _NEAR = 1e-6  # the same, where it no longer falls
-_STAGNATION = 100.0  # as in the other solves: a residual within this many rounding floors that no longer falls
 
 
 @dataclass
@@ -104,7 +104,7 @@ class PointSolver:
     def newton(self, constraint: Constraint, u: np.ndarray, load_factor: float) -> tuple[np.ndarray, float, int]:
         system, start = self.system, self.state.time
         most = min(self.model.case.solver.max_newton, _MOST)
-        comm, floor = self.model.comm, self.model.rounding
+        comm = self.model.comm
         system.prescribe(u, load_factor)
         g, previous, before = np.empty_like(u), np.inf, np.inf
         tolerance = self.tolerance(u, load_factor, constraint.size)
@@ -114,11 +114,12 @@ class PointSolver:
             terms = constraint.terms(u, load_factor - start)
             if not np.isfinite(norm + terms.value):
                 raise NotConverged(f"{self.place}: Newton's method diverged: the residual is not finite")
-            stagnant = iteration >= 1 and norm > 0.5 * previous and norm <= _STAGNATION * floor
+            stagnant = iteration >= 1 and norm > 0.5 * previous and tolerance.rounded(norm, g, STAGNATION, comm)
             off = abs(terms.value) / constraint.size
             # beside a bifurcation rounding moves iterates along its modes, and no iteration brings them closer
             near = off <= _CLOSE or (iteration >= 2 and off <= _NEAR and off > 0.5 * before)
-            if (norm <= tolerance or stagnant) and near:
+            balanced = norm <= tolerance.residual or tolerance.rounded(norm, g, 1.0, comm)
+            if (balanced or stagnant) and near:
                 return u, load_factor, iteration
             previous, before = norm, off
             if iteration == most:
@@ -135,17 +136,18 @@ class PointSolver:
             system.prescribe(u, load_factor)
         raise NotConverged(
             f"{self.place}: no convergence after {most} Newton iterations: residual {norm:.3g} N, required "
-            f"{tolerance:.3g} N"
+            f"{tolerance.residual:.3g} N"
         )
 
-    def tolerance(self, u: np.ndarray, load_factor: float, size: float) -> float:
-        """Return the tolerance of the residual's 2-norm [N]: ``solver.rtol`` of external and internal forces."""
-        solver, state = self.model.case.solver, self.state
+    def tolerance(self, u: np.ndarray, load_factor: float, size: float) -> Tolerance:
+        """Return when a point is balanced: to ``solver.rtol`` of external and internal forces."""
+        model, solver, state = self.model, self.model.case.solver, self.state
         external, internal = self.system.external(load_factor), state.f[: len(u)]
         change = self.system.external(load_factor + size) - external
         sums = np.array([(array**2).sum() for array in (external, internal, change)])
         scale = float(np.sqrt(self.model.comm.allreduce(sums).max()))
-        return max(solver.rtol * scale, solver.atol or 0.0, self.model.rounding)
+        required = max(solver.rtol * scale, solver.atol or 0.0)
+        return Tolerance(required, required, model.node_rounding, model.rounding)
 
     def tangent(self, u: np.ndarray, load_factor: float) -> tuple[np.ndarray, float]:
         """Return the unit tangent at an equilibrium along which the load factor increases."""

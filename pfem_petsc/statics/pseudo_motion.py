@@ -23,6 +23,7 @@ from mpi4py import MPI
 from ..errors import SimulationFailure
 from ..mechanics.bars import StrainEnergy
 from ..parallel.agreement import agreed
+from ..solvers.newton import Tolerance
 from ..tolerances import PROJECTED
 from .dampings import DAMPINGS
 from .relaxation_loops import (
@@ -136,9 +137,13 @@ class PseudoMotion:
         """2-norm of the residual [N]."""
         return float(np.sqrt(self.sums[RESIDUAL]))
 
-    def required(self, tolerance: float) -> float:
-        """Return the 2-norm of the residual [N] that counts as equilibrium: a fraction of the load, or rounding."""
-        return max(tolerance * self.load, self.model.rounding)
+    def balanced(self, tolerance: float) -> bool:
+        """Return whether the residual is at most a fraction of the load, or rounding. Collective."""
+        model, required = self.model, tolerance * self.load
+        if self.norm <= required:
+            return True
+        rounding = Tolerance(required, required, model.node_rounding, model.rounding)
+        return rounding.rounded(self.norm, self.residual, 1.0, model.comm)
 
     def relax(self, tolerance: float, most: int) -> bool:
         """Move until the residual is ``tolerance`` of the load, or ``most`` pseudo-steps are made. Collective.
@@ -148,7 +153,7 @@ class PseudoMotion:
         SimulationFailure
             On all ranks, for collapsed bars, infeasible walls, or positions that are not finite.
         """
-        while self.steps < self._arrival or not self.norm <= self.required(tolerance):
+        while self.steps < self._arrival or not self.balanced(tolerance):
             if self.steps >= most:
                 return False
             self.damping.move(self)

@@ -103,7 +103,10 @@ class RelaxationStepper(StaticStepper):
                 if solution is not None:
                     return solution
         solution = self._relaxed(balance)
-        self._look_at_stability(solution)
+        if self.minimum is not None and self.minimum.refusal is None and balance.time < self.end * (1.0 - TIME):
+            self.negatives = self.minimum.falling(motion.x, solution.walls, motion.time)
+            for text in self._instability(motion.time):
+                self.message(text)
         return solution
 
     @property
@@ -112,19 +115,6 @@ class RelaxationStepper(StaticStepper):
         if self.minimum is None:
             return ()
         return _HANDOVERS if self.minimum.refusal is None else _HANDOVERS[-1:]
-
-    def _look_at_stability(self, solution: Solution) -> None:
-        """Warn about an unstable equilibrium. Collective."""
-        if self.minimum is None or self.minimum.refusal is not None:
-            return
-        motion = self.motion
-        count = self.minimum.falling(motion.x, solution.walls, motion.time)
-        if count > 0:
-            self.message(
-                f"load factor {motion.time:.6g}: the equilibrium is unstable, with {count} negative "
-                f"eigenvalue{'s' * (count > 1)} of the stiffness: nothing perturbs it, as from a "
-                "symmetric start; add a small perturbing load"
-            )
 
     def _polish(self, balance: Balance) -> Solution | None:
         """Return the solution of Newton's method from the relaxed positions, None if none is near. Collective."""
@@ -161,6 +151,7 @@ class RelaxationStepper(StaticStepper):
         pushed = (motion.contact[motion.held] != 0.0).any(axis=1)
         self.held = np.zeros_like(self.held)
         self.held[motion.held[pushed]] = True
+        self.resolution.note(model, motion.x, motion.load, motion.norm, self.parameters.tolerance * motion.load)
         u = motion.x[:owned] - balance.predictor
         return Solution(u, motion.f.copy(), motion.walls, contacts=int(pushed.sum()))
 
@@ -170,7 +161,7 @@ class RelaxationStepper(StaticStepper):
         size, node = motion.worst()
         return SimulationFailure(
             f"load factor {motion.time:.6g}: relaxation has not converged in {most} pseudo-steps: residual "
-            f"{motion.norm:.3g} N, required {motion.required(self.parameters.tolerance):.3g} N; worst at node {node} "
+            f"{motion.norm:.3g} N, required {self.parameters.tolerance * motion.load:.3g} N; worst at node {node} "
             f"({size:.3g} N). Increase static.max_iterations or static.tolerance; if the residual does not fall, "
             "nothing balances the load there"
         )

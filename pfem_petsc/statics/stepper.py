@@ -8,16 +8,21 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from mpi4py import MPI
 
+from ..contact.transform import Transform
 from ..errors import NotConverged, SimulationFailure
 from ..integrators.base import Balance
 from ..solvers.linear import LinearChoice
+from ..solvers.newton import Tolerance
 from ..stepping.implicit import ImplicitStepper
 from ..stepping.prescribed import NoRates
+from ..stepping.problem import StepProblem
 from ..stepping.solution import Solution
 from ..tolerances import TIME
 from .free_motions import free_motions
+from .minimum import MinimumCheck, held_nodes, is_indefinite
 from .redistribution import hold_detached, redistribute
 from .scheme import Equilibrium
+from .stability import LARGEST, LARGEST_WITH_MUMPS
 
 if TYPE_CHECKING:
     from ..stepping.model import Model
@@ -31,6 +36,8 @@ _STRONGER = 10.0  # factor on the viscosity where an increment fails
 _TRIED = 0.1  # of an increment, to which it is halved before the viscosity grows
 _WEAKER = 0.5  # the same after an increment
 _RELEASES = 20  # attempts to find the equilibrium at the end
+UNCOUNTED = -2
+"""Of negative eigenvalues: there are some, whose number is unknown."""
 _RESISTANCE = 1e-3  # viscosity over stiffness with which a truss that nothing holds yet is moved against walls
 _EXCEEDED = (
     "nodes moved far without load, as in a snap-through, and forces from there on contain the viscous force; compare "
@@ -68,9 +75,10 @@ class StaticStepper(ImplicitStepper):
     viscosity : of the next increment, relative to ``stabilise``
     dissipated : energy dissipated by the viscosity of ``stabilise`` [J]
     exceeded : whether its share has exceeded the largest
+    negatives : number of negative eigenvalues of the stiffness at the last load factor, -1 if unknown, UNCOUNTED
     """
 
-    kept_numbers = (*ImplicitStepper.kept_numbers, "increment", "viscosity", "dissipated", "exceeded")
+    kept_numbers = (*ImplicitStepper.kept_numbers, "increment", "viscosity", "dissipated", "exceeded", "negatives")
     columns = ("load_factor",)
     remedy = "reduce static.step"
 
@@ -84,6 +92,8 @@ class StaticStepper(ImplicitStepper):
         self.prescribed = NoRates(self)
         self.stabilise, self.share = stabilise, share
         self.viscosity, self.dissipated, self.exceeded = _LEAST, 0.0, False
+        self.negatives = -1
+        self._external = self.state.external  # of the last load factor
         self.limits, self.increment, self.end = limits, limits.step, limits.end
 
     @property
@@ -131,6 +141,7 @@ class StaticStepper(ImplicitStepper):
             On all ranks, if the smallest increment does not converge.
         """
         state, reached = self.state, min(self.end, self.removals.ends())
+        self._external = state.external
         left = reached - state.time
         size = first = self.increment if self.increment < left * (1.0 - TIME) else left
         while True:
@@ -164,6 +175,52 @@ class StaticStepper(ImplicitStepper):
         self.leave()
         state.step += 1
 
+    def leave(self) -> None:
+        """See :func:`~pfem_petsc.statics.redistribution.redistribute`. Collective."""
+        redistribute(self)
+        if self.done:
+            self.negatives = self._falling()
+
+    def _falling(self) -> int:
+        """Return the number of directions in which the potential falls at the state, see :attr:`negatives`. Collective.
+
+        Bars that yield resist with the stiffness of unloading, so that only the geometry and softening elastic laws
+        are found.
+        """
+        model, state, walls = self.model, self.state, self.solution.walls
+        direct, bars = self._choice.krylov == "preonly", model.bars.state_stiffness(state.x)
+        check = MinimumCheck(model, LARGEST_WITH_MUMPS if direct else LARGEST)
+        try:
+            if check.refusal is None:
+                return check.falling(state.x, walls, state.time, bars)
+        finally:
+            check.destroy()
+        if direct:
+            return -1
+        balance = Equilibrium().balance(state, 0.0)
+        problem = StepProblem(model, state, balance, state.external, Transform(model))
+        self.hessian.put(problem, bars)
+        held = held_nodes(model, walls)
+        held[walls.nodes[walls.touching.any(axis=1)]] = True
+        return UNCOUNTED if is_indefinite(model, self.hessian, self.lagged, held) else -1
+
+    def doubts(self) -> list[str]:
+        """See :class:`~pfem_petsc.stepping.stepper.Stepper`."""
+        return [*super().doubts(), *self._instability(self.state.time)]
+
+    def _instability(self, load_factor: float) -> list[str]:
+        """Return what to tell about an unstable equilibrium."""
+        count = int(self.negatives)
+        if count in (-1, 0):
+            return []
+        many = "at least one" if count == UNCOUNTED else str(count)
+        return [
+            f"load factor {load_factor:.6g}: the equilibrium is unstable, with {many} negative "
+            f"eigenvalue{'s' * (count > 1)} of the stiffness: nothing perturbs the truss, which would not rest there "
+            "under constant loads. A bifurcation or limit point lies before it, which static.method = "
+            '"arc_length" locates; add a small perturbing load to reach a stable equilibrium'
+        ]
+
     def _solve(self, balance: Balance, guess: np.ndarray) -> Solution:
         """Solve; a truss that nothing holds before contact forces act is first moved against walls and links.
 
@@ -184,14 +241,17 @@ class StaticStepper(ImplicitStepper):
             inertia.damp(damping)
         return super()._solve(balance, approach.u)
 
+    def _tolerance(self, required: float) -> Tolerance:
+        """As for implicit steps; the guess must also be accurate relative to the load that the increment adds, which
+        may be much smaller than the forces of a prestress."""
+        change = self.model.comm.allreduce(float(((self.state.external - self._external) ** 2).sum()))
+        guess = self.model.case.solver.rtol * float(np.sqrt(change)) if change else required
+        return super()._tolerance(required)._replace(guess=min(guess, required))
+
     def _untouched(self) -> bool:
         """Return whether contact is possible and nothing is in contact at the start of the increment. Collective."""
         model = self.model
         return model.can_touch and not model.comm.allreduce(int(self.state.contact.any()), op=MPI.MAX)
-
-    def leave(self) -> None:
-        """See :func:`~pfem_petsc.statics.redistribution.redistribute`. Collective."""
-        redistribute(self)
 
     def resume(self) -> None:
         """See :class:`~pfem_petsc.stepping.stepper.Stepper`. Collective."""

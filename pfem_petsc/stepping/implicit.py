@@ -20,9 +20,9 @@ from ..solvers.linear import LinearChoice, unsymmetric
 from ..solvers.mass import MassSolver
 from ..solvers.matrix import HessianMatrix
 from ..solvers.matrix_free import MatrixFreeHessian
-from ..solvers.newton import NewtonSolver, zero_tolerance
+from ..solvers.newton import NewtonSolver, Tolerance, zero_tolerance
 from ..tolerances import ON_BOUND
-from .convergence import failure_message, residual_tolerance
+from .convergence import Resolution, failure_message, force_scale, residual_tolerance
 from .guard import StepGuard
 from .halving import HalvedSteps
 from .problem import StepProblem
@@ -42,7 +42,7 @@ __all__ = ["ImplicitStepper"]
 class ImplicitStepper(HalvedSteps):
     """Solves steps by Newton's method, or as a variational inequality if contact is possible."""
 
-    kept_numbers = (*HalvedSteps.kept_numbers, "lagged_count")
+    kept_numbers = (*HalvedSteps.kept_numbers, "lagged_count", "resolved")
     kept_arrays = (*HalvedSteps.kept_arrays, "held", "lagged_place")
     kept_bars = ("lagged_history",)
 
@@ -55,6 +55,7 @@ class ImplicitStepper(HalvedSteps):
         self._after = np.zeros_like(self.state.x)
         self.held = np.zeros(model.mesh.n_owned, dtype=bool)  # nodes in contact with walls in the last step
         self.accuracy = 1.0  # of a solve, as a factor on the tolerance of steps; zero: to rounding
+        self.resolution = Resolution()
 
     def _make_solvers(self) -> None:
         """Create matrices and solvers for the supports as they are. Collective."""
@@ -99,6 +100,15 @@ class ImplicitStepper(HalvedSteps):
         for owner in (self.hessian, self.lagged, self._mass):
             if owner is not None:
                 owner.destroy()
+
+    @property
+    def resolved(self) -> list[float]:
+        """See :class:`~pfem_petsc.stepping.convergence.Resolution`."""
+        return self.resolution.numbers
+
+    @resolved.setter
+    def resolved(self, numbers: list[float]) -> None:
+        self.resolution.numbers = [float(number) for number in numbers]
 
     @property
     def lagged_count(self) -> list[float]:
@@ -199,7 +209,9 @@ class ImplicitStepper(HalvedSteps):
             model.change_bars(balance.time)
         if model.bars.viscous and balance.weight and self.scheme.inertial and not balance.discrete_gradient:
             self._set_rates(balance)
-        tolerance = self.accuracy * residual_tolerance(model, state, balance, self.part)
+        scale = force_scale(model, state, self.part)
+        tolerance = self.accuracy * residual_tolerance(model, balance, scale)
+        ends = self._tolerance(tolerance)
         active_set = ActiveSet(model, self.state, balance, self.held, self.links, self.remedy)
         candidates, links = self._candidates(active_set, balance), active_set.links
         newton = linear = 0
@@ -213,11 +225,11 @@ class ImplicitStepper(HalvedSteps):
             w = problem.coordinates(near)
             bounds = active_set.bounds(trial, near, w)
             w = bounds.clip(w)
-            report = self.newton.solve(problem, w, tolerance, model.rounding, bounds.arrays)
+            report = self.newton.solve(problem, w, ends, bounds.arrays)
             relaxed = not report.converged and active_set.relax(trial)
             if not report.converged and not relaxed and not trial.transform.identity:
                 w = bounds.clip(problem.coordinates(active_set.approach(trial, problem, guess)))
-                report = report.then(self.newton.solve(problem, w, tolerance, model.rounding, bounds.arrays))
+                report = report.then(self.newton.solve(problem, w, ends, bounds.arrays))
             newton += report.newton
             linear += report.linear
             if relaxed:
@@ -244,6 +256,8 @@ class ImplicitStepper(HalvedSteps):
         held = model.links.count_held(np.flatnonzero(self.held), len(u))
         state.support = model.supports.part(g - state.contact)
         internal = problem.f if balance.weight else state.f
+        if self.accuracy:
+            self.resolution.note(model, problem.x, scale, report.norm, tolerance)
         return Solution(u, internal, walls, newton, linear, held)
 
     def _set_rates(self, balance: Balance) -> None:
@@ -254,6 +268,18 @@ class ImplicitStepper(HalvedSteps):
         state, w = self.state, balance.weight
         v = balance.v_hat if w == 1.0 else (balance.v_hat - (1.0 - w) * state.v) / w
         self.model.bars.set_rates(state.x, self.on_all(balance.predictor), self.on_all(v), balance.eta / w)
+
+    def _tolerance(self, required: float) -> Tolerance:
+        """Return when a solve ends that requires a residual [N]. Collective."""
+        model = self.model
+        nodes = model.node_rounding
+        if model.links:  # whose coordinates mix the residuals of nodes
+            nodes = np.full_like(nodes, model.rounding)
+        return Tolerance(required, required, nodes, model.rounding)
+
+    def doubts(self) -> list[str]:
+        """See :class:`~pfem_petsc.stepping.stepper.Stepper`."""
+        return self.resolution.doubts(self.model)
 
     def _candidates(self, active_set: ActiveSet, balance: Balance) -> Candidates:
         """Return the nodes that walls may stop, for the first solve. Collective."""

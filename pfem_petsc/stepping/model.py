@@ -55,7 +55,7 @@ class Model:
     reach : largest coordinate magnitude [m], which sets the rounding of positions
     size : length that tolerances are relative to [m], see :mod:`~pfem_petsc.tolerances`
     nodal_stiffness : (owned,) sum of E A/l0 of a node's bars [N/m]
-    rounding : 2-norm of the residual due to rounding of positions [N]
+    node_rounding, rounding : residuals of nodes (owned,) due to rounding of positions [N], and their 2-norm
     warnings : about the mesh
     links : pairs and constraints that couple nodes to nodes, see :mod:`pfem_petsc.contact.links`
     can_touch : whether nodes can touch walls or each other
@@ -105,8 +105,9 @@ class Model:
             _node_stiffness(mesh.bars, self.bars.rest, block.start, block.stop, axial, stiffness)
         self.nodal_stiffness = stiffness[: mesh.n_owned].copy()
         with np.errstate(over="ignore"):  # stiffness that overflows is refused by the plan
+            self.node_rounding = 4.0 * np.finfo(float).eps * self.reach * self.nodal_stiffness
             squares = comm.allreduce(float((self.nodal_stiffness**2).sum()))
-        self.rounding = 4.0 * np.finfo(float).eps * self.reach * np.sqrt(squares)
+            self.rounding = 4.0 * np.finfo(float).eps * self.reach * np.sqrt(squares)
         self.total_mass = comm.allreduce(float(self.inertia.mass.sum()))
         speeds = [np.sqrt(m.upper_modulus() / m.density) for m in case.material.values()]
         self.wave_speed = max(speeds)

@@ -260,6 +260,10 @@ class Stepper(ABC):
         """What users should know at the end of a run."""
         return []
 
+    def doubts(self) -> list[str]:
+        """What makes results doubtful, as warnings at the end of a run. Collective."""
+        return []
+
     def settle(self) -> None:  # noqa: B027 - steps leave nothing to settle, static ones aside
         """Reduce the residual of a static state to rounding, before a stage that begins there. Collective."""
 

@@ -94,7 +94,7 @@ def next_equilibrium(model: Model, state: State, size: float) -> str:
     finally:
         for thing in (system, stability, matrix):
             thing.destroy()
-    return "the stiffness shows no limit point"
+    return "the stiffness shows no limit point: a smaller static.min_step or a larger solver.max_newton may help"
 
 
 def _text(model: Model, state: State, free: list[np.ndarray]) -> str:

@@ -211,11 +211,11 @@ class NewtonSolver:
 
     def _without_definiteness(self, start: np.ndarray, contact: bool, careful: bool) -> NewtonReport:
         """Solve with a method for indefinite tangents after conjugate gradients has failed."""
-        snes = self._solver(contact, careful)
+        ksp = self._solver(contact, careful).getKSP()
         choice, ours = self.bounded if contact else self.choice, self._ours.get((contact, careful))
-        configure(snes.getKSP(), LinearChoice("gmres", choice.preconditioner, "indefinite"), True, ours)
+        configure(ksp, LinearChoice("gmres", choice.preconditioner, "indefinite"), True, ours)
         report = self._attempt(start, contact, careful)
-        configure(snes.getKSP(), choice, contact, ours)
+        configure(ksp, choice, contact, ours)
         return report
 
     def _solver(self, contact: bool, careful: bool = False) -> PETSc.SNES:

@@ -65,8 +65,8 @@ class NewtonSolver:
 
     Newton's method makes full steps. The residual of a stiff bar that turns rises by orders of magnitude in the first,
     and a line search that demands a decrease would make steps that are far too short. Full steps have failed if the
-    residual rises and the truss gives way along the step, or if a step after such a rise is not shorter than all
-    before (natural monotonicity, Deuflhard 2004). The solve is then repeated with a line search. If the user's options
+    residual rises and the truss gives way along the step, or if a later step is not shorter than that of the rise
+    (natural monotonicity, Deuflhard 2004). The solve is then repeated with a line search. If the user's options
     select a method or a line search, no other is used.
 
     Options: prefix ``pfem_`` for free steps, ``pfem_contact_`` for steps with bounds, which have their own linear
@@ -101,8 +101,8 @@ class NewtonSolver:
         self._solvers: dict[tuple[bool, bool], PETSc.SNES] = {}
         self.problem: Problem | None = None
         self._ours: dict[tuple[bool, bool], Preconditioning] = {}
-        self._previous = self._shortest = np.inf
-        self._full = self._rose = False
+        self._previous = self._longest = np.inf
+        self._full = False
         self._place = np.zeros((mesh.n_owned, 3))  # the last iterate of full steps
 
     def solve(
@@ -184,8 +184,7 @@ class NewtonSolver:
         if contact:
             snes.setVariableBounds(self._lower, self._upper)
         self._u.array[:] = start.ravel()
-        self._previous = self._shortest = np.inf
-        self._rose = False
+        self._previous = self._longest = np.inf
         try:
             snes.solve(None, self._u)
         except PETSc.Error as error:
@@ -272,13 +271,12 @@ class NewtonSolver:
             return PETSc.SNES.ConvergedReason.CONVERGED_FNORM_ABS
         if iteration >= 1 and norm > 0.5 * previous and norm <= _STAGNATION * self._floor:
             return PETSc.SNES.ConvergedReason.CONVERGED_SNORM_RELATIVE
-        if self._full and self._rose and not step < self._shortest:
-            return PETSc.SNES.ConvergedReason.DIVERGED_DTOL
-        self._shortest = min(self._shortest, step) if iteration else np.inf
         if self._full:
+            if not step < self._longest:
+                return PETSc.SNES.ConvergedReason.DIVERGED_DTOL
             place = snes.getSolution().getArray(readonly=True).reshape(self._place.shape)
             if norm > previous:
-                self._rose = True
+                self._longest = step
                 if not self._stiffens(self._place, place):
                     return PETSc.SNES.ConvergedReason.DIVERGED_DTOL
             self._place[:] = place

@@ -13,7 +13,7 @@ from .parser import PROGRAM
 
 __all__ = ["PREFIXES", "start_petsc", "without_effect"]
 
-PREFIXES = ("pfem_contact_full_", "pfem_contact_", "pfem_assembled_", "pfem_coarse_", "pfem_mass_", "pfem_")
+PREFIXES = ("pfem_contact_", "pfem_assembled_", "pfem_coarse_", "pfem_mass_", "pfem_")
 """Prefixes of the program's solvers, described in docs/linear_solvers.md."""
 
 _SOLVER = ("snes_", "ksp_", "pc_", "mg_", "sub_", "mat_mumps_", "esteig_", "linesearch_")

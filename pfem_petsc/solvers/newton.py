@@ -27,6 +27,9 @@ __all__ = ["STAGNATION", "NewtonReport", "NewtonSolver", "Problem", "Tolerance",
 
 STAGNATION = 100.0
 """A residual within this many rounding errors that no longer falls has converged."""
+_CAREFUL = "bt"  # PETSc's line search where full steps fail
+_SAMPLES = np.linspace(0.0, 1.0, 9)  # of a step
+_PREFIXES = "pfem_", "pfem_contact_"  # of steps without bounds, and with bounds
 
 
 def zero_tolerance(length: float) -> float:
@@ -89,9 +92,14 @@ class NewtonReport:
 class NewtonSolver:
     """Solves for the position increment of a step; created once per run.
 
-    Options: prefix ``pfem_`` for free steps, ``pfem_contact_`` for steps with bounds, and ``pfem_contact_full_`` for
-    steps with bounds that are repeated without a line search. Steps with bounds have their own linear solver,
-    ``bounded``.
+    Newton's method makes full steps. The residual of a stiff bar that turns rises by orders of magnitude in the first,
+    and a line search that demands a decrease would make steps that are far too short. Full steps have failed if the
+    residual rises and the truss gives way along the step, or if a later step is not shorter than that of the rise
+    (natural monotonicity, Deuflhard 2004). The solve is then repeated with a line search. If the user's options
+    select a method or a line search, no other is used.
+
+    Options: prefix ``pfem_`` for free steps, ``pfem_contact_`` for steps with bounds, which have their own linear
+    solver, ``bounded``.
 
     Attributes
     ----------
@@ -122,7 +130,9 @@ class NewtonSolver:
         self._solvers: dict[tuple[bool, bool], PETSc.SNES] = {}
         self.problem: Problem | None = None
         self._ours: dict[tuple[bool, bool], Preconditioning] = {}
-        self._previous = np.inf
+        self._previous = self._longest = np.inf
+        self._full = False
+        self._place = np.zeros((mesh.n_owned, 3))  # the last iterate of full steps
 
     def solve(
         self,
@@ -142,29 +152,23 @@ class NewtonSolver:
         bounds : pair of (owned, 3) arrays, optional
             Lower and upper bounds on u [m]; infinite where there is no bound.
         """
-        snes = self._solver(bounds is not None)
+        contact = bounds is not None
         self.problem = problem
         self._tolerance, self._bounds, self._suffices = tolerance, bounds, False
-        if bounds is not None:
+        if contact:
             lower, upper = bounds
             self._lower.array[:] = np.maximum(lower, PETSc.NINFINITY).ravel()
             self._upper.array[:] = np.minimum(upper, PETSc.INFINITY).ravel()
-            snes.setVariableBounds(self._lower, self._upper)
-        start = u.copy()
-        report = self._attempt(snes, start)
+        start, options = u.copy(), PETSc.Options(_PREFIXES[contact])
+        self._full = not (options.hasName("snes_linesearch_type") or options.hasName("snes_type"))
+        report = self._search(start, contact)
         if not report.converged and self._suffices:
             # the iteration that was to improve a sufficient guess failed, as where the stiffness is singular
             return NewtonReport(True, report.newton, report.linear, self._first, "")
-        if not report.converged and self.lagged is not None and self.lagged.carried:
-            self.lagged.drop()
-            snes = self._solver(bounds is not None)
-            if bounds is not None:
-                snes.setVariableBounds(self._lower, self._upper)
-            report = report.then(self._attempt(snes, start))
-        if not report.converged and "INDEFINITE" in report.why or "BREAKDOWN" in report.why:
-            report = self._without_definiteness(snes, start, report)
-        if not report.converged and bounds is not None and "LINE_SEARCH" in report.why:
-            report = self._with_full_steps(start, report)
+        # after steps that converge, but slowly, or if the first cannot be made, a line search does not help
+        if self._full and not report.converged and 0 < report.newton < self.max_newton:
+            self._full = False
+            report = report.then(self._search(start, contact, careful=True))
         u[:] = self._u.array.reshape(u.shape)
         return report
 
@@ -193,9 +197,24 @@ class NewtonSolver:
         for vector in (self._u, self._g, self._lower, self._upper):
             vector.destroy()
 
-    def _attempt(self, snes: PETSc.SNES, start: np.ndarray) -> NewtonReport:
+    def _search(self, start: np.ndarray, contact: bool, careful: bool = False) -> NewtonReport:
+        """Solve from a guess, with full steps or with a line search, and with another linear solver if necessary."""
+        report = self._attempt(start, contact, careful)
+        if not report.converged and self.lagged is not None and self.lagged.carried:
+            self.lagged.drop()
+            report = report.then(self._attempt(start, contact, careful))
+        if "INDEFINITE" in report.why or "BREAKDOWN" in report.why:
+            report = report.then(self._without_definiteness(start, contact, careful))
+        if (careful or not report.converged) and (contact, careful) in self._solvers:
+            self._solvers[contact, careful].getKSP().reset()  # only one keeps a factorisation
+        return report
+
+    def _attempt(self, start: np.ndarray, contact: bool, careful: bool) -> NewtonReport:
+        snes = self._solver(contact, careful)
+        if contact:
+            snes.setVariableBounds(self._lower, self._upper)
         self._u.array[:] = start.ravel()
-        self._previous = np.inf
+        self._previous = self._longest = np.inf
         try:
             snes.solve(None, self._u)
         except PETSc.Error as error:
@@ -203,7 +222,10 @@ class NewtonSolver:
                 raise
             why = "a linear solve failed; linear solver: MUMPS could not factorise the matrix (a singular matrix)"
             report = NewtonReport(False, snes.getIterationNumber(), 0, self._g.norm(), why)
-            self._drop(snes)
+            # the error has left the solver in the middle of a solve; the next solve makes another
+            del self._solvers[contact, careful]
+            self._ours.pop((contact, careful), None)
+            snes.destroy()
             return report
         reason = snes.getConvergedReason()
         norm = snes.getFunctionNorm()
@@ -216,41 +238,21 @@ class NewtonSolver:
                 why += f"; linear solver: {linear_reason(linear)}"
         return NewtonReport(converged, snes.getIterationNumber(), snes.getLinearSolveIterations(), norm, why)
 
-    def _drop(self, snes: PETSc.SNES) -> None:
-        """Destroy a solver that an error has left in the middle of a solve; the next makes another. Collective."""
-        key = next(key for key, solver in self._solvers.items() if solver is snes)
-        del self._solvers[key]
-        self._ours.pop(key, None)
-        snes.destroy()
-
-    def _without_definiteness(self, snes: PETSc.SNES, start: np.ndarray, first: NewtonReport) -> NewtonReport:
-        """Repeat the solve with a method for indefinite tangents after conjugate gradients has failed."""
-        ksp = snes.getKSP()
-        bounds = snes.getType() == "vinewtonrsls"
-        choice = self.bounded if bounds else self.choice
-        ours = self._ours.get((bounds, False))
+    def _without_definiteness(self, start: np.ndarray, contact: bool, careful: bool) -> NewtonReport:
+        """Solve with a method for indefinite tangents after conjugate gradients has failed."""
+        ksp = self._solver(contact, careful).getKSP()
+        choice, ours = self.bounded if contact else self.choice, self._ours.get((contact, careful))
         configure(ksp, LinearChoice("gmres", choice.preconditioner, "indefinite"), True, ours)
-        second = self._attempt(snes, start)
-        configure(ksp, choice, bounds, ours)
-        return NewtonReport(
-            second.converged, first.newton + second.newton, first.linear + second.linear, second.norm, second.why
-        )
+        report = self._attempt(start, contact, careful)
+        configure(ksp, choice, contact, ours)
+        return report
 
-    def _with_full_steps(self, start: np.ndarray, first: NewtonReport) -> NewtonReport:
-        """Repeat the solve with full steps: in oblique coordinates the residual may grow before it decreases."""
-        snes = self._solver(True, full_steps=True)
-        snes.setVariableBounds(self._lower, self._upper)
-        return first.then(self._attempt(snes, start))
-
-    def _solver(self, contact: bool, full_steps: bool = False) -> PETSc.SNES:
-        key = contact, full_steps
+    def _solver(self, contact: bool, careful: bool = False) -> PETSc.SNES:
+        key = contact, careful
         if key in self._solvers:
             return self._solvers[key]
         snes = PETSc.SNES().create(self.mesh.comm)
-        prefix = "pfem_contact_full_" if full_steps else "pfem_contact_" if contact else "pfem_"
-        snes.setOptionsPrefix(prefix)
-        if full_steps:
-            PETSc.Options(prefix)["snes_linesearch_type"] = "basic"
+        snes.setOptionsPrefix(_PREFIXES[contact])
         snes.setType("vinewtonrsls" if contact else "newtonls")
         # Methods are looked up at each call, because log events may be wrapped around them later. PETSc's solver must
         # not keep this object alive, which owns it: Python's garbage collector cannot see such a cycle.
@@ -260,19 +262,23 @@ class NewtonSolver:
         snes.setJacobian(lambda *arguments: this()._hessian(*arguments), matrix, matrix)
         snes.setTolerances(rtol=0.0, atol=0.0, stol=0.0, max_it=self.max_newton)
         snes.setConvergenceTest(lambda *arguments: this()._converged(*arguments))
+        defaults: dict[str, str | float] = {"snes_linesearch_type": _CAREFUL if careful else "basic"}
         if contact:
             # PETSc's default of 1e-8 is absolute: a node that close to its bound would be fixed there, off the bound
-            options = PETSc.Options(snes.getOptionsPrefix())
-            ours = not options.hasName("snes_vi_zero_tolerance")
-            if ours:
-                options["snes_vi_zero_tolerance"] = zero_tolerance(self.length)
+            defaults["snes_vi_zero_tolerance"] = zero_tolerance(self.length)
         if self.lagged is not None:
             self._ours[key] = Preconditioning(self.lagged, self, snes, bounded=contact)
         configure(snes.getKSP(), self.bounded if contact else self.choice, contact, self._ours.get(key))
-        snes.setFromOptions()
-        if contact and ours:
-            # options are global to the process, but the next model has another length
-            options.delValue("snes_vi_zero_tolerance")
+        # options are global to the process, but the next solver has other defaults
+        options = PETSc.Options(_PREFIXES[contact])
+        defaults = {name: value for name, value in defaults.items() if not options.hasName(name)}
+        for name, value in defaults.items():
+            options[name] = value
+        try:
+            snes.setFromOptions()
+        finally:
+            for name in defaults:
+                options.delValue(name)
         self._solvers[key] = snes
         at_exit(outlive, snes)
         return snes
@@ -287,7 +293,7 @@ class NewtonSolver:
         self.hessian.update(self.problem, array)
 
     def _converged(self, snes: PETSc.SNES, iteration: int, norms: tuple[float, float, float]) -> int:
-        norm = norms[2]
+        _, step, norm = norms
         previous, self._previous = self._previous, norm
         if not np.isfinite(norm):
             return PETSc.SNES.ConvergedReason.DIVERGED_FNORM_NAN
@@ -298,6 +304,15 @@ class NewtonSolver:
             return PETSc.SNES.ConvergedReason.CONVERGED_FNORM_ABS
         if iteration and (self._rounded(norm, 1.0) or (norm > 0.5 * previous and self._rounded(norm, STAGNATION))):
             return PETSc.SNES.ConvergedReason.CONVERGED_SNORM_RELATIVE
+        if self._full:
+            if not step < self._longest:
+                return PETSc.SNES.ConvergedReason.DIVERGED_DTOL
+            place = snes.getSolution().getArray(readonly=True).reshape(self._place.shape)
+            if norm > previous:
+                self._longest = step
+                if not self._stiffens(self._place, place):
+                    return PETSc.SNES.ConvergedReason.DIVERGED_DTOL
+            self._place[:] = place
         return PETSc.SNES.ConvergedReason.ITERATING
 
     def _rounded(self, norm: float, factor: float) -> bool:
@@ -308,3 +323,17 @@ class NewtonSolver:
             lower, upper = self._bounds
             g = np.where(((w <= lower + near) & (g > 0.0)) | ((w >= upper - near) & (g < 0.0)), 0.0, g)
         return self._tolerance.rounded(norm, g, factor, self.mesh.comm)
+
+    def _stiffens(self, start: np.ndarray, end: np.ndarray) -> bool:
+        """Return whether the force along a step grows from its start to its end. Collective.
+
+        It does where bars turn. Where it falls in between, the truss gives way, and the solution at which full steps
+        arrive may be that of a truss that has snapped.
+        """
+        step = end - start
+        g, along = np.empty_like(step), np.empty(len(_SAMPLES))
+        for k, part in enumerate(_SAMPLES):
+            self.problem.residual(start + part * step, g)
+            along[k] = (g * step).sum()
+        self.mesh.comm.Allreduce(MPI.IN_PLACE, along)
+        return bool((np.diff(along) > 0.0).all())

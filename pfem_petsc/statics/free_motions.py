@@ -1,4 +1,4 @@
-"""Motions of a truss without stiffness: rigid-body motions and mechanisms, with the nodes that move."""
+"""What the stiffness shows where no equilibrium follows: motions that it does not resist, and limit points."""
 
 from __future__ import annotations
 
@@ -6,11 +6,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
+from petsc4py import PETSc
 
 from ..contact.transform import Transform
 from ..errors import NotConverged
+from ..solvers.linear import DIRECT, LinearChoice
 from ..solvers.matrix import HessianMatrix
 from ..stepping.problem import StepProblem
+from .bordered import BorderedSystem
 from .scheme import Equilibrium
 from .stability import LARGEST, Stability
 
@@ -18,12 +21,13 @@ if TYPE_CHECKING:
     from ..integrators.base import State
     from ..stepping.model import Model
 
-__all__ = ["free_motions"]
+__all__ = ["free_motions", "next_equilibrium"]
 
 _ZERO = 1e-11  # of the largest stiffness of a node; limit points that steps come close to have 1e-6 and more
 _MOST = 8  # motions that are looked at
 _TOLD = 3
 _NAMED = 4  # nodes besides the one that moves most
+_AHEAD = 2.0, 0.5, 0.1, 0.02  # of an increment: near a limit point the response to a whole one is too large
 _MOVES = 0.3  # of the largest displacement of a motion, above which a node is named
 
 
@@ -49,6 +53,48 @@ def free_motions(model: Model, state: State) -> str:
         stability.destroy()
         matrix.destroy()
     return _text(model, state, free)
+
+
+def next_equilibrium(model: Model, state: State, size: float) -> str:
+    """What the tangent stiffness shows about the load factors up to ``size`` beyond an equilibrium. Collective.
+
+    The response to the load becomes infinite at a limit point. If one is nearer than an increment, twice this increment
+    times the response is a displacement to states beyond it, where eigenvalues are negative, or zero in plastic
+    mechanisms.
+    """
+    unknowns = 3 * model.mesh.n_nodes
+    if model.can_touch:
+        return "it may be a limit point, which is not examined where contact is possible"
+    if unknowns > LARGEST:
+        return f"it may be a limit point, which is not examined for {unknowns:,} unknowns, more than {LARGEST:,}"
+    matrix = HessianMatrix(model.mesh, model.supports)
+    stability = Stability(model, matrix)
+    choice = LinearChoice("preonly", DIRECT[not stability.dense], "of the response")
+    system = BorderedSystem(model, matrix, choice, None, Equilibrium(), size)
+    try:
+        if stability.refusal is not None:
+            return f"it may be a limit point, which is not examined: {stability.refusal}"
+        system.begin(state)
+        rest = np.zeros_like(state.position)
+        system.linearise(rest)
+        here = stability.look().negatives
+        if here:
+            return (
+                f"the equilibrium is unstable there, with {here} negative eigenvalue{'s' * (here > 1)} of the stiffness"
+            )
+        move = size * system.response(rest, state.time)
+        scale = model.comm.allreduce(float(model.nodal_stiffness.max(initial=0.0)), op=MPI.MAX)
+        for part in _AHEAD:
+            matrix.update(system.problem, part * move)
+            there = stability.look()
+            if there.negatives or there.nearest < _ZERO * scale:
+                return "it is a limit point: the stiffness becomes singular there"
+    except (NotConverged, np.linalg.LinAlgError, PETSc.Error):
+        return "it may be a limit point: the stiffness cannot be factorised there"
+    finally:
+        for thing in (system, stability, matrix):
+            thing.destroy()
+    return "the stiffness shows no limit point: a smaller static.min_step or a larger solver.max_newton may help"
 
 
 def _text(model: Model, state: State, free: list[np.ndarray]) -> str:

@@ -18,7 +18,7 @@ from ..stepping.prescribed import NoRates
 from ..stepping.problem import StepProblem
 from ..stepping.solution import Solution
 from ..tolerances import TIME
-from .free_motions import free_motions
+from .free_motions import free_motions, next_equilibrium
 from .minimum import MinimumCheck, held_nodes, is_indefinite
 from .redistribution import hold_detached, redistribute
 from .scheme import Equilibrium
@@ -346,21 +346,23 @@ class StaticStepper(ImplicitStepper):
 
     def _no_further(self, failure: NotConverged) -> SimulationFailure:
         """Return the message about the load factor beyond which no equilibrium was found."""
-        slips = ""
         others = (
             'static.method = "arc_length" follows the path beyond a limit point, static.stabilise and dynamic stages '
             'pass jumps, such as struts that snap, and "relaxation" finds the equilibrium of slack structures'
         )
-        if self.model.can_touch:
+        model, smallest = self.model, self.limits.smallest
+        free = free_motions(model, self.state)
+        cause = "part of the truss is a mechanism" if free else next_equilibrium(model, self.state, 2.0 * smallest)
+        if model.can_touch:
+            cause += ", or part of the truss is a mechanism"
             others = "static.stabilise, or supports that move the truss instead of loads, pass a limit point"
-            if self.model.contact.any and self.model.contact.symmetric:
+            if model.contact.any and model.contact.symmetric:
                 others = f"walls without friction do not hold nodes along them: add supports; {others}"
-            elif self.model.contact.any:
-                slips = ", or the friction of walls does not hold it"
+            elif model.contact.any:
+                cause += ", or the friction of walls does not hold it"
         return SimulationFailure(
-            f"no equilibrium found beyond load factor {self.state.time:.6g} with increments down to "
-            f"{self.limits.smallest:.3g}: it is a limit point, or part of the truss is a mechanism{slips}; "
-            f"{others}. The last attempt: {failure}{free_motions(self.model, self.state)}"
+            f"no equilibrium found beyond load factor {self.state.time:.6g} with increments down to {smallest:.3g}: "
+            f"{cause}; {others}. The last attempt: {failure}{free}"
         )
 
     def _guess(self, balance: Balance) -> np.ndarray:

@@ -198,6 +198,11 @@ class Simulation(WithEquations):
         before = warnings_before(self.model.case, self.model, self.analysis.plan)
         return entries, self.model.warnings + odd_accelerations(self.case) + before + warnings
 
+    def obstacle(self) -> str:
+        """Return why the run cannot make its first step, as far as it is known before; empty otherwise. Collective."""
+        self._usable()
+        return self.analysis.obstacle()
+
     def on_step(self, function: Callable[[Step], object], every: int = 1) -> None:
         """Register a function to be called on all ranks after each step whose number is a multiple of ``every``.
 

@@ -165,6 +165,7 @@ class PathStepper(StaticStepper):
                 point, events, reached = next_point(self, size)
                 break
             except NotConverged as failure:
+                self.name_obstacle(failure)
                 self._restore_bars()
                 if 0.5 * size < self.keys.smallest:
                     raise self._no_path(failure) from failure
@@ -201,6 +202,7 @@ class PathStepper(StaticStepper):
         try:
             point, moved = first_point(self)
         except NotConverged as failure:
+            self.name_obstacle(failure)
             raise self._no_path(failure) from failure
         if moved:
             self._accept(point, self.keys.step)

@@ -213,9 +213,11 @@ class Simulation(WithEquations):
         Raises
         ------
         InputError
-            If ``every`` is not a positive integer.
+            If ``function`` cannot be called, or ``every`` is not a positive integer.
         """
         self._usable()
+        if not callable(function):
+            raise InputError(f"on_step: {function!r:.80} is not a function of a step")
         if not isinstance(every, int | np.integer) or isinstance(every, bool) or every < 1:
             raise InputError(f"on_step: every = {every!r}: give a positive whole number of steps")
         self.outputs.call(function, int(every))

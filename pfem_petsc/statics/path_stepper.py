@@ -139,7 +139,14 @@ class PathStepper(StaticStepper):
         text = f"the path ended at point {state.step}, load factor {state.time:.9g}"
         if self.direction is not None:
             text += f", displacement {self.direction.at(state.position):.6g} m"
-        return [f"{text}: {reached}"]
+        found = [f"{text}: {reached}"]
+        missed = [turn for turn in self.keys.branch_at if abs(turn) > self.bifurcations]
+        if missed:
+            found.append(
+                f"static.branch_at = {missed}: the path has no such bifurcation, only {self.bifurcations}, and does "
+                "not leave there"
+            )
+        return found
 
     def start(self) -> None:
         """See :class:`StaticStepper`. Collective."""

@@ -16,7 +16,7 @@ from xml.parsers import expat
 import numpy as np
 
 from ...errors import InputError
-from ..slab import check_size
+from ..slab import check_memory
 from ..whole import WholeMesh
 from ._threemf_model import Lattice, ModelFile
 
@@ -82,7 +82,7 @@ def _model_name(path: Path, archive: zipfile.ZipFile) -> str:
 
 def _assembled(path: Path, model: ModelFile) -> WholeMesh:
     """Return the lattices of all items of the build as one mesh."""
-    check_size(model.check_instances(), str(path))
+    check_memory(model.check_instances(), str(path))
     placed: list[tuple[str, Lattice, np.ndarray, np.ndarray]] = []
     for number, (name, lattice, place) in enumerate(model.placed()):
         placed.append((name or f"object_{number}", lattice, place, lattice.used()))

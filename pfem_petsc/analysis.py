@@ -67,6 +67,10 @@ class Analysis:
         self.stepper.start()
         self.stepper.leave()
 
+    def obstacle(self) -> str:
+        """Return why no step can be made, as far as it is known before the first; empty otherwise."""
+        return ""
+
     def advance(self) -> Step:
         """Make one step; its ``row`` is None, because rows are made by recording.
 

@@ -198,6 +198,11 @@ class Simulation(WithEquations):
         before = warnings_before(self.model.case, self.model, self.analysis.plan)
         return entries, self.model.warnings + odd_accelerations(self.case) + before + warnings
 
+    def obstacle(self) -> str:
+        """Return why the run cannot make its first step, as far as it is known before; empty otherwise. Collective."""
+        self._usable()
+        return self.analysis.obstacle()
+
     def on_step(self, function: Callable[[Step], object], every: int = 1) -> None:
         """Register a function to be called on all ranks after each step whose number is a multiple of ``every``.
 
@@ -208,9 +213,11 @@ class Simulation(WithEquations):
         Raises
         ------
         InputError
-            If ``every`` is not a positive integer.
+            If ``function`` cannot be called, or ``every`` is not a positive integer.
         """
         self._usable()
+        if not callable(function):
+            raise InputError(f"on_step: {function!r:.80} is not a function of a step")
         if not isinstance(every, int | np.integer) or isinstance(every, bool) or every < 1:
             raise InputError(f"on_step: every = {every!r}: give a positive whole number of steps")
         self.outputs.call(function, int(every))

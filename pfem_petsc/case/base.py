@@ -15,6 +15,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 
 __all__ = [
     "ConstraintKeys",
+    "FileName",
     "FilePath",
     "Finite",
     "Name",
@@ -133,7 +134,15 @@ Name = Annotated[str, Field(min_length=1, pattern=r"^[^/\x00-\x1f\x7f-\x9f]+$"),
 """A name that is part of a path in the result file: not empty, no slash, and not a single dot, which HDF5 skips."""
 
 
-FilePath = Annotated[str, Field(min_length=1, json_schema_extra={"is_path": True})]
+def _without_nul(name: str) -> str:
+    if "\0" in name:
+        raise ValueError("a name of a file cannot contain a NUL character")
+    return name
+
+
+FileName = Annotated[str, Field(min_length=1), AfterValidator(_without_nul)]
+"""The name of a file, relative to the case file."""
+FilePath = Annotated[str, Field(min_length=1, json_schema_extra={"is_path": True}), AfterValidator(_without_nul)]
 """A key of a generator that names a file relative to the case file; the case has its absolute path."""
 
 

@@ -6,6 +6,7 @@ import difflib
 from pathlib import Path
 
 from ..errors import InputError
+from ..files import readable_whole
 
 __all__ = ["built_in_cases", "built_in_path", "read_text"]
 
@@ -31,7 +32,7 @@ def read_text(path: Path) -> str:
         If it cannot be read; the nearest built-in case is named.
     """
     try:
-        return path.read_bytes().decode("utf-8-sig")
+        return readable_whole(path).read_bytes().decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = error.object[: error.start].count(b"\n") + 1
         raise InputError(f"{path}: line {line}: this is not UTF-8 text; a case file is TOML in UTF-8") from error

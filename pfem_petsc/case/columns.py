@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InputError
+from ..files import check_contents, readable_whole
 from ..registry import nearest
 
 __all__ = ["Columns", "file_columns"]
@@ -75,7 +76,7 @@ def file_columns(path: Path) -> Columns:
         If the file cannot be read, or has no rows, or rows of different lengths.
     """
     try:
-        data = path.read_bytes()
+        data = readable_whole(path).read_bytes()
     except (OSError, ValueError) as error:
         raise InputError(f"this file cannot be read: {error}") from error
     if data[:4] == b"PK\x03\x04" or data[:6] == b"\x93NUMPY":
@@ -89,6 +90,8 @@ def file_columns(path: Path) -> Columns:
 def _array_columns(path: Path) -> Columns:
     try:
         found = np.load(path, allow_pickle=False)
+        if not isinstance(found, np.ndarray):
+            check_contents(found.zip)
         arrays = {"": found} if isinstance(found, np.ndarray) else {name: found[name] for name in found.files}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, KeyError) as error:
         raise InputError(f"this file cannot be read: {error}") from error

@@ -20,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..errors import InputError
+from ..files import check_contents, readable_whole
 from .columns import file_columns
 
 __all__ = ["Forces", "digest_of", "read_forces"]
@@ -57,7 +58,7 @@ def digest_of(path: Path) -> str:
         If it cannot be read.
     """
     try:
-        with path.open("rb") as file:
+        with readable_whole(path).open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except (OSError, ValueError) as error:
         raise InputError(f"this file cannot be read: {error}") from error
@@ -85,6 +86,7 @@ def read_forces(path: Path, digest: str) -> Forces:
         return _from_text(path)
     try:
         with np.load(path, allow_pickle=False) as found:
+            check_contents(found.zip)
             arrays = {name: found[name] for name in found.files}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, KeyError) as error:
         raise InputError(f"this file cannot be read: {error}") from error

@@ -7,8 +7,8 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from .base import Finite, NonNegativeFloat, PositiveFloat, StrictModel, Vector3
-from .rows import FileName, Table2, Table4
+from .base import FileName, Finite, NonNegativeFloat, PositiveFloat, StrictModel, Vector3
+from .rows import Table2, Table4
 
 __all__ = ["Gravity", "Load", "LoadFile", "Temperature", "VaryingGravity", "VaryingWind", "Wind"]
 

@@ -7,11 +7,11 @@ from itertools import chain
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
-from pydantic import AfterValidator, Field, ValidatorFunctionWrapHandler, WrapValidator
+from pydantic import AfterValidator, ValidatorFunctionWrapHandler, WrapValidator
 
 from .base import Finite, listed
 
-__all__ = ["FileName", "Table2", "Table4", "increasing"]
+__all__ = ["Table2", "Table4", "increasing"]
 
 Rows = TypeVar("Rows", bound=Sequence[Sequence[float]])
 Row2 = Annotated[tuple[Finite, Finite], listed]
@@ -30,9 +30,6 @@ def _numbers(width: int) -> WrapValidator:
         return handler(value)
 
     return WrapValidator(read)
-
-
-FileName = Annotated[str, Field(min_length=1)]
 
 
 def increasing(rows: Rows) -> Rows:

@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import AfterValidator, field_validator, model_validator
 
-from .base import Name, StrictModel, Vector3, listed
-from .rows import FileName, Table4
+from .base import FileName, Name, StrictModel, Vector3, listed
+from .rows import Table4
 
 __all__ = ["Direction", "Support", "check_frame"]
 

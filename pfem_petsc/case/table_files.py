@@ -11,10 +11,9 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field
 
 from ..errors import InputError
-from .base import Finite, PositiveFloat, StrictModel, listed
+from .base import FileName, Finite, PositiveFloat, StrictModel, listed
 from .columns import Columns, file_columns
 from .problems import Path as KeyPath
 from .problems import Problems
@@ -35,7 +34,7 @@ _COUNTS = {2: "two", 4: "four"}
 class TableFile(StrictModel):
     """A file with a table over time: columns are chosen, scaled and shifted."""
 
-    file: Annotated[str, Field(min_length=1)]
+    file: FileName
     """CSV, NPZ or NPY file, relative to the case file"""
     columns: Annotated[tuple[str | int, ...], listed] | None = None
     """columns by name or number (from 0), the time first; "" is a column of zeros; default: all columns"""

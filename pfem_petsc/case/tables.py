@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, InstanceOf, ValidationInfo, field_validator, model_validator
 
 from .base import (
+    FileName,
     Finite,
     Name,
     NodeSetName,
@@ -65,7 +66,7 @@ class MeshKeys(StrictModel):
 
     generator: Name | None = None
     """name of a mesh generator"""
-    file: Annotated[str, Field(min_length=1)] | None = None
+    file: FileName | None = None
     """mesh file, relative to the case file"""
 
     @model_validator(mode="after")

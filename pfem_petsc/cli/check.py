@@ -51,6 +51,7 @@ def run(arguments: argparse.Namespace, comm: MPI.Comm | None = None) -> int:
     simulation = Simulation(case, comm, check_only=True)
     summary = simulation.summary()
     closer, warnings = simulation.inspect()
+    obstacle = simulation.obstacle()
     summary |= closer
     if comm.rank == 0:
         width = max(map(len, summary), default=0)
@@ -61,7 +62,10 @@ def run(arguments: argparse.Namespace, comm: MPI.Comm | None = None) -> int:
             print(f"warning: {text}")
         if simulation.plan.scheme.notice:
             print(f"note: {simulation.plan.scheme.notice}")
-        print("This case can run.")
+        if not obstacle:
+            print("This case can run.")
+    if obstacle:
+        raise InputError(obstacle)
     return 0
 
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ..tolerances import RANK
+from .motion import vanishes
 
 if TYPE_CHECKING:
     from ..case.tables import Support
@@ -45,11 +46,12 @@ class Directions:
     nodes : (m,), those of them with prescribed directions
     free : (m, 3, 3) projections on the free directions
     at : (r,) owned node of each direction; axes : (r, 3) directions, orthonormal at each node
-    twice : (support, owned node) of the first direction with a motion that an earlier support prescribes, or None
+    contradiction : (support, owned node) of the first direction that depends on those of earlier supports, with another
+        motion than theirs; or None
     """
 
     def __init__(self, supports: Sequence[Prescribed], nodes: np.ndarray, origin: np.ndarray) -> None:
-        self.twice: tuple[int, int] | None = None
+        self.contradiction: tuple[int, int] | None = None
         self._motions = [each.motion for each in supports if each.motion is not None]
         bases = self._bases(supports, nodes)
         counts = np.array([len(basis[0]) for basis in bases], dtype=np.int64)
@@ -91,8 +93,14 @@ class Directions:
                 size = float(np.linalg.norm(rest))
                 row = len(axes)
                 if size <= RANK:
-                    if each.motion is not None and self.twice is None:
-                        self.twice = k, node
+                    terms = [
+                        (self._motions[sources[r, j]], along[r] * weights[r, j])
+                        for r, j in np.argwhere(sources[:row] >= 0)
+                    ]
+                    if self.contradiction is None and not vanishes(
+                        [(each.motion, direction), *((m, -w) for m, w in terms)]
+                    ):
+                        self.contradiction = k, node
                     continue
                 # direction . u is given, and so are the parts of u along the axes found before
                 sources[row, :row] = sources[np.arange(row), np.arange(row)]

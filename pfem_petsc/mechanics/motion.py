@@ -23,8 +23,9 @@ if TYPE_CHECKING:
     from ..case.tables import Support
     from ..contact.walls.base import WallKeys
 
-__all__ = ["Motion", "motion_of", "spline_slopes"]
+__all__ = ["Motion", "motion_of", "spline_slopes", "vanishes"]
 
+_AGREE = 1e-7  # relative to the displacements: by how much motions along dependent directions may differ
 _ROUNDING = 1e-14  # relative tolerance of times: a step reaches a row up to rounding
 
 
@@ -39,12 +40,13 @@ class Motion:
 
     Attributes
     ----------
+    times, coefficients : as given
     jumps : as given; accelerations are then means over the step that ends at the requested time
     """
 
     def __init__(self, times: np.ndarray, coefficients: np.ndarray, jumps: bool = False) -> None:
-        self._times = times
-        self._coefficients = coefficients
+        self.times = times
+        self.coefficients = coefficients
         self.jumps = jumps
 
     def at(self, time: float, span: float = 0.0, ahead: bool = True) -> np.ndarray:
@@ -57,17 +59,31 @@ class Motion:
         ahead : at the time of a row, whether to return the right limit; else the left limit
         """
         slack = _ROUNDING * abs(time)
-        row = int(np.searchsorted(self._times, time + slack if ahead else time - slack, "right" if ahead else "left"))
+        row = int(np.searchsorted(self.times, time + slack if ahead else time - slack, "right" if ahead else "left"))
         if row == 0:
-            return np.stack([self._coefficients[0, 0], np.zeros(3), np.zeros(3)])
-        s = time - self._times[row - 1]
-        c0, c1, c2, c3 = self._coefficients[row - 1]
+            return np.stack([self.coefficients[0, 0], np.zeros(3), np.zeros(3)])
+        s = time - self.times[row - 1]
+        c0, c1, c2, c3 = self.coefficients[row - 1]
         moved = np.stack(
             [c0 + s * (c1 + s * (c2 + s * c3)), c1 + s * (2.0 * c2 + 3.0 * s * c3), 2.0 * c2 + 6.0 * s * c3]
         )
         if self.jumps and span > 0.0:
             moved[2] = (moved[1] - self.at(max(time - span, 0.0))[1]) / span if time > 0.0 else 0.0
         return moved
+
+
+def vanishes(terms: list[tuple[Motion | None, np.ndarray]]) -> bool:
+    """Whether a sum of displacements along vectors (3,) is zero at all times; None is rest.
+
+    Motions with rows at different times are different motions: the sum of those with the same times must be zero.
+    """
+    sums: dict[bytes, tuple[np.ndarray, float]] = {}
+    for motion, vector in terms:
+        if motion is not None:
+            along = motion.coefficients @ vector
+            total, size = sums.get(motion.times.tobytes(), (0.0, 0.0))
+            sums[motion.times.tobytes()] = total + along, size + np.abs(motion.coefficients) @ np.abs(vector)
+    return all((np.abs(total).max(axis=0) <= _AGREE * size.max(axis=0)).all() for total, size in sums.values())
 
 
 def motion_of(entry: Support | WallKeys) -> Motion | None:

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..errors import InputError
 from .directions import Directions, Prescribed, directions_of
-from .motion import Motion, motion_of
+from .motion import motion_of, vanishes
 
 if TYPE_CHECKING:
     from ..case.schema import Case
@@ -36,49 +36,49 @@ class Supports:
 
     def __init__(self, case: Case, nodes: dict[str, np.ndarray], mesh: DistributedMesh) -> None:
         self.fixed = np.zeros((mesh.n_owned, 3), dtype=bool)
-        self._named: dict[str, tuple[np.ndarray, list[int]]] = {}
-        self._all: list[tuple[str | None, Prescribed]] = []
+        self._detached = np.zeros(mesh.n_owned, dtype=bool)
+        self._gone: set[str] = set()
         self._origin = mesh.points[: mesh.n_owned]
-        motions: list[tuple[np.ndarray, list[int], Motion]] = []
         given = [directions_of(support) for support in case.support]
         turned = np.zeros(mesh.n_owned, dtype=bool)
         for support, (_, axes) in zip(case.support, given, strict=True):
             turned[nodes[support.node_set]] |= axes is None
-        for index, (support, (directions, axes)) in enumerate(zip(case.support, given, strict=True)):
+        self._turned = np.flatnonzero(turned)
+        self._all: list[tuple[str | None, Prescribed]] = []
+        self._along_axes: list[tuple[np.ndarray, list[int]]] = []  # nodes and axes of each support, without turned ones
+        for support, (directions, axes) in zip(case.support, given, strict=True):
             members = nodes[support.node_set]
             # one that stays in force from the stage before holds its nodes where they are
             motion = None if case.holds("support") else motion_of(support)
             self._all.append((support.name, Prescribed(members, directions, motion)))
-            members, axes = members[~turned[members]], axes or []
-            if support.name is not None:
-                self._named[support.name] = members, axes
-            for axis in axes:
-                if motion is not None and self.fixed[members, axis].any():
-                    node = mesh.node_ids[members[self.fixed[members, axis]][0]]
-                    raise InputError(
-                        f"{case.source}: support[{index}]: the {'xyz'[axis]} component of node {node} is already "
-                        "prescribed by an earlier support; give each component one support"
-                    )
-                self.fixed[members, axis] = True
-            if motion is not None:
-                motions.append((members, axes, motion))
-        self._motions = motions
-        self._index()
-        self._start = self._origin[self.fixed]
-        self._gone: set[str] = set()
-        self._turned = np.flatnonzero(turned)
+            self._along_axes.append((members[~turned[members]], axes or []))
         self.inclined: Directions | None = None
         if any(axes is None for _, axes in given):
             self.inclined = self._directions()
-            if self.inclined.twice is not None:
-                index, node = self.inclined.twice
-                raise InputError(
-                    f"{case.source}: support[{index}]: a direction of node {mesh.node_ids[node]} is already prescribed "
-                    "by earlier supports; give each direction one support"
-                )
+        self._refuse_contradictions(case, mesh, self._index())
         self.moves = any(each.motion is not None for _, each in self._all)
         self.moving = self.moves or self.inclined is not None
         self.any = bool(case.support)
+
+    def _refuse_contradictions(self, case: Case, mesh: DistributedMesh, first: np.ndarray) -> None:
+        """Refuse supports that prescribe one component, whatever their order and axes, unless their motions agree."""
+        remedy = "by an earlier support with another motion; give both the same motion, or each component one support"
+        for index, ((_, each), (members, axes)) in enumerate(zip(self._all, self._along_axes, strict=True)):
+            for axis in axes:
+                others, unit = first[members, axis], np.eye(3)[axis]
+                for other in np.unique(others[others != index]):
+                    if not vanishes([(each.motion, unit), (self._all[other][1].motion, -unit)]):
+                        node = mesh.node_ids[members[others == other][0]]
+                        raise InputError(
+                            f"{case.source}: support[{index}]: the {'xyz'[axis]} component of node {node} is already "
+                            f"prescribed {remedy}"
+                        )
+        if self.inclined is not None and self.inclined.contradiction is not None:
+            index, node = self.inclined.contradiction
+            raise InputError(
+                f"{case.source}: support[{index}]: a direction of node {mesh.node_ids[node]} is already prescribed "
+                f"{remedy}"
+            )
 
     def _directions(self) -> Directions:
         left = [each if name not in self._gone else each._replace(nodes=each.nodes[:0]) for name, each in self._all]
@@ -86,67 +86,46 @@ class Supports:
 
     def hold(self, x: np.ndarray) -> None:
         """Take the positions (owned, 3) [m] at the start of a stage for those that motions start from."""
-        self._start = x[self.fixed]
         self._origin = x
-        if self.inclined is not None:
-            self.inclined = self._directions()
-
-    def of_name(self, name: str) -> np.ndarray:
-        """Return which components (owned, 3) bool along axes a support of the case prescribes."""
-        mine = np.zeros_like(self.fixed)
-        members, axes = self._named[name]
-        for axis in axes:
-            mine[members, axis] = True
-        return mine
+        self._update()
 
     def release(self, names: list[str]) -> None:
-        """Prescribe the components of some supports no longer."""
-        mask = self._mask(names)
-        keep = ~mask[self.fixed]
-        self._start = self._start[keep]
-        self.fixed &= ~mask  # in place: contact holds the array
-        self._index()
-        if self.inclined is not None:
-            self._gone |= set(names)
-            self.inclined = self._directions()
-
-    def freed(self, names: list[str], forces: np.ndarray) -> np.ndarray:
-        """Return the parts of forces (owned, 3) along the components that :meth:`release` of some supports frees."""
-        parts = np.where(self._mask(names), forces, 0.0)
-        if self.inclined is not None:
-            before, gone = self.inclined, self._gone
-            self._gone = gone | set(names)
-            after, self._gone = self._directions(), gone
-            parts[before.nodes] += before.part(forces)
-            parts[after.nodes] -= after.part(forces)
-        return parts
-
-    def _mask(self, names: list[str]) -> np.ndarray:
-        mask = np.zeros_like(self.fixed)
-        for name in names:
-            mask |= self.of_name(name)
-        return mask & self.fixed
+        """Remove supports; components that another support prescribes too remain prescribed."""
+        self._gone |= set(names)
+        self._update()
 
     def hold_nodes(self, nodes: np.ndarray, x: np.ndarray) -> None:
         """Prescribe all components of nodes (k,), where they are at positions ``x`` (owned, 3) [m]."""
-        start = x.copy()
-        start[self.fixed] = self._start
-        self.fixed[nodes] = True
-        self._start = start[self.fixed]
+        origin = self._origin.copy()
+        origin[nodes] = np.where(self.fixed[nodes], origin[nodes], x[nodes])
+        self._origin = origin
+        self._detached[nodes] = True
+        self._turned = np.setdiff1d(self._turned, nodes)
         self.any = True
+        self._update()
+
+    def _update(self) -> None:
         self._index()
         if self.inclined is not None:
-            self._turned = np.setdiff1d(self._turned, nodes)
             self.inclined = self._directions()
 
-    def _index(self) -> None:
+    def _index(self) -> np.ndarray:
+        """Find the prescribed components along axes; return the first support (owned, 3) of each, or -1."""
+        first = np.full(self.fixed.shape, -1, dtype=np.int32)
+        for k, ((name, _), (members, axes)) in enumerate(zip(self._all, self._along_axes, strict=True)):
+            for axis in axes if name not in self._gone else []:
+                first[members[first[members, axis] < 0], axis] = k
+        self.fixed[:] = (first >= 0) | self._detached[:, None]  # in place: contact holds the array
         self.nodes, self.components = np.nonzero(self.fixed)
         self.at = (self.nodes, self.components)
-        # where the components of each motion stand among those prescribed, as far as they still are
-        keys = 3 * self.nodes + self.components
-        self._places = [
-            [np.flatnonzero(np.isin(keys, 3 * members + axis)) for axis in axes] for members, axes, _ in self._motions
+        self._start = self._origin[self.at]
+        by = first[self.at]
+        self._moved = [  # each motion, and for each axis the places of its components among those prescribed
+            (each.motion, [np.flatnonzero((by == k) & (self.components == axis)) for axis in range(3)])
+            for k, (_, each) in enumerate(self._all)
+            if each.motion is not None
         ]
+        return first
 
     @property
     def every_node(self) -> np.ndarray:
@@ -169,7 +148,7 @@ class Supports:
 
     def positions(self, time: float) -> np.ndarray:
         """Return prescribed :meth:`coordinates` (k,) [m] at a time [s]."""
-        if not self._motions and self.inclined is None:
+        if not self._moved and self.inclined is None:
             return self._start
         return self._joined(self._start, 0.0) + self._at(time, 0.0)[0]
 
@@ -188,9 +167,9 @@ class Supports:
 
     def _at(self, time: float, span: float) -> np.ndarray:
         along_axes = np.zeros((3, len(self.nodes)))  # displacements, velocities, accelerations
-        for (_, axes, motion), places in zip(self._motions, self._places, strict=True):
+        for motion, places in self._moved:
             moved = motion.at(time, span)
-            for axis, of_axis in zip(axes, places, strict=True):
+            for axis, of_axis in enumerate(places):
                 along_axes[:, of_axis] = moved[:, axis, None]
         if self.inclined is None:
             return along_axes

@@ -6,10 +6,24 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
+from mpi4py import MPI
 
 from ..errors import InputError
+from ..files import memory_of_machine
 
-__all__ = ["MeshSlab", "check_length", "check_size", "index_type", "slab_of", "slab_of_whole", "slab_range"]
+__all__ = [
+    "MeshSlab",
+    "check_length",
+    "check_memory",
+    "check_size",
+    "index_type",
+    "slab_of",
+    "slab_of_whole",
+    "slab_range",
+]
+
+_PER_NODE, _PER_BAR = 200.0, 24.0
+"""Least memory of a model [B]: positions, velocities, accelerations, forces of nodes; ends and rest lengths of bars."""
 
 
 @dataclass
@@ -66,13 +80,13 @@ def index_type(n: int) -> type[np.signedinteger]:
     return np.int32 if n <= np.iinfo(np.int32).max else np.int64
 
 
-def check_size(n_nodes: int, where: str) -> None:
-    """Refuse a mesh whose unknowns PETSc cannot number, before anything is allocated for it. Collective (PETSc starts).
+def check_size(n_nodes: int, where: str, n_bars: int = 0) -> None:
+    """Refuse a mesh that cannot be run, before anything is allocated for it. Collective (PETSc starts).
 
     Raises
     ------
     InputError
-        If three unknowns per node do not fit in PETSc's integers.
+        If three unknowns per node do not fit in PETSc's integers, or the arrays of the model in the memory.
     """
     from petsc4py import PETSc
 
@@ -81,6 +95,23 @@ def check_size(n_nodes: int, where: str) -> None:
         raise InputError(
             f"{where}: {n_nodes:,} nodes have {3 * n_nodes:,} unknowns, more than this PETSc can number ({limit:,}): "
             "make the mesh smaller, or use a PETSc configured with 64-bit indices"
+        )
+    check_memory(n_nodes, where, n_bars)
+
+
+def check_memory(n_nodes: int, where: str, n_bars: int = 0) -> None:
+    """Refuse a mesh whose model the memory does not hold, even if each rank has a machine of its own; on any rank.
+
+    Raises
+    ------
+    InputError
+    """
+    needed, memory = _PER_NODE * n_nodes + _PER_BAR * n_bars, memory_of_machine() * MPI.COMM_WORLD.size
+    if needed > memory:
+        bars = f" and {n_bars:,} bars" if n_bars else ""
+        raise InputError(
+            f"{where}: {n_nodes:,} nodes{bars} need {needed / 1e9:,.0f} GB of memory or more, and there are "
+            f"{memory / 1e9:,.0f} GB: make the mesh smaller, or use more machines"
         )
 
 

@@ -195,6 +195,8 @@ def asked_checkpoint(folder: Path | str, asked: bool | Path | str) -> Path | Non
 def _open(path: Path) -> BinaryIO:
     for _ in range(_ATTEMPTS):
         try:
+            if path.exists() and not path.is_file():
+                raise InputError(f"{path}: is no file that a run has written; {remedy(path)}")
             return open(path, "rb")  # noqa: SIM115 - it stays open
         except FileNotFoundError:
             # a run may be between the two renamings of its next checkpoint

@@ -44,11 +44,14 @@ class FolderLock:
     """
 
     def __init__(self, folder: Path) -> None:
+        if "\0" in str(folder):
+            raise InputError(f"the name of the output folder {str(folder)!r} contains a NUL character")
         folder = folder.resolve()
         self.folder = folder
         beside = folder.parent
         while not beside.exists():
             beside = beside.parent
+        self._beside = beside
         # if the user can write only into the folder itself, the folder cannot be moved aside either
         inside = folder.is_dir() and not os.access(beside, os.W_OK | os.X_OK)
         self.path = folder / "run.lock" if inside or not folder.name else folder.with_name(folder.name + ".lock")
@@ -61,12 +64,16 @@ class FolderLock:
         return self._token is not None
 
     def check(self) -> None:
-        """Refuse a folder that another run has locked, without taking the lock.
+        """Refuse a folder that another run has locked, or that cannot be made, without taking the lock.
 
         Raises
         ------
         InputError
         """
+        if not self._beside.is_dir():
+            raise InputError(
+                f"{self.folder}: cannot write the results there: {self._beside} is no folder; choose another with -o"
+            )
         owner = _read(self.path)
         if owner is not None and not _abandoned(self.path, owner):
             self._refuse(owner)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Collection, Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
 
+from ..files import memory_of_machine
 from ..output.units import duration, engineering
 from ..solvers.linear import DIRECT
 
@@ -20,7 +19,7 @@ if TYPE_CHECKING:
     from ..stepping.model import Model
     from ..stepping.plan import Plan
 
-__all__ = ["checkpoint_bytes", "forecast", "memory_of_machine", "memory_warning", "result_bytes"]
+__all__ = ["checkpoint_bytes", "forecast", "memory_warning", "result_bytes"]
 
 # Resident memory of a rank per bar, in excess of an empty process [B]; measured with lattices: 54 explicit, 74 if bars
 # yield on a floor, 170 matrix-free (between 10^6 and 4 x 10^6 bars), 510 assembled, 1580 with GAMG (10^5 to 5 x 10^5);
@@ -110,19 +109,6 @@ def memory_warning(case: Case, model: Model, plan: Plan) -> list[str]:
         f"has {engineering(available, 'B', 3)}: the system may end the run; use more machines, a smaller mesh, or an "
         "explicit scheme"
     ]
-
-
-def memory_of_machine() -> float:
-    """Return the memory of this machine, or of the container of this process [B]."""
-    found = [float(os.sysconf("SC_PAGE_SIZE")) * os.sysconf("SC_PHYS_PAGES")]
-    for path in ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"):
-        try:
-            text = Path(path).read_text().strip()
-        except OSError:
-            continue
-        if text.isdigit():
-            found.append(float(text))
-    return min(found)
 
 
 def _needed(model: Model, plan: Plan) -> float:

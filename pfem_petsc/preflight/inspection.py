@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from ..statics.free_motions import names_motions
 from .chains import chain_nodes, chain_warning
 from .forecast import memory_warning
 from .motions import jumping_motions
@@ -50,7 +51,13 @@ def warnings_before(case: Case, model: Model, plan: Plan) -> list[str]:
 
 
 def _loose_nodes(model: Model, chained: int) -> list[str]:
-    """Warn of nodes that can move freely, besides those within ``chained`` bars. Collective."""
+    """Warn of nodes that can move freely, besides those within ``chained`` bars. Collective.
+
+    Static analyses that need a stiffness name such nodes and their directions themselves, if it is singular.
+    """
+    static = model.case.static is not None and model.case.static.method != "relaxation"
+    if static and names_motions(model):
+        return []
     loose, first = unbraced_nodes(model)
     if loose <= chained:
         return []
@@ -85,6 +92,8 @@ def inspect(case: Case, model: Model) -> tuple[dict[str, str], list[str]]:
             f"{found.unknowns} free directions{where}, {found.rigid_motions} rigid motions, {found.mechanisms} "
             f"mechanisms, {found.self_stresses} states of self-stress"
         )
+        if found.outside:
+            entries["rigidity"] += f"; {found.outside} free directions out of it, which no bar resists"
     entries |= far_points(case, model)
     for name, text in wall_gaps(model)[0].items():
         entries[f"wall {name}"] = text

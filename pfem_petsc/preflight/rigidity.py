@@ -25,13 +25,14 @@ _RANK = 1e-9
 
 class Rigidity(NamedTuple):
     """Results of the global test: free unknowns, rank of the equilibrium matrix, rigid motions, mechanisms, states of
-    self-stress."""
+    self-stress; all within the line or plane of the truss, and the free unknowns out of it."""
 
     unknowns: int
     rank: int
     rigid_motions: int
     mechanisms: int
     self_stresses: int
+    outside: int
 
 
 @kernel
@@ -103,7 +104,8 @@ def global_rigidity(model: Model) -> Rigidity | None:
     reduced = np.concatenate([basis @ rows for basis, rows in zip(bases, matrix, strict=True)])
     rank = int(np.linalg.matrix_rank(reduced, tol=_RANK)) if reduced.size else 0
     rigid = _rigid_motions(points - points.mean(axis=0), held, span)
-    return Rigidity(len(reduced), rank, rigid, len(reduced) - rank - rigid, len(bars) - rank)
+    outside = sum(len(_free(np.eye(3), held[node])) for node in range(mesh.n_nodes)) - len(reduced)
+    return Rigidity(len(reduced), rank, rigid, len(reduced) - rank - rigid, len(bars) - rank, outside)
 
 
 def _free(span: np.ndarray, held: np.ndarray) -> np.ndarray:

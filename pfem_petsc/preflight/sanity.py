@@ -22,12 +22,24 @@ _SLENDER = 1e4
 _STRONGEST = 50.0
 """Acceleration [m/s2] beyond which a record is mostly in another unit: the strongest ground motions reach 40 m/s2."""
 
+_LEAST = 5e-6
+"""Strain at which no material yields or breaks: 220 for 220 MPa is 1e-9, in kPa 1e-6; soft metals yield at 1e-4."""
+
+_PRESTRAINS = 1e-6, 0.2
+"""Range of strains that prestress gives engineering structures: cables have 1e-4 to 1e-2, those hardly taut 1e-5."""
+
+_STRENGTHS = ("yield_stress", "proof_stress", "tensile_strength")
+
 _HINT = "case files are in SI units (m, kg, s, N, Pa)"
 
 
 def odd_numbers(case: Case, model: Model) -> list[str]:
     """Return one message for each suspicious value: key, value, reason. Collective."""
     texts = [*_materials(case), *_sections(case), *_mesh(case, model), *_slender(case, model), *_weightless(case)]
+    texts += [
+        f"node_set.{name}.nearest: {text}, more than the size of the truss"
+        for name, text in _distant(case, model, model.length)
+    ]
     return [f"{case.source}: {text}" for text in texts]
 
 
@@ -67,12 +79,30 @@ def _materials(case: Case) -> Iterator[str]:
         if material.softening is not None and not case.temperature:
             yield f"{key}.softening: without a [[temperature]] its factors are those of the reference temperature"
         yield from material.suspicions(key, _HINT)
+        strengths = [(f"{key}.{name}", getattr(material, name, None)) for name in _STRENGTHS]
+        limits = material.rupture
+        if limits is not None:
+            strengths += [(f"{key}.rupture.{name}", getattr(limits, name)) for name in ("stress", "compressive_stress")]
+        for name, stress in strengths:
+            if stress is not None and stress < _LEAST * material.young_modulus:
+                strain = stress / material.young_modulus
+                yield f"{name} = {stress:g} Pa is reached at a strain of {strain:.3g}; 220 MPa are 220e6; {_HINT}"
 
 
 def _sections(case: Case) -> Iterator[str]:
     for name, section in case.section.items():
         if section.area is not None and not 1e-18 <= section.area <= 10.0:
             yield f"section.{name}.area = {section.area:g} m2: no bar has that; 1 mm2 is 1e-6 m2"
+        young = case.material[section.material].young_modulus
+        stiffness = {"prestress": young, "pretension": None if section.area is None else young * section.area}
+        for key, unit in (("prestress", "Pa"), ("pretension", "N")):
+            given = getattr(section, key)
+            if given is None or stiffness[key] is None:
+                continue
+            value = float(np.abs(np.atleast_2d(np.array(given, dtype=float))[:, -1]).max())
+            strain = value / stiffness[key]
+            if value and not _PRESTRAINS[0] <= strain <= _PRESTRAINS[1]:
+                yield f"section.{name}.{key} reaches {value:g} {unit}, a strain of {strain:.3g}; {_HINT}"
 
 
 def _weightless(case: Case) -> Iterator[str]:
@@ -103,10 +133,17 @@ def _slender(case: Case, model: Model) -> Iterator[str]:
 
 def far_points(case: Case, model: Model) -> dict[str, str]:
     """Label and text of node sets whose nearest node is far from the point. Collective."""
+    longest = max(model.comm.allgather(float(model.bars.mesh_lengths.max(initial=0.0))))
+    return {
+        f"node set {name}": f"{text}, more than the length of the longest bar"
+        for name, text in _distant(case, model, longest)
+    }
+
+
+def _distant(case: Case, model: Model, most: float) -> Iterator[tuple[str, str]]:
+    """Name and text of node sets whose nearest node is farther from the point than ``most`` [m]."""
     mesh, comm = model.mesh, model.comm
     points = mesh.points[: mesh.n_owned]
-    longest = max(comm.allgather(float(model.bars.mesh_lengths.max(initial=0.0))))
-    found = {}
     for name, node_set in case.node_set.items():
         if node_set.nearest is None:
             continue
@@ -114,12 +151,8 @@ def far_points(case: Case, model: Model) -> dict[str, str]:
         mine = int(away.argmin()) if len(away) else -1
         here = (float(away[mine]), int(mesh.node_ids[mine])) if mine >= 0 else (np.inf, -1)
         distance, node = min(comm.allgather(here))
-        if distance > longest:
-            found[f"node set {name}"] = (
-                f"the nearest node is node {node}, {engineering(distance, 'm')} away from the point, more than the "
-                "length of the longest bar"
-            )
-    return found
+        if distance > most:
+            yield name, f"the nearest node is node {node}, {engineering(distance, 'm')} away from the point"
 
 
 def _mesh(case: Case, model: Model) -> Iterator[str]:

@@ -93,7 +93,9 @@ class RunLoop:
         stages, outputs = self._stages, self._outputs
         state = stages.analysis.state
         ended = stages.at_last and state.step >= stages.analysis.last_step
-        if self.started and not outputs.is_open and not ended:
+        if self.started and not outputs.is_open:
+            if ended:
+                return
             raise InputError(
                 f"{self._folder}: the results of this simulation were closed at step {stages.analysis.stepper.number}, "
                 "when its iteration ended; continue with a new Simulation with restart=True, from a checkpoint"

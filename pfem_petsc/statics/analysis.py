@@ -100,6 +100,10 @@ class StaticAnalysis(Analysis):
         """Number of the last step once it is reached, before that a number larger than any step."""
         return self.stepper.state.step if self.stepper.done else NEVER
 
+    def obstacle(self) -> str:
+        """See :class:`~pfem_petsc.analysis.Analysis`: motions without stiffness."""
+        return self.stepper.obstacle()
+
 
 def _linear(model: Model) -> LinearChoice:
     """Choose the linear solver: a factorisation, which needs no definiteness, if affordable, else multigrid.

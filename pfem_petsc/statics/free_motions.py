@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from ..integrators.base import State
     from ..stepping.model import Model
 
-__all__ = ["free_motions", "next_equilibrium"]
+__all__ = ["free_motions", "names_motions", "next_equilibrium"]
 
 _ZERO = 1e-11  # of the largest stiffness of a node; limit points that steps come close to have 1e-6 and more
 _MOST = 8  # motions that are looked at
@@ -31,12 +31,17 @@ _AHEAD = 2.0, 0.5, 0.1, 0.02  # of an increment: near a limit point the response
 _MOVES = 0.3  # of the largest displacement of a motion, above which a node is named
 
 
+def names_motions(model: Model) -> bool:
+    """Whether motions are looked at: in models without walls and links, of at most 30,000 unknowns."""
+    return not model.can_touch and 3 * model.mesh.n_nodes <= LARGEST
+
+
 def free_motions(model: Model, state: State) -> str:
     """What to add to a message about a stiffness that may be singular; empty where no motion is free. Collective.
 
-    Walls and links are not looked at: models that have some get no answer, nor do those of more than 30,000 unknowns.
+    Models for which :func:`names_motions` is False get no answer.
     """
-    if model.can_touch or 3 * model.mesh.n_nodes > LARGEST:
+    if not names_motions(model):
         return ""
     matrix = HessianMatrix(model.mesh, model.supports)
     problem = StepProblem(model, state, Equilibrium().balance(state, 0.0), state.external, Transform(model))

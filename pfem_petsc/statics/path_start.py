@@ -39,6 +39,14 @@ def check_path(model: Model, keys: PathKeys) -> None:
         )
     if not (model.external.active or model.supports.moves or model.bars_vary):
         raise InputError(f"{case.source}: static: nothing depends on the load factor; give a [[load]] or a table")
+    free = 3 * model.mesh.n_nodes - model.comm.allreduce(model.supports.number)
+    unknown = [turn for turn in keys.branch_at if abs(turn) > free]
+    if unknown:
+        raise InputError(
+            f"{case.source}: static.branch_at = {unknown}: bifurcations are numbered from 1 along the path, and a "
+            f"truss with {free} free components has no more than {free} eigenvalues that can change their sign on it; "
+            "run the case without branch_at, which reports the bifurcations and their numbers"
+        )
     if keys.node_set is not None and not model.comm.allreduce(len(model.nodes[keys.node_set])):
         raise InputError(f"{case.source}: static.node_set = {keys.node_set!r} has no nodes")
 

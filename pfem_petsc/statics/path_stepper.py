@@ -142,7 +142,14 @@ class PathStepper(StaticStepper):
         if self.negatives > 0:
             text += f"; the equilibrium there is unstable, with {int(self.negatives)} negative eigenvalue"
             text += "s" * (self.negatives > 1) + " of the stiffness under constant loads"
-        return [text, *super().remarks()]
+        found = [text, *super().remarks()]
+        missed = [turn for turn in self.keys.branch_at if abs(turn) > self.bifurcations]
+        if missed:
+            found.append(
+                f"static.branch_at = {missed}: the path has no such bifurcation, only {self.bifurcations}, and does "
+                "not leave there"
+            )
+        return found
 
     def doubts(self) -> list[str]:
         """See :class:`~pfem_petsc.stepping.stepper.Stepper`; unstable parts of a path are no doubt, but in a remark."""
@@ -172,6 +179,7 @@ class PathStepper(StaticStepper):
                 point, events, reached = next_point(self, size)
                 break
             except NotConverged as failure:
+                self.name_obstacle(failure)
                 self._restore_bars()
                 if 0.5 * size < self.keys.smallest:
                     raise self._no_path(failure) from failure
@@ -216,6 +224,7 @@ class PathStepper(StaticStepper):
         try:
             point, moved = first_point(self)
         except NotConverged as failure:
+            self.name_obstacle(failure)
             raise self._no_path(failure) from failure
         if moved:
             self._accept(point, self.keys.step)

@@ -74,6 +74,10 @@ class RelaxationStepper(StaticStepper):
         self.leave()
         state.step += 1
 
+    def obstacle(self) -> str:
+        """See :class:`StaticStepper`: relaxation needs no stiffness. Collective."""
+        return ""
+
     def supports_changed(self) -> None:
         """See :class:`~pfem_petsc.stepping.stepper.Stepper`. Collective."""
         super().supports_changed()

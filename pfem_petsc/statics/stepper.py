@@ -11,7 +11,7 @@ from mpi4py import MPI
 from ..contact.transform import Transform
 from ..errors import NotConverged, SimulationFailure
 from ..integrators.base import Balance
-from ..solvers.linear import LinearChoice
+from ..solvers.linear import DIRECT, LinearChoice
 from ..solvers.newton import Tolerance
 from ..stepping.implicit import ImplicitStepper
 from ..stepping.prescribed import NoRates
@@ -153,6 +153,7 @@ class StaticStepper(ImplicitStepper):
                 self._make_part(end)
                 break
             except NotConverged as failure:
+                self.name_obstacle(failure)
                 if self.model.bars_vary:
                     # the failed solve has applied the temperatures and rest lengths of its end
                     self.model.change_bars(state.time)
@@ -220,6 +221,28 @@ class StaticStepper(ImplicitStepper):
             "under constant loads. A bifurcation or limit point lies before it, which static.method = "
             '"arc_length" locates; add a small perturbing load to reach a stable equilibrium'
         ]
+
+    def obstacle(self) -> str:
+        """Return a message about motions that nothing resists at the start; empty if there are none. Collective.
+
+        Nor where increments of any size may give the truss a stiffness, or need none.
+        """
+        model = self.model
+        if self.stabilise or model.bars_vary or model.supports.moves or self._choice.preconditioner not in DIRECT:
+            return ""
+        found = free_motions(model, self.state)
+        if not found:
+            return ""
+        return (
+            f"{model.case.source}: static: the stiffness is singular at the start{found}; "
+            'static.method = "relaxation" and [time] do not need them'
+        )
+
+    def name_obstacle(self, failure: NotConverged) -> None:
+        """Raise an error about motions without stiffness if the first increment has failed by them. Collective."""
+        obstacle = "" if self.state.step else self.obstacle()
+        if obstacle:
+            raise SimulationFailure(obstacle) from failure
 
     def _solve(self, balance: Balance, guess: np.ndarray) -> Solution:
         """Solve; a truss that nothing holds before contact forces act is first moved against walls and links.

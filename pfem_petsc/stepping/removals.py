@@ -137,11 +137,14 @@ class Removals:
 
     def _remove_support(self, entry: Remove, now: float) -> None:
         column = self._columns[entry.supports]
-        freed = self._model.supports.freed([entry.supports], self._stepper.recorded()[1])
-        self.released[:, column : column + 3] = freed
+        supports, forces = self._model.supports, self._stepper.recorded()[1]
+        before = supports.part(forces)
+        supports.release([entry.supports])
+        # components that another support prescribes too keep their reactions
+        self.released[:, column : column + 3] = before - supports.part(forces)
         self._replace(entry, now)
         self.gone.append(entry.supports)
-        self._release([entry.supports])
+        self._stepper.supports_changed()
 
     def _replace(self, entry: Remove, begin: float) -> None:
         """Let the reaction of a support act as a load that decreases."""

@@ -14,6 +14,7 @@ from .base import Law, MaterialKeys
 
 __all__ = ["LAW", "Parameters", "response"]
 
+_ROUNDING = 1e-12  # of strains: a cable that is shorter by less is neither slack nor stressed
 _NEVER = 1e300  # Pa; not infinite, as its product with a plastic strain of zero is the heat
 
 
@@ -48,8 +49,10 @@ def response(strain, rate, step, temperature, p, q):
     plastic = q[0]
     stress, tangent, slack = young * (strain - plastic), young, 0.0
     excess = stress - (yield_stress + hardening * plastic)
-    if stress < 0.0:
+    if strain - plastic < -_ROUNDING:
         stress, tangent, slack = 0.0, 0.0, 1.0
+    elif stress < 0.0:
+        stress = 0.0
     elif excess > 0.0:
         flow = excess / (young + hardening)
         plastic += flow

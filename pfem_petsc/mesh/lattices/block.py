@@ -48,7 +48,8 @@ class Block:
         bars = (nodes[cell.ends] - cell.offsets).min(axis=1).clip(min=0)
         if closed:
             nodes[:, 0] = bars[:, 0] = self.cells[0]
-        check_size(int(nodes.astype(object).prod(axis=1).sum()), "mesh.cells")
+        n_nodes, n_bars = (int(counts.astype(object).prod(axis=1).sum()) for counts in (nodes, bars))
+        check_size(n_nodes, "mesh.cells", n_bars)
         number: type[Numbering] = ItemByItem if plain and cell.item_by_item else CellByCell
         self.nodes, self.bars = number(nodes), number(bars)
         there = (nodes > 0).all(axis=1)

@@ -87,44 +87,57 @@ class Expression:
             raise ValueError(f"the expression has {len(text)} characters, more than {_LONGEST}")
         try:
             tree = ast.parse(text.strip(), mode="eval")
-            self._check(tree.body)
+            self._nodes = self._checked(tree.body)
         except SyntaxError as error:
             raise ValueError(f"not an expression: {error.msg} at character {error.offset}") from None
         except (RecursionError, MemoryError):
             raise ValueError("the expression is nested too deep") from None
-        self._tree = tree.body
-        self.used = {node.id for node in ast.walk(tree.body) if isinstance(node, ast.Name)}
+        self.used = {node.id for node, _, _ in self._nodes if isinstance(node, ast.Name)}
 
     def __call__(self, values: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return the values (n,) float64 at the values (n,) of the variables; not finite where it is not defined."""
         n = len(next(iter(values.values())))
+        found: dict[int, Any] = {}
         with np.errstate(all="ignore"):
-            return np.broadcast_to(np.asarray(self._value(self._tree, values), dtype=float), n).copy()
+            for node, operators, parts in reversed(self._nodes):
+                found[id(node)] = self._value(node, operators, [found.pop(id(part)) for part in parts], values)
+            return np.broadcast_to(np.asarray(found[id(self._nodes[0][0])], dtype=float), n).copy()
 
-    def _check(self, node: ast.AST) -> None:
-        """Refuse what is not arithmetic of numbers, variables and known functions."""
+    def _checked(self, tree: ast.AST) -> list[tuple[ast.AST, list[ast.AST], list[ast.AST]]]:
+        """Return all nodes, each before its parts, with operators and parts; without recursion, for long sums.
+
+        Refuse what is not arithmetic of numbers, variables and known functions.
+        """
+        nodes, left = [], [tree]
+        while left:
+            node = left.pop()
+            operators, parts = self._operands(node)
+            nodes.append((node, operators, parts))
+            left += parts
+        return nodes
+
+    def _operands(self, node: ast.AST) -> tuple[list[ast.AST], list[ast.AST]]:
         if isinstance(node, ast.Constant):
             if isinstance(node.value, bool) or not isinstance(node.value, int | float) or not _finite(node.value):
                 raise ValueError(f"{ast.unparse(node)} is not a number")
-            return
+            return [], []
         if isinstance(node, ast.Name):
             if node.id not in self.variables and node.id not in _CONSTANTS:
                 raise ValueError(f"unknown variable {node.id!r}; known: {', '.join((*self.variables, *_CONSTANTS))}")
-            return
+            return [], []
         operators, parts = _parts(node)
         if not all(type(operator) in _OPERATORS for operator in operators):
             hint = "; powers are **" if any(isinstance(operator, ast.BitXor) for operator in operators) else ""
             raise ValueError(f"{ast.unparse(node)!r}: this operator is not known{hint}")
-        for part in parts:
-            self._check(part)
+        return operators, parts
 
-    def _value(self, node: ast.AST, values: Mapping[str, np.ndarray]) -> Any:
+    def _value(
+        self, node: ast.AST, operators: list[ast.AST], found: list[Any], values: Mapping[str, np.ndarray]
+    ) -> Any:
         if isinstance(node, ast.Constant):
             return float(node.value)  # type: ignore[arg-type]
         if isinstance(node, ast.Name):
             return values[node.id] if node.id in self.variables else _CONSTANTS[node.id]
-        operators, parts = _parts(node)
-        found = [self._value(part, values) for part in parts]
         if isinstance(node, ast.Call):
             return _FUNCTIONS[node.func.id][0](*found)  # type: ignore[attr-defined]
         if isinstance(node, ast.Compare):

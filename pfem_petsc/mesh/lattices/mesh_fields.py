@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...errors import InputError
+from ...files import readable_whole
 
 if TYPE_CHECKING:
     import pyvista
@@ -60,7 +61,7 @@ class MeshField:
 
         path, array = Path(self._keys.file), self._keys.array
         try:
-            with open(path, "rb"):
+            with open(readable_whole(path), "rb"):
                 pass
             with warnings.catch_warnings(record=True):  # a file that cannot be read has no cells, which is told below
                 mesh = pyvista.read(path)

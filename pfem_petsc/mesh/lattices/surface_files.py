@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...errors import InputError
+from ...files import readable_whole
 from .surface import Surface, poly_data
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ def read_surface(path: Path, scale: float) -> Surface:
     if path.suffix.lower() not in _READERS:
         raise InputError(f"{where}: no reader for {path.suffix or 'no suffix'}; known: {', '.join(_READERS)}")
     try:
-        with open(path, "rb"):
+        with open(readable_whole(path), "rb"):
             pass
     except OSError as error:
         raise InputError(f"{where}: cannot open: {error.strerror}") from None

@@ -117,9 +117,10 @@ def missing_field(path: Path | str, fields: Mapping[str, str], known: Iterable[s
 
 def _check_file(path: Path, key: str) -> None:
     from ...errors import InputError
+    from ...files import readable_whole
 
     try:
-        with open(path, "rb"):
+        with open(readable_whole(path), "rb"):
             pass
     except FileNotFoundError:
         raise InputError(f"{key}there is no file {path}{_near(path)}") from None

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import InputError
+from ...files import readable_whole
 from ._text import numbers_of
 
 __all__ = ["Block", "blocks"]
@@ -171,8 +172,11 @@ def blocks(path: Path) -> Iterator[Block]:
 
 def _parts(path: Path, above: tuple[Path, ...]) -> Iterator[Block | Piece]:
     """Return keywords and data lines in their order."""
-    content = path.read_bytes().removeprefix(codecs.BOM_UTF8)
-    if b"\0" in content[:1000]:
+    try:
+        content = readable_whole(path).read_bytes().removeprefix(codecs.BOM_UTF8)
+    except OSError as error:
+        raise InputError(f"{path}: cannot open: {error.strerror}") from None
+    if b"\0" in content:
         raise InputError(f"{path}: is not text: save it as an Abaqus input file in UTF-8 or ASCII")
     if b"\r" in content:
         content = content.replace(b"\r\n", b"\n").replace(b"\r", b"\n")

@@ -25,6 +25,7 @@ GROUP = "node_group."
 """Beginning of the local names of metadata with a node group: name and numbers from 0, separated by a line break."""
 
 _DEEPEST = 50
+_INSTANCES = 10**6
 
 
 class Lattice:
@@ -79,6 +80,7 @@ class ModelFile:
     def __init__(self, where: str) -> None:
         self._where = where
         self._objects: dict[str, Lattice] = {}
+        self._counts: dict[str, tuple[int, int]] = {}
         self._items: list[tuple[str, np.ndarray]] = []
         self._current = Lattice("")
         self._text: list[str] | None = None
@@ -197,22 +199,49 @@ class ModelFile:
         values = _numbers([text], f"{self._where}: line {self._line()}: transform", 12)
         return values.reshape(4, 3)
 
-    def placed(self) -> Iterator[tuple[str, Lattice, np.ndarray]]:
-        """Return name, content and transform (4, 3) of each object of the build that has beams."""
-        for number, place in self._items:
-            yield from self._within(number, place, 0)
+    def check_instances(self) -> int:
+        """Return the number of vertices of all objects of the build where beams end, after their number was checked.
 
-    def _within(self, number: str, place: np.ndarray, depth: int) -> Iterator[tuple[str, Lattice, np.ndarray]]:
+        Raises
+        ------
+        InputError
+            If a component or item has no object, or has itself as a component; or if there are too many of them.
+        """
+        instances, nodes = np.sum(
+            [self._count(number, 0) for number, _ in self._items] or [(0, 0)], axis=0, dtype=object
+        )
+        if instances > _INSTANCES:
+            raise InputError(
+                f"{self._where}: the build places {instances:,} objects and components, and at most {_INSTANCES:,} are "
+                "read: write the lattice as fewer, larger objects"
+            )
+        return int(nodes)
+
+    def _count(self, number: str, depth: int) -> tuple[int, int]:
+        """Return how many objects and components an object consists of, and their number of vertices with beams."""
         if number not in self._objects:
             raise InputError(f"{self._where}: there is no object {number}, which the build or a component names")
         if depth > _DEEPEST:
             raise InputError(f"{self._where}: object {number} is a component of itself")
+        if number not in self._counts:
+            lattice = self._objects[number]
+            parts = [self._count(other, depth + 1) for other, _ in lattice.components]
+            own = int(lattice.used().sum()) if len(lattice.ends) else 0
+            self._counts[number] = 1 + sum(part[0] for part in parts), own + sum(part[1] for part in parts)
+        return self._counts[number]
+
+    def placed(self) -> Iterator[tuple[str, Lattice, np.ndarray]]:
+        """Return name, content and transform (4, 3) of each object of the build that has beams."""
+        for number, place in self._items:
+            yield from self._within(number, place)
+
+    def _within(self, number: str, place: np.ndarray) -> Iterator[tuple[str, Lattice, np.ndarray]]:
         lattice = self._objects[number]
         if len(lattice.ends):
             yield lattice.name, lattice, place
         for other, inner in lattice.components:
             move = inner[3] @ place[:3] + place[3]
-            yield from self._within(other, np.vstack([inner[:3] @ place[:3], move]), depth + 1)
+            yield from self._within(other, np.vstack([inner[:3] @ place[:3], move]))
 
 
 def _numbers(texts: list[str], what: str, width: int = 0) -> np.ndarray:

@@ -24,7 +24,7 @@ ALL = "*"
 
 def main(path: str, result: str, *fields: str) -> int:
     """Read ``path``; write ``points``, ``bars``, ``node_groups/<name>``, ``bar_groups/<name>``, ``bar_fields/<name>``
-    of the named cell fields, and the names of all, ``cell_fields``, to ``result``."""
+    of the named cell fields, and the names of all, ``cell_fields``, to ``result``; of the last of several snapshots."""
     from vtkmodules.vtkCommonCore import vtkOutputWindow, vtkStringOutputWindow
 
     # a damaged file can request any amount of memory, which takes time to fill: compressed files need at most 200 times
@@ -36,6 +36,10 @@ def main(path: str, result: str, *fields: str) -> int:
     vtkOutputWindow.SetInstance(listener)
     reader = _reader(path)
     reader.SetFileName(path)
+    reader.UpdateInformation()
+    snapshots = reader.GetNumberOfSteps() if hasattr(reader, "SetStep") else 1
+    if snapshots > 1:
+        reader.SetStep(snapshots - 1)
     reader.Update()
     grid = reader.GetOutputDataObject(0)
     # "ERROR: In FILE, line N", then on the next line "CLASS (ADDRESS): " and the message.
@@ -44,7 +48,7 @@ def main(path: str, result: str, *fields: str) -> int:
     try:
         if lines:
             raise ValueError(f"cannot be read: {(messages or lines)[0].strip()}")
-        arrays = _arrays(grid, fields)
+        arrays = _arrays(grid, fields) | {"snapshots": np.array(snapshots)}
     except ValueError as error:
         print(error)
         return REFUSED

@@ -16,6 +16,7 @@ from xml.parsers import expat
 import numpy as np
 
 from ...errors import InputError
+from ..slab import check_memory
 from ..whole import WholeMesh
 from ._threemf_model import Lattice, ModelFile
 
@@ -23,6 +24,7 @@ __all__ = ["SUFFIXES", "read"]
 
 SUFFIXES = (".3mf",)
 
+_SMALL, _COMPRESSED = 10**7, 200
 _MODEL = "http://schemas.microsoft.com/3dmanufacturing/2013/01/3dmodel"
 
 
@@ -37,12 +39,22 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     try:
         with zipfile.ZipFile(path) as archive:
             name = _model_name(path, archive)
+            _check_content(path, archive.getinfo(name))
             model = ModelFile(f"{path}: {name}")
             with archive.open(name) as stream:
                 model.parse(stream)
     except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, OSError) as error:
         raise InputError(f"{path}: is not 3MF, or damaged ({error}): write it again") from None
     return _assembled(path, model)
+
+
+def _check_content(path: Path, part: zipfile.ZipInfo) -> None:
+    """Refuse a part that is mostly blanks or repetitions: text of lattices is compressed to a tenth or a twentieth."""
+    if part.file_size > max(_SMALL, _COMPRESSED * part.compress_size):
+        raise InputError(
+            f"{path}: {part.filename} has {part.file_size:,} bytes in {part.compress_size:,} compressed ones, as no "
+            "lattice has: the file is damaged: write it again"
+        )
 
 
 def _model_name(path: Path, archive: zipfile.ZipFile) -> str:
@@ -55,6 +67,7 @@ def _model_name(path: Path, archive: zipfile.ZipFile) -> str:
 
     names = archive.namelist()
     if "_rels/.rels" in names:
+        _check_content(path, archive.getinfo("_rels/.rels"))
         parser = expat.ParserCreate()
         parser.StartElementHandler = start
         try:
@@ -69,6 +82,7 @@ def _model_name(path: Path, archive: zipfile.ZipFile) -> str:
 
 def _assembled(path: Path, model: ModelFile) -> WholeMesh:
     """Return the lattices of all items of the build as one mesh."""
+    check_memory(model.check_instances(), str(path))
     placed: list[tuple[str, Lattice, np.ndarray, np.ndarray]] = []
     for number, (name, lattice, place) in enumerate(model.placed()):
         placed.append((name or f"object_{number}", lattice, place, lattice.used()))

@@ -65,6 +65,10 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
                 kind, slash, name = key.partition("/")
                 if key == "left_out" and arrays[key]:
                     mesh.warnings.append(f"{path}: left out {arrays[key]} cells that are not lines")
+                if key == "snapshots" and arrays[key] > 1:
+                    mesh.warnings.append(
+                        f"{path}: has {arrays[key]} snapshots: the mesh and its fields are those of the last one"
+                    )
                 if slash:
                     getattr(mesh, kind)[name] = arrays[key]
             mesh.known_fields = arrays["cell_fields"].tolist()

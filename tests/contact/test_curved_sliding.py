@@ -26,12 +26,13 @@ TUBE = {"name": "tube", "type": "cylinder", "point": [0, 0, 0], "axis": [0, 1, 0
 def slide(folder, integrator, step, end, wall=None, at=(0.0, 0.0, 0.0), keys=None, **tables):
     """Final positions, velocities and last row of a bar across a tube of radius 1 m, released at 60 degrees in it."""
     place = np.array(at) + [np.sin(ANGLE), 0.0, -np.cos(ANGLE)]
+    wall = {**(wall if "type" in (wall or {}) else {**TUBE, **(wall or {})})}
     case = {
         "mesh": {"generator": "arrays", "points": [place.tolist(), (place + [0, 1, 0]).tolist()], "bars": [[0, 1]]},
         "material": {"m": {"young_modulus": 1e6, "density": 1000.0}},
         "section": {"s": {"area": 1e-3, "material": "m"}},
         "gravity": {"acceleration": [0.0, 0.0, -GRAVITY]},
-        "wall": [{**TUBE, "point": list(at), **(wall or {})}],
+        "wall": [{**wall, "point": (np.array(at) + wall["point"]).tolist()}],
         "time": {"integrator": integrator, "step": step, "end": end, **(keys or {})},
         "solver": {"rtol": 1e-12},
         "output": {"fields_every": 0, "history_every": 10},
@@ -108,3 +109,31 @@ def test_sliding_with_friction(integrator, keys, tmp_path):
         assert row["friction_dissipation"] == pytest.approx(lost, rel=4.0 * step)
     assert max(errors[1]) < 3e-4
     assert (np.array(errors[1]) < 0.3 * np.array(errors[0])).all()
+
+
+START = [np.sin(ANGLE), 0.5, -np.cos(ANGLE)]
+STEEP = {"name": "w", "point": START, "normal": [-np.sin(ANGLE), 0.0, np.cos(ANGLE)]}
+ROUND = {"name": "w", "type": "sphere", "point": [0.0, 0.5, 0.0]}
+PLACES = [
+    TUBE,
+    {**TUBE, "friction": 0.2, "static_friction": 0.3},
+    {**TUBE, "axis": [0.1, 1.0, 0.05], "side": "outside", "point": [0.3, 0.5, -1.6]},
+    {**ROUND, "side": "inside", "radius": np.sqrt(1.25)},
+    {**ROUND, "side": "outside", "point": [0.3, 0.5, -2.4], "radius": 2.04},
+    {**STEEP, "type": "plane"},
+    {**STEEP, "type": "rectangle", "along": [1.0, 0.0, 0.0], "size": [8.0, 8.0]},
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("integrator", ["central_differences", "newmark"])
+@pytest.mark.parametrize("wall", PLACES)
+def test_slides_far_from_the_origin(wall, integrator, tmp_path):
+    """As at the origin, to some thousand roundings of the coordinates, about 1 and 1000 km away."""
+    here, speed, *_ = slide(tmp_path, integrator, 2e-3, 0.3, wall)
+    for away in (2.0**10, 2.0**20):
+        there, faster, gap, _ = slide(tmp_path, integrator, 2e-3, 0.3, wall, at=(away, -away, away))
+        rounding = 2.2e-16 * away
+        np.testing.assert_allclose(there, here, atol=1e4 * rounding)
+        np.testing.assert_allclose(faster, speed, atol=1e5 * rounding)
+        assert gap > -1e2 * rounding

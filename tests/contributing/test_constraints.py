@@ -35,7 +35,10 @@ def pendulum(integrator: str, steps: int, *keys: str) -> Case:
 
 @pytest.mark.slow
 @pytest.mark.parallel
-@pytest.mark.parametrize("integrator, error", [("central_differences", 8e-4), ("chung_lee", 2e-2), ("houbolt", 6e-3)])
+@pytest.mark.parametrize(
+    "integrator, error",
+    [("central_differences", 8e-4), ("chung_lee", 2e-2), ("houbolt", 6e-3)],
+)
 def test_pendulum_on_a_tether(integrator, error, examples, comm, shared_tmp_path):
     """Against elliptic integrals: place, velocity sqrt(2 g l) and tension 3 m g at the lowest point, after
     K(1/2) sqrt(l/g), with errors of second order; its length to rounding."""
@@ -53,6 +56,21 @@ def test_pendulum_on_a_tether(integrator, error, examples, comm, shared_tmp_path
         errors.append(np.array([abs(x[-1, 0]), speed, np.abs(energy).max() / 4.905, abs(force[-1, 2] / 14.715 - 1.0)]))
     assert errors[1].max() < error
     assert (errors[1] < 0.3 * errors[0] + 1e-6).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parallel
+@pytest.mark.parametrize("integrator", ["energy_momentum", "generalized_alpha"])
+def test_pendulum_keeps_its_energy_by_gradients_within_the_step(integrator, examples, comm, shared_tmp_path):
+    """Forces act along the tether in the middle of the step, where it does no work, or at the place of the balance."""
+    errors = []
+    for steps in (25, 50):
+        run(pendulum(integrator, steps), comm, shared_tmp_path / str(steps))
+        history = history_of(shared_tmp_path / str(steps))
+        lost = (history["kinetic_energy"] - history["external_work"])[-1] / 4.905
+        errors.append(abs(lost))
+    assert errors[1] < max(0.3 * errors[0], 1e-9)
+    assert errors[1] < 1e-3
 
 
 def two_rods(integrator: str, rope: str, *keys: str) -> Case:

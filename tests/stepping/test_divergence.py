@@ -30,18 +30,24 @@ def pendulum(comm, folder, integrator, degrees, modulus=1e8, steps=30, **keys):
 
 def row_of(number, **energies):
     """A row of the history with some energies [J]."""
-    return {"step": number, "time": 0.1 * number, **dict.fromkeys((e.name for e in ENERGIES), 0.0), **energies}
+    return {
+        "step": number,
+        "time": 0.1 * number,
+        "active_contacts": 0,
+        **dict.fromkeys((e.name for e in ENERGIES), 0.0),
+        **energies,
+    }
 
 
 def test_energy_created_is_compared_with_what_moves_the_truss_in_its_stage(comm, shared_tmp_path):
     """Works of earlier stages (1 MJ), what their quadrature lost, and prestress (0.5 MJ) do not hide that 20 J of
-    motion become 200 J: the third row beyond ten times the 20 J is the last, also after a restart between them."""
+    motion become 400 J: the third row beyond twenty times the 20 J is the last, also after a restart between them."""
     simulation = pendulum(comm, shared_tmp_path / "it", "newmark", 1.0)
     simulation.start()
     state, start = simulation.state, {"elastic_energy": 5e5, "external_work": 1e6, "numerical_dissipation": 5e5}
     watch = BlowUp(simulation.model)
     watch.check(row_of(100, **start), state)
-    for number, created in enumerate([0.0, 1.0, 50.0, 150.0, 199.0, 250.0, 150.0, 300.0, 400.0]):
+    for number, created in enumerate([0.0, 1.0, 50.0, 150.0, 399.0, 450.0, 350.0, 410.0, 450.0]):
         moved = {"external_work": 1e6 + 20.0, "kinetic_energy": 20.0 + created}
         watch.check(row_of(101 + number, **{**start, **moved, "numerical_dissipation": 5e5 - created}), state)
     again = BlowUp(simulation.model)
@@ -71,8 +77,8 @@ def test_a_scheme_that_makes_energy_ends_the_run(comm, shared_tmp_path):
     with pytest.raises(SimulationFailure, match="step .*, t = .* created .* J, but only 9.81 J were supplied"):
         rows.extend(step.row for step in simulation)
     energy = np.array([row["kinetic_energy"] + row["elastic_energy"] for row in rows])
-    # it has gone on for two rows beyond ten times the energy supplied
-    assert (energy > 11.0 * 9.81).sum() <= 3
+    # it has gone on for two rows beyond twenty times the energy supplied
+    assert (energy > 21.0 * 9.81).sum() <= 3
 
 
 def test_failures_of_one_kind_are_told_once_and_counted(comm, shared_tmp_path):

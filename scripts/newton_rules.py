@@ -4,7 +4,7 @@
     .venv/bin/python scripts/newton_rules.py --kind implicit --seeds 0:80
 
 A rule is one of PETSc's line searches for all solves, or "full, then RULE": full steps as the program makes them;
-solves that fail are repeated with a line search. Counted are solves that fail, increments or steps that are bisected, Newton
+solves that fail are repeated with a line search. Counted are failed solves, bisected increments or steps, Newton
 iterations (those of failed solves included), and runs that fail. The static cases are trusses of random nodes whose
 stiffnesses differ by up to 10^8, under loads that rotate bars by up to 30 degrees, some above a wall; the implicit ones
 are those of random_cases.py with an implicit scheme.

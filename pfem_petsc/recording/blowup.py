@@ -21,7 +21,7 @@ _CREATED = (
 _IN_CONTACT = (
     1e3  # the same once nodes have been in contact: some schemes gain energy in each impact, which has a warning
 )
-_ROWS = 3  # consecutive rows; after a start from rest, or when a wall first strikes, there is no input to compare with
+_ROWS = 6  # consecutive rows; after a start from rest, or when a wall first strikes, there is no input to compare with
 _BARS = ("elastic_energy", "spring_energy")
 
 

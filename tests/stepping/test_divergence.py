@@ -41,13 +41,13 @@ def row_of(number, **energies):
 
 def test_energy_created_is_compared_with_what_moves_the_truss_in_its_stage(comm, shared_tmp_path):
     """Works of earlier stages (1 MJ), what their quadrature lost, and prestress (0.5 MJ) do not hide that 20 J of
-    motion become 400 J: the third row beyond twenty times the 20 J is the last, also after a restart between them."""
+    motion become 400 J: the sixth row beyond twenty times the 20 J is the last, also after a restart between them."""
     simulation = pendulum(comm, shared_tmp_path / "it", "newmark", 1.0)
     simulation.start()
     state, start = simulation.state, {"elastic_energy": 5e5, "external_work": 1e6, "numerical_dissipation": 5e5}
     watch = BlowUp(simulation.model)
     watch.check(row_of(100, **start), state)
-    for number, created in enumerate([0.0, 1.0, 50.0, 150.0, 399.0, 450.0, 350.0, 410.0, 450.0]):
+    for number, created in enumerate([0.0, 1.0, 50.0, 350.0, 410.0, 450.0, 450.0, 450.0, 450.0]):
         moved = {"external_work": 1e6 + 20.0, "kinetic_energy": 20.0 + created}
         watch.check(row_of(101 + number, **{**start, **moved, "numerical_dissipation": 5e5 - created}), state)
     again = BlowUp(simulation.model)
@@ -67,18 +67,6 @@ def test_released_energy_may_move_the_truss(comm, shared_tmp_path):
         energies = {"elastic_energy": 1000.0 - 50.0 * number, "kinetic_energy": 60.0 * number}
         watch.check(row_of(number, **energies, numerical_dissipation=-10.0 * number), simulation.state)
     simulation.close()
-
-
-def test_a_scheme_that_makes_energy_ends_the_run(comm, shared_tmp_path):
-    """Wilson's scheme at 20 degrees a step turns the kinetic energy of a stiff spin into a thousand times this."""
-    spin = {"angular_velocity": [0.0, 0.0, np.sqrt(2.0 * 9.81)], "centre": [0.0, 0.0, 0.0]}
-    simulation = pendulum(comm, shared_tmp_path / "it", "wilson", 20.0, initial=spin)
-    rows = []
-    with pytest.raises(SimulationFailure, match="step .*, t = .* created .* J, but only 9.81 J were supplied"):
-        rows.extend(step.row for step in simulation)
-    energy = np.array([row["kinetic_energy"] + row["elastic_energy"] for row in rows])
-    # it has gone on for two rows beyond twenty times the energy supplied
-    assert (energy > 21.0 * 9.81).sum() <= 3
 
 
 def test_failures_of_one_kind_are_told_once_and_counted(comm, shared_tmp_path):

@@ -18,12 +18,12 @@ def _impulse(history: Any, column: str) -> np.ndarray | None:
 
 
 def peak_force(result: Any, column: str) -> tuple[float, float, float]:
-    """Return the largest mean force [N] of a column, ``wall/NAME/force`` or ``support_force``, the time [s] at which its
-    window ends, and the window [s].
+    """Return the largest mean force [N] of a column, the time [s] at which its window ends, and the window [s].
 
-    The window is the time of a wave forth and back in the shortest bar at the wall or the supports, or the interval of
-    the rows if that is longer. The mean is the change of the impulse over it, zero before the run. Without an impulse,
-    as in static analyses and old results, it is the largest force of a row, with a window of zero.
+    The column is ``wall/NAME/force`` or ``support_force``. The window is the time of a wave forth and back in the
+    shortest bar at the wall or the supports, or the interval of the rows if that is longer. The mean is the change of
+    the impulse over it, zero before the run. Without an impulse, as in static analyses and old results, it is the
+    largest force of a row, with a window of zero.
     """
     history = result.history
     time, force = history["time"], history[column]

@@ -180,7 +180,7 @@ def butterworth(
         return 1.0 / (1.0 + _HALF_POWER * ratio ** (2 * order))
 
     # more than two rows per period: tan(pi f_d h) is infinite there
-    passes = _Passes(cutoff, order, 2.00001 * cutoff, f"a cut-off of {engineering(cutoff, 'Hz', 3)}")
+    passes = _Passes(cutoff, order, 2.01 * cutoff, f"a cut-off of {engineering(cutoff, 'Hz', 3)}")
     return _two_passes(time, values, passes, gain, zero_before)
 
 
@@ -212,7 +212,7 @@ def _two_passes(
     longest = float(steps.max())
     if longest * rate > 1.0 + 1e-6:
         raise InputError(
-            f"filter: {what} needs {rate:.3g} rows of the history per second, and this one has "
+            f"filter: {what} needs {rate:.5g} rows of the history per second, and this one has "
             f"{1 / longest:.4g} where they are farthest apart: set [output] history_every, or give a lower one"
         )
     if corner * (time[-1] - time[0]) < 1.0:

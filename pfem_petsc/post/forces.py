@@ -28,7 +28,8 @@ def draw_forces(
 ) -> Chart | None:
     """Draw the forces of all walls, or of all pairs or constraints, and the nodes in contact where they are counted.
 
-    Forces are drawn as computed and filtered, by default by the mean of the last 2 % of the run. They are zero before it.
+    Forces are drawn as computed and filtered, by default by the mean of the last 2 % of the run; before it, they are
+    zero.
     """
     names = [name.removeprefix(f"{source}/").removesuffix("/force") for name in history if name.endswith("/force")]
     names = [name for name in names if f"{source}/{name}/force" in history]

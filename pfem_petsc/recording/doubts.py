@@ -58,7 +58,10 @@ class Doubts:
         self._kept = {kind: dict(counts) for kind, counts in kept.items()}
 
     def look(self, x: np.ndarray, place: str, last: bool) -> None:
-        """Examine the state at positions (local, 3) [m], ghosts included, at a place of the run, or its last. Collective."""
+        """Examine the state at positions (local, 3) [m], ghosts included, at a place of the run. Collective.
+
+        ``last``: whether it is the last state of a stage.
+        """
         bars, counted = self._model.bars, self._model.mesh.counted
         for kind, limit in self._limits.items():
             if kind == "buckling":

@@ -239,7 +239,7 @@ def _last(result: Result, label: str, name: str) -> dict[str, Any]:
 
 
 def _default_results(result: Result) -> Iterator[tuple[str, Any]]:
-    """Yield name and value of the last time, of the last energies, of the largest mean forces [N], and of impulses of first touches [N s]."""
+    """Yield name and value: last time and energies, largest mean forces [N], and impulses of first touches [N s]."""
     history = result.history
     for name in ("time", *STORED, *LOST, *SUPPLIED, "energy_imbalance"):
         if name in history:

@@ -15,8 +15,9 @@ if TYPE_CHECKING:
 
 __all__ = ["Doubts"]
 
-# Searches for crossing bars, times bars, after which the interval between searches is longer by one snapshot.
-_WORK = 20_000
+# Number of bars up to which those that cross are searched at each snapshot, and of searches times bars beyond it after
+# which the interval between searches is longer by one snapshot.
+_FEW, _WORK = 2_500, 20_000
 
 _BUCKLED = "they would buckle, which their law does not describe"
 _BEYOND = "forces are extrapolated there"
@@ -125,7 +126,7 @@ class Doubts:
         counts["wait"] = counts.get("wait", 0) - 1
         if counts["wait"] >= 0:
             return False
-        counts["wait"] = self._model.mesh.n_bars * (counts["looks"] + 1) // _WORK
+        counts["wait"] = max(0, self._model.mesh.n_bars - _FEW) * (counts["looks"] + 1) // _WORK
         return True
 
     def _crossed(self, x: np.ndarray, place: str) -> None:

@@ -30,7 +30,7 @@ _NEAR = 0.01
 
 # Distance between bars up to which the search knows it, over their mean length. Until nodes have moved by half of the
 # smallest distance, no search is needed.
-_SKIN = 0.2
+_SKIN = 0.1
 
 # Limits of the work: cells listed and pairs compared, both per bar.
 _CELLS, _PAIRS = 64.0, 2000.0
@@ -96,11 +96,15 @@ class CrossingBars:
     def find(self, x: np.ndarray) -> Crossing | None:
         """Return the bars at positions (local, 3) [m] that pass through each other; None if the search would take too
         long, because too many bars are in one place."""
-        if self._last is not None and self._moved(x) < 0.499 * self._last.gap:
-            return self._last.found
+        if self._last is None:
+            points = self._model.mesh.points
+            self._before, gap = self._pairs(points, 1.0 + _NEAR)
+            self._last = _Search(Crossing(0, 0, (-1, -1)), gap, points, self._intact())
         if self._before is None:
-            self._before, _ = self._pairs(self._model.mesh.points, 1.0 + _NEAR)
-        pairs, gap = (None, 0.0) if self._before is None else self._pairs(x, 1.0)
+            return None
+        if self._moved(x) < 0.499 * self._last.gap:
+            return self._last.found
+        pairs, gap = self._pairs(x, 1.0)
         found = None if pairs is None else self._count(pairs[~np.isin(pairs, self._before)])
         self._last = _Search(found, gap, x.copy(), self._intact())
         return found
@@ -154,7 +158,7 @@ class CrossingBars:
         if not number:
             return np.empty(0, np.int64), np.inf
         skin = _SKIN * size / number
-        cell = 0.35 * size / number
+        cell = 0.5 * size / number
         while True:
             cells = (lengths // cell + 1.0) * (2.0 + (2.0 * radius + skin) / cell) ** 3
             if comm.allreduce(float(cells.sum())) <= _CELLS * number:

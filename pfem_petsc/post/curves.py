@@ -205,7 +205,8 @@ def _panel(
     shared = all(np.array_equal(place, places[0]) for place in places)
     for number, (curves, place, label, time) in enumerate(zip(found, places, labels, times, strict=True)):
         for part, values in curves.items():
-            filtered = chosen.apply(time, values) if chosen is not None else values
+            touch = part.startswith(("wall/", "pair/", "constraint/")) and "/force" in part  # zero before the run
+            filtered = chosen.apply(time, values, touch) if chosen is not None else values
             k = number * len(parts) + parts.index(part)
             text = " ".join(word for word in (label if several else "", part if len(parts) > 1 else "") if word)
             x, y = (place, filtered) if over[:4] != "time" else thinned(place, filtered)

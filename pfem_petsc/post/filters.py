@@ -29,6 +29,9 @@ AS_COMPUTED = "as computed"
 CFC_CORNER = 2.0775
 """Corner frequency of each pass over the channel frequency class (SAE J211-1, appendix C)."""
 
+_ROWS = 10.0
+"""Rows per second and unit of the channel frequency class, at least (SAE J211-1)."""
+
 _HALF_POWER = math.sqrt(2.0) - 1.0
 """(f/f_d)^(2 n) at which two passes of order n have -3 dB: (1 + x)^-1 = 2^-1/2."""
 
@@ -48,11 +51,12 @@ class Filter(NamedTuple):
     Attributes
     ----------
     name : with the cut-off, for pictures
-    apply : from times (n,) [s] and values (n,) to filtered values (n,)
+    apply : from times (n,) [s], values (n,), and whether the quantity is zero before the first row, as contact forces
+        are, to filtered values (n,)
     """
 
     name: str
-    apply: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    apply: Callable[..., np.ndarray]
 
 
 def make_filter(text: str) -> Filter:
@@ -70,32 +74,33 @@ def make_filter(text: str) -> Filter:
         numbers = [math.nan]
     good = all(math.isfinite(number) and number > 0.0 for number in numbers)
     if kind == "none" and not words:
-        return Filter(AS_COMPUTED, lambda time, values: np.array(values, dtype=float))
+        return Filter(AS_COMPUTED, lambda time, values, zero=False: np.array(values, dtype=float))
     if kind == "mean" and len(numbers) == 1 and good:
         (width,) = numbers
         corner = f"{0.4429 / width:.3g} Hz"
         name = f"mean of the {engineering(width, 's', 3)} before (−3 dB at {corner})"
-        return Filter(name, lambda time, values: window_mean(time, values, width))
+        return Filter(name, lambda time, values, zero=False: window_mean(time, values, width, zero))
     if kind == "cfc" and len(numbers) == 1 and good:
         (size,) = numbers
         corner = f"{CFC_CORNER * size * _HALF_POWER**0.25:.3g} Hz"
         name = f"CFC {size:g} of SAE J211-1 (two passes, −3 dB at {corner})"
-        return Filter(name, lambda time, values: cfc(time, values, size))
+        return Filter(name, lambda time, values, zero=False: cfc(time, values, size, zero))
     if kind == "butterworth" and len(numbers) in (1, 2) and good:
         cutoff, order = numbers[0], int(numbers[1]) if len(numbers) == 2 else 2
         if order == (numbers + [2.0])[1] and order <= 10:
             name = f"Butterworth of order {order} (two passes, −3 dB at {cutoff:g} Hz)"
-            return Filter(name, lambda time, values: butterworth(time, values, cutoff, order))
+            return Filter(name, lambda time, values, zero=False: butterworth(time, values, cutoff, order, zero))
     raise InputError(
         f"filter = {text!r} is not known; give cfc:CLASS, butterworth:FREQUENCY[:ORDER] [Hz, up to order 10], "
         "mean:SECONDS or none, like cfc:180"
     )
 
 
-def window_mean(time: np.ndarray, values: np.ndarray, width: float) -> np.ndarray:
-    """Return the mean of a piecewise linear curve over a window [s] before each point, truncated at the start.
+def window_mean(time: np.ndarray, values: np.ndarray, width: float, zero_before: bool = False) -> np.ndarray:
+    """Return the mean of a piecewise linear curve over a window [s] before each point.
 
-    It depends on past values only. The integral is exact for any spacing of the points.
+    It depends on past values only. The integral is exact for any spacing of the points. At the start, the window is
+    truncated, unless the curve is zero before it: a spike in the first row would be its own mean.
     """
     if len(time) < 2 or width <= 0:
         return values.copy()
@@ -109,7 +114,7 @@ def window_mean(time: np.ndarray, values: np.ndarray, width: float) -> np.ndarra
         slope = (values[k + 1] - values[k]) / np.where(steps[k] > 0, steps[k], 1.0)
         return integral[k] + part * (values[k] + 0.5 * slope * part)
 
-    span = time - low
+    span = np.full(len(time), width) if zero_before else time - low
     return np.where(span > 0.0, (integral - primitive(low)) / np.where(span > 0.0, span, 1.0), values)
 
 
@@ -132,24 +137,25 @@ def cfc_coefficients(size: float, interval: float) -> tuple[float, float, float,
     return a, 2.0 * a, a, -2.0 * (w * w - 1.0) / scale, (-1.0 + math.sqrt(2.0) * w - w * w) / scale
 
 
-def cfc(time: np.ndarray, values: np.ndarray, size: float) -> np.ndarray:
+def cfc(time: np.ndarray, values: np.ndarray, size: float, zero_before: bool = False) -> np.ndarray:
     """Return a history filtered by a channel frequency class of SAE J211-1: 60, 180, 600, 1000.
 
     Two passes of :func:`cfc_coefficients`, forward and backward, so that nothing is shifted in time. Together they have
     -6 dB at 2.0775 times the class and -3 dB at 1.67 times the class. They are applied in one pass over frequencies,
-    |H(f)|^2, to the history continued by odd reflection at both ends, and are equal to the recursion but for how
-    that starts.
+    |H(f)|^2, to the history continued by odd reflection at both ends, or by zero before the start, and are equal to the
+    recursion but for how that starts.
 
     Parameters
     ----------
     time : (n,) [s]; uneven steps are interpolated linearly to even ones
     values : (n,)
     size : the class; the standard asks for 10 rows or more per second and unit of it
+    zero_before : whether the quantity is zero before the first row, as contact forces are
 
     Raises
     ------
     InputError
-        If the history is too coarse or too short for the class.
+        If the history is too coarse or too short for the class, or has less than three rows.
     """
 
     def gain(frequency: np.ndarray, interval: float) -> np.ndarray:
@@ -157,10 +163,12 @@ def cfc(time: np.ndarray, values: np.ndarray, size: float) -> np.ndarray:
         z = np.exp(-2j * np.pi * frequency * interval)
         return np.abs((a0 + a1 * z + a2 * z * z) / (1.0 - b1 * z - b2 * z * z)) ** 2
 
-    return _two_passes(time, values, CFC_CORNER * size, 2, gain, f"CFC {size:g}")
+    return _two_passes(time, values, _Passes(CFC_CORNER * size, 2, _ROWS * size, f"CFC {size:g}"), gain, zero_before)
 
 
-def butterworth(time: np.ndarray, values: np.ndarray, cutoff: float, order: int = 2) -> np.ndarray:
+def butterworth(
+    time: np.ndarray, values: np.ndarray, cutoff: float, order: int = 2, zero_before: bool = False
+) -> np.ndarray:
     """Return a history after a Butterworth low-pass filter forward and backward, with -3 dB in all at the cut-off [Hz].
 
     The gain of both passes is 1/(1 + r^(2 n)), r = tan(pi f h)/tan(pi f_d h), of the bilinear transform at a sampling
@@ -171,34 +179,54 @@ def butterworth(time: np.ndarray, values: np.ndarray, cutoff: float, order: int 
         ratio = np.tan(np.pi * np.minimum(frequency * interval, 0.5 - 1e-9)) / math.tan(math.pi * cutoff * interval)
         return 1.0 / (1.0 + _HALF_POWER * ratio ** (2 * order))
 
-    return _two_passes(time, values, cutoff, order, gain, f"a cut-off of {engineering(cutoff, 'Hz', 3)}")
+    # more than two rows per period: tan(pi f_d h) is infinite there
+    passes = _Passes(cutoff, order, 2.01 * cutoff, f"a cut-off of {engineering(cutoff, 'Hz', 3)}")
+    return _two_passes(time, values, passes, gain, zero_before)
+
+
+class _Passes(NamedTuple):
+    """Corner frequency [Hz] and order of a pass, the fewest rows per second, and what a message calls the filter."""
+
+    corner: float
+    order: int
+    rate: float
+    what: str
 
 
 def _two_passes(
     time: np.ndarray,
     values: np.ndarray,
-    corner: float,
-    order: int,
+    passes: _Passes,
     gain: Callable[[np.ndarray, float], np.ndarray],
-    what: str,
+    zero_before: bool,
 ) -> np.ndarray:
     time, values = np.asarray(time, dtype=float), np.asarray(values, dtype=float)
-    if len(time) < 3:
-        return values.copy()
+    corner, order, rate, what = passes
+    steps = np.diff(time)
+    steps = steps[steps > 0.0]
+    if len(steps) < 2:
+        raise InputError(
+            f"filter: {what} needs a history of three rows or more, and this one has {len(steps) + 1}: "
+            "set [output] history_every, or give filter none"
+        )
+    longest = float(steps.max())
+    if longest * rate > 1.0 + 1e-6:
+        raise InputError(
+            f"filter: {what} needs {rate:.5g} rows of the history per second, and this one has "
+            f"{1 / longest:.4g} where they are farthest apart: set [output] history_every, or give a lower one"
+        )
+    if corner * (time[-1] - time[0]) < 1.0:
+        raise InputError(
+            f"filter: {what} is slower than the history of {engineering(time[-1] - time[0], 's')}: it has less than "
+            f"a period of {engineering(1 / corner, 's', 3)}; give a higher one"
+        )
     grid, even = _evenly(time, values)
     interval = (grid[-1] - grid[0]) / (len(grid) - 1)
-    if corner * interval >= 0.5:
-        raise InputError(
-            f"filter: {what} needs more than {2 * corner:.3g} rows of the history per second, and this one has "
-            f"{1 / interval:.4g}: set [output] history_every, or give a lower cut-off"
-        )
-    if corner * (grid[-1] - grid[0]) < 1.0:
-        raise InputError(
-            f"filter: {what} is slower than the history of {engineering(grid[-1] - grid[0], 's')}; raise the cut-off"
-        )
     # what the slowest pole forgets to rounding error
     pad = math.ceil(36.0 / (2 * math.pi * corner * interval * math.sin(math.pi / (2 * order))))
     longer = np.pad(even, pad, mode="reflect", reflect_type="odd")
+    if zero_before:
+        longer[:pad] = 0.0
     frequency = np.fft.rfftfreq(len(longer), interval)
     smooth = np.fft.irfft(np.fft.rfft(longer) * gain(frequency, interval), len(longer))[pad : pad + len(even)]
     return smooth if grid is time else np.interp(time, grid, smooth)

@@ -28,7 +28,8 @@ def draw_forces(
 ) -> Chart | None:
     """Draw the forces of all walls, or of all pairs or constraints, and the nodes in contact where they are counted.
 
-    Forces are drawn as computed and filtered, by default by the mean of the last 2 % of the run.
+    Forces are drawn as computed and filtered, by default by the mean of the last 2 % of the run; before it, they are
+    zero.
     """
     names = [name.removeprefix(f"{source}/").removesuffix("/force") for name in history if name.endswith("/force")]
     names = [name for name in names if f"{source}/{name}/force" in history]
@@ -53,7 +54,7 @@ def draw_forces(
     forces = {}
     for name in names:
         values, label = _pressing(np.asarray(history[f"{source}/{name}/force"], dtype=float), normals.get(name))
-        forms = ((AS_COMPUTED, values, 0.9), (smoothing.name, smoothing.apply(time, values), 1.6))[: 2 - plain]
+        forms = ((AS_COMPUTED, values, 0.9), (smoothing.name, smoothing.apply(time, values, True), 1.6))[: 2 - plain]
         forces[name] = label, forms
     chart.share("force", "N", [largest(drawn) for _, forms in forces.values() for _, drawn, _ in forms])
     for name, counts in zip(names, counted, strict=True):
@@ -172,7 +173,7 @@ def _wall_paths(result: Any, smoothing: Filter, exact: ClosedForm | None) -> lis
         else:
             continue
         moved = sign * np.asarray(history[place], dtype=float) @ normal
-        moved, smooth = smoothing.apply(time, moved), smoothing.apply(time, force)
+        moved, smooth = smoothing.apply(time, moved), smoothing.apply(time, force, True)
         shown, begin = _touching(force, smooth)
         line = _Path(
             f"Wall '{wall.name}'",

@@ -18,7 +18,7 @@ from ..energies import LOST, STORED, SUPPLIED
 from ..errors import InputError
 from ..output.history import EVENT
 from ..output.modes import NAMES
-from ..output.peaks import peak_force
+from ..output.peaks import peak_force, touch_impulse
 from ..output.units import engineering, prefix_for
 from .energies import balance_error
 from .plot import plot
@@ -156,9 +156,13 @@ def _summary(result: Any) -> dict[str, str]:
     rows["history"] = f"{len(history['time']):,} rows, {_span(result)}"
     rows["snapshots"] = f"{len(result.times):,}"
     for wall in case.every_wall:
-        force, time, window = peak_force(result, wall.name)
+        force, time, window = peak_force(result, f"wall/{wall.name}/force")
         over = f" (mean over {engineering(window, 's', 3)})" if window else ""
         text = f"largest force {engineering(force, 'N')}{over} at {_place(result, time)}"
+        touching, impulse = touch_impulse(result, wall.name)
+        if impulse > 0.0:
+            share = f"{engineering(touching, 'N s', 3)} of {engineering(impulse, 'N s', 3)}"
+            text = f"{text}; impulse of first touches {share}"
         rows[f"wall '{wall.name}'"] = text if force > 0.0 else "not touched"
     if "broken_bars" in history and np.asarray(history["broken_bars"])[-1]:
         rows["broken bars"] = f"{int(np.asarray(history['broken_bars'])[-1]):,} of {result.n_bars:,}"

@@ -15,6 +15,10 @@ if TYPE_CHECKING:
 
 __all__ = ["Doubts"]
 
+# Number of bars up to which those that cross are searched at each snapshot, and of searches times bars beyond it after
+# which the interval between searches is longer by one snapshot.
+_FEW, _WORK = 2_500, 20_000
+
 _BUCKLED = "they would buckle, which their law does not describe"
 _BEYOND = "forces are extrapolated there"
 _CROSSED = "bars do not touch bars, and results from then on are doubtful"
@@ -54,8 +58,11 @@ class Doubts:
         """Go on with the counts of :meth:`kept`."""
         self._kept = {kind: dict(counts) for kind, counts in kept.items()}
 
-    def look(self, x: np.ndarray, place: str) -> None:
-        """Examine the state at positions (local, 3) [m], ghosts included, at a place of the run. Collective."""
+    def look(self, x: np.ndarray, place: str, last: bool) -> None:
+        """Examine the state at positions (local, 3) [m], ghosts included, at a place of the run. Collective.
+
+        ``last``: whether it is the last state of a stage.
+        """
         bars, counted = self._model.bars, self._model.mesh.counted
         for kind, limit in self._limits.items():
             if kind == "buckling":
@@ -65,13 +72,12 @@ class Doubts:
                 if bars.can_break:
                     values[bars.watched[counted] == 0.0] = 0.0
             self._exceeded(kind, values / limit, place)
-        if self._crossing.applicable:
+        if self._crossing.applicable and (self._is_due() or last):
             self._crossed(x, place)
 
     def _counts(self, kind: str) -> dict[str, Any]:
-        counts = self._kept.setdefault(kind, {"looks": 0, "seen": 0, "first": "", "most": 0, "worst": [0.0, -1, ""]})
-        counts["looks"] += 1
-        return counts
+        none = {"looks": 0, "seen": 0, "first": "", "most": 0, "worst": [0.0, -1, ""]}
+        return self._kept.setdefault(kind, none)
 
     def _seen(self, counts: dict[str, Any], number: int, place: str) -> bool:
         """Count a snapshot with a number of bars or pairs; return whether it is the first."""
@@ -89,6 +95,7 @@ class Doubts:
         parts = self._model.comm.allgather((len(over), worst))
         number, (ratio, bar) = sum(part[0] for part in parts), min(part[1] for part in parts)
         counts = self._counts(kind)
+        counts["looks"] += 1
         if not number:
             return
         if -ratio > counts["worst"][0]:
@@ -109,15 +116,27 @@ class Doubts:
         limit, law = min((limit, law) for limit, law in limits.items() if np.isfinite(limit))
         return f"bar {bar} by {ratio * limit:.0%}, where law {law!r} describes {limit:.0%}"
 
+    def _is_due(self) -> bool:
+        """Count a snapshot; return whether crossing bars are searched at it.
+
+        A search costs more than a snapshot: the intervals grow with the number of bars and of searches. They do not
+        depend on the motion or on ranks, so that restarts continue them.
+        """
+        counts = self._counts("crossing")
+        counts["wait"] = counts.get("wait", 0) - 1
+        if counts["wait"] >= 0:
+            return False
+        counts["wait"] = max(0, self._model.mesh.n_bars - _FEW) * (counts["looks"] + 1) // _WORK
+        return True
+
     def _crossed(self, x: np.ndarray, place: str) -> None:
         """Count bars that pass through each other. Collective."""
         found, counts = self._crossing.find(x), self._counts("crossing")
+        counts["looks"] += 1
         if found is None:
             if not counts.get("unknown"):
                 counts["unknown"] = True
-                self._warn(
-                    f"{place}: bars that pass through each other are not searched: their lengths differ too much"
-                )
+                self._warn(f"{place}: bars are not searched for passing through each other: they are too crowded")
             return
         if not found.pairs:
             return

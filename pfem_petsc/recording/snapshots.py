@@ -58,7 +58,8 @@ class Snapshots(Observer):
         self.last = number
         for text in self._piercing.look(state.x, state.time):
             self._warn(text)
-        self._doubts.look(state.x, f"step {number}, {self._analysis.plan.axis.exact(place)}")
+        at = f"step {number}, {self._analysis.plan.axis.exact(place)}"
+        self._doubts.look(state.x, at, last=state.step >= self._analysis.last_step)
 
     def kept(self) -> dict[str, Any]:
         """Return what a restart and the next stage go on with: the step of the last snapshot, and counts."""

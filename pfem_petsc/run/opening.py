@@ -109,10 +109,26 @@ def _attributes(case: Case, model: Model, plan: Plan, recorder: Recorder) -> dic
         attributes["steps"] = plan.steps
     for name, nodes in recorder.probe_nodes.items():
         attributes[f"probe_nodes/{name}"] = nodes.tolist()
-    bars, members = model.bars, np.ones((model.mesh.n_local, 1))
-    for k, name in enumerate(model.contact.names):
-        members[: model.mesh.n_owned, 0] = model.contact.members[:, k]
-        model.mesh.update_ghosts(members)
+    return attributes | _wave_times(case, model)
+
+
+def _wave_times(case: Case, model: Model) -> dict[str, float]:
+    """Return the time [s] of a wave through the shortest bar at each wall, and at the supports, of all stages.
+
+    Collective.
+    """
+    sets: dict[str, list[str | None]] = {}
+    for stage in case.stages:
+        for wall in stage.wall:
+            sets.setdefault(f"wall/{wall.name}/force", []).append(wall.node_set)
+        for support in stage.support:
+            sets.setdefault("support_force", []).append(support.node_set)
+    mesh, bars, found = model.mesh, model.bars, {}
+    for column, names in sets.items():
+        members = np.zeros((mesh.n_local, 1))
+        for name in names:
+            members[: mesh.n_owned][slice(None) if name is None else model.nodes[name]] = 1.0
+        mesh.update_ghosts(members)
         times = [np.inf]
         for block in bars.blocks:
             own = slice(block.start, block.stop)
@@ -120,5 +136,5 @@ def _attributes(case: Case, model: Model, plan: Plan, recorder: Recorder) -> dic
             if block.density > 0.0 and near.any():
                 shortest = float(bars.mesh_lengths[own][near].min())
                 times.append(shortest * float(np.sqrt(block.density / block.modulus)))
-        attributes[f"wave_time/{name}"] = model.comm.allreduce(min(times), op=MPI.MIN)
-    return attributes
+        found[f"wave_time/{column}"] = model.comm.allreduce(min(times), op=MPI.MIN)
+    return found

@@ -14,7 +14,7 @@ import numpy as np
 from ..case.schema import Case
 from ..energies import LOST, STORED, SUPPLIED
 from ..errors import InputError
-from ..output.peaks import peak_force
+from ..output.peaks import peak_force, touch_impulse
 from ..output.result import Result, open_result
 from ..output.table import Table, flat_columns
 from .pool import performed
@@ -56,7 +56,8 @@ def sweep(
         whose last value is used (vectors have a column for each component; ``wall/floor/force.z`` is one of them); or
         one function that returns values by name. Functions are called in this process; an exception becomes the
         message of the row, whose status is then 1. Default: the last values of time and of the energies that occur
-        [J], and the largest forces of walls and supports [N]
+        [J], the largest forces of walls and supports [N], as means over the time of a wave forth and back in the
+        shortest bar there, and the impulses of walls in the rows in which nodes touch them [N s]
     output : folder of the results, which are in folders ``0000``, ``0001``, ... in it; default:
         ``results/<case name>-sweep``. An existing one is moved aside
     keep : whether the results of the runs are kept; otherwise those with status 0 are removed after their row is made
@@ -238,13 +239,14 @@ def _last(result: Result, label: str, name: str) -> dict[str, Any]:
 
 
 def _default_results(result: Result) -> Iterator[tuple[str, Any]]:
-    """Yield name and value of the last time, of the last energies, and of the largest forces [N]."""
+    """Yield name and value: last time and energies, largest mean forces [N], and impulses of first touches [N s]."""
     history = result.history
     for name in ("time", *STORED, *LOST, *SUPPLIED, "energy_imbalance"):
         if name in history:
             yield f"final_{name}", float(history[name][-1])
     for name in history:
-        if name.startswith("wall/") and name.endswith("/force"):
-            yield f"peak_{name}", peak_force(result, name.removeprefix("wall/").removesuffix("/force"))[0]
-        elif name == "support_force":
-            yield f"peak_{name}", float(np.linalg.norm(history[name], axis=1).max())
+        if (name.startswith("wall/") and name.endswith("/force")) or name == "support_force":
+            yield f"peak_{name}", peak_force(result, name)[0]
+        if name.startswith("wall/") and name.endswith("/contacts"):
+            wall = name.removesuffix("/contacts")
+            yield f"touch_{wall}/impulse", touch_impulse(result, wall.removeprefix("wall/"))[0]

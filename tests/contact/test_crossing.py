@@ -65,18 +65,39 @@ def test_pairs_are_those_of_every_pair_compared(seed, longest, comm):
     assert CrossingBars(model).find(model.mesh.points + 1e3).pairs == 0
 
 
-def test_first_crossing_is_told_once_and_counted_at_the_end(comm, shared_tmp_path, capfd):
-    points = np.array([[-1.0, 0, 0], [1, 0, 0], [0, -1, 0.5], [0, 1, 0.5], [0, 0, 5], [1, 0, 5.0]])
-    falling = {
+def falling_onto(others):
+    """A bar that falls through one at rest at 1 m/s, between 0.38 s and 0.62 s, and others far away; a snapshot every
+    0.1 s."""
+    points = np.array([[-1.0, 0, 0], [1, 0, 0], [0, -1, 0.5], [0, 1, 0.5]])
+    ends = np.array([[0.0, 0, 5], [1, 0, 5]])
+    points = np.concatenate([points, *(ends + [0.0, 0.0, k] for k in range(others))])
+    tables = {
         "support": [
-            {"node_set": "fixed", "fix": "xyz"},
-            {"node_set": "moving", "fix": "xyz", "motion": [[0.0, 0, 0, 0], [1.0, 0, 0, -1.0]]},
+            {"node_set": "rest", "fix": "xyz"},
+            {
+                "node_set": "moving",
+                "fix": "xyz",
+                "motion": [[0.0, 0, 0, 0], [1.0, 0, 0, -1.0]],
+                "interpolation": "linear",
+            },
         ],
-        "node_set": {"fixed": {"indices": [0, 1, 4, 5]}, "moving": {"indices": [2, 3]}},
+        "node_set": {"rest": {"indices": [0, 1, *range(4, len(points))]}, "moving": {"indices": [2, 3]}},
         "output": {"fields_every": 10, "checkpoint_every": 60},
     }
-    falling["support"][1]["interpolation"] = "linear"
-    case = rods(points, np.array([[0, 1], [2, 3], [4, 5]]), 0.06, **falling)
+    return rods(points, np.arange(len(points)).reshape(-1, 2), 0.06, **tables)
+
+
+@pytest.mark.slow
+def test_searches_of_many_bars_have_growing_intervals(comm, shared_tmp_path):
+    """With 12,500 bars, at snapshots 0, 1, 3, 5, 8 and the last, 10: of those in contact, 4 to 6, at one."""
+    assert Simulation(falling_onto(12_498), comm, output=shared_tmp_path / "it", quiet=True).run() == 0
+    if comm.rank == 0:
+        log = (shared_tmp_path / "it" / "log.txt").read_text()
+        assert "in 1 of 6 snapshots, first at step 50, t = 0.5 s: up to 1 pairs (2 bars" in log
+
+
+def test_first_crossing_is_told_once_and_counted_at_the_end(comm, shared_tmp_path, capfd):
+    case = falling_onto(1)
     # at 1 m/s, the axes are closer than 0.12 m between 0.38 s and 0.62 s: snapshots at 0.4, 0.5 and 0.6 s
     told = (
         "bars passed through each other in 3 of 11 snapshots, first at step 40, t = 0.4 s: up to 1 pairs (2 bars, 66.7%"

@@ -5,7 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pfem_petsc.post.filters import WINDOWS, amplitude_spectrum, butterworth, cfc, cfc_coefficients, make_filter
+from pfem_petsc.errors import InputError
+from pfem_petsc.post.filters import (
+    WINDOWS,
+    amplitude_spectrum,
+    butterworth,
+    cfc,
+    cfc_coefficients,
+    make_filter,
+    window_mean,
+)
 
 RATE = 10_000.0
 TIME = np.arange(4001) / RATE
@@ -123,3 +132,54 @@ def test_spectrum_of_a_sine_has_its_amplitude(window):
 def test_highest_frequency_of_an_even_number_of_rows():
     values = np.where(np.arange(64) % 2, -1.0, 1.0)
     assert amplitude_spectrum(np.arange(64) * 0.5, values, "rectangular")[1][-1] == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("name", ["cfc:180", "butterworth:300:4"])
+def test_forces_are_zero_before_the_run(name):
+    """A spike in the first row is filtered as if rows of zero came before; odd reflection keeps it as it is."""
+    values = np.exp(-TIME / 0.02)
+    values[0] += 50.0
+    before = np.concatenate([np.zeros(4000), values])
+    longer = np.concatenate([TIME[:4000] - 4000 / RATE, TIME])
+    apply = make_filter(name).apply
+    found = apply(TIME, values, True)
+    assert found == pytest.approx(apply(longer, before)[4000:], abs=1e-9)
+    assert found.max() < 0.2 * values[0] < apply(TIME, values).max()
+
+
+@pytest.mark.parametrize("rows", [101, 201, 401])
+def test_mean_of_a_spike_in_the_first_row_does_not_grow(rows):
+    """A force F, and an impulse P in the first row: the mean is (P/2 + F t)/w up to the window w, then at most F."""
+    time = np.linspace(0.0, 1.0, rows)
+    impulse, force, width = 3.0, 2.0, 0.2
+    values = np.full(rows, force)
+    values[0] += impulse * (rows - 1)
+    found = window_mean(time, values, width, zero_before=True)
+    inside = (time > 0.0) & (time < width - 1e-9)
+    assert found[inside] == pytest.approx((0.5 * impulse + force * time[inside]) / width)
+    assert found[time > width + 2.0 / rows] == pytest.approx(force)
+    assert found[0] == 0.0
+
+
+def test_filters_that_the_history_cannot_carry_are_refused():
+    """Ten rows per second and unit of the class; a period of the corner; three rows; more than two rows per period."""
+
+    def apply(name, rows, end):
+        time = np.linspace(0.0, end, rows)
+        return make_filter(name).apply(time, np.ones(rows), False)
+
+    assert apply("cfc:100", 1001, 1.0) == pytest.approx(1.0)
+    with pytest.raises(InputError, match="CFC 100 needs 1000 rows of the history per second, and this one has 990"):
+        apply("cfc:100", 991, 1.0)
+    with pytest.raises(InputError, match="CFC 100 is slower than the history of 4.000 ms"):
+        apply("cfc:100", 101, 0.004)
+    for name in ("cfc:100", "butterworth:5"):
+        with pytest.raises(InputError, match="three rows or more, and this one has 2"):
+            apply(name, 2, 0.001)
+    with pytest.raises(InputError, match="500 Hz needs 1005 rows of the history per second, and this one has 1000"):
+        apply("butterworth:500", 1001, 1.0)
+    assert apply("butterworth:497", 1001, 1.0) == pytest.approx(1.0)
+    # one long interval is too long, however short the others are
+    time = np.concatenate([np.linspace(0.0, 1.0, 2001), [1.002], np.linspace(1.003, 2.0, 2001)])
+    with pytest.raises(InputError, match="this one has 500 where they are farthest apart"):
+        cfc(time, np.ones(len(time)), 100.0)

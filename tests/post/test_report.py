@@ -46,6 +46,14 @@ def run(tmp_path_factory):
 
 
 @pytest.mark.slow
+def test_class_that_the_rows_cannot_carry_has_status_2(run, capsys):
+    """100 rows per second carry CFC 10, not CFC 11."""
+    assert main(["plot", str(run), "--curves", "wall/wall/force.x", "--filter", "cfc:10"]) == 0
+    assert main(["plot", str(run), "--curves", "wall/wall/force.x", "--filter", "cfc:11"]) == 2
+    assert "CFC 11 needs 110 rows of the history per second, and this one has 100 where" in capsys.readouterr().err
+
+
+@pytest.mark.slow
 def test_report_of_a_run(run, capsys):
     with (run / "log.txt").open("a") as log:
         log.write("2026-01-01 00:00:00 WARNING something <odd>\n  on two lines\n2026-01-01 00:00:01 INFO    later\n")
@@ -61,6 +69,7 @@ def test_report_of_a_run(run, capsys):
         "21 nodes, 20 bars",
         "central_differences, lumped mass, to 500.0 ms",
         "largest force 518.8 mN (mean over 100 ms) at t = 260 ms",
+        "impulse of first touches",
         "something <odd>\n  on two lines",
         "No pictures of the truss: not asked for",
         "50 steps in",

@@ -88,20 +88,11 @@ class ExplicitContact:
         def forces() -> tuple[np.ndarray, np.ndarray]:
             nonlocal failure
             try:
-                nodes, _, _, walls = self.project(x.copy(), stiffness, time, tolerance, booked=False)
+                nodes, correction, _, walls = self.project(x.copy(), stiffness, time, tolerance, booked=False)
             except SimulationFailure as met:  # raised once all ranks have left the iteration
                 failure = failure or met
                 return np.zeros((len(free.at), 3)), np.zeros((len(free.at), 3, 3))
-            displacements = self.contact.motion.displacements(time)
-            acting = self.contact.acting(nodes, x[nodes], displacements, self._part)
-            normals, _ = self.contact.planes(walls.touching, walls.places, displacements, acting)
-            touching = walls.touching
-            if self.contact.ties.any:
-                touching = touching & ~self.contact.ties.held[nodes][:, None]
-            active = np.where(touching[:, :, None] & ~self.contact.fixed[nodes][:, None, :], normals, 0.0)
-            inverse = np.linalg.pinv(active, rcond=RANK) if len(nodes) else np.zeros((0, 3, len(self.contact.walls)))
-            weight = stiffness[nodes][:, None] * (inverse * inverse).sum(axis=1)  # the diagonal of k (N N^T)^-1
-            slope = np.einsum("mw,mwi,mwj->wij", np.where(touching, weight, 0.0), normals, normals)
+            slope = self._slope(nodes, x[nodes], correction, stiffness[nodes], walls, time)
             if self.contact.ties.any:
                 tied, at = self.contact.ties.nodes()
                 gives = stiffness[tied, None] * ~self.contact.fixed[tied]
@@ -113,6 +104,50 @@ class ExplicitContact:
             raise failure
         if not found:
             raise SimulationFailure(self.contact.unsettled_message())
+
+    def _slope(
+        self,
+        nodes: np.ndarray,
+        free: np.ndarray,
+        correction: np.ndarray,
+        stiffness: np.ndarray,
+        walls: WallForces,
+        time: float,
+    ) -> np.ndarray:
+        """Return the derivatives (w, 3, 3) [N/m] of the walls' forces on untied nodes by the walls' positions.
+
+        Nodes (m,) at ``free`` (m, 3) without walls are moved by ``correction`` (m, 3) [m]. The normal force of a node
+        that slips drags it by mu times itself against the slip, which turns with the wall; one that sticks follows the
+        wall in all directions. Exact for nodes at one wall.
+        """
+        contact, touching = self.contact, walls.touching
+        displacements = contact.motion.displacements(time)
+        acting = contact.acting(nodes, free, displacements, self._part)
+        normals, _ = contact.planes(touching, walls.places, displacements, acting)
+        if contact.ties.any:
+            touching = touching & ~contact.ties.held[nodes][:, None]
+        held = touching[:, :, None] & ~contact.fixed[nodes][:, None, :]
+        active = np.where(held, normals, 0.0)
+        inverse = np.linalg.pinv(active, rcond=RANK) if len(nodes) else np.zeros((0, 3, len(contact.walls)))
+        weight = stiffness[:, None] * (inverse * inverse).sum(axis=1)  # the diagonal of k (N N^T)^-1
+        weight = np.where(touching, weight, 0.0)
+        slope = np.einsum("mw,mwi,mwj->wij", weight, normals, normals)
+        if not contact.has_friction:
+            return slope
+        way = displacements - contact.motion.displacements(contact.state.time)
+        slip = (walls.places - contact.state.position[nodes])[:, None, :] - way
+        slip -= np.einsum("mwi,mwi->mw", slip, normals)[:, :, None] * normals
+        size = np.linalg.norm(slip, axis=2)
+        slips = size > PROJECTED * contact.size
+        slip /= np.where(slips, size, np.inf)[:, :, None]
+        rough = np.where(touching, contact.friction, 0.0)
+        slope -= np.einsum("mw,mwi,mwj->wij", rough * weight, slip, normals)
+        drag = rough * np.maximum(np.einsum("mwi,mi->mw", normals, correction), 0.0)  # over k
+        turning = np.where(slips, drag / np.where(slips, size + drag, 1.0), contact.static_friction > 0.0)
+        sideways = (
+            np.eye(3) - normals[:, :, :, None] * normals[:, :, None, :] - slip[:, :, :, None] * slip[:, :, None, :]
+        )
+        return slope + np.einsum("mw,mwi,mwij->wij", stiffness[:, None] * turning, held.astype(float), sideways)
 
     def project(
         self, x: np.ndarray, stiffness: np.ndarray, time: float, tolerance: float, booked: bool = True

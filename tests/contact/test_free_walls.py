@@ -98,6 +98,32 @@ def test_point_mass_hits_a_wall_with_mass(comm, shared_tmp_path):
     assert last["wall/plate/velocity"][2] == pytest.approx(common - e * 1.2 * truss / (truss + mass), rel=0.02)
 
 
+@pytest.mark.parallel
+@pytest.mark.parametrize("integrator", ["central_differences", "chung_lee"])
+@pytest.mark.parametrize(("friction", "mass"), [(5.0, 0.1), (5.0, 100.0), (0.3, 0.1), (0.3, 1.0)])
+def test_friction_moves_a_wall_with_mass(friction, mass, integrator, comm, shared_tmp_path):
+    """A bar of 1 kg that meets it flat: their relative velocity along the wall decreases by mu times the approach."""
+    normal, along = np.array([0.6, 0.0, 0.8]), np.array([0.8, 0.0, -0.6])
+    drift = np.array([0.1, 0.2, -0.3])
+    wall = {"type": "plane", "name": "plate", "point": (-0.0035 * normal).tolist(), "normal": normal.tolist()}
+    case = {
+        "mesh": {"generator": "arrays", "points": [[0.0, 0.0, 0.0], [0.0, 1.0, 0.0]], "bars": [[0, 1]]},
+        "material": {"m": {"young_modulus": 1e-3, "density": 1000.0}},
+        "section": {"s": {"area": 1e-3, "material": "m"}},
+        "initial": {"velocity": (drift + 0.5 * along - normal).tolist()},
+        "wall": [wall | {"friction": friction, "mass": mass, "velocity": drift.tolist()}],
+        "time": {"integrator": integrator, "step": 1e-3, "end": 0.01},
+        "output": {"fields_every": 0},
+    }
+    row = [step.row for step in simulation(case, comm, shared_tmp_path)][-1]
+    plate = row["wall/plate/velocity"]
+    total = row["momentum"] + mass * plate
+    np.testing.assert_allclose(total, (1.0 + mass) * drift + 0.5 * along - normal, atol=1e-9 * (1.0 + mass))
+    if integrator == "central_differences":  # others leave the velocity of nodes in contact to their formulas
+        left = max(0.5 - friction, 0.0)
+        np.testing.assert_allclose(row["momentum"] - plate, left * along, atol=1e-8)
+
+
 def test_heavy_wall_is_a_fixed_one(comm, shared_tmp_path):
     """The heavier the wall, the less it differs from one at rest."""
     found = {}

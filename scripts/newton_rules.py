@@ -101,8 +101,8 @@ def implicit_seeds(first: int, last: int) -> list[int]:
     return found[first:]
 
 
-def run(kind: str, seed: int, finer: float = 1.0) -> tuple[np.ndarray | None, str]:
-    """Return the last positions of a case (None if it fails) and its messages; ``finer`` divides static increments.
+def run(kind: str, seed: int, finer: float = 1.0) -> np.ndarray | None:
+    """Return the last positions of a case, None if it fails; ``finer`` divides static increments.
 
     Raises
     ------
@@ -115,8 +115,7 @@ def run(kind: str, seed: int, finer: float = 1.0) -> tuple[np.ndarray | None, st
     from pfem_petsc import Case, Simulation
     from pfem_petsc.errors import SimulationFailure
 
-    screen = io.StringIO()
-    with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stderr(screen):
+    with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stderr(io.StringIO()):
         if kind == "static":
             tables, truss = static_case(seed)
             tables["static"]["step"] /= finer
@@ -128,9 +127,9 @@ def run(kind: str, seed: int, finer: float = 1.0) -> tuple[np.ndarray | None, st
                 simulation.run()
                 mesh, ends = simulation.model.mesh, np.empty_like(simulation.state.position)
                 ends[mesh.node_ids[: mesh.n_owned]] = simulation.state.position
-                return ends, screen.getvalue()
+                return ends
         except SimulationFailure:
-            return None, screen.getvalue()
+            return None
 
 
 def count(kind: str, seeds: list[int], rule: str, folder: Path) -> dict[int, dict[str, int]]:
@@ -138,6 +137,7 @@ def count(kind: str, seeds: list[int], rule: str, folder: Path) -> dict[int, dic
     from petsc4py import PETSc
 
     from pfem_petsc.errors import InputError
+    from pfem_petsc.stepping.halving import HalvedSteps
 
     newton = importlib.import_module("pfem_petsc.solvers.newton")
     totals: Counter[str] = Counter()
@@ -149,28 +149,33 @@ def count(kind: str, seeds: list[int], rule: str, folder: Path) -> dict[int, dic
         totals["failed solves"] += not report.converged
         return report
 
-    newton.NewtonSolver.solve = counted
+    told_failure = HalvedSteps.tell_failure
+
+    def halved(self: Any, *arguments: Any) -> None:
+        totals["bisections"] += 1
+        told_failure(self, *arguments)
+
+    newton.NewtonSolver.solve, HalvedSteps.tell_failure = counted, halved
     options, told = PETSc.Options(), {}
     names = [f"{prefix}snes_linesearch_type" for prefix in ("pfem_", "pfem_contact_")]
     for seed in seeds:
         file, reference = folder / f"{seed}.npy", None
         try:
             if kind == "static" and not file.exists():
-                np.save(file, ends if (ends := run(kind, seed, FINER)[0]) is not None else np.empty(0))
+                np.save(file, ends if (ends := run(kind, seed, FINER)) is not None else np.empty(0))
             totals.clear()
             if rule.startswith("full, then "):
                 newton._CAREFUL = rule.removeprefix("full, then ")
             else:
                 for name in names:
                     options[name] = rule
-            end, said = run(kind, seed)
+            end = run(kind, seed)
         except InputError:
             continue
         finally:
             for name in names:
                 options.delValue(name)
         totals["failed runs"] += end is None
-        totals["bisections"] = said.count("bisecting the step") + said.count("halving the increment")
         if kind == "static" and end is not None:
             reference = np.load(file)
             moved = np.abs(reference - static_case(seed)[1].points).max() if reference.size else 0.0

@@ -94,9 +94,10 @@ class NewtonSolver:
 
     Newton's method makes full steps. The residual of a stiff bar that turns rises by orders of magnitude in the first,
     and a line search that demands a decrease would make steps that are far too short. Full steps have failed if the
-    residual rises and the truss gives way along the step, or if a later step is not shorter than that of the rise
-    (natural monotonicity, Deuflhard 2004). The solve is then repeated with a line search. If the user's options
-    select a method or a line search, no other is used.
+    residual rises and the truss gives way along the step, if a later step is not shorter than that of the rise (natural
+    monotonicity, Deuflhard 2004), or if the residual rises again in a step longer than half of that: full steps of bars
+    that yield or touch may alternate between two states for ever. The solve is then repeated with a line search. If
+    the user's options select a method or a line search, no other is used.
 
     Options: prefix ``pfem_`` for free steps, ``pfem_contact_`` for steps with bounds, which have their own linear
     solver, ``bounded``.
@@ -308,9 +309,9 @@ class NewtonSolver:
             if not step < self._longest:
                 return PETSc.SNES.ConvergedReason.DIVERGED_DTOL
             place = snes.getSolution().getArray(readonly=True).reshape(self._place.shape)
-            if norm > previous:
-                self._longest = step
-                if not self._stiffens(self._place, place):
+            if not norm < previous:
+                again, self._longest = step > 0.5 * self._longest, step
+                if again or not self._stiffens(self._place, place):
                     return PETSc.SNES.ConvergedReason.DIVERGED_DTOL
             self._place[:] = place
         return PETSc.SNES.ConvergedReason.ITERATING

@@ -137,3 +137,51 @@ def test_a_limit_point_is_told_only_where_the_stiffness_shows_it(comm, shared_tm
     assert reached == 0.0
     assert "the stiffness shows no limit point" in text
     assert "it is a limit point" not in text
+
+
+def yielding_bar(speed, h, count, stress, hardening):
+    """Elongations of a bar of unit stiffness and mass whose ends fly apart, by the trapezoidal rule and bisection."""
+    e = a = plastic = hardened = 0.0
+    v, found = speed, [0.0]
+
+    def law(elongation):
+        trial = elongation - plastic
+        slip = max(abs(trial) - stress - hardening * hardened, 0.0) / (1.0 + hardening)
+        return trial - np.sign(trial) * slip, slip
+
+    for _ in range(count):
+
+        def unbalance(new, start=e + h * v + 0.25 * h * h * a):
+            return (new - start) + h * h * law(new)[0]  # each end has half of the mass
+
+        low, high = e - 10.0 * h * speed, e + 10.0 * h * speed
+        for _ in range(100):
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if unbalance(middle) < 0.0 else (low, middle)
+        force, slip = law(low)
+        plastic, hardened = plastic + np.sign(force) * slip, hardened + slip
+        e, v, a = low, v + 0.5 * h * (a - 4.0 * force), -4.0 * force
+        found.append(e)
+    return np.array(found)
+
+
+@pytest.mark.parallel
+def test_full_steps_that_alternate_between_yield_in_tension_and_in_compression_end(comm, shared_tmp_path, capsys):
+    speed, step, count, stress, hardening = 0.06, 2.0, 5, 0.01, 0.02
+    ends = {f"n{k}": {"indices": [k]} for k in range(2)}
+    tables = {
+        "mesh": {"generator": "rod", "length": 1.0, "elements": 1},
+        "node_set": ends,
+        "material": {
+            "m": {"young_modulus": 1.0, "density": 1.0, "yield_stress": stress, "isotropic_hardening": hardening}
+        },
+        "section": {"s": {"area": 1.0, "material": "m"}},
+        "initial": {"on": [{"node_set": "n1", "velocity": [speed, 0.0, 0.0]}]},
+        "time": {"integrator": "newmark", "beta": 0.25, "gamma": 0.5, "step": step, "end": count * step},
+        "solver": {"guard": False},
+        "output": {"fields_every": 0, "probe": [{"name": name, "node_set": name} for name in ends]},
+    }
+    history = run(Case.from_dict(tables), comm, shared_tmp_path)
+    assert "bisecting" not in capsys.readouterr().err
+    length = np.diff([history[f"probe/{name}/position"][:, 0, 0] for name in ends], axis=0)[0]
+    np.testing.assert_allclose(length - 1.0, yielding_bar(speed, step, count, stress, hardening), atol=1e-10)

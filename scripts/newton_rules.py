@@ -1,10 +1,10 @@
-"""Compares rules of globalisation of Newton's method on random cases; rewrites tables of the documentation.
+"""Compares rules of globalisation of Newton's method on random cases; prints rows for the table of docs/statics.md.
 
-    .venv/bin/python scripts/newton_rules.py --kind static --seeds 0:300 --rules "bt" "basic, then cp"
-    .venv/bin/python scripts/newton_rules.py --kind implicit --write
+    .venv/bin/python scripts/newton_rules.py --kind static --seeds 0:300 --rules "bt" "full, then cp"
+    .venv/bin/python scripts/newton_rules.py --kind implicit --seeds 0:80
 
-A rule is one of PETSc's line searches for all solves, or "basic, then RULE": full steps, and solves that these do not
-solve are repeated with a line search. Counted are solves that fail, increments or steps that are bisected, Newton
+A rule is one of PETSc's line searches for all solves, or "full, then RULE": full steps as the program makes them;
+solves that fail are repeated with a line search. Counted are failed solves, bisected increments or steps, Newton
 iterations (those of failed solves included), and runs that fail. The static cases are trusses of random nodes whose
 stiffnesses differ by up to 10^8, under loads that rotate bars by up to 30 degrees, some above a wall; the implicit ones
 are those of random_cases.py with an implicit scheme.
@@ -37,7 +37,6 @@ LEVELS = 6  # different stiffnesses of a truss
 FINER = 20.0  # of increments of the reference
 SAME = 0.05  # of the largest displacement, by which ends may differ from the reference
 COUNTS = ("failed solves", "bisections", "Newton iterations", "failed runs", "other ends")
-PAGES = {"static": ROOT.parent / "docs/statics.md", "implicit": ROOT.parent / "docs/integrators.md"}
 
 
 def static_case(seed: int) -> tuple[dict[str, Any], Truss]:
@@ -183,10 +182,9 @@ def count(kind: str, seeds: list[int], rule: str, folder: Path) -> dict[int, dic
 def main() -> int:
     """Run the rules, each in a process of its own, and print or write the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--kind", choices=sorted(PAGES), required=True)
+    parser.add_argument("--kind", choices=("implicit", "static"), required=True)
     parser.add_argument("--seeds", default="0:300", metavar="A:B", help="from A to before B (default: %(default)s)")
     parser.add_argument("--rules", nargs="+", default=list(RULES), metavar="RULE")
-    parser.add_argument("--write", action="store_true", help="replace the table of the documentation")
     parser.add_argument("--worker", help=argparse.SUPPRESS)
     parser.add_argument("--folder", type=Path, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
@@ -206,16 +204,6 @@ def main() -> int:
             sums = [sum(case.get(name, 0) for case in told.values()) for name in COUNTS]
             rows.append(f"| {rule} | " + " | ".join(f"{value:,}" for value in sums) + " |")
             print(rows[-1], f"{len(told)} cases", flush=True)
-    if arguments.write:
-        page = PAGES[arguments.kind]
-        head = f"| rule | {' | '.join(COUNTS)} |\n|---|{'---|' * len(COUNTS)}\n"
-        before, _, rest = page.read_text().partition("<!-- table newton -->\n")
-        page.write_text(
-            f"{before}<!-- table newton -->\n\n{head}"
-            + "\n".join(rows)
-            + "\n\n<!-- end -->"
-            + rest.partition("<!-- end -->")[2]
-        )
     return 0
 
 

@@ -73,12 +73,13 @@ def hash_cases(arguments: argparse.Namespace) -> int:
     names = sorted(path.stem for path in cases.glob("*.toml"))
     chunks = [names[at :: -(-len(names) // CHUNK)] for at in range(-(-len(names) // CHUNK))]
     jobs = [(ranks, chunk) for ranks in arguments.ranks for chunk in chunks]
-    with ThreadPoolExecutor(arguments.jobs) as pool:
-        lines = [line for found in pool.map(lambda job: _process(arguments.folder, *job), jobs) for line in found]
     hashes: dict[str, Any] = {}
-    for line in lines:
-        hashes |= json.loads(line)
-    (arguments.folder / "hashes.json").write_text(json.dumps(hashes, indent=0, sort_keys=True))
+    with ThreadPoolExecutor(arguments.jobs) as pool:
+        for found in pool.map(lambda job: _process(arguments.folder, *job), jobs):
+            for line in found:
+                hashes |= json.loads(line)
+            # after each process: a run that is ended keeps what it has
+            (arguments.folder / "hashes.json").write_text(json.dumps(hashes, indent=0, sort_keys=True))
     statuses = defaultdict(int)
     for entry in hashes.values():
         statuses[entry["status"]] += 1

@@ -13,11 +13,13 @@ from ..energies import BAR_ENERGIES
 from ..fields import STATUS
 from .bar_blocks import BarBlock, laws_of, make_blocks
 from .bar_geometry import bar_lengths, first_inverted
+from .sections import bar_shapes
 
 if TYPE_CHECKING:
     from ..case.schema import Case
     from ..mesh.distribution import DistributedMesh
     from ..solvers.matrix import BlockPattern
+    from .materials.base import BarShapes
     from .springs import Springs
 
 __all__ = ["Bars", "StrainEnergy"]
@@ -277,6 +279,30 @@ class Bars:
         lengths = np.empty_like(self.rest)
         bar_lengths(x, self.ends, lengths)
         return lengths
+
+    def _shapes(self, block: BarBlock) -> BarShapes:
+        lengths = self.mesh_lengths[block.start : block.stop]
+        return bar_shapes(self.case.section[block.section], lengths, np.broadcast_to(block.area, lengths.shape))
+
+    def radii(self) -> np.ndarray:
+        """Return the outer radius (b,) [m] of each local bar: of its shape, else of the circle of its area."""
+        radii = np.empty(len(self.ends))
+        for block in self.blocks:
+            radii[block.start : block.stop] = self._shapes(block).radius
+        return radii
+
+    def euler_loads(self) -> np.ndarray:
+        """Return pi^2 E I/(K L)^2 (b,) [N] of each local bar, with its length L in the mesh and I, K of its section;
+        infinite if the section has neither a shape nor a second moment."""
+        loads = np.full(len(self.ends), np.inf)
+        for block in self.blocks:
+            section, shapes = self.case.section[block.section], self._shapes(block)
+            young = self.case.material[section.material].young_modulus
+            known = shapes.second_moment > 0.0
+            loads[block.start : block.stop][known] = (
+                np.pi**2 * young * shapes.second_moment[known] / shapes.effective_length[known] ** 2
+            )
+        return loads
 
     def fields(self, x: np.ndarray) -> dict[str, np.ndarray]:
         """Return, per local bar at the end of the last step, ``strain``, ``stress`` [Pa], ``axial_force`` [N],

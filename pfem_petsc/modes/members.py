@@ -6,8 +6,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..mechanics.sections import areas_of, bar_shapes
-
 if TYPE_CHECKING:
     from ..stepping.model import Model
 
@@ -25,24 +23,10 @@ def weakest_member(model: Model, x: np.ndarray) -> tuple[float, int] | None:
     model : Model
     x : local positions of the state [m]
     """
-    mesh, best = model.mesh, (np.inf, -1)
-    sections = list(model.case.section.values())
-    force = model.bars.fields(x)["axial_force"]
-    for block in mesh.blocks:
-        if block.section >= len(sections):  # springs and dashpots
-            continue
-        section = sections[block.section]
-        if section.shape is None and section.second_moment is None:
-            continue
-        here = slice(block.start, block.counted)
-        lengths = model.bars.mesh_lengths[block.start : block.stop]
-        shapes = bar_shapes(section, lengths, np.broadcast_to(areas_of(section, block, mesh), lengths.shape))
-        young = model.case.material[section.material].young_modulus
-        euler = np.pi**2 * young * shapes.second_moment / shapes.effective_length**2
-        pressed = np.flatnonzero(force[here] < 0.0)
-        if len(pressed):
-            factors = euler[pressed] / -force[here][pressed]
-            at = int(np.lexsort((mesh.bar_ids[here][pressed], factors))[0])
-            best = min(best, (float(factors[at]), int(mesh.bar_ids[here][pressed[at]])))
+    counted, force = model.mesh.counted, model.bars.fields(x)["axial_force"]
+    ids, force, euler = (values[counted] for values in (model.mesh.bar_ids, force, model.bars.euler_loads()))
+    pressed = np.flatnonzero((force < 0.0) & (euler < np.inf))
+    factors = euler[pressed] / -force[pressed]
+    best = min(zip(factors.tolist(), ids[pressed].tolist(), strict=True), default=(np.inf, -1))
     factor, bar = min(model.comm.allgather(best))
     return (factor, bar) if bar >= 0 else None

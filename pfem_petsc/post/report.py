@@ -18,6 +18,7 @@ from ..energies import LOST, STORED, SUPPLIED
 from ..errors import InputError
 from ..output.history import EVENT
 from ..output.modes import NAMES
+from ..output.peaks import peak_force
 from ..output.units import engineering, prefix_for
 from .energies import balance_error
 from .plot import plot
@@ -155,10 +156,10 @@ def _summary(result: Any) -> dict[str, str]:
     rows["history"] = f"{len(history['time']):,} rows, {_span(result)}"
     rows["snapshots"] = f"{len(result.times):,}"
     for wall in case.every_wall:
-        force = np.linalg.norm(np.asarray(history[f"wall/{wall.name}/force"], dtype=float), axis=1)
-        peak = int(np.argmax(force))
-        text = f"largest force {engineering(float(force[peak]), 'N')} at {_place(result, float(history['time'][peak]))}"
-        rows[f"wall '{wall.name}'"] = text if force[peak] > 0.0 else "not touched"
+        force, time, window = peak_force(result, wall.name)
+        over = f" (mean over {engineering(window, 's', 3)})" if window else ""
+        text = f"largest force {engineering(force, 'N')}{over} at {_place(result, time)}"
+        rows[f"wall '{wall.name}'"] = text if force > 0.0 else "not touched"
     if "broken_bars" in history and np.asarray(history["broken_bars"])[-1]:
         rows["broken bars"] = f"{int(np.asarray(history['broken_bars'])[-1]):,} of {result.n_bars:,}"
     return rows

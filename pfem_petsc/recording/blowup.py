@@ -15,13 +15,11 @@ if TYPE_CHECKING:
 
 __all__ = ["BlowUp"]
 
-_CREATED = (
-    20.0  # energy created by the integration relative to the input; heavily damped explicit runs begin with up to 8
-)
-_IN_CONTACT = (
-    1e3  # the same once nodes have been in contact: some schemes gain energy in each impact, which has a warning
-)
-_ROWS = 3  # consecutive rows; after a start from rest, or when a wall first strikes, there is no input to compare with
+# energy created by the integration relative to the input; heavily damped explicit runs begin with up to 8
+_CREATED = 20.0
+# the same once nodes have been in contact: some schemes gain energy in each impact, which has a warning
+_IN_CONTACT = 1e3
+_ROWS = 6  # consecutive rows; after a start from rest, or when a wall first strikes, there is no input to compare with
 _BARS = ("elastic_energy", "spring_energy")
 
 
@@ -31,7 +29,7 @@ class BlowUp:
     What the integration has created is the total energy, with all that is dissipated, less its lowest value so far, as
     far as the truss still holds it: in large steps, dissipation exceeds the work of the forces that dissipate. It is
     compared with what could move the truss: the kinetic energy at the start of the stage, the energy that its bars have
-    released since, and the largest work of each kind. The energy of prestressed bars moves nothing while they hold it,
+    released since, and the largest rise of each work. The energy of prestressed bars moves nothing while they hold it,
     and the works of earlier stages are spent. Rows of static stages are not compared: works over their increments are
     quadratures.
     """
@@ -41,20 +39,21 @@ class BlowUp:
         self._strange = 0
         self._most = model.rounding * model.length  # [J]: what is at rest has no other energy
         self._start: dict[str, float] = {}
+        self._lowest: dict[str, float] = {}  # works
         self._lost = 0.0
         self._limit = _CREATED
 
     def kept(self) -> dict[str, Any]:
         """Return the state for a checkpoint: number of consecutive suspicious rows, energy input, the energies of the
-        first row, and the largest numerical dissipation [J]."""
-        start = dict(self._start)
-        return {"strange": self._strange, "most": self._most, "start": start, "lost": self._lost, "limit": self._limit}
+        first row, lowest works, and the largest numerical dissipation [J]."""
+        kept = {"strange": self._strange, "most": self._most, "lost": self._lost, "limit": self._limit}
+        return kept | {"start": dict(self._start), "lowest": dict(self._lowest)}
 
     def load_state(self, kept: dict[str, Any]) -> None:
         """Restore the state from a checkpoint."""
         self._strange, self._most = int(kept["strange"]), float(kept["most"])
-        self._start, self._lost = dict(kept.get("start", {})), float(kept.get("lost", 0.0))
-        self._limit = float(kept.get("limit", _IN_CONTACT))
+        self._start, self._lost = dict(kept["start"]), float(kept["lost"])
+        self._lowest, self._limit = dict(kept["lowest"]), float(kept["limit"])
 
     def check(self, row: dict[str, Any], state: State) -> None:
         """Check a row.
@@ -79,13 +78,16 @@ class BlowUp:
             return
         lost = float(row["numerical_dissipation"])
         if not self._start:
-            self._start = {name: float(row[name]) for name in (*_BARS, *SUPPLIED)}
+            self._start = {name: float(row[name]) for name in _BARS}
             # walls with mass as well: a truss at rest has no other energy than that of what hits it
             self._most += float(row["kinetic_energy"] + row["wall_kinetic_energy"])
             self._lost = lost
         released = sum(self._start[name] - float(row[name]) for name in _BARS)
-        works = [abs(float(row[name]) - self._start[name]) for name in SUPPLIED]
-        self._most = max(self._most, released, *works)
+        # rises only: what a force has taken away, as drag does, it need not give back
+        for name in SUPPLIED:
+            self._lowest[name] = min(self._lowest.get(name, np.inf), float(row[name]))
+        rises = [float(row[name]) - self._lowest[name] for name in SUPPLIED]
+        self._most = max(self._most, released, *rises)
         self._lost = max(self._lost, lost)
         held = float(row["kinetic_energy"] + row["wall_kinetic_energy"]) - released
         created = min(self._lost - lost, held)

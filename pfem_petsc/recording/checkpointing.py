@@ -58,7 +58,7 @@ class Checkpointing(Observer):
         history = self._history
         history.writer.flush_history()
         sums = history.ledger, history.recorder, history.blow_up
-        self._checkpoints.write(*sums, history.row, self._snapshots.last, history.stage())
+        self._checkpoints.write(*sums, history.row, self._snapshots.kept(), history.stage())
         self._synchroniser.checkpoint_written()
 
     def complete(self) -> None:

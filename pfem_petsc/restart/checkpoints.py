@@ -66,10 +66,10 @@ class Checkpoints:
         recorder: Recorder,
         blow_up: BlowUp,
         row: dict[str, Any],
-        snapshot: int,
+        snapshots: dict[str, Any],
         stage: dict[str, Any] | None = None,
     ) -> None:
-        """Write a checkpoint with the last history row and the step of the last snapshot. Collective.
+        """Write a checkpoint with the last history row and what is kept of the snapshots. Collective.
 
         ``stage``: what the history keeps of the stages before, None for a case without stages.
 
@@ -78,7 +78,7 @@ class Checkpoints:
         SimulationFailure
             On all ranks; earlier checkpoints are kept.
         """
-        scalars = self.state.scalars(ledger, recorder, blow_up, row, snapshot)
+        scalars = self.state.scalars(ledger, recorder, blow_up, row, snapshots)
         if stage is not None:
             scalars["stage"] = {"number": self.stage, "history": stage, "start": self.state.stage_start()}
         if scalars["step"] == self.last_step:

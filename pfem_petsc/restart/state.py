@@ -90,9 +90,9 @@ class RunState:
         return {**nodes, **bars, **self.model.links.arrays()}
 
     def scalars(
-        self, ledger: Ledger, recorder: Recorder, blow_up: BlowUp, row: dict[str, Any], snapshot: int
+        self, ledger: Ledger, recorder: Recorder, blow_up: BlowUp, row: dict[str, Any], snapshots: dict[str, Any]
     ) -> dict[str, Any]:
-        """Return the numbers, including the last history row and the step of the last snapshot. Collective."""
+        """Return the numbers, including the last history row and what is kept of the snapshots. Collective."""
         stepper, energy, walls = self.stepper, self.stepper.energy, self.stepper.solution.walls
         mine = {
             "ledger": ledger.kept(),
@@ -113,7 +113,7 @@ class RunState:
             "free_walls": self.model.contact.motion.kept(),
             "contact_times": self.model.contact.log.times(self.comm),
             "row": {name: float(row[name]) for name in ("energy_imbalance", "active_contacts", "step")},
-            "snapshot": snapshot,
+            **snapshots,
             "node_arrays": sorted(set().union(*self.comm.allgather(set(self._node_arrays())))),
             "memories": memories,
             "bar_arrays": sorted(self._bar_arrays()),

@@ -6,6 +6,9 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from mpi4py import MPI
+
 from ..case.schema import Case
 from ..errors import printable
 from ..output.progress import Progress
@@ -106,4 +109,16 @@ def _attributes(case: Case, model: Model, plan: Plan, recorder: Recorder) -> dic
         attributes["steps"] = plan.steps
     for name, nodes in recorder.probe_nodes.items():
         attributes[f"probe_nodes/{name}"] = nodes.tolist()
+    bars, members = model.bars, np.ones((model.mesh.n_local, 1))
+    for k, name in enumerate(model.contact.names):
+        members[: model.mesh.n_owned, 0] = model.contact.members[:, k]
+        model.mesh.update_ghosts(members)
+        times = [np.inf]
+        for block in bars.blocks:
+            own = slice(block.start, block.stop)
+            near = (members[bars.ends[own], 0] > 0.0).any(axis=1)
+            if block.density > 0.0 and near.any():
+                shortest = float(bars.mesh_lengths[own][near].min())
+                times.append(shortest * float(np.sqrt(block.density / block.modulus)))
+        attributes[f"wave_time/{name}"] = model.comm.allreduce(min(times), op=MPI.MIN)
     return attributes

@@ -164,7 +164,7 @@ class Outputs:
         self._observe(checkpoints)
         self.history.go_on(history, row, kick)
         self.events.writer = self.snapshots.writer = writer
-        self.snapshots.last = snapshots.last
+        self.snapshots.load_state(snapshots.kept())
 
     def _complete_stage(self) -> None:
         """The row and the snapshot of the last step of a stage."""
@@ -275,9 +275,9 @@ class Outputs:
 
     def tell_remarks(self) -> None:
         """Report the observers' remarks, such as walls that were never touched, and doubtful results. Collective."""
-        for observer in self._observers:
-            for text in observer.remarks():
-                self.progress.message(text)
+        texts = [text for observer in self._observers for text in observer.remarks()]
+        for text in texts + (self.snapshots.doubts() if self._stages.at_last else []):
+            self.progress.message(text)
         for text in self._analysis.stepper.doubts():
             self.progress.warning(text)
 

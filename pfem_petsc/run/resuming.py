@@ -21,7 +21,7 @@ def resume_observers(
     """Give history and snapshots what a checkpoint holds of them. Collective."""
     sums = history.ledger, history.recorder, history.blow_up
     history.row = checkpoints.state.load_sums(checkpoint, *sums)
-    snapshots.last = restart.last[0]
+    snapshots.load_state(restart.scalars)
     history.contact_watch.start = history.recorder.start_energy
     if restart.scalars.get("stage") is not None:
         history.load_stage(restart.scalars["stage"]["history"])

@@ -14,6 +14,7 @@ import numpy as np
 from ..case.schema import Case
 from ..energies import LOST, STORED, SUPPLIED
 from ..errors import InputError
+from ..output.peaks import peak_force
 from ..output.result import Result, open_result
 from ..output.table import Table, flat_columns
 from .pool import performed
@@ -243,5 +244,7 @@ def _default_results(result: Result) -> Iterator[tuple[str, Any]]:
         if name in history:
             yield f"final_{name}", float(history[name][-1])
     for name in history:
-        if (name.startswith("wall/") and name.endswith("/force")) or name == "support_force":
+        if name.startswith("wall/") and name.endswith("/force"):
+            yield f"peak_{name}", peak_force(result, name.removeprefix("wall/").removesuffix("/force"))[0]
+        elif name == "support_force":
             yield f"peak_{name}", float(np.linalg.norm(history[name], axis=1).max())

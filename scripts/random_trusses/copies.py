@@ -122,7 +122,8 @@ def _one_by_one(case: dict[str, Any], connector: dict[str, Any], points: np.ndar
     )
     parts = []
     for node in second:
-        nearest = first[np.linalg.norm(points[first] - points[node], axis=1).argmin()]
+        away = np.where(first == node, np.inf, np.linalg.norm(points[first] - points[node], axis=1))
+        nearest = first[away.argmin()]
         names = f"node {nearest}", f"node {node}"
         case["node_set"] |= {name: {"indices": [int(i)]} for name, i in zip(names, (nearest, node), strict=True)}
         parts.append(connector | {"between": list(names)})

@@ -242,7 +242,7 @@ def _momentum(case: Case, history: dict[str, np.ndarray]) -> Faults:
     # forces of rounding, over all steps: the impulses of walls that touch a truss at rest add up
     rounding = 1e-12 * _strongest(case) * float(history["time"][-1])
     tolerance = max(1e-9, 4.0 * case.solver.rtol)  # what a solver leaves of a balance is a force without an impulse
-    if scale > rounding and open_part > tolerance * scale:
+    if scale > rounding and open_part > tolerance * scale + rounding:
         return [("momentum is not that of the impulses", f"{open_part / scale:.3g} of the largest")]
     return []
 

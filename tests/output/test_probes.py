@@ -19,9 +19,9 @@ def test_ranks_send_their_own_nodes_and_rows_have_all(comm):
     assert probes.ids["low"].tolist() == list(range(11))
     assert probes.size == 12 * (len(sets["low"]) + len(sets["last"]))
     place = own[:, None] + np.array([0.1, 0.2, 0.3])
-    state = SimpleNamespace(x=place, v=-place, support=2.0 * place, contact=place)
+    state = SimpleNamespace(x=place, v=-place, contact=place)
     share, row = np.full(probes.size, np.nan), np.full(probes.width, np.nan)
-    probes.fill(share, state, 5.0 * place)
+    probes.fill(share, state, 5.0 * place, 2.0 * place)
     # compiled loops write vectors of a node one after the other
     assert np.array_equal(share.reshape(-1, 12)[:, :3], place[probes.nodes])
     assert np.array_equal(probes.places(), 12 * np.arange(len(probes.nodes)))

@@ -60,7 +60,7 @@ def test_report_of_a_run(run, capsys):
         "A <b>short</b> run & more",
         "21 nodes, 20 bars",
         "central_differences, lumped mass, to 500.0 ms",
-        "largest force 1.250 N at t = 100 ms",
+        "largest force 518.8 mN (mean over 100 ms) at t = 260 ms",
         "something <odd>\n  on two lines",
         "No pictures of the truss: not asked for",
         "50 steps in",

@@ -41,13 +41,13 @@ def row_of(number, **energies):
 
 def test_energy_created_is_compared_with_what_moves_the_truss_in_its_stage(comm, shared_tmp_path):
     """Works of earlier stages (1 MJ), what their quadrature lost, and prestress (0.5 MJ) do not hide that 20 J of
-    motion become 400 J: the third row beyond twenty times the 20 J is the last, also after a restart between them."""
+    motion become 400 J: the sixth row beyond twenty times the 20 J is the last, also after a restart between them."""
     simulation = pendulum(comm, shared_tmp_path / "it", "newmark", 1.0)
     simulation.start()
     state, start = simulation.state, {"elastic_energy": 5e5, "external_work": 1e6, "numerical_dissipation": 5e5}
     watch = BlowUp(simulation.model)
     watch.check(row_of(100, **start), state)
-    for number, created in enumerate([0.0, 1.0, 50.0, 150.0, 399.0, 450.0, 350.0, 410.0, 450.0]):
+    for number, created in enumerate([0.0, 1.0, 50.0, 350.0, 410.0, 450.0, 450.0, 450.0, 450.0]):
         moved = {"external_work": 1e6 + 20.0, "kinetic_energy": 20.0 + created}
         watch.check(row_of(101 + number, **{**start, **moved, "numerical_dissipation": 5e5 - created}), state)
     again = BlowUp(simulation.model)
@@ -69,16 +69,31 @@ def test_released_energy_may_move_the_truss(comm, shared_tmp_path):
     simulation.close()
 
 
-def test_a_scheme_that_makes_energy_ends_the_run(comm, shared_tmp_path):
-    """Wilson's scheme at 20 degrees a step turns the kinetic energy of a stiff spin into a thousand times this."""
-    spin = {"angular_velocity": [0.0, 0.0, np.sqrt(2.0 * 9.81)], "centre": [0.0, 0.0, 0.0]}
-    simulation = pendulum(comm, shared_tmp_path / "it", "wilson", 20.0, initial=spin)
-    rows = []
-    with pytest.raises(SimulationFailure, match="step .*, t = .* created .* J, but only 9.81 J were supplied"):
-        rows.extend(step.row for step in simulation)
-    energy = np.array([row["kinetic_energy"] + row["elastic_energy"] for row in rows])
-    # it has gone on for two rows beyond twenty times the energy supplied
-    assert (energy > 21.0 * 9.81).sum() <= 3
+NET = {
+    "mesh": {"generator": "net", "size": [20.0, 20.0], "cells": [4, 4]},
+    "node_set": {f"c{k}": {"group": f"corner_{k}"} for k in (1, 2, 3, 4)},
+    "material": {"cable": {"law": "cable", "young_modulus": 160e9, "density": 7850.0, "damping": 8e3}},
+    "section": {"all": {"area": 2e-4, "material": "cable", "pretension": 20e3, "diameter": 0.3}},
+    "support": [
+        {"node_set": f"c{k}", "fix": "xyz"} | ({"motion": [[0, 0, 0, 0], [1, 0, 0, 4.0]]} if k in (1, 3) else {})
+        for k in (1, 2, 3, 4)
+    ],
+    "gravity": {"acceleration": [0.0, 0.0, -9.81]},
+    "output": {"fields_every": 0},
+}
+
+
+@pytest.mark.slow
+def test_gust_on_a_saddle_net_at_too_large_steps_is_stopped(comm, shared_tmp_path):
+    """Form finding supplies 0.5 MJ of prestress, and drag takes energy: neither is a source of the 4 kJ that the
+    integration creates, where the gust supplies some 100 J."""
+    gust = {"velocity": [[0, 0, 0, 0], [1, 25, 0, 0], [1.5, 25, 0, 0], [2.5, 0, 0, 0]]}
+    time = {"integrator": "generalized_alpha", "step": 1e-2, "end": 3.5}
+    stages = [{"name": "form", "static": {"method": "relaxation"}}, {"name": "gust", "time": time, "wind": gust}]
+    simulation = Simulation(Case.from_dict(NET | {"stage": stages}), comm, output=shared_tmp_path / "it", quiet=True)
+    with pytest.raises(SimulationFailure, match=r"the motion is unstable and fastest at node .*reduce time\.step"):
+        simulation.run()
+    assert simulation.row["kinetic_energy"] < 1e5
 
 
 def test_failures_of_one_kind_are_told_once_and_counted(comm, shared_tmp_path):
@@ -89,7 +104,7 @@ def test_failures_of_one_kind_are_told_once_and_counted(comm, shared_tmp_path):
     remarks = simulation.stepper.remarks()
     bisected = sum(row["step_size"] < 0.99 * simulation.stepper.h for row in rows)
     failed = simulation.stepper.failures
-    assert bisected > 3 and failed.total() >= bisected
+    assert bisected > 1 and failed.total() >= bisected
     if comm.rank == 0:
         log = (shared_tmp_path / "it" / "log.txt").read_text()
         assert log.count("bisecting the step") == len(failed) < failed.total()

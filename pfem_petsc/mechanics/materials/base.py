@@ -7,9 +7,10 @@ fused), of implicit steps (assembled and matrix-free), and of the energy-momentu
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field, field_validator
@@ -49,7 +50,14 @@ SofteningRow = Annotated[tuple[Finite, PositiveFloat, PositiveFloat], listed]
 
 
 class MaterialKeys(StrictModel):
-    """Keys that all materials share."""
+    """Keys that all materials share.
+
+    A law whose bars buckle sets ``describes_buckling``; others are compared with Euler's load during a run. One that is
+    documented up to a shortening, relative to the rest length, sets ``largest_shortening``.
+    """
+
+    describes_buckling: ClassVar[bool] = False
+    largest_shortening: ClassVar[float] = math.inf
 
     law: str | None = None
     """name of a material law; default: "elastoplastic" with a yield_stress, else "elastic\""""

@@ -6,6 +6,8 @@ zero below. It yields at s_Y + K e_p; a yielded cable is longer, and becomes tau
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from numba.extending import register_jitable
 
 from ...case.base import NonNegativeFloat, PositiveFloat
@@ -20,6 +22,8 @@ _NEVER = 1e300  # Pa; not infinite, as its product with a plastic strain of zero
 
 class Parameters(MaterialKeys):
     """Keys of cables."""
+
+    describes_buckling: ClassVar[bool] = True
 
     yield_stress: PositiveFloat | None = None
     """yield stress [Pa]; default: the cable does not yield"""

@@ -23,6 +23,7 @@ the strut snaps to the branch beyond at that strain, and the energy set free is 
 from __future__ import annotations
 
 import math
+from typing import ClassVar
 
 import numpy as np
 from numba.extending import register_jitable
@@ -40,6 +41,9 @@ _MOST = 100  # iterations of a root that is bracketed; about 6 are needed
 
 class Parameters(MaterialKeys):
     """Keys of struts."""
+
+    describes_buckling: ClassVar[bool] = True
+    largest_shortening: ClassVar[float] = 0.2
 
     yield_stress: PositiveFloat
     """yield stress [Pa]"""

@@ -69,7 +69,7 @@ def test_all_that_is_looked_at_in_later_steps_is_put_back(comm, shared_tmp_path)
         simulation.close()
     (_, before, after, _) = found
     assert before[:2] == after[:2]
-    assert before[0]["rows"] == 31
+    assert before[0]["most"] > 0.0 and before[0]["start"]
     np.testing.assert_array_equal(before[2], after[2])
     assert comm.allreduce(int(before[2].any())) > 0  # pairs live on the ranks of their nodes
 

@@ -83,7 +83,8 @@ def ring_claims(m: Measures) -> list[Claim]:
 
 
 def _converge(far: dict[str, dict[str, float]]) -> Claim:
-    nearer = {scheme: far["0.05"][scheme] < far["0.5"][scheme] or far["0.05"][scheme] < 1e-3 for scheme in far["0.5"]}
+    # a motion that false releases make chaotic may be somewhat nearer by chance
+    nearer = {s: far["0.05"][s] < 0.5 * far["0.5"][s] or far["0.05"][s] < 1e-3 for s in far["0.5"]}
     return Claim(
         "5.3, Figs. 12, 13",
         "The results of the methods tend to converge for the smaller step.",

@@ -9,6 +9,8 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from .version import __version__
+
 if TYPE_CHECKING:
     from .case.schema import Case
     from .errors import EarlyStop, InputError, NotConverged, PfemError, SimulationFailure
@@ -36,8 +38,6 @@ __all__ = [
     "sweep",
     "write_mesh",
 ]
-
-__version__ = "0.3.0"
 
 _HOMES = {
     "Case": ".case.schema",

@@ -14,7 +14,7 @@ import pytest
 PACKAGE = Path(__file__).resolve().parent.parent / "pfem_petsc"
 
 FLOORS = (
-    ("energies", "errors", "fields", "files", "signals", "tolerances"),
+    ("energies", "errors", "fields", "files", "signals", "tolerances", "version"),
     ("registry",),
     ("parallel",),
     ("case", "cases"),

@@ -6,29 +6,19 @@ import json
 import platform
 import zlib
 from collections.abc import Mapping
-from functools import cache
-from importlib import metadata
 from typing import Any
 
 import h5py
 import numpy as np
 from mpi4py import MPI
 
+from ..version import __version__
 from .hdf5 import dataset_names, set_text
 
-__all__ = ["describe_run", "installed_version", "read_attributes", "write_case"]
+__all__ = ["describe_run", "read_attributes", "write_case"]
 
 # HDF5 1.10 limits an attribute, including its metadata, to 64 KiB.
 LONGEST_ATTRIBUTE = 1 << 15
-
-
-@cache
-def installed_version() -> str:
-    """Return the version of the installed package."""
-    try:
-        return metadata.version("pfem_petsc")
-    except metadata.PackageNotFoundError:
-        return "not installed"
 
 
 def describe_run(comm: MPI.Comm, attributes: Mapping[str, Any]) -> dict[str, Any]:
@@ -36,7 +26,7 @@ def describe_run(comm: MPI.Comm, attributes: Mapping[str, Any]) -> dict[str, Any
     from petsc4py import PETSc
 
     return {
-        "pfem_petsc": installed_version(),
+        "pfem_petsc": __version__,
         "petsc": ".".join(map(str, PETSc.Sys.getVersion())),
         "numpy": np.__version__,
         "h5py": h5py.__version__,

@@ -79,7 +79,7 @@ def make_filter(text: str) -> Filter:
         (width,) = numbers
         corner = f"{0.4429 / width:.3g} Hz"
         name = f"mean of the {engineering(width, 's', 3)} before (−3 dB at {corner})"
-        return Filter(name, lambda time, values, zero=False: window_mean(time, values, width, zero))
+        return Filter(name, lambda time, values, zero=False: _chosen_mean(time, values, width, zero))
     if kind == "cfc" and len(numbers) == 1 and good:
         (size,) = numbers
         corner = f"{CFC_CORNER * size * _HALF_POWER**0.25:.3g} Hz"
@@ -94,6 +94,18 @@ def make_filter(text: str) -> Filter:
         f"filter = {text!r} is not known; give cfc:CLASS, butterworth:FREQUENCY[:ORDER] [Hz, up to order 10], "
         "mean:SECONDS or none, like cfc:180"
     )
+
+
+def _chosen_mean(time: np.ndarray, values: np.ndarray, width: float, zero_before: bool) -> np.ndarray:
+    """Return :func:`window_mean`; a window that the history cannot carry is rejected."""
+    steps = np.diff(time)
+    if len(time) < 2 or width > time[-1] - time[0] or width < steps.max() * (1.0 - 1e-6):
+        least, most = (float(steps.max()), float(time[-1] - time[0])) if len(time) > 1 else (0.0, 0.0)
+        raise InputError(
+            f"filter: a mean of {engineering(width, 's', 3)} needs a window from the longest interval of rows, "
+            f"{engineering(least, 's', 3)}, to the length of the history, {engineering(most, 's', 3)}"
+        )
+    return window_mean(time, values, width, zero_before)
 
 
 def window_mean(time: np.ndarray, values: np.ndarray, width: float, zero_before: bool = False) -> np.ndarray:

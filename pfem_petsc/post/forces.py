@@ -208,7 +208,8 @@ def _touching(force: np.ndarray, smooth: np.ndarray) -> tuple[slice, int]:
 
 def _usual_filter(history: Mapping[str, np.ndarray]) -> Filter:
     time = np.asarray(history["time"], dtype=float)
-    width = WINDOW * float(time[-1] - time[0])
+    # of a window shorter than the interval of the rows, nothing would be left of a spike
+    width = max(WINDOW * float(time[-1] - time[0]), float(np.diff(time).max(initial=0.0)))
     if getattr(history, "axis", TIME) is not TIME or width <= 0.0:
         return make_filter("none")
     return make_filter(f"mean:{width!r}")

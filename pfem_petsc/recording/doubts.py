@@ -111,10 +111,10 @@ class Doubts:
 
     def _worst(self, kind: str, bar: int, ratio: float) -> str:
         if kind == "buckling":
-            return f"bar {bar} with {ratio:.0%} of it"
+            return f"bar {bar} with {100.0 * ratio:.0f} % of it"
         limits = {m.largest_shortening: m.law for m in self._model.case.material.values()}
         limit, law = min((limit, law) for limit, law in limits.items() if np.isfinite(limit))
-        return f"bar {bar} by {ratio * limit:.0%}, where law {law!r} describes {limit:.0%}"
+        return f"bar {bar} by {100.0 * (ratio * limit):.0f} %, where law {law!r} describes {100.0 * limit:.0f} %"
 
     def _is_due(self) -> bool:
         """Count a snapshot; return whether crossing bars are searched at it.
@@ -145,7 +145,7 @@ class Doubts:
             counts["worst"] = [share, found.bars, place]
         if self._seen(counts, found.pairs, place):
             pairs = f"{found.pairs:,} pairs of bars pass" if found.pairs > 1 else "1 pair of bars passes"
-            some = f"{share:.1%} of all bars, bars {found.lowest[0]} and {found.lowest[1]} among them"
+            some = f"{100.0 * share:.1f} % of all bars, bars {found.lowest[0]} and {found.lowest[1]} among them"
             self._warn(f"{place}: {pairs} through each other ({some}): {_CROSSED}")
 
     def summary(self) -> list[str]:
@@ -159,7 +159,7 @@ class Doubts:
             if kind == "crossing":
                 texts.append(
                     f"bars passed through each other {often}: up to {counts['most']:,} pairs ({bar:,} bars, "
-                    f"{value:.1%} of all) at {place}: {_CROSSED}"
+                    f"{100.0 * value:.1f} % of all) at {place}: {_CROSSED}"
                 )
             else:
                 texts.append(

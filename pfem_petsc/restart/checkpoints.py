@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..output.checkpoint import NAME
 from ..output.checkpoint_writer import write_checkpoint
-from ..output.provenance import installed_version
+from ..version import __version__
 from .compare import check_mesh_is_the_same, mesh_mark
 from .folder import Restart
 from .state import STATE_VERSION, RunState
@@ -85,7 +85,7 @@ class Checkpoints:
             return
         attributes = {
             "state_version": STATE_VERSION,
-            "pfem_petsc": installed_version(),
+            "pfem_petsc": __version__,
             "name": self.case.name,
             "overrides": list(self.case.overrides),
             "case": self.case.to_dict(),

@@ -275,10 +275,10 @@ class Outputs:
 
     def tell_remarks(self) -> None:
         """Report the observers' remarks, such as walls that were never touched, and doubtful results. Collective."""
-        texts = [text for observer in self._observers for text in observer.remarks()]
-        for text in texts + (self.snapshots.doubts() if self._stages.at_last else []):
-            self.progress.message(text)
-        for text in self._analysis.stepper.doubts():
+        for observer in self._observers:
+            for text in observer.remarks():
+                self.progress.message(text)
+        for text in (self.snapshots.doubts() if self._stages.at_last else []) + self._analysis.stepper.doubts():
             self.progress.warning(text)
 
     def close(self, outcome: str) -> None:

@@ -146,8 +146,8 @@ class PathStepper(StaticStepper):
         missed = [turn for turn in self.keys.branch_at if abs(turn) > self.bifurcations]
         if missed:
             found.append(
-                f"static.branch_at = {missed}: the path has no such bifurcation, only {self.bifurcations}, and does "
-                "not leave there"
+                f"static.branch_at = {missed}: the path has no such bifurcation, only {self.bifurcations} before "
+                "its end"
             )
         return found
 

@@ -100,11 +100,11 @@ def test_first_crossing_is_told_once_and_counted_at_the_end(comm, shared_tmp_pat
     case = falling_onto(1)
     # at 1 m/s, the axes are closer than 0.12 m between 0.38 s and 0.62 s: snapshots at 0.4, 0.5 and 0.6 s
     told = (
-        "bars passed through each other in 3 of 11 snapshots, first at step 40, t = 0.4 s: up to 1 pairs (2 bars, 66.7%"
+        "bars passed through each other in 3 of 11 snapshots, first at step 40, t = 0.4 s: up to 1 pairs (2 bars, 66.7 %"
     )
     assert Simulation(case, comm, output=shared_tmp_path / "it", quiet=True).run() == 0
     error = capfd.readouterr().err
     if comm.rank == 0:
-        assert error.count("step 40, t = 0.4 s: 1 pair of bars passes through each other (66.7% of all bars") == 1
+        assert error.count("step 40, t = 0.4 s: 1 pair of bars passes through each other (66.7 % of all bars") == 1
         assert "bars 0 and 1 among them" in error
         assert told in (shared_tmp_path / "it" / "log.txt").read_text()

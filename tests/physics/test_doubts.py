@@ -46,12 +46,12 @@ def test_static_loads_beyond_eulers_load(law, comm, shared_tmp_path, capfd):
     material = {"law": law} if law == "elastic" else {"law": law, "yield_stress": 1e9, "isotropic_hardening": 0.0}
     error, log = run(columns(material, STATIC, 2.4 * EULER), comm, shared_tmp_path / "it", capfd)
     # 0.6, 1.2, 1.8, 2.4 in the first bar; half of that in the second
-    assert error.count("Euler's load") == 1
+    assert error.count("Euler's load") == 2  # at the first, and at the end
     assert (
-        "step 2, load factor 0.5: 1 bar is compressed beyond Euler's load, most of all bar 0 with 120% of it" in error
+        "step 2, load factor 0.5: 1 bar is compressed beyond Euler's load, most of all bar 0 with 120 % of it" in error
     )
     told = "compressed beyond Euler's load in 3 of 5 snapshots, first at step 2, load factor 0.5: up to 2 at once, most"
-    assert log.count(told + " of all bar 0 with 240% of it, at step 4, load factor 1") == 1
+    assert log.count(told + " of all bar 0 with 240 % of it, at step 4, load factor 1") == 1
 
 
 @pytest.mark.parametrize("law", ["cable", "strut"])
@@ -76,13 +76,13 @@ def test_motion_in_stages_and_after_a_restart(integrator, comm, shared_tmp_path,
     folder = shared_tmp_path / "it"
     case = columns({}, {"stage": stages}, 0.9 * EULER)
     error, log = run(case, comm, folder, capfd)
-    assert error.count("Euler's load") == 1
+    assert error.count("Euler's load") == 2
     (told,) = [line for line in log.splitlines() if "bars were compressed beyond Euler's load in" in line]
     words = told.split()
     at = words.index("of")
     seen, looks, worst = int(words[at - 1]), int(words[at + 1]), told.split("bar 0 with ")[1]
     assert looks == 81 and 10 < seen < 72
-    assert 1.70 < float(worst.split("%")[0]) / 100.0 <= 1.81
+    assert 1.70 < float(worst.split(" %")[0]) / 100.0 <= 1.81
     # a run that stops in the second stage and goes on counts the same
     stopped = shared_tmp_path / "stopped"
     with Simulation(case, comm, output=stopped, quiet=True) as simulation:
@@ -91,7 +91,7 @@ def test_motion_in_stages_and_after_a_restart(integrator, comm, shared_tmp_path,
                 break
     capfd.readouterr()
     error, log = run(case, comm, stopped, capfd, restart=True)
-    assert "Euler" not in error
+    assert error.count("Euler") == 1
     assert told.split("bars were")[1] == log.split("bars were")[1].splitlines()[0]
 
 
@@ -107,6 +107,6 @@ def test_strut_beyond_its_range(analysis, comm, shared_tmp_path, capfd):
     ]
     material = {"law": "strut", "yield_stress": 3e8}
     error, log = run(columns(material, analysis, 0.0, support=support, load=[]), comm, shared_tmp_path / "it", capfd)
-    assert error.count("beyond the range") == 1
+    assert error.count("beyond the range") == 2
     assert "1 bar is shortened beyond the range of the law, most of all bar 0 by" in error
-    assert "up to 1 at once, most of all bar 0 by 40%, where law 'strut' describes 20%" in log
+    assert "up to 1 at once, most of all bar 0 by 40 %, where law 'strut' describes 20 %" in log

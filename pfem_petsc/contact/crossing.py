@@ -32,6 +32,9 @@ _NEAR = 0.01
 # smallest distance, no search is needed.
 _SKIN = 0.1
 
+# Coordinate beyond which a node is not searched [m].
+_STRAY = 1e100
+
 # Limits of the work: cells listed and pairs compared, both per bar.
 _CELLS, _PAIRS = 64.0, 2000.0
 
@@ -143,8 +146,8 @@ class CrossingBars:
         chosen = self._bars
         kept = self._intact()
         ends = mesh.bars[chosen[kept]]
-        # broken and stray nodes may be anywhere; a NaN has its own message elsewhere
-        fine = np.isfinite(x[ends]).all(axis=(1, 2))
+        # stray nodes may be anywhere, and squares of distances must be finite; a NaN has its own message elsewhere
+        fine = (np.abs(x[ends]) < _STRAY).all(axis=(1, 2))
         ends, kept = ends[fine], np.flatnonzero(kept)[fine]
         nodes, points, radius = mesh.node_ids[ends].astype(np.int64), x[ends], factor * self._radius[kept]
         meeting = (self._meeting[ends] > 0.0).any(axis=1)

@@ -45,7 +45,7 @@ def _cause(stepper: Stepper, wave: float) -> str:
     """Return the likely cause (impact, load or time integration) and the remedy."""
     model = stepper.model
     case = model.case
-    fastest = _speed_of_case(case)
+    fastest = _speed_of_case(case, model.length)
     if fastest >= _STRONG * wave:
         return (
             f"at {engineering(fastest, 'm/s')} the impact is too strong for a truss model: use a lower speed, a "
@@ -69,10 +69,13 @@ def _cause(stepper: Stepper, wave: float) -> str:
     )
 
 
-def _speed_of_case(case: Case) -> float:
-    """Return an upper bound on the initial relative speed [m/s] of bodies and walls of a case, without rotations."""
-    given = [item.velocity for item in (*case.initial, *case.wall) if item.velocity is not None]
-    found = [float(np.linalg.norm(velocity)) for velocity in given]
+def _speed_of_case(case: Case, length: float) -> float:
+    """Return an upper bound on the initial relative speed [m/s] of bodies and walls of a case; ``length`` of the truss
+    [m]."""
+    found = [float(np.linalg.norm(wall.velocity)) for wall in case.wall if wall.velocity is not None]
+    for start in case.initial:
+        turning = float(np.linalg.norm(start.angular_velocity)) * length
+        found.append(float(np.linalg.norm(start.velocity)) + turning)
     for wall in case.wall:
         if wall.motion is not None:
             rows = np.diff(np.array(wall.motion, dtype=float), axis=0)

@@ -124,7 +124,8 @@ def work(folder: Path, names: list[str]) -> None:
     from mpi4py import MPI
     from random_trusses.running import clear, run_case, run_in_two_parts
 
-    comm = MPI.COMM_WORLD
+    comm, folder = MPI.COMM_WORLD, folder.resolve()
+    os.chdir(folder / "cases")  # files that cases name lie there
     for name in names:
         text = (folder / "cases" / f"{name}.toml").read_text()
         place = folder / f"{name}-on-{comm.size}"

@@ -53,19 +53,10 @@ def main() -> None:
 def drawn(path: str, style: str, size: tuple[int, int], repeat: int) -> dict[str, float]:
     """Draw a snapshot repeatedly; return the shortest CPU and clock times of a frame [s], and the peak memory [MiB]."""
     from pfem_petsc import open_result
-    from pfem_petsc.post.fields import ColourField, ColourScale
-    from pfem_petsc.post.film import Film, Look
-    from pfem_petsc.post.motion import Motion, Overlays
-    from pfem_petsc.post.radii import drawn_radii
-    from pfem_petsc.post.scene import Style
-    from pfem_petsc.post.shots import Moves
+    from pfem_petsc.post.render import Film, Options
 
     with open_result(path) as result:
-        last = len(result.times) - 1
-        colour = ColourField(result, "stress")
-        scale = ColourScale(colour.limits([last]), None, colour.unit)
-        look = Look([Style(style == "tubes", drawn_radii(result) if style == "tubes" else None)], Moves())
-        film = Film([Motion(result, [last], 1.0, Overlays(), print)], [colour], scale, result.case.title, look)
+        film = Film([result], Options(frames=1, style=style), print)
         film.start(size)
         film.frame(0)  # loads the machine code
         times = []
@@ -75,6 +66,7 @@ def drawn(path: str, style: str, size: tuple[int, int], repeat: int) -> dict[str
             times.append((time.process_time() - cpu, time.perf_counter() - clock))
         memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
         best = {"cpu": min(each[0] for each in times), "clock": min(each[1] for each in times)}
+        film.close()
         return {"bars": len(result.bars), "memory": memory, **best}
 
 

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any, Unpack
 
 from ..errors import InputError
-from ..registry import lookup
 from .builtin import built_in_path, read_text
 from .checks import check_names
 from .containers import CaseTables
@@ -110,9 +109,6 @@ class Case(Editable):
 
     def __repr__(self) -> str:
         return f"<Case {self.name}: {self.title}>"
-
-    def _repr_html_(self) -> str:
-        return lookup("pfem_petsc.post", "inline", "").of_case(self)
 
     @property
     def stages(self) -> tuple[Case, ...]:

@@ -19,17 +19,18 @@ LIMIT = 120.0  # seconds of a probe; the first import of some packages compiles 
 PACKAGES = {  # distribution: module, and what it is for
     "numpy": ("numpy", "arrays"),
     "numba": ("numba", "compiled loops"),
+    "scipy": ("scipy", "filters, modes"),
     "pydantic": ("pydantic", "case files"),
     "rich": ("rich", "progress"),
     "matplotlib": ("matplotlib", "curves"),
     "Pillow": ("PIL", "pictures"),
     "vtk": ("vtkmodules", "pictures"),
-    "pyvista": ("pyvista", "grids"),
+    "pyvista": ("pyvista", "pictures"),
     "imageio-ffmpeg": ("imageio_ffmpeg", "films"),
 }
 OPTIONAL = {
     "meshio": ("meshio", "foreign mesh formats"),
-    "scipy": ("scipy", "modes where SLEPc is missing"),
+    "plotly": ("plotly", "render --html"),
     "slepc4py": ("slepc4py", "modes of large models"),
     "pandas": ("pandas", "tables as data frames"),
 }
@@ -249,13 +250,13 @@ def _launcher(bring: dict[str, str], run: Callable[[list[str]], tuple[int, str]]
 
 
 def _drawing(bring: dict[str, str], run: Callable[[list[str]], tuple[int, str]]) -> Finding:
-    code = "from pfem_petsc.post.headless import require_rendering as r; r(); import os; "
+    code = "from pfem_petsc.post.scene import require_rendering as r; r(); import os; "
     status, output = run(_python(code + "print(os.environ.get('VTK_DEFAULT_OPENGL_WINDOW', 'default'))"))
     if status:
         return Finding(
             "OpenGL",
             "optional",
-            "windows of pyvista need a display (grid.plot(); render, plot and report draw without)",
+            "render, report and grid.plot() cannot draw (runs and plot need none)",
             bring["drawing"],
         )
     return Finding("OpenGL", "ok", output.strip().splitlines()[-1].removeprefix("vtk"))

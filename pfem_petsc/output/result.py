@@ -12,7 +12,7 @@ import h5py
 import numpy as np
 
 from ..errors import InputError
-from ..registry import lookup, nearest
+from ..registry import nearest
 from .hdf5 import HDF5_ERRORS, dataset_names
 from .history import EVENT
 from .layout import complete_rows, complete_snapshots
@@ -215,9 +215,6 @@ class Result:
         for name in chosen:
             columns |= flat_columns(name, self.history[name])
         return Table(columns)
-
-    def _repr_html_(self) -> str:
-        return lookup("pfem_petsc.post", "inline", "").of_result(self)
 
     def _snapshot(self, name: str, i: int, n_rows: int) -> np.ndarray:
         if not -len(self.times) <= i < len(self.times):

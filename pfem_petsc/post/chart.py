@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import csv
+import io
 import itertools
+import os
 import textwrap
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -15,19 +17,6 @@ import numpy as np
 
 from ..errors import InputError
 from ..output.units import TIME, Axis, common_prefix, prefix_for
-
-__all__ = [
-    "COLOURS",
-    "FORMATS",
-    "REFERENCE",
-    "STYLE",
-    "Chart",
-    "boxes_allowed",
-    "check_formats",
-    "largest",
-    "literal",
-    "thinned",
-]
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#6b7280", "#000000")
 """For colour-blind eyes (Okabe and Ito 2008), without their yellow, which is too pale for lines on white."""
@@ -106,6 +95,23 @@ def boxes_allowed() -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "Glyph .* missing", UserWarning)
         yield
+
+
+def png(figure: Any, dpi: float = 100) -> bytes:
+    """Return a figure of matplotlib as PNG, with so many pixels per inch."""
+    made = io.BytesIO()
+    with boxes_allowed():
+        figure.savefig(made, format="png", dpi=dpi)
+    return made.getvalue()
+
+
+def opened(result: Path | str | Any) -> Any:
+    """Return a context of a result that is open, or opened by its path."""
+    if not isinstance(result, (str, os.PathLike)):
+        return nullcontext(result)
+    from ..output.result import open_result
+
+    return open_result(result)
 
 
 def check_formats(formats: Iterable[str]) -> tuple[str, ...]:

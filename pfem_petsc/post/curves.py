@@ -16,18 +16,6 @@ from .chart import COLOURS, REFERENCE, Chart, largest, literal, thinned
 from .closed_forms import closed_form
 from .filters import AS_COMPUTED, Filter
 
-__all__ = [
-    "History",
-    "column",
-    "draw_curves",
-    "labels_of",
-    "make_chart",
-    "read",
-    "unit_of_curve",
-    "usual_curves",
-    "words",
-]
-
 History = Mapping[str, np.ndarray]
 
 _DISPLACEMENT = "/displacement"  # of probes, whose columns have positions
@@ -72,13 +60,13 @@ def column(history: History, name: str) -> dict[str, np.ndarray]:
         history = {whole: values - values[:1]}
     if whole not in list(history) or whole.startswith("event/"):
         known = [each for each in history if not each.startswith("event/")]
-        raise InputError(f"plot: the history holds no column '{whole}'{nearest(whole, known)}")
+        raise InputError(f"the history holds no column '{whole}'{nearest(whole, known)}")
     values = read(history, whole)
     if values.ndim == 3:
         values = values.sum(axis=1) if whole.endswith("/reaction") else values.mean(axis=1)
     if values.ndim == 1:
         if part:
-            raise InputError(f"plot: {name}: column '{whole}' is a number and has no components")
+            raise InputError(f"{name}: column '{whole}' is a number and has no components")
         return {whole: values}
     if part == "norm":
         return {name: np.linalg.norm(values, axis=1)}

@@ -16,8 +16,6 @@ from .render import render
 if TYPE_CHECKING:
     from ..output.result import Result
 
-__all__ = ["ModeFrames", "render_modes"]
-
 _LARGEST = 0.1  # of the extent of the truss: the largest displacement that is drawn
 _PERIOD = 24  # frames of a period
 

@@ -12,13 +12,12 @@ import numpy as np
 
 from ..errors import InputError
 from ..output.units import TIME
-from .chart import COLOURS, STYLE, Chart, check_formats
+from .chart import COLOURS, STYLE, Chart, check_formats, opened
 from .closed_forms import closed_form
 from .curves import History, draw_curves, make_chart, usual_curves
 from .energies import draw_energies
 from .filters import WINDOWS, Filter, make_filter
 from .forces import draw_force_displacement, draw_forces
-from .options import opened
 from .spectra import draw_spectra
 from .vectors import draw_momentum, draw_probes
 

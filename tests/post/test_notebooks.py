@@ -1,27 +1,18 @@
-"""What notebooks show: pictures, tables, progress and curves during a run."""
+"""What notebooks show: tables, progress and curves during a run."""
 
 from __future__ import annotations
 
-import base64
 import io
 import re
 import sys
 import types
 
-import numpy as np
 import pytest
 from mpi4py import MPI
-from PIL import Image
 
-from pfem_petsc import Case, InputError, LivePlot, Simulation, Truss, open_result
+from pfem_petsc import Case, InputError, LivePlot, Simulation, open_result
 from pfem_petsc.output import bar
 from pfem_petsc.output.progress import Progress
-from pfem_petsc.post import inline
-
-
-def images(html: str) -> list[np.ndarray]:
-    found = re.findall(r'src="data:image/png;base64,([^"]+)"', html)
-    return [np.asarray(Image.open(io.BytesIO(base64.b64decode(data))).convert("RGB")) for data in found]
 
 
 @pytest.fixture(scope="module")
@@ -31,55 +22,6 @@ def result(tmp_path_factory):
     with Simulation(case, MPI.COMM_SELF, output=folder, quiet=True) as simulation:
         simulation.run()
     return open_result(folder)
-
-
-def test_a_truss_shows_its_bars():
-    truss = Truss(
-        [[0, 0, 0], [4, 0, 0], [4, 2, 0], [0, 2, 0]], [[0, 1], [1, 2], [2, 3], [3, 0]], node_groups={"<a>": [0]}
-    )
-    html = truss._repr_html_()
-    assert "&lt;a&gt; (1)" in html and "<td" in html
-    (drawn,) = images(html)
-    dark = drawn.min(axis=2) < 200
-    rows, columns = np.flatnonzero(dark.any(axis=1)), np.flatnonzero(dark.any(axis=0))
-    # a rectangle of twice its height, closed, and empty inside, not cut off
-    assert (columns[-1] - columns[0]) / (rows[-1] - rows[0]) == pytest.approx(2.0, rel=0.03)
-    assert rows[0] > 5 and rows[-1] < drawn.shape[0] - 5 and columns[0] > 5 and columns[-1] < drawn.shape[1] - 5
-    assert not dark[(rows[0] + rows[-1]) // 2, columns[0] + 10 : columns[-1] - 10].any()
-    assert dark[rows[0] + 1, columns[0] + 10 : columns[-1] - 10].all()
-
-
-def test_a_case_shows_what_it_computes(tmp_path, monkeypatch):
-    html = Case.load("ring_impact")._repr_html_()
-    assert "central_differences, step" in html and len(images(html)) == 1
-    assert "static, " in Case.load("von_mises")._repr_html_()
-    # the size of a lattice that is cut to a surface is not known before
-    assert images(Case.load("bracket_drop")._repr_html_()) == []
-    assert len(images(Case.load("octet_buckling")._repr_html_())) == 1
-    missing = Case.from_toml(Case.load("rod_impact").to_toml()).copy({"mesh": {"file": "none.msh"}})
-    assert images(missing._repr_html_()) == []
-    monkeypatch.setattr(inline, "MOST_BARS", 10)
-    assert images(Case.load("rod_impact")._repr_html_()) == []
-
-
-def test_a_result_shows_its_last_snapshot_and_its_energies(result):
-    html = result._repr_html_()
-    snapshot, curves = images(html)
-    assert snapshot.shape == (360, 640, 3) and curves.shape[1] == 640
-    assert len(np.unique(snapshot.reshape(-1, 3), axis=0)) > 50  # coloured bars
-    assert "51 rows" in html
-    figure = inline.figure_of_history(result)
-    assert [line.get_label() for line in figure.axes[0].lines][:2] == ["kinetic_energy", "elastic_energy"]
-    figure = inline.figure_of_history(result, ["wall/wall/force"])
-    assert [line.get_label() for line in figure.axes[0].lines] == [f"wall/wall/force.{axis}" for axis in "xyz"]
-
-
-def test_a_result_that_cannot_be_drawn_shows_lines(result, monkeypatch):
-    def refuse(*arguments, **options):
-        raise InputError("the result holds no snapshots")
-
-    monkeypatch.setattr("pfem_petsc.post.render.render", refuse)
-    assert len(images(result._repr_html_())) == 2
 
 
 def test_history_as_a_table(result):

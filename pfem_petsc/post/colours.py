@@ -1,9 +1,9 @@
-"""Colours of a picture: a field of a result as one number per bar or node, its range, and its colour map."""
+"""Colours of a picture: a field of a result as one number per bar or node, its range and colour map, and marks."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import Any
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -11,15 +11,31 @@ from ..errors import InputError
 from ..output.units import field_unit, prefix_for
 from ..registry import nearest
 
-__all__ = ["ColourField", "ColourScale"]
-
 # Middle and start are a dark grey, so that bars at rest stand out from a white page as well as strained ones.
 DIVERGING = ("#16b1f3", "#1f74d4", "#535b68", "#d2402f", "#fb8a1e")
 SEQUENTIAL = ("#535b68", "#6b429f", "#b5307c", "#ea5a3d", "#f9a11b")
 
+GHOST = (168, 176, 188)
+TRAILS = ((0, 158, 115), (204, 121, 167), (86, 180, 233), (230, 159, 0))
+"""Told apart with any colour vision (Okabe and Ito 2008)."""
+
 _SIGNED = ("stress", "strain", "axial_force")
 _COMPONENTS = {"x": 0, "y": 1, "z": 2, 0: 0, 1: 1, 2: 2}
 _SAMPLES = 60  # maximum number of snapshots from which a range is determined
+
+
+class Mark(NamedTuple):
+    """How bars in a state are marked: by the field that tells, with a colour, and its text below the picture."""
+
+    field: str
+    colour: tuple[int, int, int]
+    text: str
+
+
+MARKS = {
+    "broken": Mark("status", (0, 0, 0), "broken"),
+    "yielded": Mark("plastic_strain", (240, 200, 30), "yielded"),
+}
 
 
 class ColourField:
@@ -151,9 +167,17 @@ class ColourScale:
 
     def colours(self, values: np.ndarray) -> np.ndarray:
         """Return colours (n, 3) uint8 of values (n,), clipped at the limits; NaN has the lowest colour."""
-        return self.table[self.places(values)]
-
-    def places(self, values: np.ndarray) -> np.ndarray:
-        """Return rows (n,) uint8 of the table for values (n,)."""
         place = np.nan_to_num((values - self.low) * (255.0 / (self.high - self.low)), nan=0.0, posinf=255, neginf=0)
-        return np.clip(place, 0, 255).astype(np.uint8)
+        return self.table[np.clip(place, 0, 255).astype(np.uint8)]
+
+
+def limits_of(
+    clim: tuple[float, float] | None, symmetric: bool, fields: Sequence[ColourField], frames: Sequence[int]
+) -> tuple[float, float]:
+    """Return the range of colours: the one given, or that of all fields, symmetric if asked for."""
+    found = [clim] if clim is not None else [field.limits(frames) for field in fields]
+    low, high = min(pair[0] for pair in found), max(pair[1] for pair in found)
+    if symmetric:
+        high = max(abs(low), abs(high))
+        low = -high
+    return low, high

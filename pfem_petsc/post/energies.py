@@ -10,7 +10,7 @@ import numpy as np
 
 from ..energies import LOST, STORED, SUPPLIED
 from ..output.units import engineering
-from .chart import COLOURS, REFERENCE, Chart, thinned
+from .chart import COLOURS, REFERENCE, Chart, Curve, legend_beside, thinned
 from .closed_forms import ClosedForm
 from .curves import History, make_chart, read, words
 
@@ -43,16 +43,13 @@ def draw_energies(history: History, title: str, exact: ClosedForm | None) -> Cha
     colours = {name: COLOURS[k % len(COLOURS)] for k, name in enumerate(moving)}
     chart.share("energy", "J", [largest])
     _stack(chart, upper, {n: v for n, v in moving.items() if n not in SUPPLIED}, held, colours)
-    pairs = [(words(name), values) for name, values in moving.items()]
-    styles: list[dict[str, Any]] = [{"color": colours[name]} for name in moving]
-    keys = list(moving)
-    for name in moving if exact is not None else ():
-        if name in exact.columns:
-            first = not any(label == exact.name for label, _ in pairs)
-            pairs.append((exact.name if first else f"_{name}", exact.columns[name]))
-            styles.append(REFERENCE)
-            keys.append(f"{name} closed form")
-    chart.curves(middle, "energy", "J", pairs, styles=styles, keys=keys, quantity="energy")
+    curves = [Curve(words(name), values, {"color": colours[name]}, name) for name, values in moving.items()]
+    known = [] if exact is None else [name for name in moving if name in exact.columns]
+    for name in known:
+        label = exact.name if name == known[0] else f"_{name}"
+        curves.append(Curve(label, exact.columns[name], REFERENCE, f"{name} closed form"))
+    chart.curves(middle, "energy", "J", curves, quantity="energy")
+    legend_beside(middle)
     if still:
         text = textwrap.fill("zero throughout: " + ", ".join(still), _NOTE_WIDTH)
         note = upper.annotate(text, (0, 1.02), xycoords="axes fraction", fontsize=8, color="#5b6472", va="bottom")
@@ -98,4 +95,4 @@ def _stack(
     chart.record("stored and lost", total, "J")
     chart.record("at the start and supplied", available, "J")
     axes.set_ylabel(f"stored and lost,\nstacked [{shown}]")
-    axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.0, handlelength=1.4)
+    legend_beside(axes)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,36 +15,19 @@ from ..errors import InputError
 from ..output.units import TIME
 from .chart import COLOURS, STYLE, Chart, check_formats, opened
 from .closed_forms import closed_form
-from .curves import History, draw_curves, make_chart, usual_curves
+from .curves import History, draw_curves, draw_spectra, make_chart, usual_curves
 from .energies import draw_energies
 from .filters import WINDOWS, Filter, make_filter
 from .forces import draw_force_displacement, draw_forces
-from .spectra import draw_spectra
 from .vectors import draw_momentum, draw_probes
 
-__all__ = ["plot"]
 
-
-def plot(
-    result_path: Path | str | Any | Sequence[Any],
-    output: Path | str | None = None,
-    *,
-    curves: Iterable[str] | None = None,
-    formats: Iterable[str] = ("png",),
-    force_filter: str | None = None,
-    against: str | None = None,
-    spectrum: Iterable[str] | None = None,
-    window: str = "hann",
-    highest: float | None = None,
-    closed_forms: bool = True,
-) -> list[Path]:
-    """Draw the history: ``energies.png``, ``momentum.png``, ``probes.png``, ``walls.png``, ``solver.png`` and others.
+@dataclass(frozen=True)
+class Options:
+    """Options of :func:`plot`.
 
     Parameters
     ----------
-    result_path : result file or its folder, or an open result; several of them are drawn over each other, into
-        ``comparison.png`` without ``curves``
-    output : folder of the pictures; None: beside the (first) result
     curves : names of history columns, drawn into ``curves.png`` instead of the other pictures; an existing
         ``curves.png`` is kept, and the new one is ``curves_2.png`` and so on
     formats : of :data:`~pfem_petsc.post.chart.FORMATS`; "csv" writes a table of each picture, with all rows in SI
@@ -55,6 +39,41 @@ def plot(
     window : of the spectra, one of :data:`~pfem_petsc.post.filters.WINDOWS`
     highest : frequency [Hz] at which the spectra end; None: half the sampling rate
     closed_forms : whether closed forms are drawn where the case has one
+
+    Raises
+    ------
+    InputError
+        For an unknown format or window, and options that exclude each other.
+    """
+
+    curves: Iterable[str] | None = None
+    formats: Iterable[str] = ("png",)
+    force_filter: str | None = None
+    against: str | None = None
+    spectrum: Iterable[str] | None = None
+    window: str = "hann"
+    highest: float | None = None
+    closed_forms: bool = True
+
+    def __post_init__(self) -> None:
+        if self.spectrum is not None and (self.curves is not None or self.against is not None):
+            raise InputError("plot: spectrum is a picture of its own: give it without curves and against")
+        if self.against is not None and self.curves is None:
+            raise InputError(f"plot: against = {self.against!r} needs curves, the columns to draw over it")
+        if self.window not in WINDOWS:
+            raise InputError(f"plot: window = {self.window!r} is not known; it is one of {', '.join(WINDOWS)}")
+        object.__setattr__(self, "formats", check_formats(self.formats))
+
+
+def plot(result_path: Path | str | Any | Sequence[Any], output: Path | str | None = None, **options: Any) -> list[Path]:
+    """Draw the history: ``energies.png``, ``momentum.png``, ``probes.png``, ``walls.png``, ``solver.png`` and others.
+
+    Parameters
+    ----------
+    result_path : result file or its folder, or an open result; several of them are drawn over each other, into
+        ``comparison.png`` without ``curves``
+    output : folder of the pictures; None: beside the (first) result
+    options : see :class:`Options`
 
     Returns
     -------
@@ -71,10 +90,11 @@ def plot(
 
     several = isinstance(result_path, Sequence) and not isinstance(result_path, str)
     paths = list(result_path) if several else [result_path]
-    suffixes = check_formats(formats)
-    chosen = make_filter(force_filter) if force_filter is not None else None
-    names, sines = (None if found is None else list(found) for found in (curves, spectrum))
-    _check_options(paths, names, sines, against, window)
+    given = Options(**options)
+    suffixes = given.formats
+    chosen = make_filter(given.force_filter) if given.force_filter is not None else None
+    if not paths:
+        raise InputError("plot: no result named")
     with ExitStack() as stack, matplotlib.rc_context(STYLE):
         results = [stack.enter_context(opened(path)) for path in paths]
         folder = Path(output) if output is not None else Path(results[0].path).parent
@@ -85,32 +105,19 @@ def plot(
                 )
             if chosen is not None and result.axis is not TIME:
                 raise InputError(
-                    f"{result.path}: filter = {force_filter!r} needs a run over time, not a static analysis"
+                    f"{result.path}: filter = {given.force_filter!r} needs a run over time, not a static analysis"
                 )
-        if sines is not None:
-            chart = draw_spectra(results, sines, window, highest)
+        if given.spectrum is not None:
+            chart = draw_spectra(results, list(given.spectrum), given.window, given.highest)
             return chart.save(_free(folder / "spectra", suffixes), suffixes)
-        if names is not None:
-            chart = draw_curves(results, names, against, chosen, closed_forms)
+        if given.curves is not None:
+            chart = draw_curves(results, list(given.curves), given.against, chosen, given.closed_forms)
             return chart.save(_free(folder / "curves", suffixes), suffixes)
         if len(results) > 1:
-            chart = draw_curves(results, usual_curves(results), None, chosen, closed_forms)
+            chart = draw_curves(results, usual_curves(results), None, chosen, given.closed_forms)
             return chart.save(folder / "comparison", suffixes)
         (result,) = results
-        return _usual(result, folder, suffixes, chosen, closed_forms)
-
-
-def _check_options(
-    paths: list[Any], names: list[str] | None, sines: list[str] | None, against: str | None, window: str
-) -> None:
-    if not paths:
-        raise InputError("plot: no result named")
-    if sines is not None and (names is not None or against is not None):
-        raise InputError("plot: spectrum is a picture of its own: give it without curves and against")
-    if against is not None and names is None:
-        raise InputError(f"plot: against = {against!r} needs curves, the columns to draw over it")
-    if window not in WINDOWS:
-        raise InputError(f"plot: window = {window!r} is not known; it is one of {', '.join(WINDOWS)}")
+        return _usual(result, folder, suffixes, chosen, given.closed_forms)
 
 
 def _usual(

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..output.units import unit_of
-from .chart import COLOURS, REFERENCE, Chart
+from .chart import COLOURS, REFERENCE, Chart, Curve
 from .closed_forms import ClosedForm
 from .curves import History, make_chart, read, words
 
@@ -162,17 +162,15 @@ def _grid(names: Sequence[tuple[str, str]]) -> tuple[int, int, list[tuple[int, i
 
 
 def _draw(chart: Chart, axes: Any, panel: _Panel) -> None:
-    curves = _components(panel.values, panel.scale)
-    styles: list[dict[str, Any]] = [{"color": COLOURS["xyz".index(name)]} for name, _ in curves]
-    keys = [f"{panel.key}.{name}" for name, _ in curves]
-    shown = [name for name, _ in curves]
+    parts = _components(panel.values, panel.scale)
+    shown = [name for name, _ in parts]
+    curves = [
+        Curve(name, values, {"color": COLOURS["xyz".index(name)]}, f"{panel.key}.{name}") for name, values in parts
+    ]
     for name in shown if panel.exact is not None else ():
-        curves.append(("closed form" if name == shown[0] else f"_{name}", panel.exact[:, "xyz".index(name)]))
-        styles.append(REFERENCE)
-        keys.append(f"{panel.key}.{name} closed form")
-    factor, _ = chart.curves(
-        axes, panel.label, panel.unit, curves, panel.title, styles, legend=False, keys=keys, quantity=panel.label
-    )
+        label, values = "closed form" if name == shown[0] else f"_{name}", panel.exact[:, "xyz".index(name)]
+        curves.append(Curve(label, values, REFERENCE, f"{panel.key}.{name} closed form"))
+    factor, _ = chart.curves(axes, panel.label, panel.unit, curves, panel.title, panel.label)
     if panel.nodes is not None:
         every = max(1, len(panel.nodes) // 3000)
         time = chart.time[::every] * chart.factor
@@ -180,7 +178,6 @@ def _draw(chart: Chart, axes: Any, panel: _Panel) -> None:
             k = "xyz".index(name)
             low, high = (factor * pick(panel.nodes[::every, :, k], axis=1) for pick in (np.min, np.max))
             axes.fill_between(time, low, high, color=COLOURS[k], alpha=0.15, linewidth=0)
-    chart.legend_above(axes)
 
 
 def _components(values: np.ndarray, scale: float = 0.0) -> list[tuple[str, np.ndarray]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ from .camera import Camera
 from .chart import opened
 from .motion import chosen_frames
 from .render import Film, Options
-from .scene import FEW, VARIABLE, WALL_COLOUR, Segments, point_camera, require_rendering
+from .scene import FEW, VARIABLE, WALL_COLOUR, Segments, add_wall, point_camera, require_rendering
 
 _WIDTHS = ((300, 3.0), (20_000, 1.8))  # least widths of bars in pixels, by the number of bars
 _CONFIG = {"displaylogo": False, "scrollZoom": True}
@@ -202,7 +202,9 @@ def plotter_of(
         bars.move(motion.positions(k), shown, scale.colours(colour.values(k)))
         for actor in walls:
             plotter.remove_actor(actor, reset_camera=False)
-        walls[:] = _walls_in(plotter, motion.surfaces[k])
+        walls[:] = [
+            add_wall(plotter, each, np.asarray(each.points), 120, camera.towards) for each in motion.surfaces[k]
+        ]
         title.SetText(2, motion.time(k))
 
     go_to(first)
@@ -217,17 +219,3 @@ def plotter_of(
         line: dict[str, Any] = {"pointa": (0.06, 0.07), "pointb": (0.5, 0.07), "style": "modern", "title_height": 0.02}
         plotter.add_slider_widget(go_to, (0, last), value=first, title="snapshot", fmt="%.0f", color="black", **line)
     return plotter, go_to
-
-
-def _walls_in(plotter: Any, surfaces: Sequence[Any]) -> list[Any]:
-    """Add the faces of walls to a window; return what was added."""
-    import pyvista
-
-    made = []
-    for surface in surfaces:
-        points = np.asarray(surface.points, dtype=np.float32)
-        mesh = pyvista.PolyData.from_regular_faces(points, np.asarray(surface.faces))
-        opacity = 120.0 * (1.0 - np.clip(np.asarray(surface.depth), 0.0, 1.0))
-        mesh.point_data["shade"] = np.column_stack([np.tile(WALL_COLOUR, (len(points), 1)), opacity]).astype(np.uint8)
-        made.append(plotter.add_mesh(mesh, scalars="shade", rgba=True, lighting=False, reset_camera=False))
-    return made

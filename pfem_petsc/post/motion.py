@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -34,22 +33,6 @@ _MOST_NODES = 5000  # of which the outermost are found; of more, the corners of 
 _WAYS = 200  # directions in which nodes are outermost: a sphere is larger than their hull by 1 %
 
 
-@dataclass(frozen=True)
-class Overlays:
-    """What is drawn in addition to the bars.
-
-    Parameters
-    ----------
-    ghost : whether to draw the bars of the first snapshot, pale
-    marks : of "broken", "yielded"
-    trails : names of probes whose paths are drawn; empty: none
-    """
-
-    ghost: bool = False
-    marks: Sequence[str] = ()
-    trails: Sequence[str] = ()
-
-
 class Motion:
     """What the frames of one result have in common.
 
@@ -57,8 +40,8 @@ class Motion:
     ----------
     result : an open result
     frames : numbers of its snapshots
-    scale : factor on displacements since the first snapshot
-    overlays : what is drawn in addition to the bars
+    options : ``scale`` of displacements, and what is drawn in addition to the bars: ``ghost``, ``marks``, ``trails``,
+        see :class:`~pfem_petsc.post.render.Options`
     note : receives messages
 
     Attributes
@@ -74,18 +57,17 @@ class Motion:
         For marks and probes that the result does not have, and a scale that is not finite.
     """
 
-    def __init__(
-        self, result: Any, frames: Sequence[int], scale: float, overlays: Overlays, note: Callable[[str], None]
-    ) -> None:
-        if not np.isfinite(scale):
-            raise InputError(f"render: scale = {scale:g}, the factor on displacements, must be finite")
-        self.result, self.frames, self.scale, self.note, self._overlays = result, list(frames), scale, note, overlays
+    def __init__(self, result: Any, frames: Sequence[int], options: Any, note: Callable[[str], None]) -> None:
+        if not np.isfinite(options.scale):
+            raise InputError(f"render: scale = {options.scale:g}, the factor on displacements, must be finite")
+        self.result, self.frames, self._options, self.note = result, list(frames), options, note
+        self.scale = options.scale
         self.bars = np.asarray(result.bars)
         self.start = np.asarray(result.positions(0), dtype=float)
         self.times = np.asarray(result.times, dtype=float)[self.frames]
         self.n_bars = len(self.bars)
         self._check_marks()
-        self._trails = {name: self._trail(name) for name in overlays.trails}
+        self._trails = {name: self._trail(name) for name in options.trails}
         self.reach, boxes = 0.0, []
         self._hulls: list[np.ndarray] = []
         for frame in self.frames:
@@ -94,7 +76,7 @@ class Motion:
             self._hulls.append(_outermost(points))
         self.boxes = np.array(boxes)
         low, high = self.boxes[:, 0].min(axis=0), self.boxes[:, 1].max(axis=0)
-        if overlays.ghost:
+        if options.ghost:
             low, high = np.fmin(low, self.start.min(axis=0)), np.fmax(high, self.start.max(axis=0))
         self.bounds = np.array([low, high])
         walls = result.case.every_wall
@@ -106,7 +88,7 @@ class Motion:
         self._decimals = _decimals(self.time_factor * every)
 
     def _check_marks(self) -> None:
-        for mark in self._overlays.marks:
+        for mark in self._options.marks:
             if mark not in MARKS:
                 raise InputError(f"render: mark = {mark!r} is not known; it is one of {', '.join(MARKS)}")
             if MARKS[mark].field not in self.result.cell_fields:
@@ -146,7 +128,7 @@ class Motion:
     @property
     def surroundings(self) -> np.ndarray:
         """Points (n, 3) [m] that the camera has in view: the motion, and walls near it."""
-        near = self.hulls + ([_outermost(self.start)] if self._overlays.ghost else [])
+        near = self.hulls + ([_outermost(self.start)] if self._options.ghost else [])
         size = float(np.linalg.norm(self.bounds[1] - self.bounds[0])) or 1.0
         drawn = {id(surface): surface.points for each in self.surfaces.values() for surface in each}
         for points in drawn.values():
@@ -221,17 +203,17 @@ class Motion:
     def layers(self, frame: int, scene: Scene, camera: Camera) -> list[Layer]:
         """Return what is drawn in addition to the bars of a frame."""
         made, points, thick = [], self.positions(frame), scene.thickness(camera)
-        if self._overlays.ghost:
+        if self._options.ghost:
             width = float(np.clip(0.6 * scene.width / scene.unit, 1.2, 2.4))
             made.append(Layer(self.start, self.bars, GHOST, width, -thick))
         gone = self.gone(frame)
-        if "yielded" in self._overlays.marks:
+        if "yielded" in self._options.marks:
             yielded = np.asarray(self.result.field("plastic_strain", frame)) != 0.0
             if gone is not None:
                 yielded &= ~gone
             if yielded.any():
                 made.append(scene.rim(points, np.flatnonzero(yielded), MARKS["yielded"].colour))
-        if "broken" in self._overlays.marks and gone is not None and gone.any():
+        if "broken" in self._options.marks and gone is not None and gone.any():
             made.append(self._stubs(points, gone, scene.width / scene.unit))
         for number, (when, places) in enumerate(self._trails.values()):
             past = max(1, int(np.searchsorted(when, self.result.times[frame], side="right")))

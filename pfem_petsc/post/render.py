@@ -20,7 +20,7 @@ from ..parallel.agreement import agreed
 from .camera import Camera, Moves, at_one_scale
 from .chart import opened
 from .colours import MARKS, ColourField, ColourScale, limits_of
-from .motion import Motion, Overlays, Resampled, chosen_frames, drawn_radii, even_times
+from .motion import Motion, Resampled, chosen_frames, drawn_radii, even_times
 from .page import Heading, Inset, Page, grid, inset_room, over
 from .scene import FEW, TUBE_LIMIT, Scene, Style, few_threads
 
@@ -263,8 +263,7 @@ class Film:
         if all(colour.rounded for colour in self.colours):
             note(f"{self.colours[0].title} is zero in all frames, to rounding")
         self.scale = ColourScale(limits, options.cmap, self.colours[0].unit)
-        overlays = Overlays(options.ghost, tuple(options.marks), tuple(options.trails))
-        self.motions = [Motion(result, chosen, options.scale, overlays, note) for result in shown]
+        self.motions = [Motion(result, chosen, options, note) for result in shown]
         self.styles = [options.style_of(result, note) for result in results]
         for motion, style in zip(self.motions, self.styles, strict=True):
             if style.radius is not None and len(style.radius):

@@ -121,6 +121,23 @@ class _View(NamedTuple):
 
 
 @kernel
+def _unit(a, other):
+    """Return a vector over its length, or another one if it has none."""
+    length = (a[0] * a[0] + a[1] * a[1] + a[2] * a[2]) ** 0.5
+    return (a[0] / length, a[1] / length, a[2] / length) if length > 0.0 else other
+
+
+@kernel
+def _across(a, b):
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@kernel
+def _along(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@kernel
 def _fill(mesh, x, colours, bars, view):
     """Place the points of all bars, in a frame of their axis and the direction to the eye, and colour them.
 
@@ -128,55 +145,33 @@ def _fill(mesh, x, colours, bars, view):
     negative radius are shrunk to nothing.
     """
     eye, least, fade, light = view
-    form = bars.form
-    flat = len(mesh.normals) == 0
-    shaded = flat and light[0] * light[0] + light[1] * light[1] + light[2] * light[2] > 0.0
-    fades = np.zeros(2)
-    radii = np.zeros(2)
+    form, flat = bars.form, len(mesh.normals) == 0
+    shaded = flat and _along(light, light) > 0.0
     for k in range(len(bars.ends)):
-        i, j = bars.ends[k, 0], bars.ends[k, 1]
-        ax, ay, az = x[j, 0] - x[i, 0], x[j, 1] - x[i, 1], x[j, 2] - x[i, 2]
-        length = (ax * ax + ay * ay + az * az) ** 0.5
-        if length > 0.0:
-            ax, ay, az = ax / length, ay / length, az / length
-        else:
-            ax = 1.0
-        fx, fy, fz = eye[0] - eye[3] * x[i, 0], eye[1] - eye[3] * x[i, 1], eye[2] - eye[3] * x[i, 2]
-        ux, uy, uz = ay * fz - az * fy, az * fx - ax * fz, ax * fy - ay * fx
-        length = (ux * ux + uy * uy + uz * uz) ** 0.5
-        if length < 1e-9 * (fx * fx + fy * fy + fz * fz) ** 0.5:  # seen along its axis: any direction is across
-            ux, uy, uz = (0.0, az, -ay) if abs(ax) < 0.9 else (-az, 0.0, ax)
-            length = (ux * ux + uy * uy + uz * uz) ** 0.5
-        ux, uy, uz = ux / length, uy / length, uz / length
-        vx, vy, vz = uy * az - uz * ay, uz * ax - ux * az, ux * ay - uy * ax
-        facing = max(0.0, light[0] * vx + light[1] * vy + light[2] * vz)
-        across = light[0] * ux + light[1] * uy + light[2] * uz
-        for e in range(2):
-            n = bars.ends[k, e]
-            radii[e] = 0.0
-            if bars.radius[k] >= 0.0:
-                limit = least[0] * x[n, 0] + least[1] * x[n, 1] + least[2] * x[n, 2] + least[3]
-                radii[e] = max(bars.radius[k], limit)
-            deep = fade[0] * x[n, 0] + fade[1] * x[n, 1] + fade[2] * x[n, 2] + fade[3]
-            fades[e] = min(1.0, max(0.0, deep))
+        first, last = x[bars.ends[k, 0]], x[bars.ends[k, 1]]
+        axis = _unit((last[0] - first[0], last[1] - first[1], last[2] - first[2]), (1.0, 0.0, 0.0))
+        ahead = (eye[0] - eye[3] * first[0], eye[1] - eye[3] * first[1], eye[2] - eye[3] * first[2])
+        side = _across(axis, ahead)
+        if _along(side, side) < 1e-18 * _along(ahead, ahead):  # seen along its axis: any direction is across
+            side = _across(axis, (0.0, 1.0, 0.0) if abs(axis[1]) < 0.9 else (1.0, 0.0, 0.0))
+        side = _unit(side, (0.0, 0.0, 1.0))
+        facing = _across(side, axis)
+        lit, slope = 0.785 * max(0.0, _along(light, facing)), 0.35 * _along(light, side)
+        there = bars.radius[k] >= 0.0
         for q in range(len(form)):
-            e = int(form[q, 0])
-            n = bars.ends[k, e if bars.radius[k] >= 0.0 else 0]
-            row = k * len(form) + q
-            a, u, v = form[q, 1], form[q, 2], form[q, 3]
-            nx, ny, nz = a * ax + u * ux + v * vx, a * ay + u * uy + v * vy, a * az + u * uz + v * vz
-            mesh.points[row, 0] = x[n, 0] + radii[e] * nx
-            mesh.points[row, 1] = x[n, 1] + radii[e] * ny
-            mesh.points[row, 2] = x[n, 2] + radii[e] * nz
-            share = 1.0
-            if shaded:
-                # of the light that a cylinder sends back in the mean, with a slope from its bright to its dark side
-                share = min(1.0, _AMBIENT + _DIFFUSE * max(0.0, 0.785 * facing + 0.35 * u * across))
-            if not flat:
-                mesh.normals[row, 0], mesh.normals[row, 1], mesh.normals[row, 2] = nx, ny, nz
+            end = int(form[q, 0])
+            place, row, hue = x[bars.ends[k, end if there else 0]], k * len(form) + q, bars.rows[k, end]
+            radius = max(bars.radius[k], _along(least, place) + least[3]) if there else 0.0
+            pale = 0.5 * min(1.0, max(0.0, _along(fade, place) + fade[3]))
+            # of the light that a cylinder sends back in the mean, with a slope from its bright to its dark side
+            share = min(1.0, _AMBIENT + _DIFFUSE * max(0.0, lit + slope * form[q, 2])) if shaded else 1.0
             for c in range(3):
-                colour = float(colours[bars.rows[k, e], c])
-                mesh.colours[row, c] = np.uint8((colour + (255.0 - colour) * 0.5 * fades[e]) * share + 0.5)
+                normal = form[q, 1] * axis[c] + form[q, 2] * side[c] + form[q, 3] * facing[c]
+                mesh.points[row, c] = place[c] + radius * normal
+                colour = float(colours[hue, c])
+                mesh.colours[row, c] = np.uint8((colour + (255.0 - colour) * pale) * share + 0.5)
+                if not flat:
+                    mesh.normals[row, c] = normal
 
 
 def _form(kind: str) -> tuple[np.ndarray, np.ndarray]:
@@ -423,7 +418,7 @@ class Scene:
             balls, used, sizes = self._nodes
             ink = np.tile(np.array(NODE_COLOUR, dtype=np.uint8), (len(used), 1))
             balls.move(points, sizes, ink, self.view(camera, 0.7 * self.width))
-        self._extra = [self._add(layer, camera) for layer in layers]
+        self._extra = [self._add(layer, camera) for layer in layers if len(layer.lines)]
         self._extra += self._add_walls(surfaces, camera)
         return self.picture(camera)
 
@@ -481,33 +476,43 @@ class Scene:
         return made.actor
 
     def _add_walls(self, surfaces: Sequence[Surface], camera: Camera) -> list[Any]:
-        """Draw walls, which one sees through, from the farthest polygon to the nearest, and their edges."""
-        import pyvista
-
+        """Draw walls from the farthest to the nearest, and their edges."""
         actors = []
         # without perspective, walls are behind all bars, so that they hide none
-        behind = (
-            4.0 * np.linalg.norm(np.ptp(self._corners, axis=0)) * camera.towards if camera.parallel else np.zeros(3)
-        )
+        depth = 4.0 * np.linalg.norm(np.ptp(self._corners, axis=0)) if camera.parallel else 0.0
         for surface in sorted(surfaces, key=lambda each: float((np.asarray(each.points) @ camera.towards).mean())):
-            points, faces = np.asarray(surface.points, dtype=float) - behind, np.asarray(surface.faces)
-            normal = np.cross(*np.diff(points[faces[0]][:3], axis=0))
+            points = np.asarray(surface.points, dtype=float) - depth * camera.towards
+            normal = np.cross(*np.diff(points[np.asarray(surface.faces)[0]][:3], axis=0))
             facing = float(normal @ camera.towards) > 1e-12 * float(np.linalg.norm(normal))
             # a wall between the eye and the structure must be transparent
             strength = 150 if camera.parallel else 110 if facing else 35
-            shade = np.tile(np.array([*WALL_COLOUR, 0], dtype=np.uint8), (len(points), 1))
-            shade[:, 3] = strength * (1.0 - np.clip(surface.depth, 0.0, 1.0))
-            order = np.argsort((points @ camera.towards)[faces].mean(axis=1), kind="stable")
-            mesh = pyvista.PolyData.from_regular_faces(points.astype(np.float32), faces[order])
-            mesh.point_data["shade"] = shade
-            options: dict[str, Any] = {"reset_camera": False, "render": False, "lighting": False}
-            actor = self._plotter.add_mesh(mesh, scalars="shade", rgb=True, preference="point", **options)
-            actor.ForceTranslucentOn()
-            actors.append(actor)
+            actors.append(add_wall(self._plotter, surface, points, strength, camera.towards))
             edge = np.asarray(surface.edge, dtype=np.int64).reshape(-1, 2)
             if len(edge):
                 actors.append(self._add(Layer(points, edge, EDGE_COLOUR, 1.8), camera))
         return actors
+
+
+def add_wall(plotter: Any, surface: Surface, points: np.ndarray, strength: int, towards: np.ndarray) -> Any:
+    """Add a wall, which one sees through and which fades out behind, to a plotter; return the actor.
+
+    Parameters
+    ----------
+    points : (n, 3) [m], where its points are
+    strength : opacity at its face, up to 255
+    towards : (3,), the direction to the eye: polygons are drawn from the farthest to the nearest
+    """
+    import pyvista
+
+    faces = np.asarray(surface.faces)
+    order = np.argsort((points @ towards)[faces].mean(axis=1), kind="stable")
+    mesh = pyvista.PolyData.from_regular_faces(points.astype(np.float32), faces[order])
+    opacity = strength * (1.0 - np.clip(np.asarray(surface.depth), 0.0, 1.0))
+    mesh.point_data["shade"] = np.column_stack([np.tile(WALL_COLOUR, (len(points), 1)), opacity]).astype(np.uint8)
+    options: dict[str, Any] = {"reset_camera": False, "render": False, "lighting": False}
+    actor = plotter.add_mesh(mesh, scalars="shade", rgb=True, preference="point", **options)
+    actor.ForceTranslucentOn()
+    return actor
 
 
 def point_camera(plotter: Any, camera: Camera) -> None:

@@ -14,9 +14,9 @@ from PIL import Image
 from pfem_petsc.errors import InputError
 from pfem_petsc.output.units import LOAD_FACTOR
 from pfem_petsc.post.camera import Moves, camera_path
-from pfem_petsc.post.motion import Motion, Overlays, Resampled
+from pfem_petsc.post.motion import Motion, Resampled
 from pfem_petsc.post.page import Page
-from pfem_petsc.post.render import render
+from pfem_petsc.post.render import Options, render
 
 
 @pytest.fixture
@@ -69,7 +69,7 @@ def test_slow_motion_is_between_snapshots(tmp_path, flying):
 
 
 def motion_of(result):
-    return Motion(result, list(range(len(result.times))), 1.0, Overlays(), print)
+    return Motion(result, list(range(len(result.times))), Options(), print)
 
 
 def test_orbit_and_path_keep_everything_in_view(tmp_path, flying):

@@ -197,7 +197,7 @@ def _interactive(paths: list[Path], arguments: argparse.Namespace) -> int:
 
 
 def _draw_modes(paths: list[Path], arguments: argparse.Namespace, options: dict[str, Any]) -> list[Path]:
-    from ..post.modes import render_modes
+    from ..post.render import render_modes
 
     if len(paths) > 1:
         raise InputError("render: --modes draws one result; give one RESULT")

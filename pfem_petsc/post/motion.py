@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,7 +11,7 @@ from ..errors import InputError
 from ..fields import STATUS
 from ..mechanics.sections import area_fields, bar_shapes, named_groups, section_of_bars
 from ..mesh import load_slab
-from ..output.units import prefix_for
+from ..output.units import MODE, Axis, prefix_for
 from ..registry import nearest
 from .camera import Camera
 from .colours import GHOST, MARKS, TRAILS
@@ -25,6 +25,8 @@ _MOST = 20_000  # frames in slow motion
 STOUT = 0.2
 """Largest radius of a drawn bar as a fraction of its length; nodes of stouter ones would hide their bars."""
 
+_LARGEST = 0.1  # of the extent of the truss: the largest displacement that is drawn
+PERIOD = 24  # frames of a period
 _STEPWISE = ("status",)  # fields whose numbers stand for words
 
 _STUB = 0.35  # of the initial length: the part of a broken bar that is drawn at each of its nodes
@@ -430,3 +432,63 @@ def _sections_and_areas(case: Any, count: int) -> tuple[np.ndarray, np.ndarray]:
         own = np.flatnonzero(numbers == number)
         areas[own] = section.area if section.area_field is None else slab.bar_fields[section.area_field][own]
     return numbers, areas
+
+
+class ModeFrames:
+    """Modes as the snapshots of a result that :func:`~pfem_petsc.post.render.render` draws, a period each.
+
+    The field ``amplitude`` is the length of a node's displacement relative to the largest.
+
+    Parameters
+    ----------
+    result : an open result
+    modes : numbers of the modes from 1; None: all
+    period : frames of a period
+
+    Raises
+    ------
+    InputError
+        Where the result has no modes, or not these.
+    """
+
+    point_fields: Sequence[str] = ("amplitude",)
+    cell_fields: Sequence[str] = ()
+    axis: Axis = MODE
+
+    def __init__(self, result: Any, modes: Sequence[int] | None = None, period: int = PERIOD) -> None:
+        if period < 4:
+            raise InputError(f"render: {period} frames a period are too few for modes; give 4 or more")
+        found = result.modes
+        self._numbers = list(range(1, len(found) + 1)) if modes is None else list(modes)
+        for number in self._numbers:
+            if not 1 <= number <= len(found):
+                raise InputError(f"render: mode {number} does not exist; the result holds modes 1 to {len(found)}")
+        self._labels, self._period = [found.label(number - 1) for number in self._numbers], period
+        self.path, self.case, self.bars = result.path, result.case, result.bars
+        self._place = result.positions(-1)
+        shapes = found.shape[np.array(self._numbers, dtype=int) - 1]
+        sizes = np.linalg.norm(shapes, axis=2)
+        largest = sizes.max(axis=1)
+        self._amplitudes = sizes / largest[:, None]
+        extent = float(np.linalg.norm(np.ptp(self._place, axis=0))) or 1.0
+        self._shapes = shapes * (_LARGEST * extent / largest)[:, None, None]
+        # walls are where they are at the end
+        self.times = np.full(period * len(self._numbers), result.times[-1])
+        self.history: Mapping[str, np.ndarray] = result.history
+
+    def positions(self, i: int) -> np.ndarray:
+        """Positions (nodes, 3) [m] of frame i."""
+        mode, phase = divmod(i, self._period)
+        return self._place + np.sin(2.0 * np.pi * phase / self._period) * self._shapes[mode]
+
+    def field(self, name: str, i: int) -> np.ndarray:
+        """The amplitudes (nodes,) of frame i."""
+        return self._amplitudes[i // self._period]
+
+    def caption(self, i: int) -> str:
+        """The caption of frame i."""
+        return self._labels[i // self._period]
+
+    def instants(self, count: int) -> list[int]:
+        """Frames for a page: the first modes where they are largest."""
+        return [self._period * mode + self._period // 4 for mode in range(min(count, len(self._numbers)))]

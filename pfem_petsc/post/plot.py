@@ -9,17 +9,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from ..errors import InputError
 from ..output.units import TIME
-from .chart import COLOURS, STYLE, Chart, check_formats, opened
+from .chart import STYLE, Chart, check_formats, opened
 from .closed_forms import closed_form
-from .curves import History, draw_curves, draw_spectra, make_chart, usual_curves
-from .energies import draw_energies
+from .curves import History, draw_curves, draw_spectra, usual_curves
 from .filters import WINDOWS, Filter, make_filter
 from .forces import draw_force_displacement, draw_forces
-from .vectors import draw_momentum, draw_probes
+from .histories import draw_energies, draw_momentum, draw_probes, draw_solver
 
 
 @dataclass(frozen=True)
@@ -136,7 +133,7 @@ def _usual(
         "pairs": draw_forces(history, "pair", (), title, chosen),
         "constraints": draw_forces(history, "constraint", (), title, chosen),
         "force_displacement": draw_force_displacement(result, title, chosen, exact),
-        "solver": _solver(history, title),
+        "solver": draw_solver(history, title),
     }
     written = [path for name, chart in drawn.items() if chart for path in chart.save(folder / name, suffixes)]
     if "csv" in suffixes and hasattr(result, "table"):
@@ -149,27 +146,3 @@ def _free(file: Path, suffixes: Sequence[str]) -> Path:
     numbered = (file.with_name(f"{file.name}_{k}") for k in itertools.count(2))
     free = (p for p in itertools.chain([file], numbered) if not any(Path(f"{p}.{s}").exists() for s in suffixes))
     return next(free)
-
-
-def _solver(history: History, title: str) -> Chart | None:
-    labels = {
-        "newton_iterations": "Newton\niterations",
-        "linear_iterations": "linear\niterations",
-        "active_contacts": "nodes in\ncontact",
-    }
-    names = [name for name in labels if name in history]
-    # without iterations (explicit schemes) or without walls these panels would be empty
-    walls = any(name.startswith("wall/") for name in history)
-    names = [name for name in names if (walls and name == "active_contacts") or np.any(history[name])]
-    if not names or (names == ["active_contacts"] and _is_shown(history)):
-        return None
-    chart = make_chart(history, title, len(names), heights=[0.7] * len(names))
-    for number, (axes, name) in enumerate(zip(chart.axes[:, 0], names, strict=True)):
-        chart.counts(axes, labels[name], history[name], COLOURS[number], before=name.endswith("_iterations"))
-    return chart
-
-
-def _is_shown(history: History) -> bool:
-    """Whether the nodes in contact are those of a single wall: their number is in the picture of the walls."""
-    walls = [name for name in history if name.startswith("wall/") and name.endswith("/contacts")]
-    return len(walls) == 1 and np.array_equal(history[walls[0]], history["active_contacts"])

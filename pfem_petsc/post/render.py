@@ -20,7 +20,7 @@ from ..parallel.agreement import agreed
 from .camera import Camera, Moves, at_one_scale
 from .chart import opened
 from .colours import MARKS, ColourField, ColourScale, limits_of
-from .motion import Motion, Resampled, chosen_frames, drawn_radii, even_times
+from .motion import PERIOD, ModeFrames, Motion, Resampled, chosen_frames, drawn_radii, even_times
 from .page import Heading, Inset, Page, grid, inset_room, over
 from .scene import FEW, TUBE_LIMIT, Scene, Style, few_threads
 
@@ -234,6 +234,41 @@ def render(
     if comm is not None:
         written = comm.bcast(written)
     return written + [folder / "frames" / f"frame_{number:04d}.png" for number in range(film.count)]
+
+
+def render_modes(
+    result_path: Path | str,
+    output: Path | str | None = None,
+    *,
+    modes: Sequence[int] | None = None,
+    period: int = PERIOD,
+    **options: Any,
+) -> list[Path]:
+    """Draw the modes of a result as :func:`render` draws its snapshots.
+
+    Parameters
+    ----------
+    result_path : result file or its folder
+    output : folder of the pictures; None: ``modes`` beside the result
+    modes : numbers of the modes from 1; None: all
+    period : frames of a period
+    options : of ``render``, but for ``field``, ``component`` and ``frames``; ``scale`` 1 draws a tenth of the truss's
+        extent as the largest displacement
+
+    Returns
+    -------
+    The files written: poster, films, frames.
+
+    Raises
+    ------
+    InputError
+        As ``render``, and where the result has no such modes.
+    """
+    with opened(result_path) as result:
+        frames = ModeFrames(result, modes, period)
+        folder = Path(output) if output is not None else Path(result.path).parent / "modes"
+        count = len(frames.times)
+        return render(frames, folder, field="amplitude", frames=count, **{"clim": (0.0, 1.0)} | options)
 
 
 class Film:

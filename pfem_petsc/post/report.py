@@ -20,7 +20,7 @@ from ..output.history import EVENT
 from ..output.modes import NAMES
 from ..output.peaks import peak_force, touch_impulse
 from ..output.units import engineering, prefix_for
-from .energies import balance_error
+from .histories import balance_error
 from .plot import plot
 
 __all__ = ["write_report"]

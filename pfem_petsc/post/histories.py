@@ -180,7 +180,7 @@ def _draw_panels(
 ) -> Chart:
     """Draw panels in a grid (rows, columns) of their numbers, -1 for none, and name those that do not change."""
     rows, columns = places.shape
-    chart = make_chart(history, title, rows, columns, [0.9] * rows if columns == 1 else None)
+    chart = make_chart(history, title, rows, columns, None if shown[0].title else [0.9] * rows)
     for label in dict.fromkeys(panel.label for panel in shown):
         own = [panel for panel in shown if panel.label == label]
         chart.share(label, own[0].unit, [panel.size for panel in own])

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import InputError
-from .arrays import slab_from_arrays
+from .slab import slab_from_arrays
 
 if TYPE_CHECKING:
     import pyvista
@@ -99,7 +99,7 @@ class Truss:
     def _take(self, points: Any, bars: Any, node_groups: Any, bar_groups: Any, bar_fields: Any, source: str) -> None:
         from mpi4py import MPI
 
-        from .checks import check_mesh
+        from .whole import check_mesh
 
         slab = slab_from_arrays(source, points, bars, node_groups, bar_groups, bar_fields)
         self.warnings = check_mesh(slab, MPI.COMM_SELF)

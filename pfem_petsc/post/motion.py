@@ -9,7 +9,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..fields import STATUS
-from ..mechanics.sections import area_fields, bar_shapes, named_groups, section_of_bars
+from ..mechanics.bars import area_fields, bar_shapes, named_groups, section_of_bars
 from ..mesh import load_slab
 from ..output.units import MODE, Axis, prefix_for
 from ..registry import nearest

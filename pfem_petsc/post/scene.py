@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..contact.surfaces import Surface
+from ..contact.walls.base import Surface
 from ..errors import InputError
 from ..mechanics.compiled import kernel
 from .camera import Camera

@@ -30,7 +30,7 @@ import numpy as np
 from pfem_petsc import Truss
 
 ROOT = Path(__file__).resolve().parent
-sys.path.insert(0, str(ROOT))
+sys.path.insert(0, str(ROOT.parent / "tests" / "random_cases"))
 
 RULES = ("bt", "l2", "cp", "basic", "full, then bt", "full, then l2", "full, then cp")
 LEVELS = 6  # different stiffnesses of a truss

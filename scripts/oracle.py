@@ -27,7 +27,8 @@ from typing import Any
 
 import numpy as np
 
-sys.path.insert(0, str(Path(__file__).resolve().parent))
+TESTS = Path(__file__).resolve().parent.parent / "tests"
+sys.path[:0] = [str(TESTS), str(TESTS / "random_cases")]
 
 SAMPLES = 12
 """Values kept of each array, evenly spaced, from which the size of a difference is estimated."""

@@ -16,8 +16,8 @@ from pfem_petsc.errors import InputError
 @pytest.mark.slow
 def test_three_starts_and_two_restarts(tmp_path):
     """Two rounds of the script; more by hand."""
-    script = Path(__file__).parents[2] / "scripts" / "together.py"
-    line = [sys.executable, script, "--rounds", "2", "--seed", "1", "--folder", tmp_path]
+    script = Path(__file__).parents[2] / "scripts" / "endurance.py"
+    line = [sys.executable, script, "together", "2", "--seed", "1", "--folder", tmp_path]
     done = subprocess.run(line, env=environment(), capture_output=True, text=True, timeout=400)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "2 rounds: " in done.stdout

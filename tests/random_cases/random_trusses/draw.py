@@ -12,16 +12,21 @@ from typing import Any
 
 import numpy as np
 
-from .additions import ODD, draw_bar_law, draw_loads_over_time, draw_prestress, draw_stiffness_damping, vector
+from .additions import (
+    ODD,
+    draw_bar_law,
+    draw_connectors,
+    draw_inclined,
+    draw_laws,
+    draw_loads_over_time,
+    draw_points,
+    draw_prestress,
+    draw_rupture,
+    draw_stiffness_damping,
+    vector,
+)
 from .body import OPEN_KINDS, Body, draw_body
-from .connectors import draw_connectors
-from .inclined import draw_inclined
-from .laws import draw_laws
-from .points import draw_points
-from .rupture import draw_rupture
 from .walls import draw_walls
-
-__all__ = ["Motion", "draw_case"]
 
 EXPLICIT = {"central_differences": 2.0, "chung_lee": 1.85, "hulbert_chung": 1.5, "souza_moura": 1.7}
 """Explicit integrators, with a limit of Omega that is safe for all their parameters without damping."""

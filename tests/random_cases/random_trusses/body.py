@@ -12,8 +12,6 @@ from mpi4py import MPI
 
 from pfem_petsc.mesh.slab import MeshSlab
 
-__all__ = ["Body", "draw_body", "generated"]
-
 CELLS = ((1, 1, 1), (2, 1, 1), (1, 2, 1), (1, 1, 2), (2, 2, 1), (2, 1, 2), (1, 2, 2), (3, 1, 1))
 PLAIN_KINDS = ("cubic", "octet", "bcc")
 OPEN_KINDS = ("fcc", "bcc_diagonals", "kelvin", "diamond", "gyroid", "auxetic", "tetrahedral_octahedral")

@@ -9,8 +9,6 @@ import numpy as np
 
 from .body import Body
 
-__all__ = ["draw_walls"]
-
 ODD = 0.02
 
 

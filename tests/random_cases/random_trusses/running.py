@@ -23,8 +23,6 @@ from pfem_petsc import Case, Simulation
 from pfem_petsc.case.toml import table_text
 from pfem_petsc.errors import EarlyStop, InputError, SimulationFailure
 
-__all__ = ["Outcome", "case_text", "run_case", "run_in_two_parts"]
-
 COLLECT = 20
 """Number of cases between garbage collections, which take as long as a case."""
 _cleared = 0

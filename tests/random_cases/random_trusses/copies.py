@@ -14,11 +14,8 @@ import numpy as np
 from mpi4py import MPI
 
 from .body import generated
-from .loading import Loaded
-from .oracle import energy_scale
+from .checks import Loaded, energy_scale
 from .running import case_text, clear, run_case
-
-__all__ = ["KINDS", "judge_copies"]
 
 AGREE, LOOSE, CHAOS = 1e-9, 1e-6, 300.0
 """As for comparisons between ranks; more chaos, because a copy rounds in every step and not only at the start."""

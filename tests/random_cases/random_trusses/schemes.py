@@ -20,10 +20,8 @@ from pfem_petsc.errors import InputError
 from pfem_petsc.stepping.model import Model
 from pfem_petsc.stepping.plan import make_plan
 
-from .loading import Loaded
+from .checks import Loaded
 from .running import case_text, clear, run_case
-
-__all__ = ["judge_schemes", "pair_of"]
 
 MARGIN = 4.0
 EXACT = 1e-6

@@ -1,4 +1,4 @@
-"""Properties that the results of any valid case with status 0 must have.
+"""Properties that the results of any valid case with status 0 must have, and the comparison of two results.
 
 Each check returns faults, (cause, detail). Tolerances:
 
@@ -18,22 +18,57 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import h5py
 import numpy as np
 from mpi4py import MPI
 
+from pfem_petsc import open_result
 from pfem_petsc.case.schema import Case
 from pfem_petsc.contact.walls.base import WallKeys
 from pfem_petsc.stepping.model import Model
 from pfem_petsc.stepping.plan import make_plan
 
 from .body import generated
-from .loading import Loaded
-
-__all__ = ["check_result", "energy_scale"]
 
 Faults = list[tuple[str, str]]
 _ENDS = ("_energy", "_dissipation", "_work")
 LOSSES = ("numerical_dissipation", "impact_dissipation", "friction_dissipation")
+
+
+class Loaded:
+    """Everything of a result.
+
+    Attributes
+    ----------
+    case : Case
+    history : column to array (rows, ...)
+    steps : (snapshots,)
+    positions : (snapshots, nodes, 3) [m]
+    fields : name to array (snapshots, nodes or bars, ...)
+    """
+
+    def __init__(self, folder: Path) -> None:
+        result = open_result(folder)
+        self.case: Case = result.case
+        self.steps = result.steps
+        count = len(result.times)
+        with h5py.File(result.path, "r", locking=False) as file:
+            rows = result._n_rows
+            self.history = {name: file[f"history/{name}"][:rows] for name in result._columns}
+            vtk = file["VTKHDF"]
+            names = {f"PointData/{name}": result.n_nodes for name in result.point_fields}
+            names |= {f"CellData/{name}": result.n_bars for name in result.cell_fields}
+            self.fields = {name.partition("/")[2]: _by_snapshot(vtk[name], count, n) for name, n in names.items()}
+            self.positions = _by_snapshot(vtk["Points"], count, result.n_nodes)
+
+    @property
+    def size(self) -> float:
+        """Largest extent at the start [m]; 1 without snapshots."""
+        return float(np.ptp(self.positions[0], axis=0).max()) if len(self.steps) else 1.0
+
+
+def _by_snapshot(dataset: h5py.Dataset, count: int, rows: int) -> np.ndarray:
+    return dataset[: count * rows].reshape(count, rows, *dataset.shape[1:])
 
 
 def check_result(folder: Path, warned: list[str]) -> Faults:
@@ -250,3 +285,47 @@ def _momentum(case: Case, history: dict[str, np.ndarray]) -> Faults:
 def _speed_scale(history: dict[str, np.ndarray]) -> float:
     """Largest momentum of the truss [kg m/s]."""
     return float(np.linalg.norm(history["momentum"], axis=1).max())
+
+
+def distance(one: Path, other: Path) -> tuple[float, str]:
+    """Return the largest relative difference of two results, and where it is.
+
+    Positions are relative to the size of the truss, energies to the largest energy, momenta to the largest momentum (or
+    that of the displacement of the centre, if they cancel), forces of walls to the largest force.
+    """
+    a, b = Loaded(one), Loaded(other)
+    worst = paths_distance(a, b)
+    history = a.history
+    energy = max(energy_scale(history), 1e-300)
+    speed = np.abs(history["momentum"]).max()
+    size = max(a.size, 1e-300)
+    scales = {"momentum": speed, "angular_momentum": speed * size, "centre_of_mass": size}
+    for name in history:
+        if name.endswith(("_iterations", "releases", "changes", "contact_time", "active_contacts", "contacts")):
+            continue
+        x, y = (np.asarray(run.history[name], dtype=float) for run in (a, b))
+        if x.shape != y.shape:
+            return np.inf, f"{name}: {x.shape} and {y.shape}"
+        if name.endswith(("_energy", "_work", "_dissipation", "_heat", "_imbalance")):
+            scale = energy
+        elif name in scales:
+            scale = max(scales[name], 1e-300)
+        elif name in ("time", "step", "step_size") or name.endswith("/position"):
+            scale = max(np.abs(x).max(), size)
+        else:
+            continue
+        apart = float(np.abs(x - y).max()) / scale
+        if apart > worst[0]:
+            worst = apart, name
+    return worst
+
+
+def paths_distance(a: Loaded, b: Loaded) -> tuple[float, str]:
+    """Largest distance of a node in one result from itself in the other, over the truss's size."""
+    if a.positions.shape != b.positions.shape:
+        return np.inf, f"{len(a.steps)} and {len(b.steps)} snapshots"
+    if not a.positions.size:
+        return 0.0, "nothing"
+    apart = np.abs(a.positions - b.positions).max(axis=(1, 2)) / max(a.size, 1e-300)
+    i = int(apart.argmax())
+    return float(apart[i]), f"positions in snapshot {i} of {len(a.steps)}"

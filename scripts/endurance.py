@@ -55,9 +55,7 @@ def main() -> int:
     parser.add_argument("test", choices=("kills", "damage", "mutants", "together"))
     parser.add_argument("number", type=int, help="of kills, damages, mutants or rounds")
     parser.add_argument("--seed", type=int, help="of what is random; default: another one each time, 0 for mutants")
-    parser.add_argument(
-        "--folder", type=Path, help="where to work; default: a temporary one, removed if all is well"
-    )
+    parser.add_argument("--folder", type=Path, help="where to work; default: a temporary one, removed if all is well")
     parser.add_argument("--ranks", default="1,2", metavar="N,N", help="of kills, in turn (default: 1,2)")
     parser.add_argument("--python", default=sys.executable, metavar="PATH", help="of killed runs; default: this one")
     parser.add_argument("--cases", metavar="A:B", help="random cases with these numbers, to be killed")

@@ -24,8 +24,6 @@ from pfem_petsc.contact.walls.base import WallKeys
 from pfem_petsc.mechanics.materials.base import MaterialKeys
 from pfem_petsc.registry import choices, lookup
 
-__all__ = ["TABLES", "Family", "page", "rows", "type_text"]
-
 
 class Family(NamedTuple):
     """Models that a key chooses among, one in each module of a package: ``type = "plane"``."""

@@ -15,8 +15,6 @@ from .measures import RodImpact
 from .schemes import IN_TABLES, SCHEMES
 from .studies import BAR_STEPS, OTHER_RINGS, OTHER_SCHEMES, RING_STEPS, bar_key, rod_key
 
-__all__ = ["all_claims", "impact_row", "write_document"]
-
 TEMPLATE = Path(__file__).with_name("paper.md")
 
 

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-__all__ = ["BAR", "PLASTIC_BAR", "ROD", "Rod"]
-
 
 @dataclass(frozen=True)
 class Rod:

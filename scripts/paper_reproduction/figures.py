@@ -21,8 +21,6 @@ from .running import Run
 from .schemes import LIKELY, PAPER, SCHEMES
 from .studies import BAR_STEPS, bar_key, refined_key, rod_key
 
-__all__ = ["draw_bars", "draw_phases", "draw_rod", "draw_rods", "legend", "new_figure", "save", "styled"]
-
 EXACT = {"color": "#111418", "linewidth": 2.2, "alpha": 0.55, "linestyle": "-"}
 FINE = {"color": "#6b7280", "linewidth": 1.8, "alpha": 0.8, "linestyle": (0, (4, 1.5))}
 DPI = 130

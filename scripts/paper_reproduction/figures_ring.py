@@ -13,8 +13,6 @@ from .running import Run
 from .schemes import LIKELY, PAPER, SCHEMES
 from .studies import INSTANTS, RING_STEPS, ring_key
 
-__all__ = ["draw_ring"]
-
 WALL = 22.93  # [m]
 STRAIN = LinearSegmentedColormap.from_list("strain", ["#1f4e9c", "#7a4fbf", "#d9482b", "#f2a33a"])
 

@@ -9,17 +9,6 @@ import numpy as np
 from .exact import Rod
 from .running import Run
 
-__all__ = [
-    "RingImpact",
-    "RodImpact",
-    "contact_episodes",
-    "measure_ring",
-    "measure_rod",
-    "spread",
-    "tip_velocity",
-    "wall_force",
-]
-
 ENERGIES = ("kinetic_energy", "elastic_energy", "plastic_dissipation")
 WINDOW = 20  # steps after the first contact in which the velocity jump is evaluated
 PAUSE = 2.5e-3  # a release of the ring shorter than this belongs to the same contact [s]

@@ -4,18 +4,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-__all__ = [
-    "EXPLICIT",
-    "IN_TABLES",
-    "LIKELY",
-    "LUMPED",
-    "PAPER",
-    "READINGS",
-    "SCHEMES",
-    "Integrator",
-    "Reading",
-]
-
 
 class Integrator(NamedTuple):
     """One line of the comparison.

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from pfem_petsc import Case, Simulation
+from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.case.toml import table_text
 from pfem_petsc.errors import EarlyStop, InputError, SimulationFailure
 
@@ -180,6 +180,11 @@ def _meet(comm: MPI.Comm, outcome: Outcome) -> None:
     statuses = comm.allgather(outcome.status)
     if len(set(statuses)) > 1:
         outcome.faults.append(("ranks end differently", f"{statuses}: {outcome.message[:200]}"))
+
+
+def steps_of(folder: Path) -> int:
+    """Return the number of the last step of a result."""
+    return int(open_result(folder).history["step"][-1])
 
 
 def clear(comm: MPI.Comm, *folders: Path) -> None:

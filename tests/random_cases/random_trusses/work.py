@@ -16,7 +16,7 @@ from pfem_petsc import open_result
 
 from .checks import check_result, distance
 from .copies import judge_copies
-from .running import case_text, clear, run_case, run_in_two_parts
+from .running import case_text, clear, run_case, run_in_two_parts, steps_of
 from .schemes import judge_schemes
 
 CHAOS = 100.0
@@ -36,7 +36,7 @@ def check_case(text: str, comm: MPI.Comm, folder: Path, source: str, restart: bo
     if outcome.status == 0 and comm.rank == 0:
         told["faults"] += check_result(folder / "whole", outcome.warnings)
         told["touched"] = _touched(folder / "whole")
-    steps = comm.bcast(_steps(folder / "whole") if outcome.status == 0 and comm.rank == 0 else 0)
+    steps = comm.bcast(steps_of(folder / "whole") if outcome.status == 0 and comm.rank == 0 else 0)
     if restart and outcome.status == 0 and steps > 4:
         files = (folder / "whole" / "result.vtkhdf", folder / "parts" / "result.vtkhdf")
         second = run_in_two_parts(text, comm, folder / "parts", steps // 2, source)
@@ -126,10 +126,6 @@ def _table(text: str) -> dict:
 def _tell(comm: MPI.Comm, what: str, seed: int, told: dict) -> None:
     if comm.rank == 0:
         print(f"{what} {seed} {json.dumps(told, default=str)}", flush=True)
-
-
-def _steps(folder: Path) -> int:
-    return int(open_result(folder).history["step"][-1])
 
 
 def _touched(folder: Path) -> bool:

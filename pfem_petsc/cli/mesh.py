@@ -121,7 +121,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _read(path: Path, scale: float) -> WholeMesh:
     """Read a file, and print what its reader has to say."""
-    from ..mesh.readers import read_whole
+    from ..formats import read_whole
     from ..mesh.tools import scaled
 
     mesh = read_whole(path)
@@ -135,8 +135,8 @@ def _write(arguments: argparse.Namespace, mesh: WholeMesh) -> None:
     """Write the mesh, and a case file if there is to be one; print what they are."""
     import numpy as np
 
+    from ..formats import write_whole
     from ..mesh.skeleton import skeleton
-    from ..mesh.writers import write_whole
 
     if arguments.area is not None:
         mesh.bar_fields["area"] = np.full(len(mesh.bars), arguments.area)
@@ -157,9 +157,9 @@ def _write(arguments: argparse.Namespace, mesh: WholeMesh) -> None:
 
 def _generate(arguments: argparse.Namespace) -> None:
     """Generate the mesh of a case, or of a generator, with the areas and materials of the case."""
-    from ..mesh.writers import writer_name
+    from ..formats import writer_of
 
-    writer_name(arguments.output)  # before a long computation
+    writer_of(arguments.output)  # before a long computation
     _write(arguments, _made(arguments.what, arguments.overrides))
 
 
@@ -187,7 +187,7 @@ def _made(what: str, overrides: list[str]) -> WholeMesh:
     keys = case.mesh.parameters
     names = dict(getattr(keys, "bar_fields", None) or getattr(getattr(keys, "truss", None), "bar_fields", None) or {})
     if case.mesh.file is not None:
-        from ..mesh.readers import read_whole
+        from ..formats import read_whole
 
         names = read_whole(case.mesh.file).bar_fields
     slab = load_slab(case.mesh, MPI.COMM_SELF, dict.fromkeys(names, "mesh.bar_fields"))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from ..errors import InputError
 from ..parallel.agreement import agreed
 from .slab import MeshSlab, check_size, slab_range
 
-__all__ = ["WholeMesh", "case_tables", "read_and_scatter", "scattered", "without_slashes"]
+__all__ = ["WholeMesh", "case_tables", "missing_field", "read_and_scatter", "scattered", "without_slashes"]
 
 
 @dataclass
@@ -60,6 +60,16 @@ def without_slashes(named: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
             own += "_"
         found[own] = values
     return found
+
+
+def missing_field(path: Path | str, fields: Mapping[str, str], known: Iterable[str]) -> str | None:
+    """Return the message about the first of ``fields`` that is not among the ``known`` cell fields of a file."""
+    known = sorted(known)
+    for name, key in fields.items():
+        if name not in known:
+            there = f"; it has {', '.join(known)}" if known else ""
+            return f"{key} = {name!r}: {path} has no cell field of this name with one number for each bar{there}"
+    return None
 
 
 def read_and_scatter(read: Callable[[Path], WholeMesh], path: Path, comm: MPI.Comm) -> MeshSlab:

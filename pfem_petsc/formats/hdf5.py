@@ -103,7 +103,7 @@ def _content(path: Path, fields: Mapping[str, str] | None) -> _Content:
             counts.append(len(dataset))
         groups: dict[str, list[str]] = {}
         for kind in ("node_groups", "bar_groups"):
-            group = file[kind] if kind in file else None
+            group = file[kind] if kind in file else None  # noqa: SIM401 - get() hides what is wrong
             if group is not None and not isinstance(group, h5py.Group):
                 raise InputError(f"{path}: /{kind} is not a group of datasets")
             groups[kind] = sorted(group or ())

@@ -96,35 +96,28 @@ _DEEPEST = 20
 _SHORT = 200
 """Number of letters up to which lines are read one by one, which is faster then."""
 
-_STAR = re.compile(rb"^[ \t]*\*", re.MULTILINE)
+_COMMENT = re.compile(rb"^[ \t]*\*\*[^\n]*", re.MULTILINE)
+_KEYWORD = re.compile(rb"(^[ \t]*\*(?:[^\n]*,[ \t]*\n(?![ \t]*\*))*[^\n]*\n?)", re.MULTILINE)
+"""A line that begins with an asterisk, with those that continue it after a comma."""
 _PARAMETERS = re.compile(r'(?:"[^"]*"|[^,"])+')
-_BLANKS = bytes.maketrans(b",Dd\r", b" ee ")  # of Fortran's exponents as well: 1.D+3
+_BLANKS = bytes.maketrans(b",Dd", b" ee")  # of Fortran's exponents as well: 1.D+3
 
 
-@dataclass
-class _Piece:
-    """Data lines without a keyword or comment between them."""
+class _Piece(NamedTuple):
+    """Data lines of a file, from the line of a number on."""
 
     path: Path
     line: int
-    """Number of the first line."""
     text: bytes
-
-    def lines(self) -> Iterator[tuple[int, str]]:
-        """Return number and text of each line that is not blank."""
-        for number, line in enumerate(self.text.split(b"\n"), self.line):
-            if line.strip():
-                yield number, line.decode("utf-8", "replace").strip()
 
 
 @dataclass
 class _Block:
-    """A keyword with its parameters and data lines."""
+    """A keyword, in capitals without the asterisk, with its parameters and data lines."""
 
     path: Path
     line: int
     keyword: str
-    """In capitals, without the asterisk."""
     parameters: dict[str, str]
     """Names in capitals."""
     pieces: list[_Piece] = field(default_factory=list)
@@ -145,6 +138,15 @@ class _Block:
             raise InputError(f"{self.where}: the parameter {name}= is missing")
         return value
 
+    def lines(self, *pieces: _Piece) -> Iterator[tuple[str, list[str]]]:
+        """Return where it is, and the words between commas, of each data line; a last empty one is left out."""
+        for path, first, text in pieces or self.pieces:
+            for number, line in enumerate(text.split(b"\n"), first):
+                if line.strip():
+                    words = [word.strip() for word in line.decode("utf-8", "replace").split(",")]
+                    some = words[:-1] if len(words) > 1 and not words[-1] else words
+                    yield f"{path}: line {number}: *{self.keyword}", some
+
     def rows(self, width: int, least: int = 1) -> np.ndarray:
         """Return the numbers of all data lines, (lines, width): NaN where a line has fewer, and at least ``least``.
 
@@ -153,15 +155,14 @@ class _Block:
         InputError
             Naming file and line, for anything else.
         """
-        found = [_rows(piece, width, least, self.keyword) for piece in self.pieces]
-        return np.concatenate([np.empty((0, width)), *found])
-
-    def words(self) -> Iterator[tuple[_Piece, int, list[str]]]:
-        """Return piece, number and the words between commas of each data line; a last empty one is left out."""
+        found = [np.empty((0, width))]
         for piece in self.pieces:
-            for number, line in piece.lines():
-                words = [word.strip() for word in line.split(",")]
-                yield piece, number, words[:-1] if len(words) > 1 and not words[-1] else words
+            alike = _alike(piece.text) if len(piece.text) > _SHORT else None
+            if alike is not None and least <= alike.shape[1] <= width:
+                found.append(np.pad(alike, ((0, 0), (0, width - alike.shape[1])), constant_values=np.nan))
+            else:
+                found += [_row(where, words, width, least) for where, words in self.lines(piece)]
+        return np.concatenate(found)
 
     def numbers(self) -> np.ndarray | None:
         """Return all numbers of the data lines one after the other; None if there is anything else."""
@@ -171,51 +172,34 @@ class _Block:
             return None
 
 
-def _rows(piece: _Piece, width: int, least: int, keyword: str) -> np.ndarray:
-    alike = _alike(piece.text) if len(piece.text) > _SHORT else None
-    if alike is not None and least <= alike.shape[1] <= width:
-        padded = np.full((len(alike), width), np.nan)
-        padded[:, : alike.shape[1]] = alike
-        return padded
-    rows = []
-    for number, line in piece.lines():
-        words = line.rstrip(",").split(",")
-        where = f"{piece.path}: line {number}: *{keyword}"
-        if not least <= len(words) <= width:
-            raise InputError(f"{where}: {line[:60]!r} has {len(words)} values; expected {least} to {width} with commas")
-        row = [number_of(word) for word in words]
-        for word, value in zip(words, row):
-            if np.isnan(value) and word.strip():
-                raise InputError(f"{where}: {word.strip()[:40]!r} is not a number")
-        rows.append(row + [np.nan] * (width - len(row)))
-    return np.array(rows, dtype=np.float64).reshape(-1, width)
+def _row(where: str, words: list[str], width: int, least: int) -> np.ndarray:
+    if not least <= len(words) <= width:
+        raise InputError(
+            f"{where}: {', '.join(words)[:60]!r} has {len(words)} values; expected {least} to {width} with commas"
+        )
+    row = np.full((1, width), np.nan)
+    for k, word in enumerate(words):
+        row[0, k] = number_of(word)
+        if word and np.isnan(row[0, k]):
+            raise InputError(f"{where}: {word[:40]!r} is not a number")
+    return row
 
 
 def _alike(text: bytes) -> np.ndarray | None:
     """Return the numbers of lines that have as many each, in a row each; None if they are not so simple."""
-    text = text.strip(b" \t\r\n")
-    if not text:
-        return None
+    text = text.rstrip(b"\n") + b"\n"
+    for tail in (b", \n", b",\n", b"\n\n"):  # commas at the ends, and comments that were left out
+        text = text.replace(tail, b"\n")
     try:
         values = numbers_of(text.translate(_BLANKS))
     except ValueError:
         return None
-    letters = np.frombuffer(text + b"\n", np.uint8)
-    ends = np.flatnonzero(letters == ord("\n"))
-    commas = np.flatnonzero(letters == ord(","))
-    each = np.diff(np.searchsorted(commas, ends), prepend=0)
-    lines = len(ends)
-    if each.min() != each.max() or each[0] == 0 and len(values) != lines:
-        return None
-    columns = int(each[0]) + 1
-    if len(values) == lines * columns:
-        return values.reshape(lines, columns)  # no value is missing
-    before = ends - 1  # with a comma at the end of each line
-    for _ in range(3):
-        before -= np.isin(letters[before], (ord(" "), ord("\r")))
-    if len(values) == lines * (columns - 1) and (letters[before] == ord(",")).all():
-        return values.reshape(lines, columns - 1)
-    return None
+    letters = np.frombuffer(text, np.uint8)
+    ends, commas = np.flatnonzero(letters == ord("\n")), np.flatnonzero(letters == ord(","))
+    commas = np.diff(np.searchsorted(commas, ends), prepend=0)
+    columns = int(commas[0]) + 1
+    simple = (commas == commas[0]).all() and len(values) == len(commas) * columns
+    return values.reshape(-1, columns) if simple else None
 
 
 def _blocks(path: Path) -> Iterator[_Block]:
@@ -249,53 +233,26 @@ def _parts(path: Path, above: tuple[Path, ...]) -> Iterator[_Block | _Piece]:
         raise InputError(f"{path}: cannot open: {error.strerror}") from None
     if b"\0" in content:
         raise InputError(f"{path}: is not text: save it as an Abaqus input file in UTF-8 or ASCII")
-    if b"\r" in content:
-        content = content.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
-    starts = [found.start() for found in _STAR.finditer(content)]
+    content = content.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     line = 1
-    if content[: starts[0] if starts else None].strip():
-        yield _Piece(path, 1, content[: starts[0] if starts else None])
-    line += content.count(b"\n", 0, starts[0]) if starts else 0
-    for start, stop in zip(starts, [*starts[1:], len(content)]):
-        at, line = line, line + content.count(b"\n", start, stop)
-        text, end = _logical_line(content, start)
-        data = content[end:stop]
-        first = at + content.count(b"\n", start, end)
-        if not text.startswith("**"):
-            block = _keyword(path, at, text)
-            if block.keyword == "INCLUDE":
-                yield from _parts(_included(block, path, above), (*above, path))
-            else:
+    for k, text in enumerate(_KEYWORD.split(_COMMENT.sub(b"", content))):
+        if k % 2:
+            block = _keyword(path, line, text.decode("utf-8", "replace"))
+            if block.keyword != "INCLUDE":
                 yield block
-                if "INPUT" in block.parameters:
-                    yield from _parts(_included(block, path, above), (*above, path))
-        if data.strip():
-            yield _Piece(path, first, data)
-
-
-def _logical_line(content: bytes, start: int) -> tuple[str, int]:
-    """Return a keyword line with those that continue it after a comma, and where it ends."""
-    text = ""
-    while True:
-        end = content.find(b"\n", start)
-        end = len(content) if end < 0 else end
-        text += content[start:end].decode("utf-8", "replace").strip()
-        start = min(end + 1, len(content))
-        more = text.endswith(",") and not text.startswith("**") and start < len(content)
-        if not more or content[start : start + 80].lstrip(b" \t").startswith(b"*"):
-            return text, start
+            if block.keyword == "INCLUDE" or "INPUT" in block.parameters:
+                yield from _parts(_included(block, path, above), (*above, path))
+        elif text.strip():
+            yield _Piece(path, line, text)
+        line += text.count(b"\n")
 
 
 def _keyword(path: Path, line: int, text: str) -> _Block:
     words = [word.strip() for word in _PARAMETERS.findall(text.lstrip("* \t"))]
-    parameters = {}
-    for word in words[1:]:
-        name, _, value = word.partition("=")
-        parameters[" ".join(name.upper().split())] = value.strip().strip('"')
-    keyword = " ".join(words[0].upper().split()) if words else ""
-    if not keyword:
-        raise InputError(f"{path}: line {line}: {text[:60]!r} is no keyword")
-    return _Block(path, line, keyword, parameters)
+    if not words or not words[0]:
+        raise InputError(f"{path}: line {line}: {text.strip()[:60]!r} is no keyword")
+    keyword, *pairs = [(" ".join(name.upper().split()), value) for name, _, value in (w.partition("=") for w in words)]
+    return _Block(path, line, keyword[0], {name: value.strip().strip('"') for name, value in pairs})
 
 
 def _included(block: _Block, path: Path, above: tuple[Path, ...]) -> Path:
@@ -788,7 +745,7 @@ def _entries(kind: str, block: _Block) -> Iterator[_Entry]:
     elif (numbers := block.numbers()) is not None:
         yield _Entry(block, _labels(numbers, block, "member"), instance)
     else:
-        for words in (words for _, _, words in block.words()):
+        for _, words in block.lines():
             whole = np.array([float(word) for word in words if word.isdecimal()])
             yield _Entry(block, _labels(whole, block, "member"), instance)
             yield from (_Entry(block, w.strip('"'), instance) for w in words if w and not w.isdecimal())
@@ -902,10 +859,9 @@ class _Conditions:
             if block.get("AMPLITUDE"):
                 text = f"AMPLITUDE={block.get('AMPLITUDE')} is left out: give the table over time in the case"
                 mesh.warnings.append(f"{block.where}: {text}")
-            for piece, line, words in block.words():
+            for where, words in block.lines():
                 told = kinds[block.keyword](block, words)
                 if told:
-                    where = f"{piece.path}: line {line}: *{block.keyword}"
                     mesh.warnings.append(f"{where}: {', '.join(words)[:60]!r} is left out: {told}")
         if self._fixed:
             mesh.tables["support"] = {

@@ -12,6 +12,7 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Collection, Iterator
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -68,10 +69,11 @@ def read(path: Path, fields: Collection[str] | None = None) -> WholeMesh:
     bars = _Table(of_bars)
     ends = np.empty((bars.n, 2), np.int64)
     for side, name in enumerate(("first", "second")):
-        for row, label in enumerate(bars.labels(name)):
-            if label not in number:
-                raise InputError(f"{bars.where(row)}: there is no node {label!r} in {of_nodes.name}")
-            ends[row, side] = number[label]
+        ends[:, side] = np.fromiter((number.get(label, -1) for label in bars.labels(name)), np.int64, bars.n)
+        if (ends[:, side] < 0).any():
+            row = int((ends[:, side] < 0).argmax())
+            label = next(islice(bars.labels(name), row, None))
+            raise InputError(f"{bars.where(row)}: there is no node {label!r} in {of_nodes.name}")
     mesh = WholeMesh(np.stack(axes, axis=1), ends, groups, bars.groups())
     known = {bars.has(what) for what in ("bar", "first", "second", "groups")}
     for name, column in zip(bars.headings, bars.columns):

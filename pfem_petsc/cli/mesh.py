@@ -238,7 +238,7 @@ def _tell(lines: list[str]) -> None:
 
 
 def _info(arguments: argparse.Namespace) -> None:
-    from ..mesh.summary import summary
+    from ..mesh.tools import summary
 
     for path in arguments.inputs:
         mesh = _read(path, arguments.scale)

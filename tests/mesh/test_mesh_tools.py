@@ -6,8 +6,7 @@ import pytest
 from pfem_petsc import Truss
 from pfem_petsc.errors import InputError
 from pfem_petsc.mesh.generators import lattice
-from pfem_petsc.mesh.summary import summary
-from pfem_petsc.mesh.tools import cleaned, coincident, components, lengths, merged, refined, scaled
+from pfem_petsc.mesh.tools import cleaned, coincident, components, lengths, merged, refined, scaled, summary
 from pfem_petsc.mesh.whole import WholeMesh
 
 

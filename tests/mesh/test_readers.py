@@ -47,16 +47,12 @@ def test_gmsh(comm, shared_tmp_path, kind):
     assert warning.endswith("left out 1 elements that are neither lines nor points")
 
 
-def test_gmsh_with_windows_line_ends_and_other_sections(comm, shared_tmp_path):
-    content = GMSH["2.2 ascii"].replace(b"$Nodes", b"$Comments\n5 $ x\n$EndComments\n$Nodes").replace(b"\n", b"\r\n")
-    check_sample(whole(read(written(comm, shared_tmp_path, "truss.msh", content), comm), comm))
-
-
 @pytest.mark.parametrize("kind", ["2.2 ascii", "4.1 ascii"])
-def test_gmsh_with_a_byte_order_mark(comm, shared_tmp_path, kind):
-    """As editors of Windows save it."""
-    content = GMSH[kind].decode().encode("utf-8-sig")
-    check_sample(whole(read(written(comm, shared_tmp_path, "truss.msh", content), comm), comm))
+def test_gmsh_as_editors_of_windows_save_it(comm, shared_tmp_path, kind):
+    """With a byte order mark, other line ends, and sections of other programs."""
+    text = GMSH[kind].decode().replace("$Nodes", "$Comments\n5 $ x\n$EndComments\n$Nodes").replace("\n", "\r\n")
+    path = written(comm, shared_tmp_path, "truss.msh", text.encode("utf-8-sig"))
+    check_sample(whole(read(path, comm), comm))
 
 
 @pytest.mark.parametrize("version", ["gmsh22", "gmsh"])

@@ -149,7 +149,7 @@ def _write(arguments: argparse.Namespace, mesh: WholeMesh, done: Sequence[str] =
     import numpy as np
 
     from ..formats import write_whole
-    from ..mesh.skeleton import skeleton
+    from ..mesh.whole import skeleton
 
     _tell(done)
     if arguments.area is not None:
@@ -173,7 +173,7 @@ def _made(what: str, overrides: list[str]) -> WholeMesh:
     from mpi4py import MPI
 
     from ..case.schema import Case
-    from ..mechanics.sections import section_of_bars
+    from ..mechanics.bars import section_of_bars
     from ..mesh import load_slab
     from ..mesh.whole import WholeMesh
     from ..registry import choices

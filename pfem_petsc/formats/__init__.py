@@ -229,9 +229,8 @@ def write_mesh(
     """
     from mpi4py import MPI
 
-    from ..mesh.arrays import slab_from_arrays
-    from ..mesh.checks import check_mesh
-    from ..mesh.whole import WholeMesh
+    from ..mesh.slab import slab_from_arrays
+    from ..mesh.whole import WholeMesh, check_mesh
     from ..parallel.agreement import on_root
 
     def write(path: Path) -> Path:

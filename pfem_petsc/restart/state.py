@@ -38,7 +38,7 @@ from ..parallel.natural import NaturalOrder
 from ..stepping.stage import StageStart
 
 if TYPE_CHECKING:
-    from ..recording.blowup import BlowUp
+    from ..recording.monitors import BlowUp
     from ..recording.recorder import Recorder
     from ..stepping.ledger import Ledger
     from ..stepping.stepper import Stepper

@@ -1,4 +1,4 @@
-"""The Hessian as a PETSc matrix with a fixed pattern, filled by the loops over bars through precomputed indices."""
+"""The Hessian as a PETSc matrix with a fixed pattern, filled by the loops over bars."""
 
 from __future__ import annotations
 
@@ -10,15 +10,70 @@ import numpy as np
 from petsc4py import PETSc
 
 from ..mechanics.compiled import kernel
-from .projection import Projection
 
 if TYPE_CHECKING:
-    from ..contact.transform import Transform
-    from ..mechanics.supports import Supports
+    from ..contact.links import Transform
+    from ..mechanics.supports import Directions, Supports
     from ..mesh.distribution import DistributedMesh
     from ..stepping.problem import StepProblem
 
-__all__ = ["BlockPattern", "HessianMatrix", "expand_columns"]
+
+@kernel
+def turn_blocks(ptr, local_columns, place, left, right, values):
+    """Multiply the rows of nodes by matrices ``left`` (m, 3, 3), and their columns by ``right``, from the right.
+
+    ``ptr``, ``local_columns``, ``values``: of a :class:`~pfem_petsc.solvers.matrix.BlockPattern`; ``place`` (local,):
+    of a node among the m, -1 for others.
+    """
+    block = np.zeros((3, 3))
+    for row in range(len(ptr) - 1):
+        width = 3 * (ptr[row + 1] - ptr[row])
+        r = place[row]
+        for k in range(ptr[row], ptr[row + 1]):
+            c = place[local_columns[k]]
+            if r < 0 and c < 0:
+                continue
+            at = 6 * ptr[row] + 3 * k
+            for i in range(3):
+                for j in range(3):
+                    block[i, j] = values[at + i * width + j]
+            if r >= 0:
+                for j in range(3):
+                    x, y, z = block[0, j], block[1, j], block[2, j]
+                    for i in range(3):
+                        block[i, j] = left[r, i, 0] * x + left[r, i, 1] * y + left[r, i, 2] * z
+            if c >= 0:
+                for i in range(3):
+                    x, y, z = block[i, 0], block[i, 1], block[i, 2]
+                    for j in range(3):
+                        block[i, j] = x * right[c, 0, j] + y * right[c, 1, j] + z * right[c, 2, j]
+            for i in range(3):
+                for j in range(3):
+                    values[at + i * width + j] = block[i, j]
+
+
+class Projection:
+    """Projections on the free directions of local nodes. Construction is collective.
+
+    Attributes
+    ----------
+    nodes : (m,) owned nodes; held : (m, 3, 3) projections on their prescribed directions
+    """
+
+    def __init__(self, mesh: DistributedMesh, directions: Directions) -> None:
+        self.nodes, self.held = directions.nodes, np.eye(3) - directions.free
+        shared = np.zeros((mesh.n_local, 10))
+        shared[self.nodes, 0] = 1.0
+        shared[self.nodes, 1:] = directions.free.reshape(-1, 9)
+        mesh.update_ghosts(shared)
+        nodes = np.flatnonzero(shared[:, 0])
+        self._place = np.full(mesh.n_local, -1, dtype=np.int32)
+        self._place[nodes] = np.arange(len(nodes), dtype=np.int32)
+        self._free = np.ascontiguousarray(shared[nodes, 1:]).reshape(-1, 3, 3)
+
+    def project(self, ptr: np.ndarray, local_columns: np.ndarray, values: np.ndarray) -> None:
+        """Project the values of a matrix, without its new diagonal blocks."""
+        turn_blocks(ptr, local_columns, self._place, self._free, self._free, values)
 
 
 class BlockPattern:

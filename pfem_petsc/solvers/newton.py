@@ -14,11 +14,9 @@ from petsc4py import PETSc
 from ..errors import InputError
 from ..tolerances import ROUNDING
 from .lagged import LaggedPreconditioner, Preconditioning
-from .linear import LinearChoice, configure
+from .linear import LinearChoice, configure, is_failed_factorisation, linear_reason, newton_reason
 from .matrix import HessianMatrix
-from .matrix_free import MatrixFreeHessian
-from .outlive import at_exit, outlive
-from .reasons import is_failed_factorisation, linear_reason, newton_reason
+from .matrix_free import MatrixFreeHessian, at_exit, outlive
 
 if TYPE_CHECKING:
     from ..mesh.distribution import DistributedMesh

@@ -17,8 +17,8 @@ import numpy as np
 from ..errors import NotConverged
 
 if TYPE_CHECKING:
+    from .path_points import Point
     from .path_stepper import PathStepper
-    from .points import Point
 
 __all__ = ["EVENTS", "KINDS", "Event", "find_critical"]
 

@@ -2,31 +2,283 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from mpi4py import MPI
 
-from ..errors import NotConverged, SimulationFailure
+from ..errors import InputError, NotConverged, SimulationFailure
 from ..integrators.base import Balance
 from ..solvers.linear import LinearChoice
-from ..stepping.solution import Solution
-from .bordered import BorderedSystem
-from .controls import ByArc, ByComponent, Control
-from .critical import EVENTS, Event
-from .free_motions import free_motions
-from .path_constraints import Direction, Metric
-from .path_next import next_point
-from .path_rupture import settle_broken
-from .path_scheme import PathEquilibrium
-from .path_start import check_path, first_point
-from .points import Point, PointSolver
-from .stepper import StaticStepper
+from ..stepping.stepper import Solution
+from ..tolerances import TIME
+from .bordered import BorderedSystem, free_motions
+from .critical import EVENTS, Event, find_critical
+from .path_points import (
+    Along,
+    ByArc,
+    ByComponent,
+    Component,
+    Constraint,
+    Control,
+    Direction,
+    LoadFactor,
+    Metric,
+    Point,
+    PointSolver,
+    Still,
+    dot,
+)
+from .scheme import PathEquilibrium
+from .stepper import StaticStepper, hold_detached
 
 if TYPE_CHECKING:
     from ..stepping.model import Model
     from .path_keys import PathKeys
 
-__all__ = ["PathStepper"]
+
+def end_at_limit(stepper: PathStepper, point: Point) -> tuple[Point, str]:
+    """Return a point and an empty text, or the point at the first limit before it and that limit. Collective.
+
+    Raises
+    ------
+    NotConverged
+        On all ranks, if there is no point at the limit.
+    """
+    limits = _exceeded(stepper, point)
+    if not limits:
+        return point, ""
+    time = stepper.state.time
+    share, constraint, reached = min(limits, key=lambda limit: limit[0])
+    change = share * (point.load_factor - time)
+    return stepper.points.find(constraint, share * point.u, time + change), reached
+
+
+def _exceeded(stepper: PathStepper, point: Point) -> list[tuple[float, Constraint, str]]:
+    """Return the limits that a point exceeds: share of the step at which they are, constraint, and text. Collective."""
+    state, keys, direction = stepper.state, stepper.keys, stepper.direction
+    limits: list[tuple[float, Constraint, str]] = []
+    change = point.load_factor - state.time
+    if keys.end is not None and point.load_factor >= keys.end * (1.0 - TIME):
+        left = keys.end - state.time
+        limits.append((left / change, LoadFactor(left, abs(change)), f"static.end = {keys.end:g}"))
+    if keys.displacement is not None:
+        start, way = direction.at(state.position), direction.of(point.u)
+        if start + way >= keys.displacement * (1.0 - TIME):
+            left = keys.displacement - start
+            constraint = Component(direction, left, stepper.control.scale or abs(way))
+            limits.append((left / way, constraint, f"static.displacement = {keys.displacement:g} m"))
+    return limits
+
+
+_UNRESOLVED = 2.0**-6  # of the first length, down to which a step is halved if a critical point is not located
+_TURN = 0.5  # cosine between tangents of successive points, below which the step is halved if possible
+
+
+def next_point(stepper: PathStepper, size: float) -> tuple[Point, list[Event], str]:
+    """Return the point at a length or at a limit before it, the critical points on the way, and the limit reached.
+
+    Raises
+    ------
+    NotConverged
+        On all ranks.
+    """
+    state = stepper.state
+    if stepper.turning:
+        mode = stepper.turning * stepper.mode
+        guess, load_factor = size * mode, state.time
+        point = stepper.points.find(Along(stepper.metric, mode, size), guess, load_factor)
+    else:
+        tangent = state.memory["tangent"]
+        length = stepper.control.advance(tangent, size)
+        guess, load_factor = length * tangent, state.time + length * stepper.slope
+        point = stepper.points.find(stepper.control.constraint(size), guess, load_factor)
+    _suspect(stepper, point, guess)
+    if not stepper.turning:
+        _refuse_turn(stepper, point, size)
+    point, reached = end_at_limit(stepper, point)
+    if stepper.turning or stepper.points.stability is None:
+        return point, [], reached
+    try:
+        events, turn = find_critical(stepper, point)
+    except NotConverged as failure:
+        # close to an imperfect bifurcation the point may lie on a path that does not pass through it
+        if size > _UNRESOLVED * stepper.arc and 0.5 * size >= stepper.keys.smallest:
+            raise
+        stepper.message(f"a critical point was not located: {failure}")
+        events, turn = [], None
+    if turn is not None:
+        point, reached = turn, ""
+    return point, events, reached
+
+
+def _refuse_turn(stepper: PathStepper, point: Point, size: float) -> None:
+    """Refuse a tangent that has turned too far: it belongs to another path, or the step has cut a corner.
+
+    Raises
+    ------
+    NotConverged
+        On all ranks.
+    """
+    cosine = stepper.metric.product(point.tangent, point.slope, stepper.state.memory["tangent"], stepper.slope)
+    if cosine < _TURN and 0.5 * size >= stepper.keys.smallest:
+        raise NotConverged(
+            f"{stepper.points.place}: the path turns by {np.degrees(np.arccos(max(cosine, -1.0))):.3g} degrees"
+        )
+    if stepper.control.scale and cosine < 0.0:
+        raise NotConverged(
+            f"{stepper.points.place}: the displacement along static.direction turns back; static.method = "
+            '"arc_length" follows the path'
+        )
+
+
+def _suspect(stepper: PathStepper, point: Point, guess: np.ndarray) -> None:
+    """Refuse a point that is unrelated to the last one.
+
+    Raises
+    ------
+    NotConverged
+        On all ranks.
+    """
+    if stepper.guard is None:
+        return
+    state = stepper.state
+    after = stepper.with_ghosts(state.position + point.u)
+    forces = np.maximum(np.abs(stepper.system.external(point.load_factor)), np.abs(stepper.system.external(state.time)))
+    energy = 0.5 * float(((forces + np.abs(state.support)) * np.abs(point.u)).sum())
+    reason = stepper.guard.check(state.x, after, state.position + guess, energy)
+    if reason is not None:
+        raise NotConverged(f"{stepper.points.place}: {reason}; {stepper.remedy}", reason.partition(":")[0])
+
+
+PARTED = "no remaining bar carries the load"
+
+
+def settle_broken(stepper: PathStepper) -> tuple[bool, str]:
+    """Find equilibria at the same displacement until no further bar breaks. Collective.
+
+    Returns whether bars broke, and why the path ends there: an empty text if it goes on.
+
+    Raises
+    ------
+    SimulationFailure
+        On all ranks, if the rest of the truss finds no equilibrium.
+    """
+    broke, ended = False, ""
+    if not stepper.model.bars.can_break:
+        return broke, ended
+    while stepper.model.comm.allreduce(stepper.energy.changed > 0, op=MPI.LOR):
+        broke = True
+        hold_detached(stepper)
+        try:
+            point, ended = _again(stepper)
+            stepper.commit(point)
+        except NotConverged as failure:
+            raise SimulationFailure(
+                f"{stepper.arrived()}: the rest of the truss finds no equilibrium at this displacement after bars "
+                "broke: a part of it is a mechanism, or the next equilibrium is distant; [time] follows the motion. "
+                f"The last attempt: {failure}{free_motions(stepper.model, stepper.state)}"
+            ) from failure
+        stepper.keep(point)
+    return broke, ended
+
+
+def _again(stepper: PathStepper) -> tuple[Point, str]:
+    """Return the point of the bars that are left; without a load on them, that at load factor zero, and why."""
+    state, system, points, comm = stepper.state, stepper.system, stepper.points, stepper.model.comm
+    system.begin(state)
+    zero = np.zeros_like(state.position)
+    system.linearise(zero)
+    gradient = stepper.control.still(state.memory["tangent"])
+    response = system.response(zero, state.time)
+    size = float(np.sqrt(dot(comm, gradient, gradient) * dot(comm, response, response)))
+    along = dot(comm, gradient, response)
+    if not abs(along) > 1e-12 * size:
+        u, load_factor, newton = points.newton(LoadFactor(-state.time, stepper.arc), zero, state.time)
+        return Point(u, load_factor, state.memory["tangent"], stepper.slope, *points.spectrum(u), newton), PARTED
+    point = points.find(Still(comm, gradient, stepper.arc), zero, state.time)
+    sign = np.sign(dot(comm, gradient, point.tangent))
+    return replace(point, tangent=sign * point.tangent, slope=float(sign * point.slope)), ""
+
+
+def check_path(model: Model, keys: PathKeys) -> None:
+    """Refuse what path following does not support.
+
+    Raises
+    ------
+    InputError
+        On all ranks.
+    """
+    case = model.case
+    if case.remove:
+        raise InputError(
+            f'{case.source}: static.method = "{case.static.method}" can pass a load factor several times or never, '
+            'so that [[remove]] has no defined time; remove bars and supports with static.method = "newton"'
+        )
+    if model.can_touch:
+        raise InputError(
+            f'{case.source}: static.method = "{case.static.method}" follows paths without contact; remove walls, '
+            'contact pairs and constraints, or use static.method = "newton", with static.stabilise beyond limit points'
+        )
+    if not (model.external.active or model.supports.moves or model.bars_vary):
+        raise InputError(f"{case.source}: static: nothing depends on the load factor; give a [[load]] or a table")
+    free = 3 * model.mesh.n_nodes - model.comm.allreduce(model.supports.number)
+    unknown = [turn for turn in keys.branch_at if abs(turn) > free]
+    if unknown:
+        raise InputError(
+            f"{case.source}: static.branch_at = {unknown}: bifurcations are numbered from 1 along the path, and a "
+            f"truss with {free} free components has no more than {free} eigenvalues that can change their sign on it; "
+            "run the case without branch_at, which reports the bifurcations and their numbers"
+        )
+    if keys.node_set is not None and not model.comm.allreduce(len(model.nodes[keys.node_set])):
+        raise InputError(f"{case.source}: static.node_set = {keys.node_set!r} has no nodes")
+
+
+def first_point(stepper: PathStepper) -> tuple[Point, bool]:
+    """Return the first point with its tangent, and whether it differs from the state; set the metric. Collective.
+
+    It differs if the state is not an equilibrium at its load factor.
+
+    Raises
+    ------
+    NotConverged, SimulationFailure
+        On all ranks, if there is no equilibrium, or if the load factor moves no node.
+    """
+    state, system, points, u = stepper.state, stepper.system, stepper.points, np.zeros_like(stepper.zero)
+    comm, newton, g = stepper.model.comm, 0, np.empty_like(u)
+    system.residual(u, state.time, g)
+    norm, tolerance = float(np.sqrt(dot(comm, g, g))), points.tolerance(u, state.time, 0.0)
+    moved = not (norm <= tolerance.residual or tolerance.rounded(norm, g, 1.0, comm))
+    if moved:
+        u, _, newton = points.newton(LoadFactor(0.0, stepper.keys.step), u, state.time)
+    system.linearise(u)
+    response = system.response(u, state.time)
+    size = float(np.sqrt(dot(comm, response, response)))
+    if not size > 0.0 or not np.isfinite(size):
+        raise SimulationFailure(
+            f"{stepper.model.case.source}: static: the load factor moves no node at the start of the path: loads act "
+            "on supports only, or tables are constant there"
+        )
+    stepper.weight = stepper.metric.weight = 1.0 / size**2
+    sign = _scale_component(stepper, response, size) if stepper.by_component else 1.0
+    length = stepper.metric.length(response, 1.0)
+    tangent, slope = sign * response / length, sign / length
+    negatives, nearest = points.spectrum(u)
+    return Point(u, state.time, tangent, slope, negatives, nearest, newton), moved
+
+
+def _scale_component(stepper: PathStepper, response: np.ndarray, size: float) -> float:
+    """Set the scale of the prescribed displacement; return the sign of load factors that increase it. Collective."""
+    along = stepper.direction.of(response)
+    if not abs(along) > 1e-12 * size:
+        raise SimulationFailure(
+            "static.direction: the load does not move the nodes of static.node_set along it at the start of "
+            'the path; use another direction, or static.method = "arc_length"'
+        )
+    stepper.scale = abs(along)
+    return float(np.sign(along))
+
 
 _FACTORS = 0.5, 1.5  # of the length from point to point
 

@@ -1,32 +1,480 @@
-"""One step of a scheme: the solve for the position increment, with contact, and the update of the state."""
+"""One step of a scheme: phases, loads, prescribed motion, the solve for the position increment, and the update of
+the state.
+"""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from mpi4py import MPI
 
-from ..contact.alarm import CarriedNodes
+from ..contact.forces import WallForces
+from ..contact.initial_equilibrium import start_at_rest
+from ..contact.monitoring import CarriedNodes
 from ..errors import SimulationFailure
 from ..integrators.base import Balance, Scheme, State
 from ..mechanics.bars import StrainEnergy
-from ..tolerances import TIME
-from .collapse import tell_collapse
-from .loading import load_now
-from .massless import MasslessNodes
-from .phases import phases_of
-from .prescribed import PrescribedMotion
-from .removals import Removals
-from .ruptures import Ruptures
-from .solution import Solution
-from .start import start_at_zero, start_in_motion
+from ..mechanics.materials.base import EXTRAPOLATED
+from ..tolerances import BEYOND, ON_BOUND, ROUNDING, TIME
+from .bar_events import Removals, Ruptures, tell_collapse
 
 if TYPE_CHECKING:
     from .model import Model
 
-__all__ = ["Stepper"]
+
+def load_of(stepper: Stepper, balance: Balance) -> np.ndarray:
+    """Return the external force (owned, 3) [N] of a balance that is not solved yet. Collective."""
+    external = stepper.model.external
+    if not external.active:
+        return stepper.zero
+    if len(balance.loads) == 1 and balance.loads[0][0] == 1.0:
+        total = external.constant()
+        if total is not None:
+            return total
+    total = None
+    for weight, time in balance.loads:
+        if external.state_forces:
+            external.follow(*_expected(stepper, balance, time))
+        part = external.at(time, np.empty_like(stepper.state.v))
+        if weight != 1.0:
+            part *= weight
+        total = part if total is None else np.add(total, part, out=total)
+    if external.failure is not None:
+        _fail(stepper, stepper.when(balance))
+    return total
+
+
+def load_now(stepper: Stepper, time: float) -> np.ndarray:
+    """Return the external force (owned, 3) [N] at a time [s] and the present positions and velocities. Collective."""
+    external = stepper.model.external
+    if external.state_forces:
+        external.follow(stepper.state.position, stepper.state.v)
+    force = external.at(time, np.empty_like(stepper.state.v))
+    if external.failure is not None:
+        _fail(stepper, stepper.arrived())
+    return force
+
+
+def _fail(stepper: Stepper, where: str) -> None:
+    if stepper.fault is None:
+        stepper.fault = SimulationFailure(f"{where}: external_force: the function {stepper.model.external.failure}")
+
+
+def _expected(stepper: Stepper, balance: Balance, time: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return positions and velocities (owned, 3) at a time [s] of a balance that is not solved yet.
+
+    The acceleration is that of the state; nodes in contact, whose acceleration may jump, are predicted without it.
+    """
+    state = stepper.state
+    a = np.where((state.contact != 0.0).any(axis=1)[:, None], 0.0, state.a)
+    if stepper.scheme.solves_next_position:  # the velocity of the state is that of the step before
+        known = 0.0 if balance.a_hat is None else balance.a_hat
+        return state.position, balance.v_hat + (balance.eta / balance.alpha) * (a - known)
+    ahead = time - state.time
+    return state.position + ahead * (state.v + (0.5 * ahead) * a), state.v + ahead * a
+
+
+def begin(stepper: Stepper, end: float) -> None:
+    """Keep what later phases compare with the start of the part."""
+    state = stepper.state
+    if stepper.model.bars_vary:
+        stepper.model.bars.keep_start()
+    stepper.carried.start(state.position, state.time)
+    if stepper.treatment is not None:
+        stepper.treatment.before()
+
+
+def move(stepper: Stepper, end: float) -> None:
+    """Move to the positions that the last balance was solved for, supports to their exact ones."""
+    stepper.before[:] = stepper.state.x
+    stepper.scheme.advance(stepper.state, stepper.part)
+    stepper.prescribed.place(end)
+
+
+def evaluate(stepper: Stepper, end: float) -> None:
+    """Evaluate forces and energies at the positions reached, and keep the internal variables. Collective."""
+    model = stepper.model
+    if stepper.scheme.inertial:  # static steps are infinitely long for material laws
+        model.bars.step = stepper.part
+    stepper.state.time = end
+    if model.bars_vary:
+        model.change_bars(end)
+    stepper.evaluate(commit=True)
+
+
+def balance(stepper: Stepper, end: float) -> None:
+    """Set up the balance of the part, with the loads, supports, dampers and walls of its times. Collective."""
+    state, model = stepper.state, stepper.model
+    stepper.balance = stepper.scheme.balance(state, stepper.part)
+    if stepper.prescribed.moving:
+        stepper.prescribed.prescribe(stepper.balance)
+    model.inertia.change(sum(weight * time for weight, time in stepper.balance.loads))
+    model.contact.motion.begin(state.time, stepper.part)
+    state.external = load_of(stepper, stepper.balance)
+    if stepper.scheme.inertial:
+        model.bars.step = stepper.balance.time - state.time
+
+
+def solve(stepper: Stepper, end: float) -> None:
+    """Solve the balance with contact and supports. Collective if the solve is."""
+    stepper.solution = stepper.solve(stepper.balance)
+
+
+def finish(stepper: Stepper, end: float) -> None:
+    """Update velocities, accelerations, walls and the contact log from the solution."""
+    state, scheme, contact, found = stepper.state, stepper.scheme, stepper.model.contact, stepper.balance
+    fresh = contact.record(stepper.solution.walls, found.time, stepper.part)
+    if not scheme.solves_next_position:
+        stepper.before[:] = state.x
+    scheme.finish(state, found, stepper.solution.u, stepper.part)
+    if scheme.solves_next_position and stepper.prescribed.moving:
+        stepper.prescribed.take_rates(state.time)
+    contact.motion.finish(stepper.part, end)
+    if scheme.turns_held and stepper.treatment is None:
+        contact.calm(fresh, state.v, found.time, stepper.part)
+
+
+def place(stepper: Stepper, end: float) -> None:
+    """Give supports that move their exact positions and rates."""
+    if stepper.prescribed.moving:
+        stepper.prescribed.place(end)
+        stepper.prescribed.take_rates(end)
+
+
+def treat(stepper: Stepper, end: float) -> None:
+    """Apply the treatment of impact."""
+    if stepper.treatment is not None:
+        stepper.treatment.after()
+
+
+def book(stepper: Stepper, end: float) -> None:
+    """Update the ledger."""
+    stepper.booking()
+
+
+def check(stepper: Stepper, end: float) -> None:
+    """Find nodes that supports have carried through a rectangle."""
+    if stepper.carried.of and stepper.fault is None:
+        crossing = stepper.carried.crossing(stepper.state.position, end, stepper.at(stepper.state.step + 1, end))
+        stepper.fault = SimulationFailure(crossing) if crossing else None
+
+
+Phase = Callable[["Stepper", float], None]
+
+MOVES_FIRST: tuple[Phase, ...] = begin, move, evaluate, balance, solve, finish, treat, book, check
+"""For schemes that solve for the next position, as central differences."""
+
+SOLVES_FIRST: tuple[Phase, ...] = begin, balance, solve, finish, place, evaluate, treat, book, check
+"""For all others."""
+
+
+def phases_of(scheme: Scheme) -> tuple[Phase, ...]:
+    """Return the phases of a scheme's steps in their order."""
+    return MOVES_FIRST if scheme.solves_next_position else SOLVES_FIRST
+
+
+def solve_and_finish(stepper: Stepper, end: float) -> None:
+    """Make the phases of the balance alone, up to a time [s]: at the start, where the positions stay. Collective if the
+    solve is."""
+    for phase in (balance, solve, finish):
+        phase(stepper, end)
+
+
+class PrescribedMotion:
+    """Sets prescribed components in the balances and the state of a stepper.
+
+    Attributes
+    ----------
+    change : changes of velocity, acceleration and scheme memory of prescribed components (k,) relative to those of the
+        scheme in the last step, by name; empty without moving supports
+    """
+
+    def __init__(self, stepper: Stepper) -> None:
+        self.stepper, self.supports = stepper, stepper.model.supports
+        self.moving = self.supports.moving
+        self.change: dict[str, np.ndarray] = {}
+
+    def place(self, end: float) -> None:
+        """Set prescribed components of the positions to their values at a time [s]."""
+        if self.moving:
+            self.supports.place(self.stepper.state.position, self.supports.positions(end))
+
+    def prescribe(self, balance: Balance) -> None:
+        """Set exact positions, velocities and accelerations of prescribed components in a balance; their increments are
+        zero. The scheme's own formulas would derive velocities and accelerations from positions and oscillate."""
+        supports = self.supports
+        forces_hold = sum(weight * time for weight, time in balance.loads)
+        v, a = supports.rates(forces_hold, self.stepper.part)
+        self._ruled = self._by_rule(balance, a)
+        balance.predictor = balance.predictor.copy()
+        supports.place(balance.predictor, supports.positions(balance.time))
+        balance.v_hat = np.zeros_like(self.stepper.state.v) if balance.v_hat is None else balance.v_hat.copy()
+        supports.put(balance.v_hat, v)
+        balance.a_hat = np.zeros_like(self.stepper.state.v) if balance.a_hat is None else balance.a_hat.copy()
+        supports.put(balance.a_hat, a)
+
+    def _by_rule(self, balance: Balance, a: np.ndarray) -> State:
+        """Return the state of prescribed components (k, 1) if the scheme advanced them with accelerations (k,).
+
+        This is the rule by which forces become impulses.
+        """
+        supports, state = self.supports, self.stepper.state
+
+        def pick(array: np.ndarray | None) -> np.ndarray | None:
+            return None if array is None else supports.get(array)[:, None]
+
+        memory = {name: pick(state.memory[name]) for name in self.stepper.scheme.remembers if name in state.memory}
+        fields = (pick(array) for array in (state.position, state.v, state.a))
+        ruled = State(*fields, *(np.zeros((len(a), 1)) for _ in range(4)), memory=memory)
+        known = {name: pick(getattr(balance, name)) for name in ("predictor", "v_hat", "a_hat")}
+        own = replace(balance, **known)
+        u = (a[:, None] if own.a_hat is None else a[:, None] - own.a_hat) / own.alpha
+        self.stepper.scheme.finish(ruled, own, u, self.stepper.part)
+        return ruled
+
+    def take_rates(self, time: float) -> None:
+        """Set velocity, acceleration and scheme memory of prescribed components at a time [s]."""
+        supports, state = self.supports, self.stepper.state
+        for array, values in zip((state.v, state.a), supports.rates(time, self.stepper.part), strict=True):
+            supports.put(array, values)
+        self._restart()
+        if self.stepper.scheme.solves_next_position:
+            way = supports.positions(self.stepper.balance.time) - supports.positions(time)
+            supports.put(state.memory["half_velocity"], way / self.stepper.part)
+        ruled, given = self._ruled, {"v": state.v, "a": state.a, **state.memory}
+        made = {"v": ruled.v, "a": ruled.a, **ruled.memory}
+        self.change = {name: supports.get(given[name]) - array[:, 0] for name, array in made.items()}
+
+    def _restart(self) -> None:
+        """Make the memory of the scheme consistent with the new velocities and accelerations."""
+        supports, state, scheme = self.supports, self.stepper.state, self.stepper.scheme
+        if supports.inclined is None:
+            scheme.restart(state, supports.at, self.stepper.part)
+            return
+        names = [name for name in scheme.remembers if name in state.memory]
+        fields = (supports.get(array)[:, None] for array in (state.position, state.v, state.a))
+        memory = {name: supports.get(state.memory[name])[:, None] for name in names}
+        along = State(*fields, *(np.zeros((supports.number, 1)) for _ in range(4)), memory=memory)
+        scheme.restart(along, np.arange(supports.number), self.stepper.part)
+        for name in names:
+            supports.put(state.memory[name], memory[name][:, 0])
+
+
+class NoRates(PrescribedMotion):
+    """For balances without inertia, where supports prescribe positions alone: these are part of the guess."""
+
+    def __init__(self, stepper: Stepper) -> None:
+        super().__init__(stepper)
+        self.moving = False
+
+
+def start_in_motion(stepper: Stepper) -> None:
+    """Initialise velocity, internal force and acceleration of the state. Collective."""
+    state, model = stepper.state, stepper.model
+    velocity = model.initial_velocity()
+    state.v = velocity if model.start is None else state.v + velocity
+    supports = model.supports
+    if supports.any:
+        supports.place(state.position, supports.positions(0.0))
+        supports.put(state.v, supports.rates(0.0, 0.0)[0])
+    if model.external.state_forces:
+        model.external.follow(state.position, state.v)
+    if stepper.massless is not None and stepper.massless.settle(state.x, 0.0, 0.0) > BEYOND * model.size:
+        stepper.fault = SimulationFailure(
+            "step 0, t = 0 s: contact nodes without mass found no equilibrium; use another contact.treatment"
+        )
+    stepper.evaluate(commit=True)
+    if model.external.active:
+        state.external = load_now(stepper, 0.0)
+    load = state.external - state.f[: model.mesh.n_owned]
+    if model.inertia.damped:
+        load -= model.inertia.damping_times(state.v, np.zeros_like(load))
+    state.a = _acceleration(stepper, load)
+    if model.can_touch and model.inertia.redistribution is None:
+        walls = start_at_rest(model, state, partial(_acceleration, stepper), load)
+        if walls is not None:
+            held = model.links.count_held(walls.nodes[walls.touching.any(axis=1)], len(state.v))
+            stepper.solution.walls, stepper.solution.contacts = walls, held
+    if stepper.massless is not None:
+        state.contact, stepper.solution.walls = stepper.massless.press(state.position, load, 0.0)
+        stepper.solution.contacts = int(stepper.solution.walls.touching.sum())
+    if supports.any:
+        inertial = model.inertia.mass_times(state.a, np.empty_like(state.a))
+        state.support = supports.part(inertial - load - state.contact)
+    stepper.totals_at_start = stepper.totals()
+    stepper.walls_at_start = stepper.solution.walls.force
+    stepper.links_at_start = model.links.totals()
+    stepper.scheme.start(state, stepper.h)
+    if model.bars.viscous and stepper.scheme.solves_next_position:  # the rate half a step before, to extrapolate from
+        half = stepper.on_all(state.memory["half_velocity"])
+        model.bars.set_rates(state.x, state.x - (0.5 * stepper.h) * half, (1.0 - EXTRAPOLATED) * half, 0.0)
+    motion = model.contact.motion
+    motion.start(stepper.h)
+    if stepper.scheme.solves_next_position:
+        v, speeds = state.v, motion.speeds
+        solve_and_finish(stepper, state.time)
+        stepper.totals_solved = stepper.totals()
+        if model.inertia.damped:
+            stepper.velocity_solved = state.v
+        # nodes on a wall have not lost their velocity yet; the scheme continues from its own memory
+        state.v = v
+        motion.set_speeds(speeds)
+
+
+def start_at_zero(stepper: Stepper) -> None:
+    """Initialise positions, internal forces and loads at time zero, where nothing moves. Collective."""
+    state, model = stepper.state, stepper.model
+    state.v = np.zeros_like(stepper.zero)
+    state.a = np.zeros_like(stepper.zero)
+    if model.supports.any:
+        model.supports.place(state.position, model.supports.positions(0.0))
+    stepper.evaluate(commit=True)
+    if model.external.active:
+        state.external = model.external.at(0.0, np.empty_like(state.v))
+
+
+def _acceleration(stepper: Stepper, load: np.ndarray) -> np.ndarray:
+    """Return the acceleration (owned, 3) with M a = load [N], prescribed values included. Collective."""
+    supports = stepper.model.supports
+    if not supports.moving:
+        return stepper.accelerate(load)
+    carried = np.zeros_like(load)
+    supports.put(carried, supports.rates(stepper.state.time, 0.0)[1])
+    a = stepper.accelerate(load - stepper.model.inertia.mass_times(carried, np.empty_like(load)))
+    supports.put(a, supports.get(carried))
+    return a
+
+
+_ITERATIONS = 200
+_CALMER, _BOLDER = 0.7, 1.3  # factors that shorten moves while they oscillate, and lengthen them up to full moves
+_FARTHEST = 0.25  # longest single move, relative to the shortest bar of the node
+_STEEPEST = 0.05  # minimum squared cosine between bars and the normal in the stiffness
+_SOFTEST = 1e-4  # smallest accepted ratio between secant and elastic stiffness, either way; below it is rounding
+
+
+class MasslessNodes:
+    """Contact nodes whose mass is redistributed."""
+
+    def __init__(self, model: Model) -> None:
+        self.model = model
+        self.moved = model.inertia.redistribution
+        self._force = np.zeros((model.mesh.n_local, 3))
+
+    def settle(self, x: np.ndarray, time: float, now: float) -> float:
+        """Move nodes of ``x`` (local, 3), in place, along their normals into equilibrium or onto the wall.
+
+        Forces, walls and bars are those of ``time``; afterwards bars are reset to ``now`` [s]. Returns
+        the largest of the last moves, which is rounding of the model's length unless no equilibrium was found.
+        Collective.
+        """
+        model, moved = self.model, self.moved
+        owned, nodes, n = model.mesh.n_owned, moved.nodes, moved.normals
+        external = np.zeros((owned, 3))
+        if model.external.active:
+            model.external.at(time, external)
+        if model.bars_vary:
+            model.change_bars(time)
+        model.mesh.update_ghosts(x)  # a scheme predicts owned nodes alone
+        elastic, farthest = self._stiffness(x)
+        stiffness, force, step = elastic, np.full(len(nodes), np.nan), np.zeros(len(nodes))
+        part, largest = np.ones(len(nodes)), 0.0
+        for _ in range(_ITERATIONS):
+            gap = self.gaps(x[:owned], time)
+            x[nodes] -= np.minimum(gap, 0.0)[:, None] * n
+            model.mesh.update_ghosts(x)
+            model.bars.forces(x, self._force, commit=False)
+            last, force = force, np.einsum("mi,mi->m", external[nodes] - self._force[nodes], n)
+            with np.errstate(invalid="ignore", divide="ignore"):
+                secant = (last - force) / step
+            # where bars yield or rotate, the elastic stiffness would need hundreds of moves
+            stiffness = np.where((secant > _SOFTEST * elastic) & (secant < elastic / _SOFTEST), secant, elastic)
+            swings = step * force < 0.0  # massless neighbours may push each other back and forth
+            part = np.where(swings, _CALMER * part, np.minimum(_BOLDER * part, 1.0))
+            move = np.clip(part * force / stiffness, -farthest, farthest)
+            step = np.maximum(move, -np.maximum(gap, 0.0))
+            x[nodes] += step[:, None] * n
+            # with a bar perpendicular to the normal, forces within rounding may leave the position undetermined
+            open_way = np.minimum(np.abs(step), np.abs(force) / elastic)
+            largest = model.comm.allreduce(float(open_way.max(initial=0.0)), op=MPI.MAX)
+            if largest <= ROUNDING * model.size:
+                break
+        model.mesh.update_ghosts(x)
+        if model.bars_vary:
+            model.change_bars(now)
+        return largest
+
+    def gaps(self, x: np.ndarray, time: float) -> np.ndarray:
+        """Return the distances (m,) of the nodes from the wall along their vectors [m]."""
+        gaps = self.model.contact.gaps(x[self.moved.nodes], time, self.moved.nodes)
+        return gaps[np.arange(len(gaps)), self.moved.walls] / self.moved.across
+
+    def press(self, x: np.ndarray, load: np.ndarray, time: float) -> tuple[np.ndarray, WallForces]:
+        """Return wall forces (owned, 3) that balance a load on nodes at x (owned, 3), and their sums.
+
+        The residual force on a massless node in equilibrium is the force of its wall.
+        """
+        moved, contact = self.moved, self.model.contact
+        n, nodes = moved.normals, moved.nodes
+        strength = -np.einsum("mi,mi->m", load[nodes], n)
+        touching = self.gaps(x, time) <= ON_BOUND * self.model.size
+        strength = np.where(touching, np.maximum(strength, 0.0), 0.0) / moved.across
+        full = contact.normals[moved.walls]
+        force = np.zeros_like(load)
+        force[nodes] = strength[:, None] * full
+        if not len(nodes):
+            return force, contact.nothing
+        touched = np.zeros((len(nodes), len(contact.names)), dtype=bool)
+        touched[np.arange(len(nodes)), moved.walls] = strength > 0.0
+        each = touched[:, :, None] * (strength[:, None] * full)[:, None, :]
+        return force, contact.sums(nodes, each, x[nodes], touched)
+
+    def _stiffness(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return stiffness (m,) of nodes along their normals at fixed neighbours [N/m], and their longest moves [m].
+
+        A bar perpendicular to the normal has geometric stiffness only, so a minimum inclination is assumed.
+        """
+        mesh, model = self.model.mesh, self.model
+        a, b = mesh.bars.T
+        total = np.zeros(mesh.n_local)
+        shortest = np.full(mesh.n_local, np.inf)
+        normal = np.zeros((mesh.n_local, 3))
+        normal[self.moved.nodes] = self.moved.normals
+        way = x[b] - x[a]
+        length = np.linalg.norm(way, axis=1)
+        axial = np.concatenate(
+            [np.full(k.stop - k.start, k.area * k.modulus) for k in model.bars.blocks] or [np.zeros(0)]
+        )
+        for end in (a, b):
+            along = np.einsum("bi,bi->b", way, normal[end]) / length
+            np.add.at(total, end, axial / model.bars.rest * np.maximum(along * along, _STEEPEST))
+            np.minimum.at(shortest, end, model.bars.rest)
+        return total[self.moved.nodes], _FARTHEST * shortest[self.moved.nodes]
+
+
+@dataclass
+class Solution:
+    """Result of solving one balance.
+
+    Attributes
+    ----------
+    u : (owned, 3) increment from the predictor [m]
+    internal : (local, 3) internal force in the balance [N]
+    walls : forces per wall, this rank's share
+    newton, linear : numbers of iterations
+    contacts : number of this rank's nodes in contact with walls
+    """
+
+    u: np.ndarray
+    internal: np.ndarray
+    walls: WallForces
+    newton: int = 0
+    linear: int = 0
+    contacts: int = 0
 
 
 class Stepper(ABC):
@@ -57,7 +505,7 @@ class Stepper(ABC):
     velocity_solved : (owned, 3) velocity of that balance if there is damping, whose force depends on it [m/s]
     walls_at_start, links_at_start : (walls, 3), (tables of links, 3) forces at the start [N]
     renews_forces : each evaluation of the state fills another array ``state.f``, so that the last one is kept
-    steady : the loop over many steps (``stepping/fused_loop.py``) makes the same steps, where all else allows it
+    steady : the loop over many steps (``stepping/batch_loop.py``) makes the same steps, where all else allows it
     kept_numbers, kept_arrays, kept_bars : names of attributes that, with the state, determine what comes: numbers,
         arrays with a row for each owned node, and for each local bar
     columns : names of attributes, numbers, that are columns of the history
@@ -226,7 +674,7 @@ class Stepper(ABC):
 
     @property
     def removal_times(self) -> list[float]:
-        """See :class:`~pfem_petsc.stepping.removals.Removals`, as the next two."""
+        """See :class:`~pfem_petsc.stepping.bar_events.Removals`, as the next two."""
         return self.removals.times
 
     @removal_times.setter

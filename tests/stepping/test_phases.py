@@ -5,7 +5,7 @@ import pytest
 
 from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.errors import SimulationFailure
-from pfem_petsc.stepping import phases
+from pfem_petsc.stepping import stepper as phases
 
 # A damped lattice that yields on a floor, so that each phase matters.
 TABLES = {

@@ -8,13 +8,13 @@ from helpers.bar_twins import STEP, Law, shaken, whole_truss
 
 from pfem_petsc import Case
 from pfem_petsc.contact.frames import build_frames
-from pfem_petsc.contact.transform import Transform
+from pfem_petsc.contact.links import Transform
 from pfem_petsc.solvers.matrix_free import MatrixFreeHessian
-from pfem_petsc.stepping.loading import load_of
 from pfem_petsc.stepping.model import Model
 from pfem_petsc.stepping.plan import make_plan
-from pfem_petsc.stepping.prepare import make_stepper
 from pfem_petsc.stepping.problem import StepProblem
+from pfem_petsc.stepping.stepper import load_of
+from pfem_petsc.stepping.time_stepping import make_stepper
 
 pytestmark = pytest.mark.parallel
 

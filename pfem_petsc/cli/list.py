@@ -8,7 +8,7 @@ import importlib.util
 import tomllib
 from pathlib import Path
 
-from ..case.builtin import built_in_cases, built_in_path
+from ..case.toml import built_in_cases, built_in_path
 from ..registry import choices
 from .parser import PROGRAM
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
-from ..case.builtin import built_in_cases
+from ..case.toml import built_in_cases
 from ..errors import InputError
 from ..signals import give_back_early
 from .launcher import collectively, launched_rank, on_first_rank, refuse

@@ -86,8 +86,8 @@ def load_case(arguments: argparse.Namespace, comm: MPI.Comm) -> Case:
 
 
 def _load(arguments: argparse.Namespace) -> Case:
-    from ..case.builtin import built_in_path
     from ..case.schema import Case
+    from ..case.toml import built_in_path
 
     overrides = arguments.overrides
     restart = getattr(arguments, "restart", None)

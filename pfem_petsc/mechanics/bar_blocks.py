@@ -9,11 +9,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..case.materials import law_of
 from ..errors import InputError
 from .conserving import make_conserving_kernels
 from .kernels import make_kernels
-from .materials.base import Law, UnsuitableBarError
+from .materials.base import Law, UnsuitableBarError, law_of
 from .rupture import breakable, limit_values, make_release
 from .sections import areas_of, bar_shapes
 from .strain import MEASURES

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ..case.materials import internal_variables
 from ..energies import BAR_ENERGIES
 from ..fields import STATUS
 from .bar_blocks import BarBlock, laws_of, make_blocks
 from .bar_geometry import bar_lengths, first_inverted
+from .materials.base import internal_variables
 from .sections import bar_shapes
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..case.load_files import Forces, read_forces
+from ..case.files import Forces, read_forces
 from ..case.tables import LoadFile
 from ..errors import InputError
 from ..parallel.agreement import on_root

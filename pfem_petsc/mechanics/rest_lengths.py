@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..case.materials import law_of
 from ..errors import InputError
 from .force_kernels import COLLAPSED_STRETCH
 from .law_rows import no_variables
+from .materials.base import law_of
 from .rupture import intact
 from .strain import MEASURES
 from .time_tables import Table

@@ -32,7 +32,7 @@ from .materials.base import Law
 from .rows import bar_value, blend, extend, keep_where, put, sum_where, sum_with, take
 
 if TYPE_CHECKING:
-    from ..case.rupture import Rupture
+    from ..case.tables import Rupture
 
 __all__ = ["LIMITS", "WHOLE", "breakable", "intact", "limit_values", "make_release", "variable_of"]
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..case.load_tables import VaryingWind
+from ..case.tables import VaryingWind
 from .compiled import kernel
 from .sections import bar_shapes
 from .state_forces import ForceState

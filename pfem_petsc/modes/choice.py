@@ -11,7 +11,7 @@ from ..errors import InputError
 from ..registry import lookup
 
 if TYPE_CHECKING:
-    from ..case.settings import Modes
+    from ..case.tables import Modes
     from ..stepping.model import Model
 
 __all__ = ["SOLVERS", "available", "choose", "describe_modes", "solver_module"]

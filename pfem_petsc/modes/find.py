@@ -17,7 +17,7 @@ from .pencil import Pencil, StateMatrices, buckling_bars, join
 from .shapes import Basis, same
 
 if TYPE_CHECKING:
-    from ..case.settings import Modes as Settings
+    from ..case.tables import Modes as Settings
     from ..integrators.base import State
     from ..stepping.model import Model
 

@@ -7,8 +7,8 @@ from collections.abc import Iterable
 from functools import cache
 from typing import NamedTuple
 
-from ..case.materials import LAWS
 from ..fields import FIELDS
+from ..mechanics.materials.base import LAWS
 from ..registry import choices, lookup
 
 __all__ = [

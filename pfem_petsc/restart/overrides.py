@@ -7,7 +7,7 @@ from pathlib import Path
 
 from mpi4py import MPI
 
-from ..case.overrides import split_key
+from ..case.toml import split_key
 from ..errors import InputError
 from ..output.checkpoint import asked_checkpoint, read_checkpoint_header
 from ..output.result import open_result

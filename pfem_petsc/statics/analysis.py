@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..analysis import Analysis
-from ..case.materials import law_name, law_of
 from ..errors import InputError
 from ..integrators.base import Scheme
+from ..mechanics.materials.base import law_name, law_of
 from ..output.units import LOAD_FACTOR, POINT, Axis
 from ..registry import lookup
 from ..solvers.grid_planes import fills_block

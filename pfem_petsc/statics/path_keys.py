@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Annotated
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import model_validator
 
-from ..case.base import PositiveFloat, PositiveInt, StrictModel, Vector3, listed
+from ..case.base import NodeSetName, PositiveFloat, PositiveInt, StrictModel, Vector3, listed
 from ..errors import InputError
 
 __all__ = ["PathKeys"]
@@ -33,7 +33,7 @@ class PathKeys(StrictModel):
     """load factor at which the path ends"""
     max_points: PositiveInt = 1000
     """number of points after which it ends"""
-    node_set: Annotated[str | None, Field(json_schema_extra={"refers_to": "node_set"})] = None
+    node_set: NodeSetName | None = None
     """nodes whose mean displacement along ``direction`` is followed"""
     direction: Vector3 | None = None
     """direction of that displacement"""

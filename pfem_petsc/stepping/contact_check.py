@@ -12,8 +12,8 @@ from ..contact.impact_phases import KNOWN, PHASES, Asked, scan_impacts
 from ..registry import lookup
 
 if TYPE_CHECKING:
+    from ..case.model import Time
     from ..case.schema import Case
-    from ..case.settings import Time
 
 __all__ = ["BOUND", "contact_gain", "overshoots", "warn_of_gain"]
 

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from mpi4py import MPI
 
-from ..case.materials import law_name, law_of
 from ..errors import InputError
 from ..integrators.base import Scheme
 from ..mechanics.connectors import viscous_rate
+from ..mechanics.materials.base import law_name, law_of
 from ..output.units import TIME as AXIS
 from ..output.units import Axis, engineering
 from ..registry import lookup

@@ -9,7 +9,7 @@ import sys
 import pytest
 from helpers.contributed import EXAMPLES, PACKAGES
 
-from pfem_petsc.case import builtin
+from pfem_petsc.case import toml
 
 
 @pytest.fixture
@@ -17,7 +17,7 @@ def examples(monkeypatch, comm, shared_tmp_path):
     """The package with the examples' files in its folders."""
     root = shared_tmp_path / "added"
     if comm.rank == 0:
-        shutil.copytree(builtin.FOLDER, root / "cases")
+        shutil.copytree(toml.FOLDER, root / "cases")
         for path, code in EXAMPLES.items():
             (root / path).parent.mkdir(parents=True, exist_ok=True)
             (root / path).write_text(code)
@@ -26,7 +26,7 @@ def examples(monkeypatch, comm, shared_tmp_path):
     for name in PACKAGES:
         package = importlib.import_module(f"pfem_petsc.{name}")
         monkeypatch.setattr(package, "__path__", [*package.__path__, str(root / name.replace(".", "/"))])
-    monkeypatch.setattr(builtin, "FOLDER", root / "cases")
+    monkeypatch.setattr(toml, "FOLDER", root / "cases")
     yield
     for path in EXAMPLES:
         module = "pfem_petsc." + path.removesuffix(".py").replace("/", ".")

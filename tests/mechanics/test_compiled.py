@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from pfem_petsc import Case, Simulation
-from pfem_petsc.case.materials import LAWS
 from pfem_petsc.mechanics import strips
 from pfem_petsc.mechanics.code_digest import code_digest
 from pfem_petsc.mechanics.compiled import Compilation, _variant
@@ -20,6 +19,7 @@ from pfem_petsc.mechanics.kernels import fused_parts, make_kernels
 from pfem_petsc.mechanics.materials import elastic, elastoplastic
 from pfem_petsc.mechanics.materials._softening import softened
 from pfem_petsc.mechanics.materials._stiffness_damping import damped
+from pfem_petsc.mechanics.materials.base import LAWS
 from pfem_petsc.mechanics.rupture import breakable
 from pfem_petsc.mechanics.strain import MEASURES, engineering
 from pfem_petsc.registry import choices, lookup

@@ -8,7 +8,7 @@ fused), of implicit steps (assembled and matrix-free), and of the energy-momentu
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
@@ -16,12 +16,22 @@ import numpy as np
 from pydantic import Field, field_validator
 
 from ...case.base import Finite, NonNegativeFloat, PositiveFloat, StrictModel, listed
-from ...case.rupture import Rupture
+from ...case.tables import Rupture
 from ...energies import BAR_ENERGIES
+from ...registry import lookup
 from ._softening import Softening, softened
 from ._stiffness_damping import EXTRAPOLATED, damped
 
-__all__ = ["BarShapes", "Law", "MaterialKeys", "UnsuitableBarError"]
+__all__ = [
+    "LAWS",
+    "BarShapes",
+    "Law",
+    "MaterialKeys",
+    "UnsuitableBarError",
+    "internal_variables",
+    "law_name",
+    "law_of",
+]
 
 
 class BarShapes(NamedTuple):
@@ -214,3 +224,24 @@ class Law:
         if scheme.discrete_gradient and self.mean_stress is None:
             return self.no_mean_stress or "it has no mean stress over a step (mean_stress), which this scheme needs"
         return None
+
+
+LAWS = "pfem_petsc.mechanics.materials"
+"""The package of the laws."""
+
+
+def law_name(keys: Mapping[str, Any]) -> Any:
+    """Return the law of a table; without the key ``law`` it depends on whether there is a ``yield_stress``."""
+    if keys.get("law") is not None:
+        return keys["law"]
+    return "elastic" if keys.get("yield_stress") is None else "elastoplastic"
+
+
+def law_of(material: MaterialKeys) -> Law:
+    """Return the law of a material."""
+    return material.choose(lookup(LAWS, law_name(dict(material)), "material.law").LAW)
+
+
+def internal_variables(materials: Mapping[str, MaterialKeys]) -> dict[str, str]:
+    """Return name and unit of all internal variables of the laws of materials, in their order."""
+    return {name: unit for material in materials.values() for name, unit in law_of(material).internal}

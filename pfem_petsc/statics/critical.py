@@ -214,7 +214,7 @@ class _Search:
         """
         stepper = self.stepper
         u, load_factor, _, _ = self._cubic(self._start, 0.0, self.last, self.size, size)
-        return stepper.points.find(stepper.control.constraint(size), u, load_factor)
+        return stepper.points.find(stepper.constraint(size), u, load_factor)
 
     def _cubic(
         self, first: Point, low: float, second: Point, high: float, size: float

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field
 
-from ...case.base import PositiveFloat, PositiveInt, StrictModel
+from ...case.base import PositiveFloat, PositiveInt
+from ..keys import Increments
 
 if TYPE_CHECKING:
     from ...solvers.linear import LinearChoice
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
 __all__ = ["Parameters", "make_stepper"]
 
 
-class Parameters(StrictModel):
+class Parameters(Increments):
     """Increments of the load factor, and the end of their relaxation."""
 
     step: PositiveFloat = 1.0
@@ -34,13 +35,10 @@ class Parameters(StrictModel):
 
     @property
     def smallest(self) -> float:
-        """The smallest increment; increments are not halved."""
+        """The smallest increment; increments are not halved, and do not grow."""
         return self.step
 
-    @property
-    def largest(self) -> float:
-        """The largest increment; increments do not grow."""
-        return self.step
+    largest = smallest
 
 
 def make_stepper(model: Model, parameters: Parameters, choice: LinearChoice) -> RelaxationStepper:

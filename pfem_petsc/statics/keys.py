@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -88,3 +88,27 @@ class PathKeys(Increments):
         if self.branch_at and not self.critical_points:
             raise InputError("branch_at needs critical_points = true")
         return self
+
+
+class RelaxationKeys(Increments):
+    """Increments of the load factor, and the end of their relaxation."""
+
+    step: PositiveFloat = 1.0
+    """increment of the load factor"""
+    end: PositiveFloat = 1.0
+    """last load factor"""
+    damping: Literal["kinetic", "fire"] = "kinetic"
+    """damping of the pseudo-motion"""
+    tolerance: Annotated[float, Field(gt=0.0, lt=1.0)] = 1e-9
+    """residual relative to the load, in 2-norms, at which relaxation ends"""
+    max_iterations: PositiveInt = 200_000
+    """maximum number of pseudo-steps in an increment"""
+    newton: bool = True
+    """whether Newton's method computes the last digits, if it finds the same equilibrium"""
+
+    @property
+    def smallest(self) -> float:
+        """The smallest increment; increments are not halved, and do not grow."""
+        return self.step
+
+    largest = smallest

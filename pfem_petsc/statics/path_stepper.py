@@ -14,7 +14,7 @@ from ..solvers.linear import LinearChoice
 from ..stepping.stepper import Solution
 from ..tolerances import TIME
 from .bordered import BorderedSystem, free_motions
-from .critical import EVENTS, Event, find_critical
+from .critical import EVENTS, CriticalPoints, Event
 from .path_points import Arc, Constraint, Direction, Linear, Metric, Point, PointSolver, dot
 from .scheme import PathEquilibrium
 from .stepper import StaticStepper
@@ -351,7 +351,8 @@ class PathStepper(StaticStepper):
         if self.turning or self.points.stability is None:
             return point, [], reached
         try:
-            events, turn = find_critical(self, point)
+            critical = CriticalPoints(self, point)
+            events, turn = critical.events, critical.turn
         except NotConverged as failure:
             # close to an imperfect bifurcation the point may lie on a path that does not pass through it
             if size > _UNRESOLVED * self.arc and 0.5 * size >= self.keys.smallest:

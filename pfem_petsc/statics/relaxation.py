@@ -436,7 +436,7 @@ class RelaxationStepper(StaticStepper):
         SimulationFailure
             On all ranks, if relaxation does not converge in ``max_iterations`` pseudo-steps.
         """
-        state, end = self.state, min(self.end, self.removals.ends())
+        state, end = self.state, min(self.end, self.removals.ends(self.state.time))
         left = end - state.time
         last = left <= self.limits.step * (1.0 + TIME)
         size = left if last else self.limits.step

@@ -128,7 +128,7 @@ class StaticStepper(ImplicitStepper):
         NotConverged
             On all ranks, if the smallest increment does not converge.
         """
-        state, reached = self.state, min(self.end, self.removals.ends())
+        state, reached = self.state, min(self.end, self.removals.ends(self.state.time))
         self._external = state.external
         left = reached - state.time
         size = first = self.increment if self.increment < left * (1.0 - TIME) else left
@@ -178,7 +178,7 @@ class StaticStepper(ImplicitStepper):
         SimulationFailure
             On all ranks, if the rest of the truss finds no equilibrium.
         """
-        changed = self.removals.apply()
+        changed = self.remove_due()
         if not self.model.bars.can_break and not changed:
             return
         while self.model.comm.allreduce(changed or self.energy.changed > 0, op=MPI.LOR):

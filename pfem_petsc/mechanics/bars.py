@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from ..case.tables import Section
     from ..mesh.distribution import Block, DistributedMesh
     from ..mesh.slab import MeshSlab
-    from ..solvers.matrix import BlockPattern
+    from .block_pattern import BlockPattern
     from .springs import Springs
 
 

@@ -16,7 +16,7 @@ from ..errors import InputError, SimulationFailure
 from .matrix import HessianMatrix
 
 if TYPE_CHECKING:
-    from ..stepping.model import Model
+    from .problem import Mechanics
 
 
 DIRECT = ("lu", "mumps")
@@ -277,11 +277,11 @@ class MassSolver:
 
     Parameters
     ----------
-    model : Model
+    model : Mechanics
         With consistent mass.
     """
 
-    def __init__(self, model: Model) -> None:
+    def __init__(self, model: Mechanics) -> None:
         self._supports = model.supports
         self._matrix = matrix = HessianMatrix(model.mesh, model.supports)
 

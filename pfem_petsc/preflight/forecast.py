@@ -15,7 +15,7 @@ from ..solvers.linear import DIRECT
 if TYPE_CHECKING:
     from ..case.schema import Case
     from ..mesh.distribution import DistributedMesh
-    from ..recording.fields import Fields
+    from ..recording.recorder import Fields
     from ..stepping.model import Model
     from ..stepping.plan import Plan
 

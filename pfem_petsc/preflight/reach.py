@@ -6,12 +6,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..contact.piercing import distances, small_walls
+from ..contact.monitoring import distances, small_walls
 from ..output.units import engineering
 
 if TYPE_CHECKING:
     from ..case.schema import Case
-    from ..contact.motion import WallMotion
+    from ..contact.wall_motion import WallMotion
     from ..contact.walls.base import WallKeys
     from ..stepping.model import Model
 

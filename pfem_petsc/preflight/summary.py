@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..modes.choice import describe_modes
+from ..modes.find import describe_modes
 from ..output.units import engineering
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ from ..integrators.base import Scheme
 from ..mechanics.materials.base import law_name, law_of
 from ..output.units import LOAD_FACTOR, POINT, Axis
 from ..registry import lookup
-from ..solvers.grid_planes import fills_block
+from ..solvers.background_grid import fills_block
 from ..solvers.linear import LinearChoice, choose_linear
 from ..tolerances import TIME
 

@@ -6,8 +6,8 @@ from helpers.gathered import stiffness_modes, whole
 from pydantic import ValidationError
 
 from pfem_petsc.errors import InputError
-from pfem_petsc.mesh.checks import check_mesh
 from pfem_petsc.mesh.generators import lattice, mast, net, prism, ring, rod
+from pfem_petsc.mesh.whole import check_mesh
 
 pytestmark = pytest.mark.parallel
 

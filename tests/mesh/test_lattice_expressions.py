@@ -15,9 +15,9 @@ from pydantic import ValidationError
 
 from pfem_petsc import Case, Simulation
 from pfem_petsc.errors import InputError
-from pfem_petsc.mesh.checks import check_mesh
 from pfem_petsc.mesh.generators import lattice
 from pfem_petsc.mesh.lattices.expressions import Expression
+from pfem_petsc.mesh.whole import check_mesh
 
 ROOT = Path(__file__).parents[2]
 

@@ -13,9 +13,9 @@ from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation, cases
 from pfem_petsc.errors import InputError
-from pfem_petsc.mesh.checks import check_mesh
 from pfem_petsc.mesh.generators import lattice
 from pfem_petsc.mesh.lattices.surface_files import read_surface
+from pfem_petsc.mesh.whole import check_mesh
 
 """Triangles of a unit cube, with outward normals."""
 

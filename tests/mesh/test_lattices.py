@@ -11,10 +11,10 @@ from pydantic import ValidationError
 
 from pfem_petsc import Case, Simulation
 from pfem_petsc.errors import InputError
-from pfem_petsc.mesh.checks import check_mesh
 from pfem_petsc.mesh.generators import lattice
 from pfem_petsc.mesh.lattices.making import cell_of_kind
 from pfem_petsc.mesh.lattices.mechanisms import periodic_mechanisms
+from pfem_petsc.mesh.whole import check_mesh
 
 SIZES = [(1, 1, 1), (2, 3, 4)]
 

@@ -5,9 +5,9 @@ import pytest
 from helpers.stopped import TWO_RODS
 
 from pfem_petsc import Case, Simulation, Truss
-from pfem_petsc.contact.transform import Transform
+from pfem_petsc.contact.links import Transform
 from pfem_petsc.errors import InputError
-from pfem_petsc.solvers.grid_kernels import interpolate, restrict
+from pfem_petsc.solvers.background_grid import interpolate, restrict
 from pfem_petsc.solvers.linear import choose_linear
 from pfem_petsc.solvers.multigrid import GridMultigrid
 from pfem_petsc.stepping.problem import StepProblem

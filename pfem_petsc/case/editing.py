@@ -8,7 +8,7 @@ read, so that references to tables stay valid. A rejected change has no effect.
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Callable, Iterable, Iterator, Mapping, MutableMapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from ..errors import InputError
@@ -127,73 +127,53 @@ class Place(NamedTuple):
         self.case.edit([((*self.path, key), value)])
 
 
+def _through_copy(*names: str) -> Callable[[type], type]:
+    """Decorate a list or dict whose methods ``names`` change a copy, with which the case is then validated."""
+
+    def decorate(cls: Any) -> Any:
+        plain = cls.__mro__[1]
+        for name in names:
+
+            def method(self: Any, *arguments: Any, name: str = name, **named: Any) -> Any:
+                changed = plain(self)
+                result = getattr(changed, name)(*arguments, **named)
+                self._place.case.edit(self._changes(changed))
+                if name == "setdefault":
+                    return self[arguments[0]]
+                return self if result is changed else result
+
+            method.__name__, method.__doc__ = name, getattr(plain, name).__doc__
+            setattr(cls, name, method)
+        cls.__reduce__ = lambda self: (plain, (plain(self),))
+        return cls
+
+    return decorate
+
+
+@_through_copy("__setitem__", "__delitem__", "__ior__", "pop", "popitem", "setdefault", "update", "clear")
 class Tables(dict[str, V]):
     """Tables by name, such as the materials of a case; changes are validated at once."""
 
     __slots__ = ("_place",)
     _place: Place
 
-    def __setitem__(self, name: str, table: Any) -> None:
-        self._place.change(name, table)
-
-    def __delitem__(self, name: str) -> None:
-        if name not in self:
-            raise KeyError(name)
-        self._place.change(name, None)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return dict, (dict(self),)
-
-    def update(self, *tables: Any, **named: Any) -> None:
-        """Set several tables at once."""
-        changes = dict(*tables, **named)
-        self._place.case.edit([((*self._place.path, name), table) for name, table in changes.items()])
-
-    def __ior__(self, tables: Mapping[str, Any]) -> Tables[V]:
-        self.update(tables)
-        return self
-
-    def clear(self) -> None:
-        """Remove all tables."""
-        self._place.case.edit([(self._place.path, None)])
-
-    def popitem(self) -> tuple[str, V]:
-        """Remove the last table and return it with its name."""
-        name = next(reversed(self))
-        return name, self.pop(name)
-
-    pop = MutableMapping.pop
-    setdefault = MutableMapping.setdefault
+    def _changes(self, changed: Mapping[str, Any]) -> list[tuple[KeyPath, Any]]:
+        named = {**dict.fromkeys(self), **changed}
+        return [((*self._place.path, name), table) for name, table in named.items() if table is not self.get(name)]
 
 
+@_through_copy(
+    *("__setitem__", "__delitem__", "__iadd__", "__imul__", "append", "extend", "insert", "pop", "remove", "clear"),
+    *("reverse", "sort"),
+)
 class Rows(list[V]):
     """A list of tables, such as the walls of a case; changes are validated at once."""
 
     __slots__ = ("_place",)
     _place: Place
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        return list, (list(self),)
-
-
-def _of_plain_list(name: str) -> Callable[..., Any]:
-    """The method of a list, which changes a plain copy, with which the case is then validated."""
-
-    def method(self: Rows[Any], *arguments: Any, **named: Any) -> Any:
-        rows = list(self)
-        result = getattr(rows, name)(*arguments, **named)
-        self._place.case.edit([(self._place.path, rows)])
-        return self if result is rows else result
-
-    method.__name__, method.__doc__ = name, getattr(list, name).__doc__
-    return method
-
-
-for _name in (
-    *("__setitem__", "__delitem__", "__iadd__", "__imul__", "append", "extend", "insert", "pop", "remove", "clear"),
-    *("reverse", "sort"),
-):
-    setattr(Rows, _name, _of_plain_list(_name))
+    def _changes(self, changed: list[Any]) -> list[tuple[KeyPath, Any]]:
+        return [(self._place.path, changed)]
 
 
 def attribute_of(key: str) -> str:
@@ -352,28 +332,6 @@ def merged_stages(old: tuple[Case, ...], new: tuple[Case, ...]) -> tuple[Case, .
         for key, value in other.__dict__.items():
             one.__dict__[key] = merge(one.__dict__.get(key), value)
     return old
-
-
-def copied(case: Case) -> Case:
-    """Return a case with tables of its own, without places."""
-    made = case.__new__(type(case))
-    made.__dict__.update({key: _copied(value) for key, value in case.__dict__.items() if key != "editor"})
-    made.__dict__["stage"] = tuple(copied(stage) for stage in case.stage)
-    return made
-
-
-def _copied(value: Any) -> Any:
-    if isinstance(value, StrictModel):
-        value = value.model_copy()
-        value.__dict__.update({key: _copied(item) for key, item in value.__dict__.items()})
-        return value
-    if isinstance(value, dict):
-        return {name: _copied(table) for name, table in value.items()}
-    if isinstance(value, list):
-        return [_copied(row) for row in value]
-    if isinstance(value, tuple) and value and isinstance(value[0], StrictModel):
-        return tuple(_copied(item) for item in value)
-    return value
 
 
 def settle(case: Case, attached: bool = True) -> None:

@@ -13,7 +13,6 @@ from .editing import (
     apply_overrides,
     attribute_of,
     changed_data,
-    copied,
     key_path,
     merge,
     merged_stages,
@@ -294,7 +293,7 @@ class Case(_Tables):
             The case is unchanged.
         """
         self._check_not_fixed()
-        new = type(self).from_dict(changed_data(self, changes), name=self.name, source=self.source, folder=self.folder)
+        new = self._reread(changed_data(self, changes))
         settle(self, attached=False)
         for key in ("title", *TABLES.values(), "removes_bars"):
             self.__dict__[key] = merge(self.__dict__[key], new.__dict__[key])
@@ -332,14 +331,14 @@ class Case(_Tables):
 
     def copy(self, changes: Mapping[str, Any] | None = None, /, *, fixed: bool = False, **named: Any) -> Self:
         """Return a copy, with changes as for :meth:`update`; if ``fixed``, the copy cannot be changed."""
-        made = copied(self)
-        if self.number or self.editor[0] is not self:  # of a stage
-            made.__dict__.update(number=0, given=())
-        made.__dict__["fixed"] = False
-        settle(made)
+        made = self._reread(tables_of(self, given=True))
+        made.__dict__.update(overrides=self.overrides, removes_bars=self.removes_bars)
         made.update(changes, **named)
         made.__dict__["fixed"] = fixed
         return made
+
+    def _reread(self, tables: Mapping[str, Any]) -> Case:
+        return type(self).from_dict(tables, name=self.name, source=self.source, folder=self.folder)
 
     def __copy__(self) -> Self:
         return self.copy()

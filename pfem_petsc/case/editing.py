@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from ..errors import InputError
 from .base import StrictModel
-from .model import ANALYSES, LISTS, ONE_STAGE, CaseModel, StageOutput
+from .model import ANALYSES, LISTS, ONE_STAGE, CaseModel, StageOutput, shape_of
 from .toml import DEEPEST, KeyPath, key_text, split_key
 
 if TYPE_CHECKING:
@@ -181,7 +181,7 @@ def attribute_of(key: str) -> str:
     return "point_mass" if key == "mass" else key
 
 
-TABLES = {key: attribute_of(key) for key in CaseModel.model_fields if key not in ("title", "stage")}
+TABLES = {key: attribute_of(key) for key, field in CaseModel.model_fields.items() if shape_of(field).models}
 """Attributes of a case that are tables, by top-level key."""
 
 
@@ -200,7 +200,7 @@ def tables_of(case: Case, given: bool = False) -> dict[str, Any]:
 
     Tables over time from files have rows instead.
     """
-    data = {"title": case.title, **_tables(case, given)}
+    data = {"title": case.title, **({"plugins": list(case.plugins)} if case.plugins else {}), **_tables(case, given)}
     if case.stage:
         data["stage"] = [_stage(case, stage, given) for stage in case.stage]
     return data

@@ -30,7 +30,7 @@ from ..fields import cell_fields, point_fields
 from ..mechanics.materials.base import LAWS, MaterialKeys, internal_variables, law_name
 from ..registry import choices, lookup, nearest
 from . import tables as t
-from .base import ConstraintKeys, Name, NonNegativeInt, PositiveInt, StrictModel, refusal
+from .base import ConstraintKeys, FilePath, Name, NonNegativeInt, PositiveInt, StrictModel, listed, refusal
 from .files import Columns, TableFile, file_columns, rows_of
 
 GENERATORS = "pfem_petsc.mesh.generators"
@@ -45,10 +45,14 @@ ARRAYS = "arrays"
 
 
 class Reading:
-    """The :class:`~pfem_petsc.case.base.Context` of a case: its folder, the names of its tables, files read once."""
+    """The :class:`~pfem_petsc.case.base.Context` of a case: its folder, the names of its tables, files read once.
 
-    def __init__(self, data: Mapping[str, Any], folder: Path) -> None:
-        self.folder = folder
+    If ``lenient``, as for results, tables may be of modules that are not there; ``missing`` tells which.
+    """
+
+    def __init__(self, data: Mapping[str, Any], folder: Path, lenient: bool = False) -> None:
+        self.folder, self.lenient = folder, lenient
+        self.missing: list[str] = []
         self.names = {key: _names(data.get(key)) for key in ("node_set", "material", "section", "support")}
         self._columns: dict[str, Columns] = {}
 
@@ -91,7 +95,11 @@ class Chosen:
         """Validate a table."""
         if not isinstance(table, Mapping):
             raise refusal(((), "expected a table", table))
-        return self.validated(self.model_of(table), table, info)
+        return self.validated(self.chosen(table, info), table, info)
+
+    def chosen(self, table: Mapping[str, Any], info: ValidationInfo) -> type[StrictModel]:
+        """Return the model of a table that is validated."""
+        return self.model_of(table)
 
     def model_of(self, table: Mapping[str, Any]) -> type[StrictModel]:
         """Return the model of a table, or refuse the key that chooses it."""
@@ -120,12 +128,22 @@ class Family(Chosen):
     package : of the modules
     key : that names the module
     common : model of the keys that all have
+    unknown : model of the tables of a result whose module is not there
     taker : what has the keys, for messages: ``generator rod``
     missing : text of the message where the key is missing
     """
 
-    def __init__(self, package: str, key: str, common: type[StrictModel], taker: str, missing: str = "") -> None:
-        self.package, self.key, self.models, self.taker, self._missing = package, key, (common,), taker, missing
+    def __init__(
+        self,
+        package: str,
+        key: str,
+        common: type[StrictModel],
+        unknown: type[StrictModel],
+        taker: str,
+        missing: str = "",
+    ) -> None:
+        self.package, self.key, self.models, self.unknown = package, key, (common,), unknown
+        self.taker, self._missing = taker, missing
 
     def name(self, table: Mapping[str, Any]) -> Any:
         """Return the name of the module of a table."""
@@ -145,11 +163,35 @@ class Family(Chosen):
             text = f"{self.package}.{name} has no Parameters: it is not meant for case files"
             raise refusal(((self.key,), text, name)) from error
 
+    def chosen(self, table: Mapping[str, Any], info: ValidationInfo) -> type[StrictModel]:
+        """Return the model of a table that is validated: in results, one without module where there is none."""
+        found, name = self.found(table), self.name(table)
+        if found is None and name is not None and getattr(info.context, "lenient", False):
+            info.context.missing.append(self.taker.format(name))
+            return self.unknown
+        return found or self.model_of(table)  # which says what is wrong
+
     def keys(self) -> dict[str, list[str]]:
         """Return the keys of all modules by name, without common ones."""
         found = {name: getattr(lookup(self.package, name, ""), "Parameters", None) for name in choices(self.package)}
         common = self.models[0].model_fields
         return {n: [k for k in model.model_fields if k not in common] for n, model in found.items() if model}
+
+
+class UnknownParameters(StrictModel, extra="allow"):
+    """Keys of a module that is not there."""
+
+
+class UnknownWall(WallKeys, extra="allow"):
+    """A wall of a type that is not there."""
+
+
+class UnknownConstraint(ConstraintKeys, extra="allow"):
+    """A constraint of a kind that is not there."""
+
+
+class UnknownMaterial(MaterialKeys, extra="allow"):
+    """A material with a law that is not there."""
 
 
 class WithParameters(StrictModel):
@@ -199,11 +241,16 @@ class _Parameters(Family):
         name = info.data.get(self.key)
         if isinstance(table, StrictModel):
             return table
-        return None if name is None else self.validated(self.model_of({self.key: name}), table, info)
+        return None if name is None else self.validated(self.chosen({self.key: name}, info), table, info)
 
     def name(self, table: Mapping[str, Any]) -> Any:
         """Return the name of the module of a table."""
         return table.get(self.key, self.models[0].model_fields[self.key].default)
+
+
+_generator = _Parameters(GENERATORS, "generator", t.MeshKeys, UnknownParameters, "generator {}")
+_integrator = _Parameters(INTEGRATORS, "integrator", t.TimeKeys, UnknownParameters, "{}")
+_method = _Parameters(STATIC_METHODS, "method", t.StaticKeys, UnknownParameters, "{}")
 
 
 class Mesh(t.MeshKeys, WithParameters):
@@ -211,7 +258,7 @@ class Mesh(t.MeshKeys, WithParameters):
 
     slot: ClassVar[str] = "parameters"
 
-    parameters: Annotated[StrictModel | None, _Parameters(GENERATORS, "generator", t.MeshKeys, "generator {}")] = None
+    parameters: Annotated[StrictModel | None, _generator] = None
 
     @model_validator(mode="before")
     @classmethod
@@ -235,11 +282,13 @@ class Time(t.TimeKeys, WithParameters):
 
     slot: ClassVar[str] = "scheme"
 
-    scheme: Annotated[StrictModel, _Parameters(INTEGRATORS, "integrator", t.TimeKeys, "{}")]
+    scheme: Annotated[StrictModel, _integrator]
 
     @model_validator(mode="after")
     def _known_step(self) -> Time:
-        if self.step == "auto" and not lookup(INTEGRATORS, self.integrator, "time.integrator").Scheme.explicit:
+        if self.step != "auto" or isinstance(self.scheme, UnknownParameters):
+            return self
+        if not lookup(INTEGRATORS, self.integrator, "time.integrator").Scheme.explicit:
             text = f'"auto" is for explicit schemes, and {self.integrator} is implicit: give the step in seconds'
             raise refusal((("step",), text, "auto"))
         return self
@@ -250,7 +299,7 @@ class Static(t.StaticKeys, WithParameters):
 
     slot: ClassVar[str] = "parameters"
 
-    parameters: Annotated[StrictModel, _Parameters(STATIC_METHODS, "method", t.StaticKeys, "{}")]
+    parameters: Annotated[StrictModel, _method]
 
 
 class _Materials(Family):
@@ -278,6 +327,8 @@ class _Materials(Family):
             # resolved cases of earlier versions have zeros for materials that cannot yield
             table = {key: value for key, value in table.items() if key not in self._HARDENING}
         material = super().validated(model, table, info)
+        if isinstance(material, UnknownMaterial):
+            return material
         if hardening:
             text = f"{hardening[0]} = {table[hardening[0]]!r} needs a yield_stress [Pa]"
             raise refusal(((), text, None))
@@ -350,11 +401,11 @@ class StageName(StrictModel):
     """name of the stage in results and messages; unique. Default: ``stage1``, ``stage2``, ..."""
 
 
-Material = Annotated[MaterialKeys, _Materials(LAWS, "law", MaterialKeys, "the law {}")]
-Wall = Annotated[WallKeys, Family(WALLS, "type", WallKeys, "a wall of type {}", "the kind of wall")]
+Material = Annotated[MaterialKeys, _Materials(LAWS, "law", MaterialKeys, UnknownMaterial, "the law {}")]
+Wall = Annotated[WallKeys, Family(WALLS, "type", WallKeys, UnknownWall, "a wall of type {}", "the kind of wall")]
 Constraint = Annotated[
     ConstraintKeys,
-    Family(CONSTRAINTS, "kind", ConstraintKeys, "a constraint of kind {}", "the kind of constraint"),
+    Family(CONSTRAINTS, "kind", ConstraintKeys, UnknownConstraint, "a constraint of kind {}", "the kind of constraint"),
 ]
 Load = Annotated[
     t.Load | t.LoadFile, Chosen(t.Load, t.LoadFile, choose=lambda row: t.LoadFile if "file" in row else t.Load)
@@ -378,6 +429,7 @@ class CaseModel(StrictModel):
     """The tables of a case file by top-level key."""
 
     title: str | None = None
+    plugins: Annotated[tuple[FilePath, ...], listed] = ()
     mesh: Mesh
     node_set: dict[str, t.NodeSet] = {}
     material: dict[str, Material] = {}
@@ -431,15 +483,19 @@ class CaseModel(StrictModel):
 
     @field_validator("contact")
     @classmethod
-    def _treats(cls, contact: t.ContactSettings) -> t.ContactSettings:
+    def _treats(cls, contact: t.ContactSettings, info: ValidationInfo) -> t.ContactSettings:
         known = ["scheme", *choices(TREATMENTS)]
-        if contact.treatment not in known:
+        if contact.treatment not in known and info.context.lenient:
+            info.context.missing.append(f"the treatment {contact.treatment}")
+        elif contact.treatment not in known:
             raise refusal((("treatment",), f"unknown value{nearest(contact.treatment, known)}", contact.treatment))
         return contact
 
     @field_validator("output")
     @classmethod
     def _known_fields(cls, output: t.Output, info: ValidationInfo) -> t.Output:
+        if info.context.lenient:
+            return output
         laws = internal_variables(info.data.get("material", {}))
         known = list(dict.fromkeys([*point_fields(), *cell_fields(), *laws]))
         for i, name in enumerate(output.fields or ()):

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import pickle
+import warnings
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 from ..errors import InputError
-from ..registry import lookup, nearest
+from ..registry import add_plugin, has_plugin, lookup, nearest
 from .editing import (
     TABLES,
     apply_overrides,
@@ -163,7 +165,9 @@ class Case(_Tables):
         return (self.modes is not None and self.modes.mass) or "lumped"
 
     @classmethod
-    def load(cls, path_or_name: str | Path, overrides: Iterable[str] = (), *, mesh: Any = None) -> Case:
+    def load(
+        cls, path_or_name: str | Path, overrides: Iterable[str] = (), *, mesh: Any = None, plugins: Iterable[Any] = ()
+    ) -> Case:
         """Read a case file, or a built-in case by its name.
 
         Parameters
@@ -171,6 +175,7 @@ class Case(_Tables):
         path_or_name : TOML file, or name of a built-in case
         overrides : strings such as ``"time.step=1e-5"`` that override values of the file
         mesh : Truss that replaces the mesh of the file
+        plugins : files with modules, in addition to those of the case; relative to the working directory
 
         Raises
         ------
@@ -178,8 +183,15 @@ class Case(_Tables):
             Names all invalid keys.
         """
         path = built_in_path(str(path_or_name)) or Path(path_or_name)
+        data = parse_toml(read_text(path), str(path))
+        if plugins:
+            own = data.get("plugins", [])
+            data["plugins"] = [
+                *(own if isinstance(own, list) else [own]),
+                *(str(Path(each).resolve()) for each in plugins),
+            ]
         named: dict[str, Any] = {"name": path.stem, "source": str(path), "overrides": overrides, "mesh": mesh}
-        return cls.from_toml(read_text(path), path.parent, **named)
+        return cls.from_dict(data, folder=path.parent, **named)
 
     from_file = load
 
@@ -193,10 +205,14 @@ class Case(_Tables):
         source: str = "case",
         overrides: Iterable[str] = (),
         mesh: Any = None,
+        lenient: bool = False,
     ) -> Case:
-        """Read the text of a case; see :meth:`load`. The path of its mesh file is relative to ``folder``."""
-        data = parse_toml(text, source)
-        return cls.from_dict(data, name=name, source=source, folder=folder, overrides=overrides, mesh=mesh)
+        """Read the text of a case; see :meth:`load`. The path of its mesh file is relative to ``folder``.
+
+        If ``lenient``, as for the case of a result, plugins are not run, and what is missing is a warning.
+        """
+        data, keys = parse_toml(text, source), {"overrides": overrides, "mesh": mesh, "lenient": lenient}
+        return cls.from_dict(data, name=name, source=source, folder=folder, **keys)
 
     @classmethod
     def from_dict(
@@ -208,6 +224,7 @@ class Case(_Tables):
         folder: str | Path = ".",
         overrides: Iterable[str] = (),
         mesh: Any = None,
+        lenient: bool = False,
     ) -> Case:
         """Validate a case given as nested tables with the keys of the case file; see :meth:`load`.
 
@@ -228,9 +245,18 @@ class Case(_Tables):
         overrides, folder = tuple(overrides), Path(folder)
         problems = Problems(source, apply_overrides(data, overrides))
         stages = stages_of(data, problems) if "stage" in data else []
-        model = _validated(data, folder, problems)
-        models = [_validated(stage.data, folder, problems, stage.place) for stage in stages]
+        if not lenient:
+            _add_plugins(data.get("plugins"), folder, problems)
+        reading = [Reading(tables, folder, lenient) for tables in (data, *(stage.data for stage in stages))]
+        model = _validated(data, reading[0], problems)
+        models = [
+            _validated(stage.data, each, problems, stage.place) for stage, each in zip(stages, reading[1:], strict=True)
+        ]
         problems.raise_if_any()
+        missing = dict.fromkeys(text for each in reading for text in each.missing)
+        if missing:
+            text = f"{', '.join(missing)}: not there, as the plugin or package that has it; what needs it is left out"
+            warnings.warn(f"{source}: {text}", stacklevel=2)
         name = Path(source).stem if name is None else _checked_name(name, source)
         title = name if model.title is None else model.title
         common = {"title": title, "folder": folder, "overrides": overrides}
@@ -295,7 +321,7 @@ class Case(_Tables):
         self._check_not_fixed()
         new = self._reread(changed_data(self, changes))
         settle(self, attached=False)
-        for key in ("title", *TABLES.values(), "removes_bars"):
+        for key in ("title", "plugins", *TABLES.values(), "removes_bars"):
             self.__dict__[key] = merge(self.__dict__[key], new.__dict__[key])
         self.__dict__["stage"] = merged_stages(self.stage, new.stage)
         settle(self)
@@ -346,12 +372,11 @@ class Case(_Tables):
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
         return self.copy()
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {key: value for key, value in self.__dict__.items() if key != "editor"}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        settle(self)
+    def __reduce__(self) -> tuple[Any, ...]:
+        """The plugins are added before what they have is read."""
+        state = {key: value for key, value in self.__dict__.items() if key != "editor"}
+        plugins = [path for path in self.plugins if has_plugin(path)]  # not those of a result, whose case is lenient
+        return _unpickled, (type(self), plugins, pickle.dumps(state))
 
 
 def _with_arrays(table: Any, mesh: Any) -> Any:
@@ -361,8 +386,17 @@ def _with_arrays(table: Any, mesh: Any) -> Any:
     return mesh
 
 
+def _unpickled(cls: type[Case], plugins: Iterable[str], state: bytes) -> Case:
+    for path in plugins:
+        add_plugin(path)
+    case = cls.__new__(cls)
+    case.__dict__.update(pickle.loads(state))
+    settle(case)
+    return case
+
+
 def _validated(
-    data: Mapping[str, Any], folder: Path, problems: Problems, place: Callable[[KeyPath], KeyPath] = tuple
+    data: Mapping[str, Any], reading: Reading, problems: Problems, place: Callable[[KeyPath], KeyPath] = tuple
 ) -> Any:
     """Return the model of nested tables; if they are rejected, add the problems and return None."""
     for key in [key for key in data if key not in KEYS]:
@@ -375,7 +409,17 @@ def _validated(
     if not any(key in data for key in (*ANALYSES, "stage", "modes")):
         problems.add((), "the table [time] is missing, or one of [static], [[stage]], [modes], which give the analysis")
     known = {key: value for key, value in data.items() if key in KEYS and (value is not None or key == "stage")}
-    return problems.validated(CaseModel, known, Reading(data, folder), place)
+    return problems.validated(CaseModel, known, reading, place)
+
+
+def _add_plugins(given: Any, folder: Path, problems: Problems) -> None:
+    """Add the modules of the files ``plugins``; those that are no names are refused with the other keys."""
+    for i, name in enumerate(given if isinstance(given, list) else ()):
+        if isinstance(name, str) and name and "\0" not in name:
+            try:
+                add_plugin(folder / name)
+            except InputError as error:
+                problems.add(("plugins", i), str(error), name)
 
 
 def _hint(key: str, known: Iterable[str]) -> str:

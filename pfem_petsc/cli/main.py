@@ -53,6 +53,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     debug = "--debug" in own
     # overflows are reported by their consequences
     warnings.filterwarnings("default" if debug else "ignore", category=RuntimeWarning)
+    warnings.formatwarning = lambda message, *_, **__: f"warning: {message}\n"
     try:
         _require_text(words)
         arguments, verb = _parse(own)

@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from ..stepping.stepper import Stepper
 
 
-FREE = ("title", "time.end", "static.end", "modes", "output", "solver")
+FREE = ("title", "plugins", "time.end", "static.end", "modes", "output", "solver")
 """Keys and tables that a restart may change: they do not change what is simulated."""
 
 _OF_STAGES = re.compile(r"stage\[(\d+)\]\.(.*)")

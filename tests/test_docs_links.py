@@ -50,7 +50,8 @@ def test_every_folder_is_on_its_floor():
     picture = re.search(r"^```\n(  cli/.*?)^```$", (ROOT / "docs" / "architecture.md").read_text(), re.M | re.S)[1]
     rows = [re.findall(r"(\w+)(?:/|\.py)", row) for row in picture.splitlines()]
     floors = [[FLOOR[name] for name in row] for row in rows if row]
-    assert {name for row in rows for name in row} == {name for name in FLOOR if "." not in name} - {"__init__", "__main__"}
+    folders = {name for name in FLOOR if "." not in name}
+    assert {name for row in rows for name in row} == folders - {"__init__", "__main__"}
     assert all(max(below) < min(above) for above, below in zip(floors, floors[1:], strict=False))
 
 

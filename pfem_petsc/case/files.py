@@ -95,14 +95,21 @@ def file_columns(path: Path) -> Columns:
         raise InputError("this is not a text file; expected CSV, NPZ or NPY") from error
 
 
-def _array_columns(path: Path) -> Columns:
+def _arrays(path: Path) -> dict[str, np.ndarray]:
+    """Return the arrays of an NPZ file by name, or that of an NPY file."""
     try:
         found = np.load(path, allow_pickle=False)
-        if not isinstance(found, np.ndarray):
+        if isinstance(found, np.ndarray):
+            return {"": found}
+        with found:
             check_contents(found.zip)
-        arrays = {"": found} if isinstance(found, np.ndarray) else {name: found[name] for name in found.files}
+            return {name: found[name] for name in found.files}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, KeyError) as error:
         raise InputError(f"this file cannot be read: {error}") from error
+
+
+def _array_columns(path: Path) -> Columns:
+    arrays = _arrays(path)
     names: list[str | None] = []
     columns: list[np.ndarray] = []
     for name, array in arrays.items():
@@ -315,12 +322,7 @@ def read_forces(path: Path, digest: str) -> Forces:
         )
     if not zipfile.is_zipfile(path):
         return _from_text(path)
-    try:
-        with np.load(path, allow_pickle=False) as found:
-            check_contents(found.zip)
-            arrays = {name: found[name] for name in found.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, KeyError) as error:
-        raise InputError(f"this file cannot be read: {error}") from error
+    arrays = _arrays(path)
     for name, array in arrays.items():
         if array.dtype.kind not in "fiu":
             raise InputError(f"array {name!r} has the type {array.dtype}: expected numbers")

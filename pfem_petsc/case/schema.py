@@ -71,7 +71,6 @@ class Case(_Tables):
     number : of a stage among those of its case, from 0
     given : tables that a stage gives itself, and does not have from the stages before
     stressed : names of the sections whose prestress a stage gives itself
-    removes_bars : whether bars are removed, in this or another stage
     fixed : whether it cannot be changed, as the case of a simulation
     editor : the case that is changed with this one, which is another for those of stages; and the key path of a table
 
@@ -108,13 +107,10 @@ class Case(_Tables):
         settle(self)
 
     @classmethod
-    def _of(cls, model: CaseModel | None, **attributes: Any) -> Case:
-        """The case of a model, or of one that was rejected."""
+    def _of(cls, model: CaseModel, **attributes: Any) -> Case:
         case = cls.__new__(cls)
-        if model is not None:
-            case.__dict__.update({attribute_of(key): value for key, value in model.__dict__.items()}, stage=())
-            case.__dict__["removes_bars"] = any(entry.bars is not None for entry in model.remove)
-        case.__dict__.update({"number": 0, "given": (), "stressed": (), "fixed": False, **attributes})
+        case.__dict__.update({attribute_of(key): value for key, value in model.__dict__.items()})
+        case.__dict__.update({"stage": (), "number": 0, "given": (), "stressed": (), "fixed": False, **attributes})
         return case
 
     def __eq__(self, other: object) -> bool:
@@ -141,6 +137,12 @@ class Case(_Tables):
         for stage in self.stages:
             named = {**{wall.name: wall for wall in stage.wall}, **named}
         return list(named.values())
+
+    @property
+    def removes_bars(self) -> bool:
+        """Whether bars are removed, in this or another stage."""
+        whole = self.editor[0]
+        return any(entry.bars is not None for each in (whole, *whole.stage) for entry in each.remove)
 
     def holds(self, table: str) -> bool:
         """Whether a table keeps its state at the end of the previous stage."""
@@ -273,9 +275,6 @@ class Case(_Tables):
             )
             for k, (stage, tables) in enumerate(zip(stages, models, strict=True))
         )
-        removes = any(each.removes_bars for each in (case, *case.stage))
-        for each in (case, *case.stage):
-            each.__dict__["removes_bars"] = removes
         settle(case)
         return case
 
@@ -321,7 +320,7 @@ class Case(_Tables):
         self._check_not_fixed()
         new = self._reread(changed_data(self, changes))
         settle(self, attached=False)
-        for key in ("title", "plugins", *TABLES.values(), "removes_bars"):
+        for key in ("title", "plugins", *TABLES.values()):
             self.__dict__[key] = merge(self.__dict__[key], new.__dict__[key])
         self.__dict__["stage"] = merged_stages(self.stage, new.stage)
         settle(self)
@@ -358,7 +357,7 @@ class Case(_Tables):
     def copy(self, changes: Mapping[str, Any] | None = None, /, *, fixed: bool = False, **named: Any) -> Self:
         """Return a copy, with changes as for :meth:`update`; if ``fixed``, the copy cannot be changed."""
         made = self._reread(tables_of(self, given=True))
-        made.__dict__.update(overrides=self.overrides, removes_bars=self.removes_bars)
+        made.__dict__["overrides"] = self.overrides
         made.update(changes, **named)
         made.__dict__["fixed"] = fixed
         return made

@@ -66,11 +66,12 @@ def accelerations(u, alpha, a):
 
 
 @kernel
-def hold(begin, end, origin, nodes, components, positions, predictor, stiffness, u, load):
-    """Set the prescribed components [begin, end) of ``u`` to their values; ``load`` (k,) output: force that would move
-    them [N]. ``origin``: the node in the first row of ``predictor``, ``stiffness`` and ``u``."""
-    for k in range(begin, end):
-        i, c = nodes[k] - origin, components[k]
+def hold(supports, predictor, stiffness, u, load):
+    """Set prescribed components of ``u`` (owned, 3) to their values; ``load`` (k,) output: force that would move them
+    [N]. ``supports``: nodes, components and positions (k,)."""
+    nodes, components, positions = supports
+    for k in range(len(nodes)):
+        i, c = nodes[k], components[k]
         load[k] = stiffness[i] * u[i, c]
         u[i, c] = positions[k] - predictor[i, c]
 
@@ -98,11 +99,12 @@ def hold_still(
 
 
 @kernel
-def react(begin, end, origin, nodes, components, load, contact, stiffness, u, support):
-    """Write support forces [begin, end) into ``support`` (owned, 3) [N], from the loads that :func:`hold` computed."""
-    for k in range(begin, end):
+def react(supports, load, contact, stiffness, u, support):
+    """Write support forces into ``support`` (owned, 3) [N], from the loads that :func:`hold` computed."""
+    nodes, components, _ = supports
+    for k in range(len(nodes)):
         i, c = nodes[k], components[k]
-        support[i, c] = stiffness[i - origin] * u[i - origin, c] - load[k] - contact[i, c]
+        support[i, c] = stiffness[i] * u[i, c] - load[k] - contact[i, c]
 
 
 class ExplicitStepper(Stepper):
@@ -175,7 +177,8 @@ class ExplicitStepper(Stepper):
             if supports.inclined is not None:
                 others = self._hold(balance, stiffness, u)
             positions = supports.positions(balance.time)[: len(supports.nodes)]
-            hold(0, len(load), 0, supports.nodes, supports.components, positions, balance.predictor, stiffness, u, load)
+            held_at = supports.nodes, supports.components, positions
+            hold(held_at, balance.predictor, stiffness, u, load)
         walls, held, tolerance = model.contact.nothing, self._nobody, PROJECTED * model.size
         with self._faults(balance):
             state.contact = model.links.explicit(balance, state, u, stiffness, self.zero, tolerance)
@@ -191,9 +194,7 @@ class ExplicitStepper(Stepper):
                 held = nodes
         if supports.any:
             state.support = np.zeros_like(u)
-            react(
-                0, len(load), 0, supports.nodes, supports.components, load, state.contact, stiffness, u, state.support
-            )
+            react(held_at, load, state.contact, stiffness, u, state.support)
             if supports.inclined is not None:
                 state.support[supports.inclined.nodes] = others - supports.inclined.part(state.contact)
         return Solution(u, state.f, walls, contacts=model.links.count_held(held, len(u)))

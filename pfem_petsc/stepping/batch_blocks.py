@@ -410,17 +410,10 @@ def complete(n, f, half, nodes, alpha, eta, alone, held, stiffness, u, a, v):
             continue
         first = NODE_BLOCK * block
         last = min(first + NODE_BLOCK, n)
+        loads = nodes.external[first:last] if loaded else nothing
+        inertia = nodes.mass[first:last], nodes.damping
         explicit_increments(
-            nodes.external[first:last] if loaded else nothing,
-            f[first:last],
-            nodes.mass[first:last],
-            nodes.damping,
-            alpha,
-            eta,
-            nothing,
-            nothing,
-            stiffness[first:last],
-            u[first:last],
+            (loads, f[first:last]), inertia, (alpha, eta), (nothing, nothing), stiffness[first:last], u[first:last]
         )
         for k in range(nodes.support_starts[block], nodes.support_starts[block + 1]):
             u[nodes.support_nodes[k], nodes.support_components[k]] = held[k]

@@ -20,12 +20,17 @@ if TYPE_CHECKING:
 
 
 @kernel
-def explicit_increments(external, f, mass, damping, alpha, eta, a_hat, v_hat, stiffness, u):
+def explicit_increments(forces, inertia, factors, known, stiffness, u):
     """Solve (alpha m + eta c) u = f_ext - f_int - m a_hat - c v_hat for every node.
 
-    ``external``, ``a_hat``, ``v_hat`` are (owned, 3), or (0, 3) for zero; ``stiffness`` (owned,) and ``u`` (owned, 3)
-    are written.
+    ``forces``: f_ext and f_int; ``inertia``: m and c (owned,); ``factors``: alpha and eta; ``known``: a_hat and v_hat.
+    The first, a_hat and v_hat are (owned, 3), or (0, 3) for zero; ``stiffness`` (owned,) and ``u`` (owned, 3) are
+    written.
     """
+    external, f = forces
+    mass, damping = inertia
+    alpha, eta = factors
+    a_hat, v_hat = known
     loaded = len(external) > 0
     carried = len(a_hat) > 0
     damped = len(v_hat) > 0
@@ -158,18 +163,13 @@ class ExplicitStepper(Stepper):
         model, state = self.model, self.state
         inertia = model.inertia
         u, stiffness = np.empty_like(state.v), self._stiffness_for(balance)
-        explicit_increments(
-            state.external if model.external.active else self._none,
-            state.f,
-            inertia.mass,
-            inertia.damping,
-            balance.alpha,
-            balance.eta,
+        forces = state.external if model.external.active else self._none, state.f
+        known = (
             balance.a_hat if balance.a_hat is not None else self._none,
             balance.v_hat if inertia.damped else self._none,
-            stiffness,
-            u,
         )
+        factors = balance.alpha, balance.eta
+        explicit_increments(forces, (inertia.mass, inertia.damping), factors, known, stiffness, u)
         supports = model.supports
         state.contact = self.zero
         if supports.any:

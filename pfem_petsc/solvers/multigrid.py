@@ -10,7 +10,7 @@ from petsc4py import PETSc
 from ..mechanics.block_pattern import expand_columns
 from ..mechanics.compiled import kernel
 from ..mesh.exchange import Router
-from .background_grid import BackgroundGrid, arrange, assemble, interpolate, neighbours, restrict, stabilise
+from .background_grid import BackgroundGrid, Summands, arrange, assemble, interpolate, neighbours, restrict, stabilise
 from .linear import reproducible_products
 from .matrix_free import MatrixFreeHessian, full_blocks
 
@@ -62,25 +62,11 @@ class CoarseMatrix:
         self._scalar_columns = np.empty(int(self._pointers[-1]), PETSc.IntType)
         expand_columns(self._block_ptr, block_columns, self._scalar_columns)
 
-    def make(
-        self,
-        ends: np.ndarray,
-        x: np.ndarray,
-        stored: np.ndarray,
-        nodal: np.ndarray,
-        place: np.ndarray,
-        turned: np.ndarray,
-        extra: np.ndarray,
-    ) -> PETSc.Mat:
-        """Return the matrix for bars at ``x`` (local, 3) with ``stored`` (2, b), nodal inertia (owned,), and matrices
-        of some local nodes, see :func:`~pfem_petsc.solvers.background_grid.assemble`. Collective."""
+    def make(self, parts: Summands) -> PETSc.Mat:
+        """Return the matrix of what it is summed of. Collective."""
         grid = self.grid
-        each = grid.elements
         blocks = np.zeros((len(self._columns), 3, 3))
-        assemble(
-            grid.t, grid.base, each.boxes, each.corners, each.bars, each.bar_starts, ends, x, stored,
-            each.nodes, each.node_starts, nodal, extra, place, turned, self._ptr, self._columns, blocks,
-        )  # fmt: skip
+        assemble(grid.t, grid.base, grid.elements, parts, (self._ptr, self._columns), blocks)
         arrived = self._router.send(blocks[self._n_own :].reshape(-1, 9)).reshape(-1, 3, 3)
         values = np.zeros(len(self._scalar_columns))
         own = self._n_own
@@ -237,7 +223,9 @@ class GridMultigrid:
         matrices[place[nodes]] = turned
         further = np.zeros((len(every), 3, 3))
         further[place[extra_nodes]] = extra
-        matrix = self.pattern.make(mesh.bars, product.x, product.stored, problem.nodal, place, matrices, further)
+        matrix = self.pattern.make(
+            Summands(mesh.bars, product.x, product.stored, problem.nodal, place, matrices, further)
+        )
         self._new_solver(matrix)
         self._solver.setCoordinates(self._positions(problem)[: self.grid.n_owned])
         with reproducible_products(mesh.comm):

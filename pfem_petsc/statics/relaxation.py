@@ -61,8 +61,10 @@ def add_up(r, v, mass, sums):
 
 
 @kernel
-def move_freely(r, mass, keep, push, step, reach, v, u):
-    """v = keep v + push r/m, and u = step v, both (owned, 3); a node's u is at most ``reach`` (owned,) [m]."""
+def move_freely(r, mass, factors, reach, v, u):
+    """v = keep v + push r/m, and u = step v, both (owned, 3), with these three ``factors``; a node's u is at most
+    ``reach`` (owned,) [m]."""
+    keep, push, step = factors
     for i in range(len(r)):
         share = push / mass[i]
         square = 0.0
@@ -304,7 +306,7 @@ class PseudoMotion:
         """Compute v = keep v + push residual/m, x = x + step v, both with the constraints of walls."""
         owned = self.model.mesh.n_owned
         u = self._u
-        move_freely(self.residual, self.mass, keep, push, step, self._reach, self.v, u)
+        move_freely(self.residual, self.mass, (keep, push, step), self._reach, self.v, u)
         if self.model.contact.any:
             self._project(u)
             np.divide(u, step, out=self.v)

@@ -7,6 +7,7 @@ A module of one of the packages :data:`KINDS` has the name of its file. Other di
 from __future__ import annotations
 
 import ast
+import contextlib
 import difflib
 import importlib
 import pkgutil
@@ -19,6 +20,7 @@ from types import ModuleType
 from typing import Any, NamedTuple
 
 from .errors import InputError
+from .files import readable_whole
 
 
 class Kind(NamedTuple):
@@ -97,12 +99,21 @@ def lookup(package: str, name: str, where: str) -> ModuleType:
     raise InputError(f"{where}: unknown value {name!r}{hint}")
 
 
+def modules(package: str) -> dict[str, ModuleType]:
+    """Return all modules by name that can be imported; a package of others may be broken."""
+    found = {}
+    for name in choices(package):
+        with contextlib.suppress(InputError):
+            found[name] = lookup(package, name, "")
+    return found
+
+
 def description(package: str, name: str) -> str:
     """Return the first line of a module's docstring; one of the program is not imported, as some compile kernels."""
     if name in _own(package):
         text = ast.get_docstring(ast.parse(Path(find_spec(f"{package}.{name}").origin).read_text(encoding="utf-8")))
     else:
-        text = lookup(package, name, "").__doc__
+        text = getattr(modules(package).get(name), "__doc__", "cannot be imported")
     return (text or "").strip().partition("\n")[0]
 
 
@@ -118,7 +129,7 @@ def add_plugin(path: Path | str) -> None:
     """
     path = Path(path).resolve()
     try:
-        source = path.read_bytes()
+        source = readable_whole(path).read_bytes()
         if _sources.get(path) == source:
             return
         tree = ast.parse(source, str(path))

@@ -27,12 +27,9 @@ def _tables() -> dict[str, tuple[type[StrictModel] | Family, ...]]:
     """The tables of a case file by heading, with the models that have their keys."""
     found: dict[str, tuple[type[StrictModel] | Family, ...]] = {}
     for key, field in CaseModel.model_fields.items():
-        many, models, chosen = shape_of(field)
-        slot = getattr(models[0], "slot", None) if models else None
-        if slot is not None:
-            chosen = shape_of(models[0].model_fields[slot]).chosen
-        heading = {list: f"[[{key}]]", dict: f"[{key}.NAME]"}.get(many, f"[{key}]")
-        found[heading] = (*models, chosen) if isinstance(chosen, Family) else models
+        shape = shape_of(field)
+        heading = {list: f"[[{key}]]", dict: f"[{key}.NAME]"}.get(shape.many, f"[{key}]")
+        found[heading] = shape.models if shape.family is None else (*shape.models, shape.family)
     found["[[stage]]"] = (StageName, StageOutput)
     return {**{heading: models for heading, models in found.items() if models}, "Columns of files": (TableFile,)}
 
@@ -62,7 +59,9 @@ def page() -> str:
         "Generated from the models that validate case files; [the keys of a case file](../case_file.md) explains them, "
         "with examples. A key without default and not marked *required* may be left out. Whole numbers are accepted "
         "for numbers; rows are lists of lists.\n\n"
-        "The top level of a case file has `title` and the tables " + ", ".join(f"`{key}`" for key in KEYS[1:]) + ".\n"
+        "The top level of a case file has `title`, `plugins` (files with modules of your own) and the tables "
+        + ", ".join(f"`{key}`" for key in KEYS[2:])
+        + ".\n"
     )
     for heading, models in TABLES.items():
         text += f"\n## `{heading}`\n" if heading.startswith("[") else f"\n## {heading}\n"

@@ -28,7 +28,7 @@ from ..contact.walls.base import WallKeys
 from ..errors import InputError
 from ..fields import cell_fields, point_fields
 from ..mechanics.materials.base import LAWS, MaterialKeys, internal_variables, law_name
-from ..registry import choices, lookup, nearest
+from ..registry import choices, lookup, modules, nearest
 from . import tables as t
 from .base import ConstraintKeys, FilePath, Name, NonNegativeInt, PositiveInt, StrictModel, listed, refusal
 from .files import Columns, TableFile, file_columns, rows_of
@@ -173,7 +173,7 @@ class Family(Chosen):
 
     def keys(self) -> dict[str, list[str]]:
         """Return the keys of all modules by name, without common ones."""
-        found = {name: getattr(lookup(self.package, name, ""), "Parameters", None) for name in choices(self.package)}
+        found = {name: getattr(module, "Parameters", None) for name, module in modules(self.package).items()}
         common = self.models[0].model_fields
         return {n: [k for k in model.model_fields if k not in common] for n, model in found.items() if model}
 
@@ -217,11 +217,6 @@ class WithParameters(StrictModel):
     def __dir__(self) -> list[str]:
         others = self._others
         return sorted({*super().__dir__(), *(type(others).model_fields if others is not None else ())})
-
-    @classmethod
-    def family(cls) -> Family:
-        """The family of the keys that are not the table's own."""
-        return shape_of(cls.model_fields[cls.slot]).chosen
 
     @model_validator(mode="before")
     @classmethod
@@ -529,6 +524,18 @@ class Shape(NamedTuple):
     many: type | None
     models: tuple[type[StrictModel], ...]
     chosen: Any
+
+    @property
+    def family(self) -> Family | None:
+        """The family of the modules whose keys stand in the table, if there is one."""
+        slot = getattr(self.models[0], "slot", None) if self.models else None
+        found = self.chosen if slot is None else shape_of(self.models[0].model_fields[slot]).chosen
+        return found if isinstance(found, Family) else None
+
+    def keys(self) -> set[str]:
+        """The keys of the table, of any model and any module."""
+        own = {key for model in self.models for key in model.model_fields if key != getattr(model, "slot", None)}
+        return own.union(*(self.family.keys().values() if self.family is not None else ()))
 
 
 def shape_of(field: FieldInfo) -> Shape:

@@ -68,18 +68,13 @@ def _parsers(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParse
 
 def keys() -> Iterator[str]:
     """Yield the keys of --set: of lists those of the first entry, of named tables those of the built-in cases."""
-    from ..case.model import CaseModel, Family, shape_of
+    from ..case.model import CaseModel, shape_of
     from ..case.schema import Case
 
     cases = [Case.load(name) for name in built_in_cases()]
     for table, field in CaseModel.model_fields.items():
-        many, models, chosen = shape_of(field)
-        slot = getattr(models[0], "slot", None) if models else None
-        if slot is not None:
-            chosen = shape_of(models[0].model_fields[slot]).chosen
-        found = {key for model in models for key in model.model_fields if key != slot}
-        if isinstance(chosen, Family):
-            found |= {key for own in chosen.keys().values() for key in own}
+        shape = shape_of(field)
+        many, found = shape.many, shape.keys()
         names = {name for case in cases for name in case.__dict__[table]} if many is dict else ["0"] if many else []
         if not found:
             yield table

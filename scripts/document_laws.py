@@ -12,8 +12,7 @@ from typing import Any
 
 from pydantic_core import PydanticUndefined
 
-from pfem_petsc.case.materials import LAWS
-from pfem_petsc.mechanics.materials.base import MaterialKeys
+from pfem_petsc.mechanics.materials.base import LAWS, MaterialKeys
 from pfem_petsc.registry import choices, lookup
 
 __all__ = ["BEGIN", "END", "FILE", "text_of", "undocumented"]

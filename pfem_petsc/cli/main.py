@@ -14,7 +14,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
-from ..case.builtin import built_in_cases
+from ..case.toml import built_in_cases
 from ..errors import InputError
 from ..signals import give_back_early
 from .launcher import collectively, launched_rank, on_first_rank, refuse
@@ -53,6 +53,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     debug = "--debug" in own
     # overflows are reported by their consequences
     warnings.filterwarnings("default" if debug else "ignore", category=RuntimeWarning)
+    warnings.formatwarning = lambda message, *_, **__: f"warning: {message}\n"
     try:
         _require_text(words)
         arguments, verb = _parse(own)

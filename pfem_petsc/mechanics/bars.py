@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ..case.materials import internal_variables, law_of
 from ..energies import BAR_ENERGIES
 from ..errors import InputError
 from ..fields import STATUS
@@ -18,7 +17,7 @@ from ..mesh.node_sets import group_hint
 from .bar_loops import bar_lengths, first_inverted, make_kernels
 from .columns import Sweep, make_sweep
 from .conserving import MEASURES, make_conserving_kernels
-from .materials.base import BarShapes, Law, UnsuitableBarError
+from .materials.base import BarShapes, Law, UnsuitableBarError, internal_variables, law_of
 from .rupture import breakable, limit_values, make_release
 
 if TYPE_CHECKING:
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
     from ..case.tables import Section
     from ..mesh.distribution import Block, DistributedMesh
     from ..mesh.slab import MeshSlab
-    from ..solvers.matrix import BlockPattern
+    from .block_pattern import BlockPattern
     from .springs import Springs
 
 

@@ -231,10 +231,11 @@ class Result:
 
     @property
     def case(self) -> Case:
-        """The case, read from the text in the file."""
+        """The case, read from the text in the file; what plugins or packages that are not there had is a warning."""
         from ..case.schema import Case
 
-        return Case.from_toml(self.case_text, Path(self.attributes.get("folder", self.path.parent)))
+        folder = Path(self.attributes.get("folder", self.path.parent))
+        return Case.from_toml(self.case_text, folder, source=str(self.path), lenient=True)
 
     @property
     def bars(self) -> np.ndarray:

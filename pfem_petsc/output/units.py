@@ -7,9 +7,9 @@ from collections.abc import Iterable
 from functools import cache
 from typing import NamedTuple
 
-from ..case.materials import LAWS
 from ..fields import FIELDS
-from ..registry import choices, lookup
+from ..mechanics.materials.base import LAWS
+from ..registry import modules
 
 __all__ = [
     "AXES",
@@ -106,7 +106,7 @@ def field_unit(name: str) -> str:
 
 @cache
 def _units_of_variables() -> dict[str, str]:
-    return dict(variable for law in choices(LAWS) for variable in lookup(LAWS, law, "").LAW.internal)
+    return dict(variable for law in modules(LAWS).values() for variable in law.LAW.internal)
 
 
 def prefix_for(magnitude: float, unit: str) -> tuple[float, str]:

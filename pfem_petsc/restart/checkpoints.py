@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from mpi4py import MPI
 
-from ..case.overrides import split_key
-from ..case.toml import value_text
+from ..case.toml import split_key, value_text
 from ..errors import InputError
 from ..output import result as results
 from ..output.checkpoint import (
@@ -47,7 +46,7 @@ if TYPE_CHECKING:
     from ..stepping.stepper import Stepper
 
 
-FREE = ("title", "time.end", "static.end", "modes", "output", "solver")
+FREE = ("title", "plugins", "time.end", "static.end", "modes", "output", "solver")
 """Keys and tables that a restart may change: they do not change what is simulated."""
 
 _OF_STAGES = re.compile(r"stage\[(\d+)\]\.(.*)")

@@ -35,7 +35,7 @@ from ..mesh.exchange import Router
 from ..mesh.slab import slab_of
 from ..output.checkpoint import Checkpoint
 from ..parallel.natural import NaturalOrder
-from ..stepping.stage import StageStart
+from ..stepping.model import StageStart
 
 if TYPE_CHECKING:
     from ..recording.monitors import BlowUp

@@ -204,7 +204,7 @@ class Batch:
         state.step, state.time = begin + done - 1, (begin + done) * stepper.h
         stepper.balance = scheme.balance(state, stepper.h)
         if changed:
-            stepper.ruptures.note()
+            stepper.ruptures.note(state.x, stepper.number + 1, stepper.arrived())
             self.sums[done - 1, _BROKEN] = stepper.ruptures.count
         if known is not None:  # of earlier steps; the ranks have not synchronised since
             self.sums[: len(due), _ALARM] = 1.0
@@ -257,7 +257,7 @@ class Batches:
         """
         stepper, state, end = analysis.stepper, analysis.state, analysis.last_step
         begin = state.step
-        count = min(left, end - begin, MOST + 1, stepper.removals.steps_left()) - 1
+        count = min(left, end - begin, MOST + 1, stepper.removals.steps_left(state.time, stepper.h)) - 1
         if self._refused or count < _FEWEST or end < self._min_steps or not history.ledger.begun:
             return True
         if self._changes != stepper.support_changes:

@@ -6,7 +6,7 @@ import sys
 import pytest
 
 from pfem_petsc import __version__
-from pfem_petsc.case.builtin import built_in_cases
+from pfem_petsc.case.toml import built_in_cases
 from pfem_petsc.cli.list import KINDS
 from pfem_petsc.cli.main import VERBS, main
 from pfem_petsc.cli.parser import seconds

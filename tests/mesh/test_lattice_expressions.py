@@ -209,7 +209,7 @@ def test_nodes_go_where_the_map_says(comm, more):
 
 
 def test_a_map_that_makes_nodes_meet_is_refused():
-    from pfem_petsc.case.tables import Mesh
+    from pfem_petsc.case.model import Mesh
     from pfem_petsc.mesh import load_slab
 
     keys = lattice.Parameters(kind="cubic", cells=(2, 2, 2), pitch=0.5, map=("x", "y", "max(z, 0.5)"))

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from helpers.generated import OCTET, degrees, generated, lengths
 
-from pfem_petsc.mesh.lattices.numbering import CellByCell, ItemByItem
-from pfem_petsc.mesh.lattices.shape import random_numbers
+from pfem_petsc.mesh.lattices.block import CellByCell, ItemByItem, random_numbers
 
 
 def as_sets(mesh):

@@ -10,7 +10,7 @@ from helpers.surfaces import CORNERS, CUBE, filled, write_stl
 
 from pfem_petsc import Case, cases
 from pfem_petsc.errors import InputError
-from pfem_petsc.mesh.lattices.surface_files import read_surface
+from pfem_petsc.mesh.lattices.surface import read_surface
 
 
 def test_obj_and_ply_are_read(tmp_path):

@@ -15,7 +15,7 @@ from pfem_petsc import Case, Simulation, cases
 from pfem_petsc.errors import InputError
 from pfem_petsc.mesh.checks import check_mesh
 from pfem_petsc.mesh.generators import lattice
-from pfem_petsc.mesh.lattices.surface_files import read_surface
+from pfem_petsc.mesh.lattices.surface import read_surface
 
 """Triangles of a unit cube, with outward normals."""
 
@@ -239,7 +239,7 @@ def test_graded_cells_cover_the_surface(tmp_path, kind, below):
 )
 def test_gradings_that_do_not_fit_the_surface(tmp_path, factor, origin, told, monkeypatch):
     path = write_stl(tmp_path / "cube.stl", CORNERS + (0.0, 0.0, 0.125), CUBE)
-    monkeypatch.setattr("pfem_petsc.mesh.lattices.shape._STEPS", 1)
+    monkeypatch.setattr("pfem_petsc.mesh.lattices.block._STEPS", 1)
     with pytest.raises(InputError, match=told):
         filled(kind="cubic", pitch=0.25, surface={"file": str(path)}, grading=(1, 1, factor), origin=origin)
 

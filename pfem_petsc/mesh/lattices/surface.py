@@ -15,7 +15,9 @@ from ...errors import InputError
 from ...files import readable_whole
 
 if TYPE_CHECKING:
-    from vtkmodules.vtkCommonDataModel import vtkPolyData
+    import pyvista
+
+_Triangles = tuple[np.ndarray, np.ndarray]
 
 ON = 1e-6
 """Points nearer to the surface than this fraction of the bar lengths count as inside: those on it are inside."""
@@ -46,8 +48,10 @@ class Surface:
         return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
 
     @cached_property
-    def _data(self) -> vtkPolyData:
-        return poly_data(self.points, self.triangles)
+    def _data(self) -> pyvista.PolyData:
+        import pyvista
+
+        return pyvista.PolyData.from_regular_faces(self.points, self.triangles)
 
     @cached_property
     def _distance(self) -> Any:
@@ -157,24 +161,6 @@ class Surface:
         return line, np.clip(along, 0.0, 1.0)
 
 
-def poly_data(points: np.ndarray, triangles: np.ndarray) -> vtkPolyData:
-    """Return points (n, 3) and triangles (m, 3) as an object of VTK."""
-    from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
-    from vtkmodules.vtkCommonCore import vtkPoints
-    from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkPolyData
-
-    data, nodes, cells = vtkPolyData(), vtkPoints(), vtkCellArray()
-    nodes.SetData(numpy_to_vtk(np.ascontiguousarray(points), deep=True))
-    offsets = np.arange(0, 3 * len(triangles) + 1, 3)
-    cells.SetData(
-        numpy_to_vtkIdTypeArray(offsets, deep=True),
-        numpy_to_vtkIdTypeArray(np.ascontiguousarray(triangles.ravel()), deep=True),
-    )
-    data.SetPoints(nodes)
-    data.SetPolys(cells)
-    return data
-
-
 _READERS = {
     ".stl": ("vtkmodules.vtkIOGeometry", "vtkSTLReader"),
     ".obj": ("vtkmodules.vtkIOGeometry", "vtkOBJReader"),
@@ -192,6 +178,8 @@ def read_surface(path: Path, scale: float) -> Surface:
     InputError
         If the file is not there, is not of triangles, or the surface is open.
     """
+    import pyvista
+
     where = f"mesh.surface.file: {path}"
     if path.suffix.lower() not in _READERS:
         raise InputError(f"{where}: no reader for {path.suffix or 'no suffix'}; known: {', '.join(_READERS)}")
@@ -205,14 +193,17 @@ def read_surface(path: Path, scale: float) -> Surface:
     messages = _observed(reader)
     reader.SetFileName(str(path))
     reader.Update()
-    points, triangles = _triangles(reader.GetOutput(), 0.0)
+    data = pyvista.wrap(reader.GetOutput())
+    points, triangles = _triangles(data)
     if len(triangles) == 0 or not np.isfinite(points).all():
         what = f" ({messages[0]})" if messages else ""
         raise InputError(f"{where}: no surface of triangles could be read from it{what}")
     count, edge = _open_edges(triangles)
     if count:
-        points, triangles = _better((points, triangles), _triangles(reader.GetOutput(), _MERGED))
-        points, triangles = _better((points, triangles), _oriented(points, triangles))
+        points, triangles = _better((points, triangles), _triangles(data, _MERGED))
+        data = pyvista.PolyData.from_regular_faces(points, triangles)
+        turned = data.compute_normals(cell_normals=False, auto_orient_normals=True)
+        points, triangles = _better((points, triangles), _triangles(turned))
         count, edge = _open_edges(triangles)
     if count:
         a, b = (", ".join(f"{x:.6g}" for x in points[node]) for node in edge)
@@ -243,24 +234,14 @@ def _observed(reader: Any) -> list[str]:
     return messages
 
 
-def _triangles(data: vtkPolyData, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
+def _triangles(data: pyvista.PolyData, tolerance: float = 0.0) -> _Triangles:
     """Return points and triangles; points within the tolerance, in diagonals, are merged, flat triangles left out."""
-    from vtkmodules.util.numpy_support import vtk_to_numpy
-    from vtkmodules.vtkFiltersCore import vtkCleanPolyData, vtkTriangleFilter
-
-    split, clean = vtkTriangleFilter(), vtkCleanPolyData()
-    split.PassLinesOff()
-    split.PassVertsOff()
-    split.SetInputData(data)
-    clean.SetInputConnection(split.GetOutputPort())
-    clean.SetTolerance(tolerance)
-    clean.Update()
-    found = clean.GetOutput()
-    if found.GetNumberOfPolys() == 0:
+    data = data.triangulate()
+    if data.n_cells == 0:
         return np.empty((0, 3)), np.empty((0, 3), np.int64)
-    points = vtk_to_numpy(found.GetPoints().GetData()).astype(np.float64)
-    corners = vtk_to_numpy(found.GetPolys().GetConnectivityArray()).reshape(-1, 3).astype(np.int64)
-    return points, corners[(corners != np.roll(corners, 1, axis=1)).all(axis=1)]
+    data = data.clean(tolerance=tolerance, absolute=False)
+    corners = data.faces.reshape(-1, 4)[:, 1:].astype(np.int64)
+    return data.points.astype(np.float64), corners[(corners != np.roll(corners, 1, axis=1)).all(axis=1)]
 
 
 def _open_edges(triangles: np.ndarray) -> tuple[int, np.ndarray]:
@@ -273,19 +254,6 @@ def _open_edges(triangles: np.ndarray) -> tuple[int, np.ndarray]:
     return len(wrong), pairs[wrong[0]] if len(wrong) else np.empty(0, np.int64)
 
 
-def _oriented(points: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the triangles with normals of one sense."""
-    from vtkmodules.vtkFiltersCore import vtkPolyDataNormals
-
-    normals = vtkPolyDataNormals()
-    normals.SetInputData(poly_data(points, triangles))
-    normals.ConsistencyOn()
-    normals.AutoOrientNormalsOn()
-    normals.SplittingOff()
-    normals.Update()
-    return _triangles(normals.GetOutput(), 0.0)
-
-
-def _better(one: tuple[np.ndarray, np.ndarray], two: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+def _better(one: _Triangles, two: _Triangles) -> _Triangles:
     """Return the points and triangles with fewer open edges; a surface that has lost all triangles is no better."""
     return two if len(two[1]) and _open_edges(two[1])[0] < _open_edges(one[1])[0] else one

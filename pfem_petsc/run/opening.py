@@ -13,9 +13,9 @@ from ..case.schema import Case
 from ..errors import printable
 from ..output.progress import Progress
 from ..output.vtkhdf import ResultWriter
+from ..preflight.forecast import summarise
 from ..preflight.inspection import warnings_before
-from ..preflight.sanity import odd_accelerations
-from ..preflight.summary import summarise
+from ..preflight.values import odd_accelerations
 from ..recording.fields import Fields
 from ..recording.history import History
 from ..recording.recorder import Recorder

@@ -75,7 +75,7 @@ class NeighbourSearch:
         comm.Allreduce(MPI.IN_PLACE, high, op=MPI.MAX)
         sizes = lengths + 2.0 * one.margin
         number, long, size = comm.allreduce(np.array([len(lengths), np.count_nonzero(lengths), sizes.sum()]))
-        self._low, self._cell, self.crowded = low, 0.5 * size / max(long, 1.0), False
+        self._low, self._cell, self.crowded = low, 0.7 * size / max(long, 1.0), False
         self._held, self._start, change = one, np.zeros(1, np.int64), 1.0
         while number:
             cells = ((lengths // self._cell + 1.0) * (2.0 + 2.0 * one.margin / self._cell) ** 3).sum()
@@ -93,23 +93,21 @@ class NeighbourSearch:
 
     def _hold(self, comm: MPI.Comm, own: Segments) -> None:
         """Send segments to the ranks of their cells, and sort the cells that are held by this one. Collective."""
+        none, no_rows = np.empty(0, np.int64), np.empty(0, np.int32)
         if comm.size > 1:
-            ranks, rows = self._listed(own, comm.size, -1)
-            each = np.unique(rows * comm.size + ranks)
+            cells = own.ends, own.margin, self._low, self._cell
+            count = _list_cells(*cells, (comm.size, -1), none, (none, no_rows))
+            ranks, rows = np.empty(count, np.int64), np.empty(count, np.int32)
+            _list_cells(*cells, (comm.size, -1), none, (ranks, rows))
+            each = np.unique(rows.astype(np.int64) * comm.size + ranks)
             router = Router(comm, each % comm.size, each // comm.size)
             own = Segments(*(router.send(array) for array in own))
-        self._held = own
-        self._start, self._keys, self._rows = _buckets(*self._listed(own, comm.size, comm.rank))
-
-    def _listed(self, segments: Segments, size: int, rank: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the cells of a rank around each segment and its row; with -1, the ranks of all cells and the row."""
-        room = 12 * len(segments.ids)
-        while True:
-            keys, rows = np.empty(room, np.int64), np.empty(room, np.int64)
-            count = _list_cells(segments.ends, segments.margin, self._low, self._cell, (size, rank), keys, rows)
-            if count <= room:
-                return keys[:count], rows[:count]
-            room = count
+        cells = own.ends, own.margin, self._low, self._cell
+        counts = np.zeros(1 << (2 * len(own.ids)).bit_length(), np.int64)
+        count = _list_cells(*cells, (comm.size, comm.rank), counts, (none, no_rows))
+        self._start = np.append(0, np.cumsum(counts))
+        self._held, self._keys, self._rows = own, np.empty(count, np.int64), np.empty(count, np.int32)
+        _list_cells(*cells, (comm.size, comm.rank), self._start[:-1].copy(), (self._keys, self._rows))
 
     def pairs(self) -> Iterator[Pairs]:
         """Yield the pairs that this rank finds, a limited number at a time; each is found by one rank."""
@@ -146,9 +144,11 @@ def _mixed(key):
 
 
 @kernel
-def _list_cells(ends, margins, low, cell, ranks, keys, rows):
-    """List the cells around segments, as far as there is room: the cell and the row of the segment, for cells of
-    ``ranks[1]`` of ``ranks[0]``; with -1, the rank of the cell and the row. Returns the length of the list."""
+def _list_cells(ends, margins, low, cell, ranks, buckets, listed):
+    """List the cells around segments: the key of the cell and the row of the segment, for cells of ``ranks[1]`` of
+    ``ranks[0]``; with -1, the rank of the cell and the row. Each goes to the place that its bucket, if there are any,
+    is at, which moves on; without arrays for the list they are counted. Returns the length of the list."""
+    keys, rows = listed
     size, rank = ranks
     first = np.empty(3, np.int64)
     last = np.empty(3, np.int64)
@@ -181,35 +181,19 @@ def _list_cells(ends, margins, low, cell, ranks, keys, rows):
                             holder = _mixed(_key(i // _BLOCK, j // _BLOCK, k // _BLOCK)) % size
                         if rank >= 0 and holder != rank:
                             continue
-                        if count < len(keys):
-                            keys[count] = holder if rank < 0 else _key(i, j, k)
-                            rows[count] = n
+                        key = holder if rank < 0 else _key(i, j, k)
+                        at = count
+                        if len(buckets):
+                            bucket = _mixed(key) & (len(buckets) - 1)
+                            at = buckets[bucket]
+                            buckets[bucket] += 1
+                        if len(keys):
+                            keys[at] = key
+                            rows[at] = n
                         count += 1
             before[0] = first
             before[1] = last
     return count
-
-
-@kernel
-def _buckets(keys, rows):
-    """Sort a list into buckets of cells: returns the start of each bucket (buckets + 1,), and the sorted list."""
-    size = 1
-    while size < len(keys):
-        size *= 2
-    start = np.zeros(size + 1, np.int64)
-    for key in keys:
-        start[(_mixed(key) & (size - 1)) + 1] += 1
-    for b in range(size):
-        start[b + 1] += start[b]
-    at = start[:size].copy()
-    cells = np.empty_like(keys)
-    segments = np.empty_like(rows)
-    for n in range(len(keys)):
-        b = _mixed(keys[n]) & (size - 1)
-        cells[at[b]] = keys[n]
-        segments[at[b]] = rows[n]
-        at[b] += 1
-    return start, cells, segments
 
 
 @inlined

@@ -7,6 +7,7 @@ from helpers.mesh_files import case_of
 from helpers.runs import inspected
 
 from pfem_petsc import Case
+from pfem_petsc.registry import lookup
 
 pytestmark = pytest.mark.parallel
 
@@ -109,9 +110,8 @@ def test_lengths_that_differ_too_much_for_a_search_are_told(told):
 @pytest.mark.parametrize("name", ["rod_impact", "ring_impact", "lattice_drop", "tumbling_lattice"])
 def test_generated_meshes_have_no_overlaps(comm, name, shared_tmp_path):
     """Nor when they are read from arrays, whose nodes and bars are checked."""
-    mesh = Case.load(name, ["mesh.cells=[3,3,3]"] if name == "lattice_drop" else []).mesh.parameters
-    module = __import__(f"pfem_petsc.mesh.generators.{mesh.__module__.split('.')[-1]}", fromlist=["generate"])
-    slab = module.generate(mesh, 0, 1)
+    mesh = Case.load(name, ["mesh.cells=[3,3,3]"] if name == "lattice_drop" else []).mesh
+    slab = lookup("pfem_petsc.mesh.generators", mesh.generator, "").generate(mesh.parameters, 0, 1)
     entries, warnings = inspected(case_of(shared_tmp_path, comm, slab.points, slab.bars), comm)
     assert not {"same place", "nodes on bars"} & set(entries)
     assert not any("overlap" in text or "on bars" in text for text in warnings)

@@ -193,10 +193,11 @@ class _Left:
 
     def _longest(self) -> float:
         """Return a length [m] that no bar of any rank exceeds. Collective."""
-        longest = 0.0
+        used, longest = (self._first, self._first + self._n_used), 0.0
+        (points,) = self.block.nodes.arrays(used, lambda *nodes: [self.block.positions(*nodes)])
         for start in range(0, len(self.bars), PIECE):
-            one, two = self._end_points(slice(start, start + PIECE))
-            longest = max(longest, float(np.linalg.norm(two - one, axis=1).max()))
+            ends = points[self.ends[start : start + PIECE] - self._first]
+            longest = max(longest, float(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).max()))
         return self._comm.allreduce(longest, op=MPI.MAX) * (1.0 + 1e-9)
 
     def _cut(self, surface: Surface) -> None:

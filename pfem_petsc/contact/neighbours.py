@@ -29,8 +29,8 @@ _SECOND = 1 << 62  # added to the numbers of the second set of segments
 class Segments(NamedTuple):
     """Segments of a rank.
 
-    ids (n,) int64: numbers, unique on all ranks; labels (n, 2) int64: those with a common one are no pair; ends
-    (n, 2, 3) [m]; margin (n,) [m]: pairs are closer than the sum of theirs
+    ids (n,) int64: numbers, unique on all ranks; labels (n, k) int64: those with a common one are no pair; ends
+    (n, 2, 3) [m]; margin (n,) [m]: pairs are not farther apart than the sum of theirs
     """
 
     ids: np.ndarray
@@ -40,13 +40,14 @@ class Segments(NamedTuple):
 
 
 class Pairs(NamedTuple):
-    """Pairs (m,): their ids and labels (m, 2, ...), where they are closest to each other, from 0 at the first end of
-    each to 1 at the second (m, 2), and their distance there (m,) [m]."""
+    """Pairs: their ids (m, 2) and labels (m, 2, k), where they are closest to each other, from 0 at the first end of
+    each to 1 at the second (m, 2), their distance there (m,) [m], and the sum of their margins (m,) [m]."""
 
     ids: np.ndarray
     labels: np.ndarray
     at: np.ndarray
     distance: np.ndarray
+    reach: np.ndarray
 
 
 class NeighbourSearch:
@@ -125,7 +126,8 @@ class NeighbourSearch:
             if found:
                 ids = self._held.ids[rows]
                 ids[ids >= _SECOND] -= _SECOND
-                yield Pairs(ids, self._held.labels[rows], at[:found], distance[:found])
+                reach = self._held.margin[rows].sum(axis=1)
+                yield Pairs(ids, self._held.labels[rows], at[:found], distance[:found], reach)
             first = last
 
 
@@ -253,12 +255,11 @@ def _compare(buckets, held, grid, found_rows, found_at, found_distance):
                 b = rows[q] if a == rows[p] else rows[p]
                 if between and (ids[a] >= _SECOND or ids[b] < _SECOND):
                     continue
-                if labels[a, 0] == labels[b, 0] or labels[a, 1] == labels[b, 1]:
-                    continue
-                if labels[a, 0] == labels[b, 1] or labels[a, 1] == labels[b, 0]:
-                    continue
                 reach = margin[a] + margin[b]
                 apart = False
+                for i in range(labels.shape[1]):
+                    for j in range(labels.shape[1]):
+                        apart |= labels[a, i] == labels[b, j]
                 for c in range(3):
                     apart |= min(ends[a, 0, c], ends[a, 1, c]) - max(ends[b, 0, c], ends[b, 1, c]) > reach
                     apart |= min(ends[b, 0, c], ends[b, 1, c]) - max(ends[a, 0, c], ends[a, 1, c]) > reach

@@ -154,20 +154,19 @@ class Geometry:
         search = NeighbourSearch(comm, own, nodes)
         if search.crowded:
             return None
-        between, on_bars, twins = 0, np.empty((0, 4), np.int64), np.empty((0, 2), np.int64)
+        between, on_bars, twins = 0, [], np.empty((0, 2), np.int64)
         for pairs in search.pairs():
             part = pairs.at[:, 0]
             inner = (part > _ANGLE) & (part < 1.0 - _ANGLE)
             between += int(inner.sum())
             rows = np.concatenate([pairs.ids, pairs.labels[:, 0]], axis=1)[inner]
-            on_bars = np.concatenate([on_bars, rows])
-            on_bars = on_bars[np.lexsort(on_bars[:, 1::-1].T)][:_SHOWN]
+            on_bars = sorted(on_bars + rows.tolist())[:_SHOWN]
             end = pairs.labels[np.arange(len(part)), 0, (part > 0.5).astype(np.int64)]
             met = np.sort(np.stack([end, pairs.ids[:, 1]], axis=1)[~inner], axis=1)
             twins = np.unique(np.concatenate([twins, met]), axis=0)  # one for each bar of its nodes
         alike = np.unique(twins)
         alike = np.unique(Router(comm, slab_of(alike, mesh.n_nodes, comm.size)).send(alike))
-        every = sorted(row for some in comm.allgather(on_bars.tolist()) for row in some)[:_SHOWN]
+        every = sorted(row for some in comm.allgather(on_bars) for row in some)[:_SHOWN]
         shown = [f"node {node} on {_bar(bar, a, b)}" for bar, node, a, b in every]
         together = sorted({tuple(pair) for some in comm.allgather(twins[:_SHOWN].tolist()) for pair in some})
         twins_shown = [f"nodes {a} and {b}" for a, b in together[:_SHOWN]]

@@ -27,7 +27,7 @@ class Field(NamedTuple):
     ----------
     place : ``nodes``, values (owned, 3), or ``bars``, values (local bars,)
     unit : SI unit, empty for a pure number
-    value : returns its values from a :class:`~pfem_petsc.recording.fields.Snapshot`; called by all ranks
+    value : returns its values from a :class:`~pfem_petsc.recording.recorder.Snapshot`; called by all ranks
     default : whether it is written if a case does not name fields, from a :class:`~pfem_petsc.stepping.model.Model`
     """
 

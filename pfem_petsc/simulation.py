@@ -13,10 +13,10 @@ from mpi4py import MPI
 
 from .analysis import Analysis, Step
 from .case.schema import Case
-from .contact.start import check_start
+from .contact.contact import check_start
 from .errors import InputError, PfemError
 from .integrators.base import State
-from .mechanics.state_forces import ForceState
+from .mechanics.loads import ForceState
 from .output.lock import FolderLock
 from .parallel.agreement import on_root
 from .parallel.heap import returning_freed_memory
@@ -25,15 +25,13 @@ from .preflight.forecast import forecast, summarise
 from .preflight.inspection import inspect, warnings_before
 from .preflight.values import odd_accelerations
 from .recording.recorder import Recorder
-from .restart.folder import Restart, find_restart, finished, finished_message
-from .run.compilation import ReportedCompilation
+from .restart.checkpoints import Restart, find_restart, finished, finished_message
 from .run.loop import RunLoop
-from .run.outputs import Outputs
+from .run.outputs import Outputs, ReportedCompilation
 from .run.stages import Stages
-from .run.stop import StopRequest
-from .run.synchroniser import Synchroniser
+from .run.synchroniser import StopRequest, Synchroniser
 from .statics.equations import WithEquations
-from .stepping.fused_steps import WORTH, Batches
+from .stepping.batches import WORTH, Batches
 from .stepping.model import Model
 from .stepping.stepper import Stepper
 
@@ -225,7 +223,7 @@ class Simulation(WithEquations):
         """Register a function that computes external forces. Collective; call it before the run.
 
         The function is called on each rank as ``function(t, state)`` with a time [s] and a
-        :class:`~pfem_petsc.mechanics.state_forces.ForceState`, and returns forces (owned, 3) [N] on this rank's nodes,
+        :class:`~pfem_petsc.mechanics.loads.ForceState`, and returns forces (owned, 3) [N] on this rank's nodes,
         which are added to the loads. ``state`` contains their mesh numbers, and positions and velocities predicted
         for this time from the last state. The function may be called several times in a step, and again if the step is
         bisected, so it must depend only on its arguments. Its work is part of ``external_work``. It acts in dynamic

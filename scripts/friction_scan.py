@@ -21,7 +21,7 @@ from pfem_petsc import Case
 from pfem_petsc.errors import InputError
 from pfem_petsc.stepping.model import Model
 from pfem_petsc.stepping.plan import make_plan
-from pfem_petsc.stepping.prepare import make_stepper
+from pfem_petsc.stepping.time_stepping import make_stepper
 
 DOCUMENT = Path(__file__).resolve().parent.parent / "docs" / "contact.md"
 START, END = "<!-- table: scripts/friction_scan.py -->\n", "<!-- end of friction -->"

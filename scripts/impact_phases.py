@@ -22,14 +22,13 @@ import numpy as np
 from mpi4py import MPI
 
 from pfem_petsc import Case
-from pfem_petsc.contact.impact_phases import Asked, scan_impacts
 from pfem_petsc.errors import InputError, SimulationFailure
 from pfem_petsc.registry import lookup
-from pfem_petsc.stepping.contact_check import BOUND, contact_gain, overshoots
+from pfem_petsc.stepping.contact_check import BOUND, Asked, contact_gain, overshoots, scan_impacts
 from pfem_petsc.stepping.model import Model
 from pfem_petsc.stepping.plan import make_plan
-from pfem_petsc.stepping.prepare import make_stepper
 from pfem_petsc.stepping.stepper import Stepper
+from pfem_petsc.stepping.time_stepping import make_stepper
 
 DOCS = Path(__file__).parent.parent / "docs"
 START, END = "<!-- table: scripts/impact_phases.py -->\n", "<!-- end of phases -->"
@@ -63,7 +62,7 @@ SCHEMES = (
 
 @dataclass(frozen=True)
 class Impacts:
-    """Results of the impacts; arrays (phases,) as in :class:`pfem_petsc.contact.impact_phases.ImpactScan`.
+    """Results of the impacts; arrays (phases,) as in :class:`pfem_petsc.stepping.contact_check.ImpactScan`.
 
     ``warned``: whether the program warned about gains before it started.
     """

@@ -137,7 +137,7 @@ def count(kind: str, seeds: list[int], rule: str, folder: Path) -> dict[int, dic
     from petsc4py import PETSc
 
     from pfem_petsc.errors import InputError
-    from pfem_petsc.stepping.halving import HalvedSteps
+    from pfem_petsc.stepping.implicit import HalvedSteps
 
     newton = importlib.import_module("pfem_petsc.solvers.newton")
     totals: Counter[str] = Counter()

@@ -123,7 +123,7 @@ def document(
     operations: float | None = None,
 ) -> str:
     """Return all measurements as JSON."""
-    from ..output.provenance import describe_run
+    from ..output.layout import describe_run
 
     content: dict[str, Any] = {
         "machine": {"processor": processor(), "cores": os.cpu_count(), "system": platform.platform()},

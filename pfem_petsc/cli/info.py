@@ -13,8 +13,7 @@ from .parser import PROGRAM, add_result, surviving
 if TYPE_CHECKING:
     import numpy as np
 
-    from ..output.result import Result
-    from ..output.result_tables import Modes
+    from ..output.result import Modes, Result
 
 RANKS = "one"
 

@@ -135,7 +135,7 @@ def _write(arguments: argparse.Namespace, mesh: WholeMesh) -> None:
     """Write the mesh, and a case file if there is to be one; print what they are."""
     import numpy as np
 
-    from ..mesh.skeleton import skeleton
+    from ..mesh.whole import skeleton
     from ..mesh.writers import write_whole
 
     if arguments.area is not None:
@@ -167,7 +167,7 @@ def _made(what: str, overrides: list[str]) -> WholeMesh:
     from mpi4py import MPI
 
     from ..case.schema import Case
-    from ..mechanics.sections import section_of_bars
+    from ..mechanics.bars import section_of_bars
     from ..mesh import load_slab
     from ..mesh.whole import WholeMesh
     from ..registry import choices

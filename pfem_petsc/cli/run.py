@@ -92,7 +92,7 @@ def _load(arguments: argparse.Namespace) -> Case:
     overrides = arguments.overrides
     restart = getattr(arguments, "restart", None)
     if restart is not None:
-        from ..restart.overrides import joined_overrides, kept_overrides
+        from ..restart.checkpoints import joined_overrides, kept_overrides
 
         name = (built_in_path(arguments.case) or Path(arguments.case)).stem
         kept = kept_overrides(name, arguments.output or Path("results", name), restart)

@@ -1,11 +1,5 @@
-"""The active set of contact in an implicit step: bounded solves until all rows of walls and links are satisfied.
-
-A step is solved with bounds for the nodes that may reach a wall and for the links that may close. Afterwards all rows
-are checked: walls that nodes were not expected to reach, walls without a row among the three coordinates, curved walls
-whose tangent plane was taken at another point, links that have closed, and rows whose gradients have turned. If any
-check fails, the step is solved again from the current solution with updated candidates. Data flow:
-
-    Candidates -> Trial (frames, transform) -> Bounds -> solution -> Outcome (forces, next Candidates) -> ...
+"""The active set of contact in an implicit step: bounded solves until all rows of walls and links hold, with Coulomb
+friction.
 """
 
 from __future__ import annotations
@@ -20,22 +14,410 @@ from mpi4py import MPI
 from ..errors import NotConverged
 from ..integrators.base import Balance, State
 from ..tolerances import BEYOND, ON_BOUND, PROJECTED
-from .bounds import Bounds
-from .candidates import Candidates, expected_candidates
-from .forces import WallForces
-from .frames import MIN_VOLUME, NodalFrames
-from .implicit_friction import StepFriction
-from .links import LinkCoordinates
-from .no_friction import NoStepFriction
+from .contact import Candidates, expected_candidates
+from .explicit import LocalSolution, jam, solve_locally
+from .forces import WallForces, held_by_supports
+from .frames import MIN_VOLUME, NodalFrames, Sliding
+from .links import LinkCoordinates, Transform
 from .projection import project
-from .transform import Transform
-from .wall_check import broken_walls, is_misaligned, is_off_surface
 
 if TYPE_CHECKING:
     from ..stepping.model import Model
     from ..stepping.problem import StepProblem
+    from .contact import Contact
 
-__all__ = ["ActiveSet", "Outcome", "Trial"]
+
+@dataclass(frozen=True)
+class Bounds:
+    """Lower and upper bounds that the rows of walls and links place on the unknowns.
+
+    Attributes
+    ----------
+    arrays : lower and upper bounds (owned, 3) [m], infinite where there is no bound; None in free flight
+    """
+
+    arrays: tuple[np.ndarray, np.ndarray] | None = None
+
+    def clip(self, w: np.ndarray) -> np.ndarray:
+        """Return a guess (owned, 3) clipped exactly to the bounds."""
+        return w if self.arrays is None else np.clip(w, *self.arrays)
+
+    def project(self, w: np.ndarray, within: float) -> None:
+        """Set unknowns (owned, 3) within ``within`` [m] of a bound to the bound, in place."""
+        for bound in self.arrays or ():
+            near = np.abs(w - bound) <= within
+            w[near] = bound[near]
+
+    def active(self, nodes: np.ndarray, w: np.ndarray, g: np.ndarray, noise: float) -> np.ndarray:
+        """Return (m, 3) int8: -1 where an unknown of nodes (m,) is active at its lower bound, 1 at the upper, else 0.
+
+        ``w`` (owned, 3); ``g`` (m, 3) residual of these nodes, zero up to ``noise`` [N].
+        """
+        lower, upper = self.arrays
+        active = np.zeros((len(nodes), 3), dtype=np.int8)
+        active[(w[nodes] <= lower[nodes]) & (g > noise)] = -1
+        active[(w[nodes] >= upper[nodes]) & (g < -noise)] = 1
+        return active
+
+
+def broken_walls(
+    contact: Contact,
+    displacements: np.ndarray,
+    candidates: Candidates,
+    frames: NodalFrames,
+    x: np.ndarray,
+    tolerance: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return nodes (k,) beyond walls that no bound of theirs represents, and these walls (k, walls) bool.
+
+    Parameters
+    ----------
+    contact : Contact
+    displacements : (walls, 3) of walls [m]
+    candidates, frames : of the solve
+    x : (owned, 3) solution [m]
+    tolerance : depth that counts as zero [m]
+    """
+    beyond = np.flatnonzero(contact.near(x, displacements, np.array([-tolerance])))
+    applicable = contact.applicable(beyond, x[beyond], displacements)
+    normals, offsets = contact.planes(applicable, x[beyond], displacements)
+    gaps = np.einsum("iwk,ik->iw", normals, x[beyond]) - offsets
+    broken = gaps < -tolerance
+    place = np.searchsorted(candidates.nodes, beyond)
+    known = place < len(candidates.nodes)
+    known[known] = candidates.nodes[place[known]] == beyond[known]
+    # walls with their own bound are satisfied to rounding of the coordinates; supports override walls
+    place = place[known]
+    broken[known] &= (frames.rows[place] < 0) | frames.shared[place]
+    broken &= ~contact.ties.held[beyond][:, None]
+    broken &= ~held_by_supports(contact.fixed[beyond][:, None, :], normals)
+    met = broken.any(axis=1)
+    return beyond[met], broken[met]
+
+
+def is_misaligned(frames: NodalFrames, strengths: np.ndarray) -> bool:
+    """Return whether a wall presses through the row of an almost parallel wall, so that the force is off its normal."""
+    normal_forces = strengths > 0.0
+    astray = normal_forces & frames.shared
+    for node, wall in np.argwhere(astray):
+        own = (frames.rows[node] == frames.rows[node, wall]) & ~frames.shared[node]
+        turn = np.abs(
+            frames.normals[node, wall] - frames.signs[node, wall] * frames.basis[node, frames.rows[node, wall]]
+        )
+        if turn.max() > ON_BOUND and not (normal_forces[node] & own).any():
+            return True
+    return False
+
+
+def is_off_surface(
+    contact: Contact,
+    displacements: np.ndarray,
+    frames: NodalFrames,
+    strengths: np.ndarray,
+    x: np.ndarray,
+    tolerance: float,
+    part: float,
+) -> bool:
+    """Return whether a node in contact with a curved wall is off its surface or used the normal of another point.
+
+    A node without contact force may satisfy the plane of another point and still lie beyond the wall. ``part``: see
+    :meth:`~pfem_petsc.contact.contact.Contact.acting`.
+    """
+    at = frames.nodes
+    acting = contact.acting(at, x[at], displacements, part)
+    normals, _ = contact.planes(strengths > 0.0, x[at], displacements, acting)
+    for k in np.flatnonzero(~contact.flat):
+        pressed = strengths[:, k] > 0.0
+        passed = ~pressed & (frames.rows[:, k] >= 0)
+        if passed.any() and (contact.gap(k, x[at[passed]], displacements) < -tolerance).any():
+            return True
+        if pressed.any():
+            turn = np.abs(normals[pressed, k] - frames.normals[pressed, k]).max(axis=1)
+            # far from the origin, the rounding of positions turns normals by more
+            moved = np.abs(x[at[pressed]] - frames.places[pressed]).max(axis=1)
+            turned = (turn > ON_BOUND) & (moved > PROJECTED * contact.size)
+            if np.abs(contact.gap(k, x[at[pressed]], displacements)).max() > tolerance or turned.any():
+                return True
+    return False
+
+
+class NoStepFriction:
+    """Null object for :class:`~pfem_petsc.contact.active_set.StepFriction` if no wall has friction."""
+
+    def __init__(self, model: Model, state: State, balance: Balance) -> None:
+        self.unsettled = np.empty(0, dtype=np.int64)
+
+    def apply(self, frames: NodalFrames, x: np.ndarray) -> None:
+        """Do nothing: no node sticks or slips."""
+
+    def check(
+        self,
+        frames: NodalFrames,
+        x: np.ndarray,
+        reaction: np.ndarray,
+        strengths: np.ndarray,
+        noise: float,
+        tolerance: float,
+    ) -> np.ndarray:
+        """Return the normal forces unchanged."""
+        return strengths
+
+    def jams(self, nodes: np.ndarray, x: np.ndarray, displacements: np.ndarray) -> list[str]:
+        """Return no messages."""
+        return []
+
+    def relax(self) -> bool:
+        """Return False: there is nothing to simplify."""
+        return False
+
+    def add(self, force: np.ndarray, nodes: np.ndarray, x: np.ndarray) -> float:
+        """Add no force; return zero energy."""
+        return 0.0
+
+
+# Weight of the known direction relative to the one solved for, multiplied by ten after each failure. 0.01 saves a fifth
+# of the solves at first, but fails if nodes slip by micrometres.
+_FIRM = 0.1
+# The error of directions falls by about the weight from solve to solve. Once they are all that changes, the weight
+# falls as well, from this number of solves on.
+_STEADY = 2
+_SOFTER, _LEAST = 0.1, 1e-4
+
+
+class StepFriction:
+    """Friction in one implicit step.
+
+    Parameters
+    ----------
+    model : Model
+    state : at the start of the step
+    balance : of the step
+
+    Attributes
+    ----------
+    drag : (m, walls, 3) friction forces on the nodes of the frames, after :meth:`check` [N]
+    unsettled : owned nodes whose solution violated the law in :meth:`check`
+    """
+
+    def __init__(self, model: Model, state: State, balance: Balance) -> None:
+        self.model = model
+        self.contact = model.contact
+        self.state = state
+        displacements = self.contact.motion.displacements
+        self._way = displacements(balance.time) - displacements(state.time)
+        inertia = model.inertia
+        self._inertial = balance.alpha * inertia.mass + balance.eta * inertia.damping
+        self._stiffness = self._inertial + balance.weight * model.nodal_stiffness
+        owned, walls = self.contact.members.shape
+        self._guessed = np.zeros(owned, dtype=bool)
+        self._sticks = np.full(owned, -1)  # the wall that a node sticks to, -1 for none
+        self._directions = np.zeros((owned, walls, 3))  # d a of slipping nodes
+        self._slips = np.zeros(owned, dtype=bool)  # known to slip along their direction
+        self._forces = np.zeros((owned, 3))  # friction force on each node in its last local solution
+        self._firmness = _FIRM
+        self._steady = 0  # solves in which no node has begun or ceased to stick or to slip
+        self._lagged = False  # friction is treated as a known force
+        self._failed = np.zeros(owned, dtype=bool)  # found not to stick
+        self.drag = np.zeros((0, walls, 3))
+        self.unsettled = np.empty(0, dtype=np.int64)
+
+    def dissipated(self, nodes: np.ndarray, x: np.ndarray) -> float:
+        """Return the energy [J] that friction dissipates as nodes (m,) move to positions (m, 3)."""
+        slip = (x - self.state.position[nodes])[:, None, :] - self._way
+        return -float((self.drag * slip).sum())
+
+    def add(self, force: np.ndarray, nodes: np.ndarray, x: np.ndarray) -> float:
+        """Add friction to the forces (m, walls, 3) on nodes (m,) at (m, 3) [N]; return the energy dissipated [J]."""
+        force += self.drag
+        return self.dissipated(nodes, x)
+
+    def apply(self, frames: NodalFrames, x: np.ndarray) -> None:
+        """Fix the sticking nodes of the frames and apply friction to the slipping ones, at a guess (owned, 3)."""
+        nodes = frames.nodes
+        has_friction = self._has_friction(frames)
+        fresh = has_friction & ~self._guessed[nodes]
+        if fresh.any():
+            at = np.flatnonzero(fresh)
+            reaction = self.state.contact[nodes[at]]
+            none = np.zeros(len(at), dtype=bool)
+            own = self._local(frames, at, x[nodes[at]], reaction, none)
+            self._forces[nodes[at]] = own.drag.sum(axis=1)
+            self._decide(frames, at, x[nodes[at]], none, own)
+            self._guessed[nodes[at]] = True
+        self._hold(frames, np.flatnonzero(has_friction & (self._sticks[nodes] >= 0)))
+        moving = has_friction & (self._sticks[nodes] < 0) & (self._directions[nodes] != 0.0).any(axis=(1, 2))
+        frames.sliding = self._slide(frames, np.flatnonzero(moving))
+
+    def check(
+        self,
+        frames: NodalFrames,
+        x: np.ndarray,
+        reaction: np.ndarray,
+        strengths: np.ndarray,
+        noise: float,
+        tolerance: float,
+    ) -> np.ndarray:
+        """Find the nodes that violate the law; return normal forces (m, walls) of all nodes of the frames [N].
+
+        Parameters
+        ----------
+        x, reaction : (m, 3) positions and forces by walls of the frames' nodes [m], [N]
+        strengths : (m, walls) normal forces without friction; used for nodes at frictionless walls only
+        noise : force below which a force counts as zero [N]
+        tolerance : of the forces [N]
+        """
+        nodes, contact = frames.nodes, self.contact
+        strengths = strengths.copy()
+        self.drag = np.zeros((*strengths.shape, 3))
+        at = np.flatnonzero(self._has_friction(frames))
+        slipping = self._sticks[nodes[at]] < 0
+        own = self._local(frames, at, x[at], reaction[at], slipping)
+        moved, normal_forces, drag, stiffness = own
+        self._forces[nodes[at]] = drag.sum(axis=1)
+        before = self._sticks.copy(), self._slips.copy()
+        apart = stiffness * np.linalg.norm(moved - x[at], axis=1)
+        # rounding of positions, and of the frames' coordinates on the way to them
+        floor = 2e-14 * stiffness * (np.abs(x[at]).sum(axis=1) + contact.size)
+        kept = apart <= np.maximum(max(tolerance, 2.0 * noise), floor)
+        wrong = np.flatnonzero(~kept)
+        if len(wrong):
+            self._decide(frames, at[wrong], x[at[wrong]], slipping[wrong], own.of(wrong))
+        may = self._may_stick(nodes[at], slipping & kept, x[at], normal_forces, frames.normals[at])
+        trying = may.any(axis=1)
+        self._sticks[nodes[at[trying]]] = may[trying].argmax(axis=1)
+        self.unsettled = nodes[np.union1d(at[wrong], at[trying])]
+        self._soften(before)
+        none = normal_forces <= noise
+        normal_forces[none], drag[none] = 0.0, 0.0
+        strengths[at], self.drag[at] = normal_forces, drag
+        return strengths
+
+    def _soften(self, before: tuple[np.ndarray, np.ndarray]) -> None:
+        """Reduce the weight of known directions if statuses, ``before`` and now, are the same. Collective."""
+        changed = any((now != was).any() for now, was in zip((self._sticks, self._slips), before, strict=True))
+        self._steady = 0 if self.model.comm.allreduce(int(changed)) else self._steady + 1
+        if self._steady >= _STEADY:
+            self._firmness = max(_SOFTER * self._firmness, _LEAST)
+
+    def relax(self) -> bool:
+        """Simplify the next solve after a failure; return whether it could be simplified. Collective.
+
+        First the directions are fixed, then friction forces are fixed as well.
+        """
+        slips, moves = bool(self._slips.any()), bool((self._directions != 0.0).any())
+        turning, moving = self.model.comm.allreduce(np.array([slips, moves], dtype=np.int64)) > 0
+        self._slips[:] = False
+        self._firmness *= 10.0
+        self._steady = 0
+        if turning:
+            return True
+        lagged, self._lagged = self._lagged, True
+        return moving and not lagged
+
+    def jams(self, nodes: np.ndarray, x: np.ndarray, displacements: np.ndarray) -> list[str]:
+        """Return messages about nodes (k,) at (owned, 3) that are jammed in a self-locking wedge by friction."""
+        normals, _ = self.contact.planes(self.contact.members[nodes], x[nodes], displacements)
+        return [text for node, n in zip(nodes, normals, strict=True) if (text := jam(self.contact, node, n))]
+
+    def _has_friction(self, frames: NodalFrames) -> np.ndarray:
+        """Return (m,) bool: frames with a wall that has friction."""
+        return ((frames.rows >= 0) & (self.contact.static_friction > 0.0)).any(axis=1)
+
+    def _local(
+        self, frames: NodalFrames, at: np.ndarray, x: np.ndarray, reaction: np.ndarray, slipping: np.ndarray
+    ) -> LocalSolution:
+        """Solve the local problems of some nodes of the frames."""
+        nodes = frames.nodes[at]
+        planes = frames.normals[at], frames.offsets[at]
+        start, stiffness = self.state.position[nodes], self._stiffness[nodes]
+        return solve_locally(self.contact, nodes, planes, x, reaction, start, self._way, stiffness, slipping)
+
+    def _may_stick(
+        self, nodes: np.ndarray, slipping: np.ndarray, x: np.ndarray, normal_forces: np.ndarray, normals: np.ndarray
+    ) -> np.ndarray:
+        """Return (k, w) bool: walls whose static coefficient may stop slipping nodes, which is tried once."""
+        contact = self.contact
+        slip = self._slip(nodes, x, normals)
+        # if the rest of the truss moves along, inertia alone resists
+        needed = contact.friction * normal_forces + self._inertial[nodes, None] * np.linalg.norm(slip, axis=2)
+        may = (contact.static_friction > contact.friction) & (needed <= contact.static_friction * normal_forces)
+        return may & (normal_forces > 0.0) & (slipping & ~self._failed[nodes])[:, None]
+
+    def _slip(self, nodes: np.ndarray, x: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        """Return the slip of nodes at (k, 3) on their walls (k, w, 3) [m]."""
+        slip = x[:, None, :] - self.state.position[nodes][:, None, :] - self._way
+        return slip - np.einsum("kwi,kwi->kw", slip, normals)[:, :, None] * normals
+
+    def _decide(
+        self, frames: NodalFrames, at: np.ndarray, x: np.ndarray, slipping: np.ndarray, own: LocalSolution
+    ) -> None:
+        """Decide which nodes stick or slip in the next solve, from positions x and the solutions of local problems."""
+        nodes, contact = frames.nodes[at], self.contact
+        moved, normal_forces, drag, stiffness = own
+        slip = self._slip(nodes, moved, frames.normals[at])
+        size = np.linalg.norm(drag, axis=2)
+        # a normal force within rounding neither sticks nor causes friction
+        least = 1e-9 * normal_forces.max(axis=1, initial=0.0)
+        rubbing = (normal_forces > least[:, None]) & (contact.static_friction > 0.0)
+        needed = np.linalg.norm(drag - stiffness[:, None, None] * slip, axis=2)
+        limit = np.where(slipping[:, None], contact.friction, contact.static_friction) * normal_forces
+        slips = rubbing & (needed > (1.0 + 1e-13) * limit)
+        was = self._sticks[nodes] >= 0
+        forwards = np.einsum("kwi,kwi->kw", self._slip(nodes, x, frames.normals[at]), self._directions[nodes])
+        # friction has reversed the slip, so it is large enough to stop it
+        slips &= (forwards >= 0.0) | was[:, None]
+        holds = rubbing & ~slips
+        infeasible = holds.any(axis=1)
+        unit = np.where(slips[:, :, None], -drag / np.maximum(size, 1e-300)[:, :, None], 0.0)
+        self._slips[nodes] = ~infeasible & ~was & (forwards > 0.0).any(axis=1)
+        self._failed[nodes] |= was & ~infeasible
+        self._sticks[nodes] = np.where(infeasible, holds.argmax(axis=1), -1)
+        self._directions[nodes] = unit * np.maximum(contact.friction * normal_forces, 1e-300)[:, :, None]
+
+    def _hold(self, frames: NodalFrames, at: np.ndarray) -> None:
+        """Fix sticking nodes at zero slip."""
+        nodes = frames.nodes[at]
+        wall = self._sticks[nodes]
+        row = frames.rows[at, wall]
+        place = self.state.position[nodes] + self._way[wall]
+        n = frames.normals[at, wall]
+        place += (frames.offsets[at, wall] - np.einsum("ki,ki->k", n, place))[:, None] * n
+        held = np.einsum("kij,kj->ki", frames.basis[at], place)
+        which = ~self.contact.fixed[nodes] & (np.arange(3) != row[:, None])
+        slack = ON_BOUND * self.contact.size
+        fits = (held >= frames.lower[at] - slack) & (held <= frames.upper[at] + slack)
+        # another wall pushes the node along, or its wall has no row: it cannot stick
+        possible = (fits | ~which).all(axis=1) & (row >= 0)
+        self._sticks[nodes[~possible]] = -1
+        frames.pin(at[possible], held[possible], which[possible])
+
+    def _slide(self, frames: NodalFrames, at: np.ndarray) -> Sliding:
+        nodes = frames.nodes[at]
+        friction = np.where((self._directions[nodes] != 0.0).any(axis=2), self.contact.friction, 0.0)
+        friction = np.where(frames.rows[at] >= 0, friction, 0.0)
+        for k in range(1, friction.shape[1]):
+            # where walls share a bound, one takes the force
+            shared = (frames.rows[at, :k] == frames.rows[at, k][:, None]) & (friction[:, :k] > 0.0)
+            friction[shared.any(axis=1), k] = 0.0
+        slips = self._slips[nodes]
+        known = np.zeros((len(at), 3))
+        if self._lagged:
+            known, friction = self._forces[nodes], np.zeros_like(friction)
+        start = np.where(slips[:, None, None], self._firmness, 1.0) * self._directions[nodes]
+        return Sliding(
+            nodes,
+            at,
+            known,
+            frames.inverse[at],
+            frames.rows[at],
+            frames.signs[at],
+            friction,
+            frames.normals[at],
+            self.state.position[nodes][:, None, :] + self._way,
+            start,
+            np.where(slips, self._stiffness[nodes], 0.0),
+        )
+
 
 _ITERATIONS = 50  # solves of a step
 _PATIENCE = 5  # solves before deferred walls may take a row of smaller volume

@@ -1,33 +1,64 @@
-"""Walls and the nodes that they stop: which nodes can touch which walls, and the contact forces."""
+"""Walls and the nodes that they stop: search, candidates of implicit steps, nodes that start beyond walls."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
 
-from ..errors import SimulationFailure
+from ..errors import InputError, SimulationFailure
+from ..integrators.base import Balance, State
+from ..mechanics.compiled import kernel
 from ..parallel.agreement import agreed
 from ..registry import lookup
-from ..tolerances import BEYOND, ON_BOUND, resolvable
+from ..tolerances import BEYOND, ON_BOUND, PROJECTED, resolvable
 from .explicit import ExplicitContact
-from .forces import WallForces
+from .forces import ContactLog, WallForces
 from .frames import MIN_VOLUME, NodalFrames, build_frames
-from .log import ContactLog
-from .motion import WallMotion
-from .search import near_planes
 from .tied import FreshTies, NoTies, Ties
+from .wall_motion import WallMotion
 
 if TYPE_CHECKING:
     from ..case.schema import Case
     from ..mesh.distribution import DistributedMesh
-    from .candidates import Candidates
+    from ..stepping.model import Model
     from .walls.base import WallKeys
 
-__all__ = ["Contact"]
+
+@kernel
+def near_planes(x, normals, offsets, all_nodes, members, reach, near):
+    """Mark nodes within reach of a plane.
+
+    Parameters
+    ----------
+    x : (n, 3) positions [m]
+    normals : (w, 3); offsets : (w,) [m]: planes n . x = d
+    all_nodes : (w,) bool, whether a plane applies to all nodes
+    members : (n, w) bool, nodes to which a plane applies otherwise
+    reach : (n,) or (1,) distance below which a node counts as near [m]
+    near : (n,) bool, updated
+
+    Returns
+    -------
+    int
+        Number of nodes marked here.
+    """
+    count = 0
+    per_node = len(reach) > 1
+    for i in range(len(x)):
+        limit = reach[i] if per_node else reach[0]
+        for k in range(len(offsets)):
+            gap = normals[k, 0] * x[i, 0] + normals[k, 1] * x[i, 1] + normals[k, 2] * x[i, 2] - offsets[k]
+            if gap < limit and (all_nodes[k] or members[i, k]):
+                near[i] = True
+                count += 1
+                break
+    return count
+
 
 _ZERO = np.zeros(1)
 _TURN = 0.8  # cosine between normals in a step, below which forces act along that at the new position
@@ -327,3 +358,169 @@ class Contact:
             strengths[touching, k] = np.abs(left[every[touching], safe[touching]])
             left[every[touching], safe[touching]] = 0.0  # where walls share a bound, the first takes the force
         return strengths
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Nodes whose unknowns have bounds.
+
+    Attributes
+    ----------
+    nodes : (m,) owned local indices, ascending; applicable : (m, walls) bool, walls that may stop them
+    priority : (m, walls) order of the walls, lowest first; None: by distance
+    anywhere : whether any rank has candidates
+    """
+
+    nodes: np.ndarray
+    applicable: np.ndarray
+    priority: np.ndarray | None = None
+    anywhere: bool = True
+
+    def join(
+        self,
+        contact: Contact,
+        displacements: np.ndarray,
+        joined: np.ndarray,
+        broken: np.ndarray,
+        x: np.ndarray,
+        strengths: np.ndarray,
+        largest_rank: float,
+    ) -> Candidates:
+        """Return the candidates of the next solve: violated walls first, then those that press, then by distance.
+
+        Parameters
+        ----------
+        contact : Contact
+        displacements : (walls, 3) of walls [m]
+        joined, broken : (k,) nodes beyond walls, and (k, walls) bool, which walls
+        x : (owned, 3) positions [m]
+        strengths : (m, walls) normal forces on the present candidates [N]
+        largest_rank : offset that orders walls that press before all open ones [m]
+        """
+        nodes = np.union1d(self.nodes, joined)
+        applicable = np.zeros((len(nodes), len(contact.walls)), dtype=bool)
+        applicable[np.searchsorted(nodes, joined)] = broken
+        place = np.searchsorted(nodes, self.nodes)
+        applicable[place] |= self.applicable
+        normals, offsets = contact.planes(applicable, x[nodes], displacements)
+        priority = np.einsum("iwk,ik->iw", normals, x[nodes]) - offsets
+        normal_forces = strengths > 0.0
+        largest = max(float(strengths.max(initial=0.0)), 1e-300)
+        held = priority[place]
+        held[normal_forces] = -largest_rank * (1.0 + strengths[normal_forces] / largest)
+        priority[place] = held
+        return Candidates(nodes, applicable, priority)
+
+    def without(self, held: np.ndarray) -> Candidates:
+        """Return the candidates with no applicable walls at tied nodes, ``held`` (owned,) bool."""
+        return replace(self, applicable=self.applicable & ~held[self.nodes][:, None])
+
+
+def expected_candidates(
+    model: Model, state: State, balance: Balance, held: np.ndarray, displacements: np.ndarray
+) -> Candidates:
+    """Return the owned nodes that may touch a wall in a step, among them those in contact before it. Collective.
+
+    ``held`` (owned,) bool : nodes in contact before the step; ``displacements`` (walls, 3) : of the walls at the time
+    of the balance [m]
+    """
+    contact, walls = model.contact, len(model.contact.walls)
+    nobody = Candidates(np.empty(0, dtype=np.int64), np.zeros((0, walls), dtype=bool), anywhere=False)
+    if not contact.any:
+        return nobody
+    move = (balance.time - state.time) * state.v
+    reach = 0.5 * np.linalg.norm(move, axis=1) + BEYOND * model.size
+    near = held | contact.near(state.position + move, displacements, reach) | contact.ties.held
+    if model.comm.allreduce(int(near.any()), op=MPI.MAX) == 0:
+        return nobody
+    nodes = np.flatnonzero(near)
+    return Candidates(
+        nodes, _within_reach(model, state, nodes, (state.position + move)[nodes], displacements, reach[nodes])
+    )
+
+
+def _within_reach(
+    model: Model, state: State, nodes: np.ndarray, x: np.ndarray, displacements: np.ndarray, reach: np.ndarray
+) -> np.ndarray:
+    """Return (m, walls) bool: walls that nodes (m,) moving to (m, 3) touch or come within reach (m,) [m] of."""
+    contact = model.contact
+    applicable = contact.applicable(nodes, x, displacements)
+    within = np.zeros_like(applicable)
+    starts = state.position[nodes], contact.motion.displacements(state.time), BEYOND * model.size
+    for place, there, distance in ((x, displacements, reach[:, None]), starts):
+        normals, offsets = contact.planes(applicable, place, there)
+        within |= np.einsum("mwi,mi->mw", normals, place) - offsets < distance
+    return within & applicable
+
+
+def adjust_start(case: Case, nodes: dict[str, np.ndarray], mesh: DistributedMesh) -> int:
+    """Move nodes onto walls with ``adjust = true``; bars are unstressed in the new positions. Collective.
+
+    Returns
+    -------
+    int
+        Number of nodes moved on all ranks.
+
+    Raises
+    ------
+    InputError
+        On all ranks, for infeasible walls at a node, or a bar that loses its length.
+    """
+    # friction, restitution and ties play no role here
+    plain = {"friction": 0.0, "static_friction": None, "restitution": 0.0, "tied": False}
+    walls = [wall.model_copy(update=plain) for wall in case.wall if wall.adjust]
+    if not walls:
+        return 0
+    owned = mesh.n_owned
+    contact = Contact(case, nodes, mesh, np.zeros((owned, 3), dtype=bool), walls)
+    points, way = mesh.points[:owned], np.zeros((owned, 3))
+    moved = np.empty(0, dtype=np.int64)
+    with agreed(mesh.comm):
+        try:
+            moved, *_ = contact.explicit(points, way, np.ones(owned), 0.0, PROJECTED * contact.size)
+        except SimulationFailure as failure:
+            raise InputError(f"{case.source}: wall.adjust: {failure}") from failure
+    points += way
+    mesh.update_ghosts(mesh.points)
+    a, b = mesh.bars.T
+    length = np.linalg.norm(mesh.points[b] - mesh.points[a], axis=1)
+    with agreed(mesh.comm):
+        if len(length) and length.min() <= BEYOND * contact.size:
+            bar = int(np.argmin(length))
+            ends = mesh.node_ids[[a[bar], b[bar]]]
+            raise InputError(
+                f"{case.source}: wall.adjust: bar {mesh.bar_ids[bar]} between nodes {ends[0]} and {ends[1]} has zero "
+                "length once its nodes are on the wall; move the wall or the mesh"
+            )
+    return mesh.comm.allreduce(len(moved))
+
+
+def check_start(contact: Contact, x: np.ndarray, length: float) -> None:
+    """Check that no node starts beyond a wall by more than rounding of the model's size ``length`` [m]. Collective.
+
+    Raises
+    ------
+    InputError
+        On all ranks; names the wall, the deepest node and its depth.
+    """
+    if not contact.any:
+        return
+    comm = contact.mesh.comm
+    gaps = contact.gaps(x, 0.0)
+    for k, wall in enumerate(contact.walls):
+        if wall.partial:  # no node starts beyond a wall that nodes can pass beside
+            continue
+        deepest, node, count = 0.0, -1, 0
+        if len(gaps):
+            at = int(np.argmin(gaps[:, k]))
+            deepest, node = float(gaps[at, k]), int(contact.mesh.node_ids[at])
+            count = int((gaps[:, k] < -ON_BOUND * length).sum())
+        depth, node = min(comm.allgather((deepest, node)))
+        count = comm.allreduce(count)
+        if count:
+            raise InputError(
+                f"{contact.source}: wall {contact.names[k]!r}: node {node} starts {-depth:.6g} "
+                f"m beyond the wall ({count} node{'s' if count > 1 else ''} in all); move the wall or the mesh, "
+                "turn the normal to the allowed side, name the nodes that it applies to with 'node_set', or let "
+                "'adjust = true' move the nodes"
+            )

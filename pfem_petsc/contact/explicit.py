@@ -1,24 +1,369 @@
-"""Contact in explicit steps: a small problem per node, with curved walls, walls with mass, friction and restitution."""
+"""Contact in explicit steps: a small problem per node, with flat and curved walls, walls with mass, friction and
+restitution.
+"""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import math
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from ..errors import SimulationFailure
-from ..tolerances import FIXED_POINT, PROJECTED, RANK
-from .flat import press_planes
-from .forces import WallForces
-from .friction import add_friction
-from .jamming import jam
+from ..mechanics.compiled import borrowing, inlined, kernel
+from ..mesh.ordering import NODE_BLOCK
+from ..tolerances import FIXED_POINT, FREE_PART, PROJECTED, RANK
+from .forces import WallForces, free_squares
 from .projection import project
-from .rebound import impact_square, rebound_way
 
 if TYPE_CHECKING:
     from .contact import Contact
 
-__all__ = ["ExplicitContact"]
+
+@borrowing
+def find_beyond(first, free, normals, offsets, all_nodes, members, found):
+    """Write the nodes, from node ``first`` on, whose positions ``free`` (3 m,) lie beyond a plane to ``found``; return
+    their number. Other arguments: see :func:`press_planes`.
+    """
+    n = len(free) // 3
+    beyond = 0
+    for k in range(len(offsets)):  # without branches
+        nx, ny, nz, offset = normals[k, 0], normals[k, 1], normals[k, 2], offsets[k]
+        for i in range(n):
+            gap = -offset + nx * free[3 * i] + ny * free[3 * i + 1] + nz * free[3 * i + 2]
+            beyond += 1 if gap < 0.0 else 0
+    if beyond == 0:
+        return 0
+    m = 0
+    for i in range(n):
+        for k in range(len(offsets)):
+            gap = -offsets[k]
+            for c in range(3):
+                gap += normals[k, c] * free[3 * i + c]
+            if gap < 0.0 and (all_nodes[k] or members[first + i, k]):
+                found[m] = first + i
+                m += 1
+                break
+    return m
+
+
+@kernel
+def press_nodes(
+    nodes, places, fixed, normals, offsets, all_nodes, members, tolerance, stiffness, force, contacts, moment
+):
+    """Project ``nodes`` (m,) at ``places`` (m, 3) [m], in place, and add the forces of the planes to their sums:
+    ``force`` (w, 3) [N], number of ``contacts`` (w,) and ``moment`` about the origin (w, 3) [N m].
+
+    ``stiffness`` (m,) force for a displacement of each of them [N/m]; other arguments: see :func:`press_planes`.
+    Returns the index of the first infeasible node among them, or -1; their offsets (m, w), -inf where a plane does not
+    apply; the total force (m, 3) [N]; and planes that they touch (m, w).
+    """
+    w, m = len(offsets), len(nodes)
+    held = np.empty((m, 3), dtype=np.bool_)
+    all_normals = np.empty((m, w, 3))
+    all_offsets = np.empty((m, w))
+    for j in range(m):
+        i = nodes[j]
+        for c in range(3):
+            held[j, c] = fixed[i, c]
+        for k in range(w):
+            for c in range(3):
+                all_normals[j, k, c] = normals[k, c]
+            all_offsets[j, k] = offsets[k] if all_nodes[k] or members[i, k] else -math.inf
+    multipliers = np.zeros((m, w))
+    infeasible = project(places, held, all_normals, all_offsets, tolerance, multipliers)
+    total = np.zeros((m, 3))
+    touching = np.zeros((m, w), dtype=np.bool_)
+    for j in range(m):
+        x, y, z = places[j, 0], places[j, 1], places[j, 2]
+        for k in range(w):
+            strength = multipliers[j, k] * stiffness[j]
+            if strength == 0.0:
+                continue
+            fx, fy, fz = strength * normals[k, 0], strength * normals[k, 1], strength * normals[k, 2]
+            total[j, 0] += fx
+            total[j, 1] += fy
+            total[j, 2] += fz
+            force[k, 0] += fx
+            force[k, 1] += fy
+            force[k, 2] += fz
+            moment[k, 0] += y * fz - z * fy
+            moment[k, 1] += z * fx - x * fz
+            moment[k, 2] += x * fy - y * fx
+            touching[j, k] = True
+            contacts[k] += 1
+    return infeasible, all_offsets, total, touching
+
+
+@kernel
+def press_planes(predictor, u, fixed, normals, offsets, all_nodes, members, tolerance, stiffness, room):
+    """Project nodes that lie beyond planes onto them, and sum the forces of the planes.
+
+    Parameters
+    ----------
+    predictor, u : (n, 3); the free positions are predictor + u [m]; ``u`` is corrected in place
+    fixed : (n, 3) bool, components that supports prescribe
+    normals, offsets : (w, 3), (w,) planes n . x >= d [m]
+    all_nodes : (w,) bool, whether a plane applies to all nodes; members : (n, w) bool, to which nodes otherwise
+    tolerance : [m]
+    stiffness : (n,) force for a displacement of the node [N/m]
+    room : (n,) int64, workspace
+
+    Returns
+    -------
+    tuple
+        Nodes (m,); index of the first infeasible node among them, or -1; their offsets (m, w), -inf where a plane does
+        not apply; total force (m, 3) [N]; planes that they touch (m, w); positions (m, 3) [m]; and per plane the force
+        (w, 3) [N], number of contacts (w,) and moment about the origin (w, 3) [N m].
+    """
+    n, w = len(u), len(offsets)
+    free = np.empty(3 * NODE_BLOCK)
+    m = 0
+    for first in range(0, n, NODE_BLOCK):
+        last = min(first + NODE_BLOCK, n)
+        where, more = predictor[first:last].reshape(-1), u[first:last].reshape(-1)
+        for j in range(len(where)):
+            free[j] = where[j] + more[j]
+        m += find_beyond(first, free[: len(where)], normals, offsets, all_nodes, members, room[m:])
+    nodes = room[:m].copy()
+    places, own = np.empty((m, 3)), np.empty(m)
+    for j in range(m):
+        own[j] = stiffness[nodes[j]]
+        for c in range(3):
+            places[j, c] = predictor[nodes[j], c] + u[nodes[j], c]
+    start = places.copy()
+    force, contacts, moment = np.zeros((w, 3)), np.zeros(w, dtype=np.int64), np.zeros((w, 3))
+    infeasible, all_offsets, total, touching = press_nodes(
+        nodes, places, fixed, normals, offsets, all_nodes, members, tolerance, own, force, contacts, moment
+    )
+    for j in range(m):
+        for c in range(3):
+            u[nodes[j], c] += places[j, c] - start[j, c]
+    return nodes, infeasible, all_offsets, total, touching, places, force, contacts, moment
+
+
+def jam(contact: Contact, node: int, normals: np.ndarray) -> str:
+    """Return why the friction of an owned node has no solution, and the remedy; empty if the node is not jammed.
+
+    Parameters
+    ----------
+    contact : Contact
+    normals : (w, 3) of the walls at the node
+    """
+    fixed = contact.fixed[node]
+    if not fixed.any():
+        return ""
+    square = free_squares(fixed, normals)
+    least = np.sqrt(square / np.maximum(1.0 - square, 1e-300))
+    jams = contact.members[node] & (square > FREE_PART) & (contact.static_friction >= least)
+    if not jams.any():
+        return ""
+    wall = int(np.flatnonzero(jams)[0])
+    return (
+        f"friction jams node {contact.mesh.node_ids[node]}: its supports let it move only at an angle at which wall "
+        f"{contact.names[wall]!r} cannot push it if the coefficient of friction is {least[wall]:.3g} or more, and it "
+        f"is {contact.static_friction[wall]:.3g}; reduce the friction, free the node, or name the nodes that the wall "
+        "stops with 'node_set'"
+    )
+
+
+def impact_square(approach: np.ndarray, arrival: np.ndarray, pull: np.ndarray) -> np.ndarray:
+    """Return the part of I^2 [m2] that is known in the step of the impact, zero for nodes that do not approach.
+
+    Parameters
+    ----------
+    approach : a, displacement towards the wall without contact [m]
+    arrival : d, distance to the wall [m]
+    pull : p, contribution of forces to the approach [m]
+    """
+    square = approach * approach - pull * (approach - arrival)
+    return np.where(approach > 0.0, np.maximum(square, 0.0), 0.0)
+
+
+def rebound_way(
+    restitution: np.ndarray | float, square: np.ndarray, arrival: np.ndarray, pull: np.ndarray
+) -> np.ndarray:
+    """Return w + q/2, the rebound velocity times the step [m]; 0 where ``square`` is 0.
+
+    Parameters
+    ----------
+    restitution : e
+    square, arrival : of the step of the impact, see :func:`impact_square`
+    pull : q, towards the wall, by the forces at the position of impact [m]
+    """
+    whole = np.maximum(square + pull * arrival + 0.25 * pull * pull, 0.0)
+    return np.where(square > 0.0, restitution * np.sqrt(whole), 0.0)
+
+
+_SWEEPS = 2000
+_SLIDES = 1e-13  # of the position: slips beyond are no rounding
+_OVERSHOOT = 0.9  # of the drag over the normal force, from which on sweeps go a part of the way
+
+
+@inlined
+def slides_along_guide(i, x, before, way, fixed, normals, dynamic, normal_forces, drag):
+    """Forces on a node that supports leave one component, pressed by one wall with friction: in closed form.
+
+    Where it is, and so its slip s, is decided by the wall alone. Along the free component f, with lambda_0 the normal
+    force without friction, lambda (n_f - mu s_f/|s|) = lambda_0 n_f: no sweeps are needed, which creep where the wall
+    is almost parallel to the guide.
+
+    Returns
+    -------
+    bool
+        Whether it is such a node, slides, and a normal force does it; otherwise nothing has changed.
+    """
+    free = -1
+    for c in range(3):
+        if not fixed[i, c]:
+            if free >= 0:
+                return False
+            free = c
+    if free < 0:
+        return False
+    wall = -1
+    for k in range(normal_forces.shape[1]):
+        if normal_forces[i, k] > 0.0:
+            if wall >= 0:
+                return False
+            wall = k
+    if wall < 0 or not dynamic[wall] > 0.0:
+        return False
+    n = normals[i, wall]
+    along = 0.0
+    for c in range(3):
+        along += (x[i, c] - before[i, c] - way[wall, c]) * n[c]
+    size, where = 0.0, 0.0
+    for c in range(3):
+        slip = x[i, c] - before[i, c] - way[wall, c] - along * n[c]
+        size += slip * slip
+        where += abs(x[i, c])
+    size = math.sqrt(size)
+    if not size > _SLIDES * where:
+        return False
+    slip = x[i, free] - before[i, free] - way[wall, free] - along * n[free]
+    helped = 1.0 - dynamic[wall] * slip / (size * n[free])
+    if not helped > _SLIDES:
+        return False
+    normal_forces[i, wall] /= helped
+    for c in range(3):
+        slip = x[i, c] - before[i, c] - way[wall, c] - along * n[c]
+        drag[i, wall, c] = -dynamic[wall] * normal_forces[i, wall] * slip / size
+    return True
+
+
+@kernel
+def add_friction(x, before, way, fixed, normals, offsets, dynamic, static, stiffness, normal_forces, drag):
+    """Apply friction forces to the nodes in contact with walls that have friction.
+
+    Parameters
+    ----------
+    x : (m, 3) positions under the normal forces alone, changed in place [m]
+    before : (m, 3) positions at the start of the step [m]
+    way : (w, 3) displacements of the walls in the step [m]
+    fixed : (m, 3) bool, components that supports prescribe
+    normals, offsets : (m, w, 3), (m, w) planes n . x >= d; -inf where a wall does not apply
+    dynamic, static : (w,) coefficients of friction
+    stiffness : (m,) force for a displacement of the node [N/m]
+    normal_forces : (m, w) normal forces [N], changed in place
+    drag : (m, w, 3) friction forces, output [N]
+
+    Returns
+    -------
+    int
+        First node whose sweeps did not converge, or -1.
+    """
+    m, w = offsets.shape
+    trial = np.zeros(3)
+    unsettled = -1
+    for i in range(m):
+        rubbing = False
+        for k in range(w):
+            for c in range(3):
+                drag[i, k, c] = 0.0
+            if normal_forces[i, k] > 0.0:
+                rubbing = rubbing or static[k] > 0.0
+        if not rubbing or slides_along_guide(i, x, before, way, fixed, normals, dynamic, normal_forces, drag):
+            continue
+        soft = 1.0 / stiffness[i]
+        reach = stiffness[i] * (
+            abs(x[i, 0]) + abs(x[i, 1]) + abs(x[i, 2])
+        )  # forces that correspond to the rounding of positions
+        # where supports leave little of a normal free, the friction force moves the node r times as far as the normal
+        # force; sweeps overshoot for r >= 1 unless they are underrelaxed
+        part = 1.0
+        for k in range(w):
+            if offsets[i, k] > -math.inf and static[k] > 0.0:
+                length = 0.0
+                for c in range(3):
+                    if not fixed[i, c]:
+                        length += normals[i, k, c] * normals[i, k, c]
+                if length >= 1e-12:
+                    ratio = static[k] * math.sqrt(max(1.0 - length, 0.0) / length)
+                    if ratio > _OVERSHOOT:
+                        part = min(part, 1.0 / (1.0 + ratio))
+        settled = False
+        for _ in range(_SWEEPS):
+            change = 0.0
+            largest = 0.0
+            least = 1.0  # where supports leave little of a normal free, rounding is amplified in forces
+            for k in range(w):
+                if offsets[i, k] == -math.inf:
+                    continue
+                length = 0.0
+                gap = -offsets[i, k]
+                for c in range(3):
+                    gap += normals[i, k, c] * x[i, c]
+                    if not fixed[i, c]:
+                        length += normals[i, k, c] * normals[i, k, c]
+                if length < 1e-12:
+                    continue
+                # normal
+                old = normal_forces[i, k]
+                new = max(0.0, old - gap * stiffness[i] / length)
+                if new == 0.0 and old == 0.0:
+                    continue
+                least = min(least, length)
+                change = max(change, abs(new - old))
+                if part < 1.0:
+                    new = old + part * (new - old)
+                for c in range(3):
+                    if not fixed[i, c]:
+                        x[i, c] += (new - old) * normals[i, k, c] * soft
+                normal_forces[i, k] = new
+                largest = max(largest, new)
+                # tangential: the force that would stop the slip, limited by Coulomb's law
+                if static[k] == 0.0:
+                    continue
+                slip = 0.0
+                for c in range(3):
+                    trial[c] = x[i, c] - before[i, c] - way[k, c]
+                    slip += trial[c] * normals[i, k, c]
+                size = 0.0
+                for c in range(3):
+                    trial[c] = drag[i, k, c] - stiffness[i] * (trial[c] - slip * normals[i, k, c])
+                    size += trial[c] * trial[c]
+                size = math.sqrt(size)
+                factor = 1.0
+                if size > static[k] * new:
+                    factor = dynamic[k] * new / size
+                for c in range(3):
+                    force = factor * trial[c]
+                    move = force - drag[i, k, c]
+                    change = max(change, abs(move))
+                    if part < 1.0:
+                        move *= part
+                        force = drag[i, k, c] + move
+                    drag[i, k, c] = force
+                    if not fixed[i, c]:
+                        x[i, c] += move * soft
+            if change <= 1e-15 * (largest + reach / least) or largest == 0.0:
+                settled = True
+                break
+        if not settled and unsettled < 0:
+            unsettled = i
+    return unsettled
+
 
 _CURVED_ROUNDS = 100  # projections of a step until tangent planes and positions agree
 
@@ -250,7 +595,7 @@ class ExplicitContact:
         normals: np.ndarray,
         strength: np.ndarray,
     ) -> None:
-        """Record which nodes hit a wall with restitution in this step; see :mod:`~pfem_petsc.contact.rebound`."""
+        """Record which nodes hit a wall with restitution in this step; see :mod:`~pfem_petsc.contact.explicit`."""
         state = self.contact.state
         shape = len(self.contact.members), len(self.contact.walls)
         squares, arrivals = (state.memory.setdefault(name, np.zeros(shape)) for name in ("rebound", "arrival"))
@@ -321,3 +666,72 @@ class ExplicitContact:
             strength = multipliers * stiffness[:, None]
         friction = -float((drag * (at[:, None, :] - before[:, None, :] - way)).sum())
         return at, normal_forces[:, :, None] * normals + drag, friction
+
+
+class LocalSolution(NamedTuple):
+    """Solutions of the local problems of k nodes at w walls.
+
+    Attributes
+    ----------
+    moved : (k, 3) positions [m]
+    normal_forces, drag : (k, w), (k, w, 3) normal and friction forces [N]
+    stiffness : (k,) K of each node [N/m]
+    """
+
+    moved: np.ndarray
+    normal_forces: np.ndarray
+    drag: np.ndarray
+    stiffness: np.ndarray
+
+    def of(self, some: np.ndarray) -> LocalSolution:
+        """Return the solutions of some of the nodes."""
+        return LocalSolution(*(each[some] for each in self))
+
+
+def solve_locally(
+    contact: Contact,
+    nodes: np.ndarray,
+    planes: tuple[np.ndarray, np.ndarray],
+    x: np.ndarray,
+    reaction: np.ndarray,
+    start: np.ndarray,
+    wall_motion: np.ndarray,
+    stiffness: np.ndarray,
+    slipping: np.ndarray,
+) -> LocalSolution:
+    """Solve the local problems of nodes (k,) at tangent planes, normals (k, w, 3) and offsets (k, w) [m].
+
+    Slipping nodes use the dynamic coefficient only; whether they stick is determined by a trial.
+
+    Parameters
+    ----------
+    x, reaction : (k, 3) positions [m] and forces by walls [N]
+    start : (k, 3) positions at the start of the step [m]
+    wall_motion : (w, 3) displacements of the walls in the step [m]
+    stiffness : (k,) [N/m]
+    slipping : (k,) bool
+    """
+    normals, offsets = planes
+    fixed = contact.fixed[nodes]
+    moved = x - np.where(fixed, 0.0, reaction) / stiffness[:, None]
+    normal_forces, drag = np.zeros(offsets.shape), np.zeros(normals.shape)
+    project(moved, fixed, normals, offsets, PROJECTED * contact.size, normal_forces)
+    normal_forces *= stiffness[:, None]
+    for group, static in ((slipping, contact.friction), (~slipping, contact.static_friction)):
+        part = np.flatnonzero(group)
+        place, press, pull = moved[part], normal_forces[part], drag[part]
+        add_friction(
+            place,
+            start[part],
+            wall_motion,
+            fixed[part],
+            normals[part],
+            offsets[part],
+            contact.friction,
+            static,
+            stiffness[part],
+            press,
+            pull,
+        )
+        moved[part], normal_forces[part], drag[part] = place, press, pull
+    return LocalSolution(moved, normal_forces, drag, stiffness)

@@ -1,23 +1,90 @@
-"""Bounds on nodal coordinates for implicit steps, and the oblique coordinates that turn planes into bounds.
-
-At a node, y = B x with the normals of up to three independent planes as rows of B makes each plane a bound on one
-coordinate; opposite planes bound the same coordinate from both sides. Rows along the axes stay in the slot of their
-axis, so walls along the axes need no change of coordinates. Planes are taken in a given order, nearest first by
-default. A plane is deferred if no row is left, or if it would reduce the volume of the rows (the product of the sines
-of their angles) below :data:`MIN_VOLUME`; it is verified after the solve. A plane almost parallel to a row shares it,
-with the bound that is exact at the expected position of the node; this too is verified after the solve.
+"""Bounds on nodal coordinates for implicit steps, the oblique coordinates that turn planes into bounds, and friction
+of slipping nodes.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 
 from ..mechanics.compiled import kernel
-from .sliding import Sliding
 
-__all__ = ["MIN_VOLUME", "NodalFrames", "build_frames"]
+_SINGULAR = 1e-6  # determinant of I - C below which a wedge is jammed
+
+
+@dataclass
+class Sliding:
+    """Slipping nodes of a rank.
+
+    Attributes
+    ----------
+    nodes, at : (m,) owned local indices, and indices among the frames
+    known : (m, 3) known part of the friction forces [N]
+    inverse : (m, 3, 3) of the frames' bases
+    rows, signs : (m, w) of the frames
+    friction : (m, w) coefficients, zero where a wall exerts no friction
+    normals, origins : (m, w, 3) normals of the walls; positions of the node without slip [m]
+    start : (m, w, 3) a d [N]
+    weight : (m,) b [N/m]
+    maps : (m, 3, 3) (I - C)^-1 at the last evaluation
+    stiffness : (m, 3, 3) derivative of friction with respect to the node's position x, at the last evaluation [N/m]
+    """
+
+    nodes: np.ndarray
+    at: np.ndarray
+    known: np.ndarray
+    inverse: np.ndarray
+    rows: np.ndarray
+    signs: np.ndarray
+    friction: np.ndarray
+    normals: np.ndarray
+    origins: np.ndarray
+    start: np.ndarray
+    weight: np.ndarray
+
+    def __post_init__(self) -> None:
+        self.maps = np.tile(np.eye(3), (len(self.nodes), 1, 1))
+        self.stiffness = np.zeros((len(self.nodes), 3, 3))
+
+    @classmethod
+    def none(cls, walls: int) -> Sliding:
+        """Return an instance without slipping nodes."""
+        zeros, rows = np.zeros((0, walls, 3)), np.zeros((0, walls), dtype=np.int8)
+        nodes, matrices = np.empty(0, dtype=np.int64), np.zeros((0, 3, 3))
+        signs, known = np.zeros((0, walls)), np.zeros((0, 3))
+        return cls(nodes, nodes, known, matrices, rows, signs, signs, zeros, zeros, zeros, np.zeros(0))
+
+    def couple(self, x: np.ndarray, g: np.ndarray) -> np.ndarray:
+        """Return the residual (m, 3) with friction from the one without, in frame coordinates, at positions (m, 3)."""
+        slip = x[:, None, :] - self.origins
+        slip -= np.einsum("mwi,mwi->mw", slip, self.normals)[:, :, None] * self.normals
+        way = self.start + self.weight[:, None, None] * slip
+        size = np.maximum(np.linalg.norm(way, axis=2), 1e-300)
+        directions = way / size[:, :, None]
+        every = np.arange(len(self.nodes))
+        coupling = np.zeros((len(self.nodes), 3, 3))
+        turned = np.einsum("mji,mwj->mwi", self.inverse, directions)
+        for k in range(self.rows.shape[1]):
+            row = np.maximum(self.rows[:, k], 0)
+            factor = self.friction[:, k] * self.signs[:, k]
+            coupling[every, :, row] += factor[:, None] * turned[:, k]
+        system = np.eye(3) - coupling
+        jammed = np.abs(np.linalg.det(system)) < _SINGULAR
+        system[jammed] = np.eye(3)
+        self.maps = np.linalg.inv(system)
+        g = np.einsum("mij,mj->mi", self.maps, g - np.einsum("mji,mj->mi", self.inverse, self.known))
+        # the change of friction as the direction of slip turns
+        self.stiffness[:] = 0.0
+        for k in range(self.rows.shape[1]):
+            normal_forces = np.maximum(self.signs[:, k] * g[every, np.maximum(self.rows[:, k], 0)], 0.0)
+            factor = self.friction[:, k] * normal_forces * self.weight / size[:, k]
+            n, d = self.normals[:, k], directions[:, k]
+            across = np.eye(3) - n[:, :, None] * n[:, None, :] - d[:, :, None] * d[:, None, :]
+            self.stiffness += factor[:, None, None] * across
+        return g
+
 
 MIN_VOLUME = 0.04  # of the rows of B: cond(B) <= 2.6/0.04 = 65; two planes can share a node from 2.3 degrees
 _PARALLEL = 1e-14  # 1 - |cos| of normals that share a row; the bound is exact only at the given position

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..tolerances import ON_BOUND
+from .explicit import add_friction
 from .forces import WallForces
-from .friction import add_friction
 from .projection import project
 
 if TYPE_CHECKING:

@@ -1,28 +1,246 @@
-"""All bars of a rank, in blocks of one section each, evaluated by the compiled loops of their material."""
+"""All bars of a rank, in blocks of one section each, evaluated by the compiled loops of their laws."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ..case.materials import internal_variables
+from ..case.materials import internal_variables, law_of
 from ..energies import BAR_ENERGIES
+from ..errors import InputError
 from ..fields import STATUS
-from .bar_blocks import BarBlock, laws_of, make_blocks
-from .bar_geometry import bar_lengths, first_inverted
-from .sections import bar_shapes
+from ..mesh.node_sets import group_hint
+from .bar_loops import bar_lengths, first_inverted, make_kernels
+from .columns import Sweep, make_sweep
+from .conserving import MEASURES, make_conserving_kernels
+from .materials.base import BarShapes, Law, UnsuitableBarError
+from .rupture import breakable, limit_values, make_release
 
 if TYPE_CHECKING:
     from ..case.schema import Case
-    from ..mesh.distribution import DistributedMesh
-    from ..solvers.matrix import BlockPattern
-    from .materials.base import BarShapes
+    from ..case.tables import Section
+    from ..mesh.distribution import Block, DistributedMesh
+    from ..mesh.slab import MeshSlab
+    from .block_pattern import BlockPattern
     from .springs import Springs
 
-__all__ = ["Bars", "StrainEnergy"]
+
+def bar_shapes(section: Section, length: np.ndarray, area: np.ndarray) -> BarShapes:
+    """Return the shapes of bars of a section from their lengths [m] and areas [m2], both (b,)."""
+    nothing = np.zeros_like(length)
+    outer, inner, moment, modulus = np.sqrt(area / np.pi), nothing, nothing, nothing
+    if section.thickness is not None:
+        outer = area / (2.0 * np.pi * section.thickness) + 0.5 * section.thickness
+        inner = np.maximum(outer - section.thickness, 0.0)
+    if section.second_moment is not None:
+        moment = np.full_like(length, section.second_moment)
+        squares, difference = 4.0 * moment / area, area / np.pi
+        hollow = squares >= difference
+        outer = np.where(hollow, np.sqrt(0.5 * (squares + difference)), outer)
+        inner = np.where(hollow, np.sqrt(0.5 * np.maximum(squares - difference, 0.0)), 0.0)
+        flat = 0.25 * area * np.sqrt(3.0 * squares)
+        modulus = np.where(hollow, 4.0 / 3.0 * (outer**3 - inner**3), flat)
+    elif section.shape is not None:
+        moment = 0.25 * np.pi * (outer**4 - inner**4)
+        modulus = 4.0 / 3.0 * (outer**3 - inner**3)
+    return BarShapes(length, area, moment, modulus, outer, section.effective_length * length)
+
+
+def area_fields(case: Case) -> dict[str, str]:
+    """Return the cell fields of the mesh that sections take their areas from, each with the key that names it."""
+    named = [(s.area_field, f"{case.source}: section.{name}.area_field") for name, s in case.section.items()]
+    return {field: key for field, key in reversed(named) if field is not None}
+
+
+def named_groups(case: Case) -> set[str]:
+    """Return the names of all groups of the mesh that a case uses."""
+    names = [section.bars for section in case.section.values()]
+    names += [node_set.group for node_set in case.node_set.values()]
+    names += [entry.bars for entry in (*case.temperature, *case.remove)]
+    return {name for name in names if name is not None}
+
+
+def areas_of(section: Section, block: Block, mesh: DistributedMesh) -> float | np.ndarray:
+    """Return the area of the bars of a block [m2]: a number, or (stop - start,)."""
+    if section.area_field is None:
+        return float(section.area)
+    return np.ascontiguousarray(mesh.bar_fields[section.area_field][block.start : block.stop])
+
+
+def check_areas(case: Case, slab: MeshSlab, sections: np.ndarray) -> None:
+    """Refuse areas of a mesh field that are not positive. ``sections``: of :func:`section_of_bars`.
+
+    Raises
+    ------
+    InputError
+        Names the first such bar of this rank.
+    """
+    for index, (name, section) in enumerate(case.section.items()):
+        if section.area_field is None:
+            continue
+        values = slab.bar_fields[section.area_field]
+        wrong = np.flatnonzero((sections == index) & ~((values > 0.0) & np.isfinite(values)))
+        if len(wrong):
+            key = f"{case.source}: section.{name}.area_field = {section.area_field!r}"
+            raise InputError(
+                f"{key}: bar {wrong[0] + slab.first_bar} of {slab.source} (and {len(wrong) - 1} more here) has "
+                f"{values[wrong[0]]:g} m2; give each bar of the section an area > 0"
+            )
+        least = 0.0 if section.thickness is None else np.pi * section.thickness**2
+        thin = np.flatnonzero((sections == index) & (values < least))
+        if len(thin):
+            raise InputError(
+                f"{case.source}: section.{name}.thickness = {section.thickness!r} m is too much for the tube of bar "
+                f"{thin[0] + slab.first_bar}, whose area is {values[thin[0]]:g} m2"
+            )
+
+
+def section_of_bars(case: Case, slab: MeshSlab) -> np.ndarray:
+    """Return the section index (m,) int32 of each bar of a slab: the section that names its group, else the default.
+
+    Raises
+    ------
+    InputError
+        If a section names a group that the mesh does not have, or a bar has two sections or none.
+    """
+    if [section.bars for section in case.section.values()] == [None]:
+        return np.broadcast_to(np.int32(0), len(slab.bars))  # without memory of its own
+    chosen = np.full(len(slab.bars), -1, dtype=np.int32)
+    for index, (name, section) in enumerate(case.section.items()):
+        if section.bars is None:
+            continue
+        if section.bars not in slab.bar_groups:
+            hint = group_hint(case, section.bars, sorted(slab.bar_groups), "Curve")
+            raise InputError(
+                f"{case.source}: section.{name}.bars = {section.bars!r}: no such bar group in {slab.source}{hint}"
+            )
+        members = slab.bar_groups[section.bars] - slab.first_bar
+        taken = members[chosen[members] >= 0]
+        if len(taken):
+            other = list(case.section)[chosen[taken[0]]]
+            raise InputError(
+                f"{case.source}: section.{name}.bars: bar {taken[0] + slab.first_bar} already belongs to section "
+                f"{other!r}; give each bar one section"
+            )
+        chosen[members] = index
+    default = [i for i, section in enumerate(case.section.values()) if section.bars is None]
+    if default:
+        chosen[chosen < 0] = default[0]
+    bare = np.flatnonzero(chosen < 0)
+    if len(bare):
+        raise InputError(
+            f"{case.source}: section: bar {bare[0] + slab.first_bar} of {slab.source} (and {len(bare) - 1} more here) "
+            "has no section; add a section without 'bars' as the default"
+        )
+    return chosen
+
+
+@dataclass(eq=False)
+class BarBlock:
+    """Local bars [start, stop) of one section, of which [start, counted) are counted on this rank.
+
+    ``area`` [m2] is a number, or (stop - start,) if it differs from bar to bar. ``modulus`` is the largest tangent
+    modulus of the law [Pa]; ``history`` (rows, stop - start) holds ``law.rows`` and, after them, ``law.bar_data``;
+    ``release`` removes bars, if they can leave the model.
+    """
+
+    section: str
+    start: int
+    counted: int
+    stop: int
+    area: float | np.ndarray
+    density: float
+    damping: float
+    thermal_expansion: float
+    law: Law
+    measure: Callable
+    parameters: tuple[float, ...]
+    modulus: float
+    history: np.ndarray
+    sweep: Sweep
+    kernels: SimpleNamespace
+    conserving: SimpleNamespace | None
+    release: Callable | None
+
+    @property
+    def counted_area(self) -> float | np.ndarray:
+        """Area of the counted bars [m2], a number or (counted - start,)."""
+        return self.area if isinstance(self.area, float) else self.area[: self.counted - self.start]
+
+    def variables(self) -> Iterator[tuple[str, str, np.ndarray]]:
+        """Yield name, unit and values (stop - start,) of all data kept from step to step."""
+        for (name, unit), values in zip(self.law.rows, self.history, strict=False):
+            yield name, unit, values
+
+
+def laws_of(case: Case) -> dict[str, Law]:
+    """Return the law of each material that a section has, by its name; that of bars that can leave the model is
+    breakable."""
+    laws = {section.material: law_of(case.material[section.material]) for section in case.section.values()}
+    for name, law in laws.items():
+        if case.material[name].rupture is not None or case.removes_bars:
+            laws[name] = breakable(law)
+    return laws
+
+
+def make_blocks(mesh: DistributedMesh, case: Case, lengths: np.ndarray) -> list[BarBlock]:
+    """Return the blocks of this rank; ``lengths`` (b,): of the bars in the mesh [m].
+
+    Raises
+    ------
+    InputError
+        On this rank, if a law cannot describe one of its bars.
+    """
+    laws, names, blocks = laws_of(case), list(case.section), []
+    for block in mesh.blocks:
+        section = case.section[names[block.section]]
+        material = case.material[section.material]
+        law, measure = laws[section.material], MEASURES[material.strain]
+        blocks.append(
+            BarBlock(
+                section=names[block.section],
+                start=block.start,
+                counted=block.counted,
+                stop=block.stop,
+                area=areas_of(section, block, mesh),
+                density=material.density,
+                damping=material.damping,
+                thermal_expansion=material.thermal_expansion,
+                law=law,
+                measure=measure,
+                parameters=(*(limit_values(material.rupture) if law.rupture >= 0 else ()), *material.numbers()),
+                modulus=material.upper_modulus(),
+                history=np.zeros((len(law.rows) + len(law.bar_data), block.stop - block.start)),
+                sweep=make_sweep(mesh.bars, block.start, block.counted, block.stop),
+                kernels=make_kernels(law, measure),
+                conserving=None if law.mean_stress is None else make_conserving_kernels(law, measure),
+                release=make_release(law_of(material), measure) if law.rupture >= 0 else None,
+            )
+        )
+    for block in blocks:
+        if block.law.bar_data:
+            _fill_bar_data(mesh, case, block, lengths[block.start : block.stop])
+    return blocks
+
+
+def _fill_bar_data(mesh: DistributedMesh, case: Case, block: BarBlock, lengths: np.ndarray) -> None:
+    """Give the law of a block what it reads of each bar."""
+    section = case.section[block.section]
+    shapes = bar_shapes(section, lengths, np.broadcast_to(block.area, block.stop - block.start))
+    try:
+        data = case.material[section.material].pack_bars(shapes)
+    except UnsuitableBarError as error:
+        bar = mesh.bar_ids[block.start + error.bar]
+        raise InputError(
+            f"{case.source}: section.{block.section} with material.{section.material}: bar {bar}: {error.reason}"
+        ) from error
+    block.history[len(block.law.rows) :] = data
+
 
 _LOADING = 1e-8  # relative change of all lengths that distinguishes the tangents of loading and unloading
 _KINK = 1e-6  # relative difference of these tangents above which the bar is at a kink of its law
@@ -362,3 +580,32 @@ class Bars:
         for block in self.blocks:
             for name, _, values in block.variables():
                 values[:] = history[block.start : block.stop, self.kept_names.index(name)]
+
+
+def state_before_rupture(bars: Bars, x: np.ndarray, bar: int) -> tuple[BarBlock, np.ndarray, float, float]:
+    """Return the block of a bar (local index), its data (rows,), and its stress [Pa] and strain without the thermal
+    strain at positions ``x``, as if it had not broken."""
+    block = next(block for block in bars.blocks if block.start <= bar < block.stop)
+    k = bar - block.start
+    history = block.history[:, k : k + 1].copy()
+    history[block.law.rupture] = 0.0
+    strain, stress, force = (np.zeros(bar + 1) for _ in range(3))
+    arguments = (x, bars.ends, bars.rest, bars.heat, block.parameters, block.area, bars.step, history)
+    block.kernels.fields(*arguments, bar, bar + 1, strain, stress, force)
+    shift = bars.heat[0, bar] if bars.heat.shape[1] else 0.0
+    return block, history[:, 0], float(stress[bar]), float(strain[bar] - shift)
+
+
+def release(bars: Bars, x: np.ndarray, members: np.ndarray, state: float) -> np.ndarray:
+    """Remove bars (local indices) up to a share, see :mod:`~pfem_petsc.mechanics.rupture`; return by how much the
+    energies of the bars counted on this rank change, in the order of :data:`~pfem_petsc.energies.BAR_ENERGIES`."""
+    change = np.zeros(len(BAR_ENERGIES))
+    for block in bars.blocks:
+        mine = members[(members >= block.start) & (members < block.stop)].astype(np.int64)
+        moved = np.zeros(len(block.law.energies) - 1)
+        law = (block.parameters, block.area, block.history, block.start)
+        block.release(x, bars.ends, bars.rest, bars.heat, *law, mine, state, block.counted, moved)
+        for name, energy in zip(block.law.energies, moved.tolist(), strict=False):
+            change[BAR_ENERGIES.index(name)] -= energy
+            change[BAR_ENERGIES.index("rupture_dissipation")] += energy
+    return change

@@ -1,4 +1,4 @@
-"""Compilation of loops over bars and nodes by Numba, with a cache keyed by byte code."""
+"""Compilation of loops over bars and nodes by Numba, with a cache keyed by all that the machine code depends on."""
 
 from __future__ import annotations
 
@@ -10,17 +10,92 @@ import threading
 import time
 import warnings
 from collections.abc import Callable
-from types import FunctionType
+from types import CodeType, FunctionType, ModuleType
 from typing import Any
 
 import numba
+import numpy as np
 from numba.core import event
 from numba.core.caching import FunctionCache, IndexDataCacheFile
-from numba.extending import register_jitable
+from numba.core.dispatcher import Dispatcher
+from numba.extending import _Intrinsic, register_jitable
 
-from .code_digest import code_digest
 
-__all__ = ["Compilation", "borrowing", "inlined", "kernel"]
+def code_digest(function: Callable[..., Any]) -> str:
+    """Return a digest of the byte code of a function and of all functions, constants and record types it refers to.
+
+    Machine code depends on nothing else in the program. Calls of compiled functions are followed too.
+    """
+    digest = _Digest()
+    digest.add(function)
+    return digest.hexdigest()
+
+
+class _Digest:
+    """Digest of objects that machine code can depend on, and of all objects that they refer to."""
+
+    def __init__(self) -> None:
+        self._digest = hashlib.sha256()
+        self._seen: set[int] = set()
+        self.hexdigest = self._digest.hexdigest
+
+    def add(self, thing: Any) -> None:
+        """Add a function, or an object that functions refer to."""
+        update = self._digest.update
+        if isinstance(thing, CodeType):
+            self._add_code(thing)
+        elif isinstance(thing, Dispatcher):
+            self.add(thing.py_func)
+        elif isinstance(thing, _Intrinsic):
+            self.add(thing._defn)
+        elif isinstance(thing, FunctionType):
+            self._add_function(thing)
+        elif isinstance(thing, np.ndarray):
+            update(repr((thing.shape, thing.dtype)).encode() + thing.tobytes())
+        elif isinstance(thing, ModuleType):
+            update(thing.__name__.encode())
+        elif isinstance(thing, type):
+            update(repr((thing.__qualname__, getattr(thing, "_fields", ()))).encode())
+            if thing.__module__.partition(".")[0] == __name__.partition(".")[0]:  # it may generate code
+                for part in vars(thing).values():
+                    if isinstance(part, FunctionType):
+                        self._add_function(part)
+        elif isinstance(thing, (tuple, list, frozenset)):
+            for part in sorted(thing, key=repr) if isinstance(thing, frozenset) else thing:
+                self.add(part)
+        elif isinstance(thing, (bool, int, float, complex, str, bytes, type(None), type(...), np.generic)):
+            update(repr(thing).encode())
+        else:
+            update(type(thing).__qualname__.encode())
+
+    def _add_code(self, code: CodeType) -> None:
+        self._digest.update(code.co_code)
+        self._digest.update(repr((code.co_names, code.co_varnames, code.co_freevars)).encode())
+        for constant in code.co_consts:
+            self.add(constant)
+
+    def _add_function(self, function: FunctionType) -> None:
+        if id(function) in self._seen:
+            return
+        self._seen.add(id(function))
+        self._add_code(function.__code__)
+        for cell in function.__closure__ or ():
+            self.add(cell.cell_contents)
+        # sorted, because the order of a set of names differs between processes
+        for name in sorted(_global_names(function.__code__)):
+            if name in function.__globals__:
+                self._digest.update(name.encode())
+                self.add(function.__globals__[name])
+
+
+def _global_names(code: CodeType) -> set[str]:
+    """Return the names that a function and its nested functions may look up globally."""
+    names = set(code.co_names)
+    for constant in code.co_consts:
+        if isinstance(constant, CodeType):
+            names |= _global_names(constant)
+    return names
+
 
 # Neither contraction to fused multiply-add nor reassociation: the result of a loop must not depend on how it was
 # compiled, alone or into the fused loop, for one bar or for eight at once. Then a bar evaluated on two ranks has the
@@ -75,7 +150,7 @@ def _warn_once(text: str) -> None:
 def _variant(function: Callable[..., Any]) -> str:
     """Return the names of the functions in modules from which a loop was made: ``elastic.response-strain.green``.
 
-    Functions that a private module makes from others add the name of what makes them, ``_stiffness_damping.damped``.
+    Functions that a base or private module of laws makes from others add the name of what makes them, ``base.damped``.
     """
     found: list[str] = []
     seen: set[int] = set()
@@ -89,7 +164,7 @@ def _variant(function: Callable[..., Any]) -> str:
             found.append(f"{inner.__module__.rpartition('.')[2]}.{inner.__name__}")
             return
         module, maker = inner.__module__.rpartition(".")[2], inner.__qualname__.partition(".")[0]
-        if module.startswith("_") and f"{module}.{maker}" not in found:
+        if (module == "base" or module.startswith("_")) and f"{module}.{maker}" not in found:
             found.append(f"{module}.{maker}")
         for cell in inner.__closure__ or ():
             walk(cell.cell_contents)

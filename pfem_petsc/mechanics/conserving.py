@@ -1,15 +1,5 @@
-"""The discrete-gradient force of bars between two positions, of Simo-Tarnow type, which conserves energy and momenta.
-
-Between d0 and d1 (end differences of a bar at the start and end of a step) with d = (d0 + d1)/2, the force on the ends
-is -+ A l0 S R d, with R = (e1 - e0)/((l1^2 - l0^2)/2) and the stress S, the mean over a path on which the strain goes
-from e0 to e1 in one direction. Its work over the step is exactly A l0 S (e1 - e0); it acts along d, so both momenta
-are conserved. For engineering strain R = 2/(L (l0 + l1)), for Green's 1/L^2, for the logarithmic
-ln(l1/l0)/((l1^2 - l0^2)/2).
-
-The material law defines S (``mean_stress`` of :class:`~pfem_petsc.mechanics.materials.base.Law`): (s0 + s1)/2 for an
-elastic bar, so that the work equals the change of its energy. If the temperature changes, e is the strain minus the
-thermal strain. If the rest length changes, e0 and e1 are the strains with the rest lengths at either end of the step,
-and l0 and R are those of their mean.
+"""The discrete-gradient force of bars between two positions, of Simo-Tarnow type, which conserves energy; strain
+measures.
 """
 
 from __future__ import annotations
@@ -21,14 +11,31 @@ from types import SimpleNamespace
 
 from numba.extending import register_jitable
 
+from .bar_loops import COLLAPSED_STRETCH, last_row, no_bar_data, no_variables
 from .compiled import inlined, kernel
-from .force_kernels import COLLAPSED_STRETCH
-from .law_rows import last_row, no_bar_data, no_variables
 from .materials.base import Law
 from .rows import bar_value, extend, take
-from .strain import engineering, green, logarithmic
 
-__all__ = ["make_conserving_kernels"]
+
+@register_jitable
+def engineering(stretch: float) -> tuple[float, float, float]:
+    """Return the engineering strain l/l0 - 1 and its derivatives."""
+    return stretch - 1.0, 1.0, 0.0
+
+
+@register_jitable
+def green(stretch: float) -> tuple[float, float, float]:
+    """Return Green's strain ((l/l0)^2 - 1)/2 and its derivatives."""
+    return 0.5 * (stretch * stretch - 1.0), stretch, 1.0
+
+
+@register_jitable
+def logarithmic(stretch: float) -> tuple[float, float, float]:
+    """Return the logarithmic strain ln(l/l0) and its derivatives."""
+    return math.log(stretch), 1.0 / stretch, -1.0 / (stretch * stretch)
+
+
+MEASURES = {"engineering": engineering, "green": green, "logarithmic": logarithmic}
 
 
 @register_jitable
@@ -63,7 +70,7 @@ _RATIOS = {engineering: _engineering_ratio, green: _green_ratio, logarithmic: _l
 @cache
 def make_conserving_kernels(law: Law, measure: Callable) -> SimpleNamespace:
     """Make the kernels ``forces`` and ``tangents`` of a material law; arguments as in
-    :mod:`~pfem_petsc.mechanics.kernels`, with positions, thermal strains and temperatures at the start (``x0``,
+    :mod:`~pfem_petsc.mechanics.bar_loops`, with positions, thermal strains and temperatures at the start (``x0``,
     ``cold``) and end (``x``, ``heat``) of the step; ``rest0`` (b,): rest lengths at the start, (0,) if constant."""
     response, mean_stress, like, by_rate, last = (
         law.response,

@@ -1,23 +1,293 @@
-"""External forces: gravity, nodal loads multiplied by time tables, and forces that depend on the motion."""
+"""External forces: gravity, nodal loads over time, and forces that depend on the motion, such as wind."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+import traceback
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
-from ..case.tables import VaryingGravity
-from .nodal_loads import NodalLoads
-from .state_forces import ForceState, FunctionForce, StateForce
-from .time_tables import Table
-from .wind import Wind
+from ..case.load_files import Forces, read_forces
+from ..case.load_tables import VaryingWind
+from ..case.tables import LoadFile, VaryingGravity
+from ..errors import InputError
+from ..parallel.agreement import on_root
+from ..registry import nearest
+from .bars import bar_shapes
+from .compiled import kernel
+from .motion import Group, Table, TimeTables, grouped
 
 if TYPE_CHECKING:
     from ..case.schema import Case
+    from ..mesh.distribution import DistributedMesh
+    from .bars import Bars
     from .mass import Inertia
 
-__all__ = ["ExternalForce"]
+
+@kernel
+def _add_forces(first, members, forces, columns, values, out):
+    """Add force k (3,) times its value to the nodes ``members[first[k]:first[k + 1]]`` of ``out``."""
+    for k in range(len(forces)):
+        value = values[columns[k]]
+        x, y, z = forces[k, 0] * value, forces[k, 1] * value, forces[k, 2] * value
+        for m in range(first[k], first[k + 1]):
+            i = members[m]
+            out[i, 0] += x
+            out[i, 1] += y
+            out[i, 2] += z
+
+
+class NodalLoads:
+    """All entries of ``[[load]]`` on this rank's nodes. Construction is collective if there are files.
+
+    Attributes
+    ----------
+    any : whether there are any in the model
+    steady : whether all of them are constant
+    """
+
+    def __init__(self, case: Case, nodes: dict[str, np.ndarray], mesh: DistributedMesh) -> None:
+        self.any = bool(case.load)
+        self._groups: list[Group] = []
+        self._members: list[np.ndarray] = []
+        self._forces: list[np.ndarray] = []
+        self._columns: list[int] = []
+        plain = [load for load in case.load if not isinstance(load, LoadFile)]
+        tables = [(np.array(load.table), load.interpolation == "smooth") for load in plain if load.table is not None]
+        self._groups, columns = grouped(tables)
+        self._width = sum(group.values.shape[1] for group in self._groups)
+        left = iter(columns.tolist())
+        for index, load in enumerate(case.load):
+            if isinstance(load, LoadFile):
+                key = f'{case.source}: load[{index}].file = "{load.file}"'
+                self._add_file(key, load, nodes, mesh)
+            else:
+                column = -1 if load.table is None else next(left)
+                self._add(nodes[load.node_set], np.array(load.force), column)
+        self.steady = not self._groups
+        self._tables = TimeTables(self._groups)
+        sizes = np.array([len(each) for each in self._members], dtype=np.int64)
+        first = np.append(0, np.cumsum(sizes))
+        members = np.concatenate([np.zeros(0, dtype=np.int64), *self._members])
+        forces = np.array(self._forces).reshape(-1, 3)
+        # forces without a table are multiplied by the last value
+        which = np.array(self._columns, dtype=np.int64)
+        which[which < 0] = self._width
+        self._arguments = first, members, forces, which
+        self._values = np.empty(self._width + 1)
+
+    def _add(self, members: np.ndarray, force: np.ndarray, column: int) -> None:
+        self._members.append(np.asarray(members, dtype=np.int64))
+        self._forces.append(force)
+        self._columns.append(column)
+
+    def _add_file(self, key: str, load: LoadFile, nodes: dict[str, np.ndarray], mesh: DistributedMesh) -> None:
+        content = on_root(mesh.comm, _read, key, load)
+        members = _members(key, content, nodes, mesh)
+        values = content.values
+        if len(content.times) == 1 and (values == 1.0).all():
+            columns = np.full(len(content.columns), -1)  # constant: with a load factor they grow with it
+        else:
+            used = [e for e, member in enumerate(content.members.tolist()) if len(members[member])]
+            mine = np.unique(content.columns[used])  # of the columns, those of this rank
+            place = np.full(values.shape[1], -1)
+            place[mine] = self._width + np.arange(len(mine))
+            columns = place[content.columns]
+            self._groups.append(Group(load.time_scale * content.times, values[:, mine], load.interpolation == "smooth"))
+            self._width += len(mine)
+        for member, column, force in zip(content.members.tolist(), columns.tolist(), content.forces, strict=True):
+            if len(members[member]):
+                self._add(members[member], load.scale * force, column)
+
+    def add(self, time: float, constant: float, out: np.ndarray) -> None:
+        """Add the forces at a time [s] to ``out`` (owned, 3) [N]; those without a table times ``constant``."""
+        self._tables.at(time, self._values)
+        self._values[self._width] = constant
+        _add_forces(*self._arguments, self._values, out)
+
+
+def _read(key: str, load: LoadFile) -> Forces:
+    try:
+        return read_forces(Path(load.file), load.digest)
+    except InputError as error:
+        raise InputError(f"{key}: {error}") from error
+
+
+def _members(key: str, content: Forces, nodes: dict[str, np.ndarray], mesh: DistributedMesh) -> list[np.ndarray]:
+    """Return the owned local indices of each target."""
+    nothing = np.zeros(0, dtype=np.int64)
+    owned = mesh.node_ids[: mesh.n_owned]
+    order = np.argsort(owned)
+    numbers = np.array([target for target in content.targets if isinstance(target, int)], dtype=np.int64)
+    outside = numbers[(numbers < 0) | (numbers >= mesh.n_nodes)]
+    if len(outside):
+        raise InputError(f"{key}: there is no node {outside[0]}: the mesh has the nodes 0 to {mesh.n_nodes - 1}")
+    places = np.searchsorted(owned, numbers, sorter=order) if len(owned) else np.zeros(len(numbers), dtype=np.int64)
+    found, k = [], 0
+    for target in content.targets:
+        if isinstance(target, str):
+            if target not in nodes:
+                raise InputError(f"{key}: there is no node set {target!r}{nearest(target, list(nodes))}")
+            found.append(nodes[target])
+            continue
+        at = order[places[k]] if places[k] < len(owned) else -1
+        found.append(np.array([at]) if at >= 0 and owned[at] == target else nothing)
+        k += 1
+    return found
+
+
+@dataclass(frozen=True)
+class ForceState:
+    """What a force depends on, of the nodes that this rank owns.
+
+    Attributes
+    ----------
+    position : (owned, 3) [m]
+    v : (owned, 3) velocities [m/s]; also ``velocity``
+    nodes : (owned,) node numbers of the mesh
+    node_sets : rows of the nodes of each node set, by name
+    """
+
+    position: np.ndarray
+    v: np.ndarray
+    nodes: np.ndarray
+    node_sets: Mapping[str, np.ndarray]
+
+    @property
+    def velocity(self) -> np.ndarray:
+        """Velocities (owned, 3) [m/s]."""
+        return self.v
+
+
+class StateForce(Protocol):
+    """A force that depends on the motion.
+
+    Attributes
+    ----------
+    failure : why the last force could not be evaluated on this rank, None if it could
+    """
+
+    failure: str | None
+
+    def add(self, time: float, state: ForceState, out: np.ndarray) -> None:
+        """Add the force at a time [s] to ``out`` (owned, 3) [N]. Collective."""
+
+
+class FunctionForce:
+    """The force that a function of time and state returns."""
+
+    def __init__(self, function: Callable[[float, ForceState], Any], mesh: DistributedMesh) -> None:
+        self.function, self.failure = function, None
+        self._shape = mesh.n_owned, 3
+
+    def add(self, time: float, state: ForceState, out: np.ndarray) -> None:
+        """See :class:`StateForce`; what is wrong with a force becomes the failure, so that no rank is left alone."""
+        try:
+            force = np.asarray(self.function(time, state), dtype=np.float64)
+        except Exception as error:  # noqa: BLE001 - of a user; the other ranks would wait
+            place = traceback.extract_tb(error.__traceback__)[-1]
+            self.failure = f"raised {type(error).__name__}: {error} ({place.filename}, line {place.lineno})"
+            return
+        if force.shape != self._shape:
+            self.failure = (
+                f"returned an array {force.shape}: expected {self._shape}, a force for each node of this rank"
+            )
+        elif not np.isfinite(force).all():
+            node = state.nodes[np.flatnonzero(~np.isfinite(force).all(axis=1))[0]]
+            self.failure = f"returned a force on node {node} that is not finite"
+        else:
+            out += force
+
+
+@kernel
+def _add_drag(bars, x, v, factor, wind, owned, out):
+    """Add the drag of bars at positions and velocities (local, 3) to the forces ``out`` (owned, 3) of their ends."""
+    for k in range(len(bars)):
+        a, b = bars[k, 0], bars[k, 1]
+        tx, ty, tz = x[b, 0] - x[a, 0], x[b, 1] - x[a, 1], x[b, 2] - x[a, 2]
+        length = (tx * tx + ty * ty + tz * tz) ** 0.5
+        if factor[k] == 0.0 or length == 0.0:
+            continue
+        tx, ty, tz = tx / length, ty / length, tz / length
+        wx = wind[0] - 0.5 * (v[a, 0] + v[b, 0])
+        wy = wind[1] - 0.5 * (v[a, 1] + v[b, 1])
+        wz = wind[2] - 0.5 * (v[a, 2] + v[b, 2])
+        along = wx * tx + wy * ty + wz * tz
+        wx, wy, wz = wx - along * tx, wy - along * ty, wz - along * tz
+        f = factor[k] * length * (wx * wx + wy * wy + wz * wz) ** 0.5
+        for end in (a, b):
+            if end < owned:
+                out[end, 0] += f * wx
+                out[end, 1] += f * wy
+                out[end, 2] += f * wz
+
+
+class Wind:
+    """The drag of all bars; a :class:`~pfem_petsc.mechanics.loads.StateForce`.
+
+    Attributes
+    ----------
+    held : (3,) velocity at the start of a stage that does not give its own [m/s], None for none
+    """
+
+    failure = None
+
+    def __init__(self, case: Case, bars: Bars) -> None:
+        wind = case.wind
+        self.held: np.ndarray | None = None
+        self._holds = case.holds("wind")
+        self._table, self._constant = None, np.zeros(3)
+        if isinstance(wind, VaryingWind):
+            self._table = Table(wind.velocity, wind.interpolation == "smooth")
+        else:
+            self._constant = np.array(wind.velocity, dtype=np.float64)
+        mesh = bars.mesh
+        self._bars, self._mesh, self._rate = bars, mesh, 0.0
+        self._factor = np.zeros(len(mesh.bars))
+        for block in bars.blocks:
+            if block.section not in case.section:  # springs and dashpots
+                continue
+            section, part = case.section[block.section], slice(block.start, block.stop)
+            rest = bars.rest[part]
+            diameter = section.diameter
+            if diameter is None:
+                diameter = 2.0 * bar_shapes(section, rest, np.full_like(rest, block.area)).radius
+            coefficient = wind.drag_coefficient if section.drag_coefficient is None else section.drag_coefficient
+            self._factor[part] = 0.25 * wind.density * coefficient * diameter
+            # dF/dw over the mass of the bar, for w = 1 m/s
+            most = float(np.max(4.0 * self._factor[part] / (block.density * block.area), initial=0.0))
+            self._rate = max(self._rate, most)
+        self._x, self._v = np.zeros((mesh.n_local, 3)), np.zeros((mesh.n_local, 3))
+
+    def velocity(self, time: float) -> np.ndarray:
+        """Return the velocity of the wind (3,) [m/s] at a time [s]."""
+        if self._holds and self.held is not None:
+            return self.held
+        return self._constant if self._table is None else self._table(time)
+
+    def add(self, time: float, state: ForceState, out: np.ndarray) -> None:
+        """Add the drag at a time [s] to ``out`` (owned, 3) [N]. Collective."""
+        owned = self._mesh.n_owned
+        for local, given in ((self._x, state.position), (self._v, state.v)):
+            local[:owned] = given
+            self._mesh.update_ghosts(local)
+        # the share of a bar that is left has its drag: the ends of a broken bar may be far from each other
+        left = 1.0 - np.abs(self._bars.rupture()) if self._bars.can_break else 1.0
+        _add_drag(self._mesh.bars, self._x, self._v, self._factor * left, self.velocity(time), owned, out)
+
+    def rate(self, speed: float) -> float:
+        """Return the largest rate [1/s] of a bar's drag over its velocity and mass, at a speed [m/s]. Collective."""
+        return max(self._mesh.comm.allgather(self._rate)) * speed
+
+    def fastest(self) -> float:
+        """Largest speed of the wind [m/s]."""
+        if self._holds and self.held is not None:
+            return float(np.linalg.norm(self.held))
+        rows = self._constant if self._table is None else self._table.values
+        return float(np.linalg.norm(np.atleast_2d(rows), axis=1).max())
 
 
 class ExternalForce:

@@ -13,14 +13,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .compiled import kernel
+from .motion import Table
 from .rows import bar_value
-from .time_tables import Table
 
 if TYPE_CHECKING:
     from ..case.schema import Case
     from ..mesh.distribution import DistributedMesh
-    from .bar_blocks import BarBlock
-    from .bars import Bars
+    from .bars import BarBlock, Bars
 
 __all__ = ["Inertia", "PointInertia", "consistent_product"]
 

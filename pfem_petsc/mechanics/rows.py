@@ -149,7 +149,7 @@ def accumulate(typingctx, rows, first, column, factor, values):  # noqa: ANN001,
 @intrinsic
 def put_apart(typingctx, rows, first, column, factor, values):  # noqa: ANN001, ANN201
     """Write ``factor`` times a tuple to ``rows[first, column]`` and the following rows, which do not overlap with what
-    the functions of :mod:`~pfem_petsc.mechanics.planes` load."""
+    the functions of :mod:`~pfem_petsc.mechanics.columns` load."""
     count = len(values)
 
     def generate(context, builder, signature, args):  # noqa: ANN001, ANN202

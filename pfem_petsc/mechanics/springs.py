@@ -1,25 +1,24 @@
-"""Springs from nodes to the ground: forces -K (x - X) about the positions X of the mesh, along constant axes.
-
-K is diagonal in the frame of each table, by default that of the model; tables of one node add up.
-
-They are added to the internal forces of the bars, so every scheme integrates them with the bars. The forces of bars
-cancel in the sum over all nodes; what remains of it is the force of the truss on the ground by the springs.
-"""
+"""Springs from nodes to the ground, and springs and dashpots between two nodes as bars without mass."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import copy
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from mpi4py import MPI
 
-from .directions import axes_of
+from ..case.tables import Section
+from ..errors import InputError
+from ..mesh.slab import MeshSlab, index_type, with_bars
+from .materials.base import EXTRAPOLATED, Law, MaterialKeys, damped
+from .supports import axes_of
 
 if TYPE_CHECKING:
     from ..case.schema import Case
     from ..mesh.distribution import DistributedMesh
-    from ..solvers.matrix import BlockPattern
-
-__all__ = ["Springs", "make_springs"]
+    from .bars import Bars
+    from .block_pattern import BlockPattern
 
 
 class Springs:
@@ -86,3 +85,134 @@ def make_springs(case: Case, nodes: dict[str, np.ndarray], mesh: DistributedMesh
         stiffness[nodes[entry.node_set]] += tensor
     held = np.flatnonzero(stiffness.any(axis=(1, 2)))
     return Springs(held, stiffness[held], mesh.points[held].copy())
+
+
+_AREA = "(springs and dashpots)"
+"""Name of the field of the mesh with the areas of these bars; no dataset or array can have it by mistake."""
+
+
+class _Viscous(MaterialKeys):
+    """A material without stiffness and with the viscosity ``young_modulus`` [Pa s]."""
+
+    def numbers(self) -> tuple[Any, ...]:
+        return (0.0,), float(self.young_modulus), EXTRAPOLATED
+
+    def choose(self, law: Law) -> Law:
+        return damped(law)
+
+    def largest_modulus(self) -> float:
+        return 0.0
+
+
+class _Table(NamedTuple):
+    """A table ``[[spring]]`` or ``[[dashpot]]`` between nodes: its place in the case, node sets, and value."""
+
+    key: str
+    between: tuple[str, str]
+    value: float
+    viscous: bool
+
+
+def connected(case: Case) -> list[_Table]:
+    """Return the tables of springs, then dashpots, between nodes."""
+    springs = [(f"spring[{k}]", entry, False) for k, entry in enumerate(case.spring)]
+    dashpots = [(f"dashpot[{k}]", entry, True) for k, entry in enumerate(case.dashpot)]
+    return [
+        _Table(key, entry.between, float(entry.coefficient if viscous else entry.stiffness), viscous)
+        for key, entry, viscous in springs + dashpots
+        if entry.between is not None
+    ]
+
+
+def with_connectors(case: Case) -> Case:
+    """Return the case with a section and a material for each such table; the case itself if it has none."""
+    tables = connected(case)
+    if not tables:
+        return case
+    scale = _modulus(case)
+    made = copy.copy(case)
+    materials, sections = dict(case.material), dict(case.section)
+    for table in tables:
+        kind = _Viscous if table.viscous else MaterialKeys
+        materials[table.key] = kind.model_construct(young_modulus=scale, density=0.0)
+        sections[table.key] = Section.model_construct(area_field=_AREA, material=table.key)
+    made.__dict__.update(material=materials, section=sections)
+    return made
+
+
+def _modulus(case: Case) -> float:
+    """Modulus [Pa], and viscosity [Pa s], of all connectors: that of a bar of the case."""
+    return max(material.young_modulus for material in case.material.values())
+
+
+def add_connectors(
+    case: Case, nodes: dict[str, np.ndarray], mesh: DistributedMesh, slab: MeshSlab, sections: np.ndarray
+) -> tuple[MeshSlab, np.ndarray]:
+    """Return slab and sections of its bars with the springs and dashpots between nodes. Collective.
+
+    Parameters
+    ----------
+    nodes : owned members of each node set; mesh : distributed without them
+
+    Raises
+    ------
+    InputError
+        On all ranks, for nodes without a distance or a partner.
+    """
+    ends, areas, kinds = [], [], []
+    for k, table in enumerate(connected(case)):
+        pairs, lengths = _pairs(f"{case.source}: {table.key}.between", table.between, nodes, mesh)
+        ends.append(pairs)
+        areas.append(table.value * lengths / _modulus(case))
+        kinds.append(np.full(len(pairs), len(case.section) + k, dtype=np.int32))
+    new = np.concatenate(ends).astype(index_type(slab.n_nodes))
+    return with_bars(slab, mesh.comm, new, sections, np.concatenate(kinds), (_AREA, np.concatenate(areas)))
+
+
+def _pairs(
+    key: str, between: tuple[str, str], nodes: dict[str, np.ndarray], mesh: DistributedMesh
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return mesh numbers (m, 2) and distances (m,) [m]: each node of the second set with the nearest of the first."""
+    found = []
+    for name in between:
+        members = nodes[name]
+        parts = mesh.comm.allgather((mesh.node_ids[members], mesh.points[members]))
+        numbers, points = (np.concatenate(rows) for rows in zip(*parts, strict=True))
+        order = np.argsort(numbers)
+        found.append((numbers[order], points[order]))
+    (first, places), (second, points) = found
+    pairs, lengths = np.empty((len(second), 2), dtype=np.int64), np.empty(len(second))
+    for k, (number, point) in enumerate(zip(second, points, strict=True)):
+        away = np.where(first == number, np.inf, np.linalg.norm(places - point, axis=1))
+        at = int(away.argmin())
+        if away[at] == np.inf:
+            raise InputError(
+                f"{key}: node {number} is the only node of {between[0]!r}, and also in {between[1]!r}; name two nodes"
+            )
+        if not away[at] > 0.0:
+            raise InputError(
+                f"{key}: node {number} of {between[1]!r} and node {first[at]} of {between[0]!r} have the same position,"
+                " so there is no line between them; use nodes at different positions"
+            )
+        pairs[k], lengths[k] = (first[at], number), away[at]
+    return pairs, lengths
+
+
+def viscous_rate(case: Case, bars: Bars, mass: np.ndarray, consistent: bool) -> float:
+    """Return an upper bound of the eigenvalues of C over M [1/s] of dashpots between nodes. Collective.
+
+    By Gershgorin's theorem it is the largest sum of 2 c/m at a node; a consistent mass is at least a third of the
+    lumped one.
+    """
+    viscous = {table.key for table in connected(case) if table.viscous}
+    if not viscous:
+        return 0.0
+    sums = np.zeros(bars.mesh.n_local)
+    for block in bars.blocks:
+        if block.section in viscous:
+            part = slice(block.start, block.stop)
+            values = np.asarray(block.area) * _modulus(case) / bars.mesh_lengths[part]
+            for end in (0, 1):
+                np.add.at(sums, bars.ends[part, end], 2.0 * values)
+    largest = float((sums[: len(mass)] / mass).max(initial=0.0))
+    return (3.0 if consistent else 1.0) * bars.mesh.comm.allreduce(largest, op=MPI.MAX)

@@ -35,7 +35,7 @@ def load_slab(
     """
     from ..parallel.agreement import agreed
     from ..registry import lookup
-    from .checks import check_mesh
+    from .whole import check_mesh
 
     if mesh.generator is not None:
         from ..errors import InputError

@@ -10,8 +10,7 @@ from mpi4py import MPI
 
 from ..parallel.natural import NaturalOrder
 from .exchange import GhostExchange, Messages, Router
-from .ordering import bar_order, node_order, sweep_axes, sweep_keys
-from .partition import bounding_box, partition
+from .ordering import bar_order, bounding_box, node_order, partition, sweep_axes, sweep_keys
 from .slab import MeshSlab, index_type, slab_of
 
 __all__ = ["Block", "DistributedMesh", "distribute"]
@@ -136,7 +135,7 @@ def distribute(
         Section of each bar.
     comm : MPI.Comm
     partitioner : str
-        ``"auto"``, ``"ptscotch"`` or ``"coordinates"``; see :func:`~pfem_petsc.mesh.partition.partition`.
+        ``"auto"``, ``"ptscotch"`` or ``"coordinates"``; see :func:`~pfem_petsc.mesh.ordering.partition`.
     keep : bool
         False: the slab loses its points and bars on the way, which saves memory.
 

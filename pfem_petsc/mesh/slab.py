@@ -1,26 +1,21 @@
-"""The part of a mesh on a rank before its distribution: contiguous ranges of nodes and bars."""
+"""A slab of a mesh: the contiguous range of nodes and bars that a rank has before distribution."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
 
 from ..errors import InputError
 from ..files import memory_of_machine
+from .exchange import Router
 
-__all__ = [
-    "MeshSlab",
-    "check_length",
-    "check_memory",
-    "check_size",
-    "index_type",
-    "slab_of",
-    "slab_of_whole",
-    "slab_range",
-]
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
 
 _PER_NODE, _PER_BAR = 200.0, 24.0
 """Least memory of a model [B]: positions, velocities, accelerations, forces of nodes; ends and rest lengths of bars."""
@@ -158,3 +153,120 @@ def slab_of_whole(
         source=source,
         structured=True,
     )
+
+
+def with_bars(
+    slab: MeshSlab,
+    comm: MPI.Comm,
+    ends: np.ndarray,
+    sections: np.ndarray,
+    new_sections: np.ndarray,
+    field: tuple[str, np.ndarray],
+) -> tuple[MeshSlab, np.ndarray]:
+    """Return a slab with further bars after those of the mesh, and the section of each of its bars. Collective.
+
+    Parameters
+    ----------
+    ends : (m, 2) mesh numbers of the nodes of the new bars, the same on all ranks
+    sections : (bars here,) of the bars of the slab; new_sections : (m,) of the new ones
+    field : name and values (m,) of a further field of the bars; it is zero for the others
+    """
+    total = slab.n_bars + len(ends)
+    numbers = slab.first_bar + np.arange(len(slab.bars), dtype=np.int64)
+    # contiguous ranges arrive in order, and the new bars are the last ones
+    router = Router(comm, slab_of(numbers, total, comm.size))
+    first, last = slab_range(total, comm.rank, comm.size)
+    own = slice(max(first - slab.n_bars, 0), max(last - slab.n_bars, 0))
+    name, values = field
+    fields = {key: np.concatenate([router.send(old), np.zeros(len(ends[own]))]) for key, old in slab.bar_fields.items()}
+    fields[name] = np.concatenate([np.zeros(router.n_received), values[own]])
+    groups = {
+        key: Router(comm, slab_of(members, total, comm.size)).send(members) for key, members in slab.bar_groups.items()
+    }
+    made = replace(
+        slab,
+        n_bars=total,
+        first_bar=first,
+        bars=np.concatenate([router.send(slab.bars), ends[own].astype(slab.bars.dtype)]),
+        bar_groups=groups,
+        bar_fields=fields,
+    )
+    return made, np.concatenate([router.send(sections), new_sections[own]]).astype(np.int32)
+
+
+def slab_from_arrays(
+    source: str,
+    points: ArrayLike,
+    bars: ArrayLike,
+    node_groups: Mapping[str, ArrayLike],
+    bar_groups: Mapping[str, ArrayLike],
+    bar_fields: Mapping[str, ArrayLike],
+) -> MeshSlab:
+    """Return the slab of one rank that has the whole mesh; ``source`` names it in messages.
+
+    Raises
+    ------
+    InputError
+        For arrays of wrong shape or type, and members of groups that do not exist.
+    """
+    nodes, ends = _array(source, "points", points, 3, "fiu"), _array(source, "bars", bars, 2, "iu")
+    return MeshSlab(
+        n_nodes=len(nodes),
+        n_bars=len(ends),
+        first_node=0,
+        points=nodes.astype(np.float64),
+        first_bar=0,
+        bars=ends.astype(np.int64),
+        node_groups={name: _members(source, "node_groups", name, m, len(nodes)) for name, m in node_groups.items()},
+        bar_groups={name: _members(source, "bar_groups", name, m, len(ends)) for name, m in bar_groups.items()},
+        bar_fields={name: _field(source, name, values, len(ends)) for name, values in bar_fields.items()},
+        source=source,
+    )
+
+
+def _array(where: str, name: str, values: ArrayLike, width: int, kinds: str) -> np.ndarray:
+    try:
+        array = np.asarray(values)
+    except ValueError:
+        array = np.empty(0, object)  # rows of different lengths
+    if array.ndim != 2 or array.shape[1] != width or array.dtype.kind not in kinds:
+        what = "positions [m]" if name == "points" else "integers, the nodes at both ends"
+        raise InputError(
+            f"{where}: {name} has shape {array.shape} and type {array.dtype}; expected ({name}, {width}) {what}"
+        )
+    return array
+
+
+def _field(source: str, name: str, values: ArrayLike, n: int) -> np.ndarray:
+    """Return the values of a cell field."""
+    where = f"{source}: bar_fields[{name!r}]"
+    _check_name(where, name)
+    array = np.asarray(values)
+    if array.shape != (n,) or array.dtype.kind not in "fiu":
+        raise InputError(f"{where} has shape {array.shape} and type {array.dtype}; expected ({n},) numbers")
+    return array.astype(np.float64)
+
+
+def _check_name(where: str, name: str) -> None:
+    if not isinstance(name, str) or not name or "/" in name or name == ".":
+        raise InputError(f"{where}: expected a name without slashes")
+
+
+def _members(source: str, kind: str, name: str, values: ArrayLike, n: int) -> np.ndarray:
+    """Return the numbers of the members of a group, ascending."""
+    where = f"{source}: {kind}[{name!r}]"
+    _check_name(where, name)
+    array = np.asarray(values)
+    if array.dtype.kind == "b" and array.shape == (n,):
+        return np.flatnonzero(array)
+    if array.size == 0:
+        return np.empty(0, np.int64)
+    if array.ndim != 1 or array.dtype.kind not in "iu":
+        raise InputError(
+            f"{where} has shape {array.shape} and type {array.dtype}; expected a list of numbers from 0, or ({n},) "
+            "booleans"
+        )
+    wrong = array[(array < 0) | (array >= n)]
+    if len(wrong):
+        raise InputError(f"{where} has member {wrong[0]}, but numbers go from 0 to {n - 1}")
+    return np.unique(array.astype(np.int64))

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..registry import lookup
-from .arrays import slab_from_arrays
+from .slab import slab_from_arrays
 
 if TYPE_CHECKING:
     import pyvista
@@ -100,7 +100,7 @@ class Truss:
     def _take(self, points: Any, bars: Any, node_groups: Any, bar_groups: Any, bar_fields: Any, source: str) -> None:
         from mpi4py import MPI
 
-        from .checks import check_mesh
+        from .whole import check_mesh
 
         slab = slab_from_arrays(source, points, bars, node_groups, bar_groups, bar_fields)
         self.warnings = check_mesh(slab, MPI.COMM_SELF)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..parallel.agreement import on_root
-from .arrays import slab_from_arrays
+from .slab import slab_from_arrays
 
 if TYPE_CHECKING:
     from mpi4py import MPI
@@ -67,8 +67,7 @@ def _write(
 ) -> Path:
     from mpi4py import MPI
 
-    from .checks import check_mesh
-    from .whole import WholeMesh
+    from .whole import WholeMesh, check_mesh
     from .writers import write_whole, writer_name
 
     writer_name(path)

@@ -1,27 +1,218 @@
-"""Natural frequencies, or linear buckling factors, of the state of a model."""
+"""Natural frequencies, or linear buckling factors, of the state of a model, with unique vectors on any number of
+ranks.
+"""
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from functools import cache
+from types import ModuleType
+from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from ..errors import SimulationFailure
-from .choice import choose, solver_module
-from .holds import Holds
-from .pencil import Pencil, StateMatrices, buckling_bars, join
-from .shapes import Basis, same
+from ..errors import InputError, SimulationFailure
+from ..registry import lookup
+from .pencil import Holds, Pencil, StateMatrices, buckling_bars, join
 
 if TYPE_CHECKING:
+    from ..case.settings import Modes
     from ..case.settings import Modes as Settings
     from ..integrators.base import State
     from ..stepping.model import Model
 
-__all__ = ["Found", "find_modes"]
+
+_EQUAL = 1e-9  # relative difference below which eigenvalues count as equal
+_TIE = 1e-6  # relative difference below which components count as equal
+_SEEN = 1e-3  # smallest projection of a unit rigid motion on a space that is used
+
+
+class Basis:
+    """Makes vectors unique, given each rank's components.
+
+    Parameters
+    ----------
+    comm : MPI.Comm
+    numbers : (owned,) mesh numbers of the nodes
+    points : (owned, 3) [m]
+    mass : (owned,) lumped mass [kg], the weight of the projections
+    """
+
+    def __init__(self, comm: MPI.Comm, numbers: np.ndarray, points: np.ndarray, mass: np.ndarray) -> None:
+        self._comm, self._mass = comm, mass
+        self._places = (3 * numbers[:, None] + np.arange(3)).ravel()
+        sums = comm.allreduce(np.append(mass @ points, mass.sum()))
+        arms = points - sums[:3] / sums[3]
+        translations = np.broadcast_to(np.eye(3)[:, None], (3, len(numbers), 3))
+        rotations = np.stack([np.cross(axis, arms) for axis in np.eye(3)])
+        self._motions = np.concatenate([translations, rotations])
+
+    def unique(self, values: np.ndarray, shapes: np.ndarray, zero: float) -> np.ndarray:
+        """Make B-orthonormal shapes (k, owned, 3) of ascending eigenvalues (k,) unique. Collective.
+
+        ``zero`` : difference of eigenvalues within rounding.
+        """
+        shapes, first = shapes.copy(), 0
+        while first < len(values):
+            last = first + 1
+            while last < len(values) and same(values[last - 1], values[last], zero):
+                last += 1
+            if last > first + 1:
+                turn = self._basis(shapes[first:last])
+                shapes[first:last] = np.einsum("ij,jnc->inc", turn, shapes[first:last])
+            first = last
+        return shapes * self._signs(shapes)[:, None, None]
+
+    def _basis(self, space: np.ndarray) -> np.ndarray:
+        """Return the orthogonal matrix whose rows are the new basis in terms of the given one. Collective."""
+        weighted = space * self._mass[:, None]
+        mine = np.concatenate(
+            [np.einsum("knc,mnc->mk", weighted, self._motions), [np.einsum("knc,knc->k", weighted, space)]]
+        )
+        lengths = np.einsum("mnc,n,mnc->m", self._motions, self._mass, self._motions)
+        total = self._comm.allreduce(np.append(mine.ravel(), lengths))
+        mine, lengths = total[: mine.size].reshape(mine.shape), total[mine.size :]
+        largest = np.sqrt(mine[-1].max())
+        rows: list[np.ndarray] = []
+        for motion, length in zip(mine[:-1], lengths, strict=True):
+            rest = _without(motion, rows)
+            if len(rows) < len(space) and np.linalg.norm(rest) > _SEEN * np.sqrt(length) * largest:
+                rows.append(rest / np.linalg.norm(rest))
+        while len(rows) < len(space):
+            rest = _without(self._peak(space, rows), rows)
+            rows.append(rest / np.linalg.norm(rest))
+        return np.array(rows)
+
+    def _peak(self, space: np.ndarray, rows: list[np.ndarray]) -> np.ndarray:
+        """Return coefficients (k,) of the vector orthogonal to ``rows`` with the largest component. Collective."""
+        left = np.eye(len(space)) - sum((np.outer(row, row) for row in rows), np.zeros((len(space),) * 2))
+        components = left @ space.reshape(len(space), len(self._places))
+        at = self._first_largest(np.sqrt((components**2).sum(axis=0)))
+        return self._comm.allreduce(components[:, at].copy() if at >= 0 else np.zeros(len(space)))
+
+    def _signs(self, shapes: np.ndarray) -> np.ndarray:
+        signs = np.zeros(len(shapes))
+        for k in range(len(shapes)):
+            shape = shapes[k].ravel()
+            at = self._first_largest(np.abs(shape))
+            signs[k] = np.sign(shape[at]) if at >= 0 else 0.0
+        self._comm.Allreduce(MPI.IN_PLACE, signs)
+        return np.where(signs < 0.0, -1.0, 1.0)
+
+    def _first_largest(self, sizes: np.ndarray) -> int:
+        """Return the local index of the largest value of all ranks, the first in mesh numbering; -1 elsewhere."""
+        largest = self._comm.allreduce(float(sizes.max(initial=0.0)), op=MPI.MAX)
+        near = np.flatnonzero(sizes >= (1.0 - _TIE) * largest)
+        none = np.iinfo(np.int64).max
+        first = int(self._places[near].min()) if len(near) else none
+        winner = self._comm.allreduce(first, op=MPI.MIN)
+        if first != winner or not len(near):
+            return -1
+        return int(near[np.argmin(self._places[near])])
+
+
+def same(one: float, other: float, zero: float) -> bool:
+    """Return whether two eigenvalues are equal up to rounding."""
+    if not np.isfinite(one) or not np.isfinite(other):
+        return one == other
+    return abs(other - one) <= max(zero, _EQUAL * max(abs(one), abs(other)))
+
+
+def _without(vector: np.ndarray, rows: list[np.ndarray]) -> np.ndarray:
+    for _ in range(2):
+        for row in rows:
+            vector = vector - (row @ vector) * row
+    return vector
+
+
+SOLVERS = "pfem_petsc.modes.eigen"
+LIBRARIES = {"slepc": "slepc4py.SLEPc", "scipy": "scipy.sparse.linalg"}
+DENSE_UP_TO = 600
+"""Maximum number of components for which NumPy computes all eigenvalues, faster than an iteration."""
+DENSE_AT_MOST = 6_000
+"""Maximum number of components for NumPy without a library for sparse matrices: about 2 minutes and 1 GB."""
+_PART = 0.2  # of all modes, from which on computing all of them takes less time than iterations
+GATHERED_AT_MOST = 300_000
+"""Maximum number of components for which matrices are gathered on one rank for SciPy."""
+
+
+@cache
+def available(package: str) -> bool:
+    """Return whether a library is installed and can be loaded; PETSc must be initialised before."""
+    try:
+        importlib.import_module(package)
+    except ImportError:
+        return False
+    return True
+
+
+def describe_modes(model: Model) -> dict[str, str]:
+    """Return label and text of the modes that a case requests, empty if none. Collective.
+
+    Raises
+    ------
+    InputError
+        On all ranks, if no suitable library is installed.
+    """
+    case = model.case
+    if case.modes is None:
+        return {}
+    free = 3 * model.mesh.n_nodes - model.comm.allreduce(model.supports.number)
+    name = choose(case.modes, free, case.source)
+    what = "natural vibrations" if case.modes.kind == "vibration" else "buckling modes"
+    mass = f", {case.modes.mass or case.mass} mass" if case.modes.kind == "vibration" else ""
+    return {"modes": f"{min(case.modes.count, free)} {what} of the state at the end{mass}, solver {name}"}
+
+
+def choose(settings: Modes, free: int, source: str) -> str:
+    """Return the name of the solver for a number of free components.
+
+    Parameters
+    ----------
+    settings : table ``[modes]``
+    free : number of free components
+    source : file of the case, for the message
+
+    Raises
+    ------
+    InputError
+        If no installed library can solve a problem of this size.
+    """
+    asked, most = settings.solver, min(settings.count, free)
+    if asked == "auto":
+        if free <= DENSE_UP_TO or (free <= DENSE_AT_MOST and most > _PART * free):
+            return "dense"
+        if available(LIBRARIES["slepc"]):
+            return "slepc"
+        if free <= GATHERED_AT_MOST and available(LIBRARIES["scipy"]):
+            return "scipy"
+        if free <= DENSE_AT_MOST:
+            return "dense"
+        raise InputError(
+            f"{source}: modes: {free:,} free components need slepc4py, which is not installed (Debian, Ubuntu: "
+            "python3-slepc4py-real and the version of PETSc; scripts/setup.sh installs it), or up to "
+            f"{GATHERED_AT_MOST:,} of them scipy (pip install scipy)"
+        )
+    limits = {"dense": DENSE_AT_MOST, "scipy": GATHERED_AT_MOST}
+    if asked in limits and free > limits[asked]:
+        raise InputError(
+            f'{source}: modes.solver = "{asked}": {free:,} free components exceed its limit of '
+            f'{limits[asked]:,}; use "slepc" or "auto"'
+        )
+    if asked in LIBRARIES and not available(LIBRARIES[asked]):
+        package = LIBRARIES[asked].partition(".")[0]
+        raise InputError(f'{source}: modes.solver = "{asked}": {package} is not installed; install it, or use "auto"')
+    return asked
+
+
+def solver_module(name: str) -> ModuleType:
+    """Return the module of a solver, with ``largest(problem, count, start)`` and ``definite(problem)``."""
+    return lookup(SOLVERS, name, "modes.solver")
+
 
 _SHIFT = 1e-3  # distance of the shift below zero, relative to the squared frequency wave speed / length
 _ROUNDING = 1e-13  # relative to the largest eigenvalue: smaller ones are zero
@@ -77,6 +268,14 @@ class _Solver(Protocol):
     def destroy(self) -> None: ...
 
 
+class _Scale(NamedTuple):
+    """Eigenvalues of theta, the magnitude up to which they are zero, and that of theta over the largest."""
+
+    values: Callable[[np.ndarray], np.ndarray]
+    zero: float
+    nothing: float = 0.0
+
+
 def find_modes(model: Model, state: State, settings: Settings, consistent: bool) -> Found:
     """Compute the lowest modes of a state. Collective.
 
@@ -125,16 +324,14 @@ def _vibration(
         pencil.b.destroy()
     basis = _basis(model, state)
 
-    def values_of(theta: np.ndarray) -> np.ndarray:
-        return shift + 1.0 / theta
-
     try:
-        theta, shapes = _lowest(model, holds, pencil, solver, basis, count, values_of, zero)
+        scale = _Scale(lambda theta: shift + 1.0 / theta, zero)
+        theta, shapes = _lowest(model, holds, pencil, solver, basis, count, scale)
     finally:
         solver.destroy()
         pencil.destroy()
         stiffness.destroy()
-    values = values_of(theta)
+    values = scale.values(theta)
     values[np.abs(values) <= zero] = 0.0
     shapes /= np.sqrt(theta)[:, None, None]
     negative = int((values < 0.0).sum())
@@ -169,7 +366,8 @@ def _buckling(
                 "stiffness is singular, and no factor of the load is defined; brace and support it, or use "
                 'kind = "vibration", whose eigenvalues include the stresses of the state'
             )
-        theta, shapes = _lowest(model, holds, pencil, solver, _basis(model, state), count, np.reciprocal, 0.0, _NOTHING)
+        scale = _Scale(np.reciprocal, 0.0, _NOTHING)
+        theta, shapes = _lowest(model, holds, pencil, solver, _basis(model, state), count, scale)
     finally:
         solver.destroy()
         pencil.destroy()
@@ -195,9 +393,7 @@ def _lowest(
     solver: _Solver,
     basis: Basis,
     count: int,
-    values_of: Callable[[np.ndarray], np.ndarray],
-    zero: float,
-    nothing: float = 0.0,
+    scale: _Scale,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the ``count`` largest positive theta (k,), and unique vectors (k, owned, 3), x^T B x = 1. Collective.
 
@@ -213,13 +409,13 @@ def _lowest(
             found = solver.largest(ask, _start(model, holds, search), known)
             found = np.where(holds.held.ravel(), 0.0, found[:ask])
             theta, known = _ritz(model.comm, pencil, np.concatenate([known, found]))
-            positive = theta > nothing * np.abs(theta).max(initial=0.0)
+            positive = theta > scale.nothing * np.abs(theta).max(initial=0.0)
             theta, known = theta[positive], known[positive]
         now = theta[:wanted]
         if not (solver.finds_all or (len(now) == len(before) and np.allclose(now, before, rtol=1e-9, atol=0.0))):
             continue
-        values = values_of(now)
-        cut = len(now) == wanted < pencil.free and same(values[-1], values[min(count, wanted) - 1], zero)
+        values = scale.values(now)
+        cut = len(now) == wanted < pencil.free and same(values[-1], values[min(count, wanted) - 1], scale.zero)
         if not cut or wanted > count + 8 * _MORE:
             break
         wanted = min(wanted + 2 * _MORE, pencil.free)
@@ -229,7 +425,7 @@ def _lowest(
             "fewer modes (modes.count)"
         )
     shapes = holds.to_axes(known[: len(now)].reshape(len(now), model.mesh.n_owned, 3))
-    shapes = basis.unique(values_of(now), shapes, zero)
+    shapes = basis.unique(scale.values(now), shapes, scale.zero)
     return now[:count].copy(), shapes[:count]
 
 
@@ -266,3 +462,23 @@ def _products(matrix: PETSc.Mat, vectors: np.ndarray) -> np.ndarray:
     x.destroy()
     y.destroy()
     return products
+
+
+def weakest_member(model: Model, x: np.ndarray) -> tuple[float, int] | None:
+    """Return the smallest factor pi^2 E I/((K L)^2 |N|) of the compressed bars, and the number of that bar. Collective.
+
+    L is the length in the mesh, and I, K are those of the section; bars whose section has no shape are left out. None
+    if there are no such bars.
+
+    Parameters
+    ----------
+    model : Model
+    x : local positions of the state [m]
+    """
+    counted, force = model.mesh.counted, model.bars.fields(x)["axial_force"]
+    ids, force, euler = (values[counted] for values in (model.mesh.bar_ids, force, model.bars.euler_loads()))
+    pressed = np.flatnonzero((force < 0.0) & (euler < np.inf))
+    factors = euler[pressed] / -force[pressed]
+    best = min(zip(factors.tolist(), ids[pressed].tolist(), strict=True), default=(np.inf, -1))
+    factor, bar = min(model.comm.allgather(best))
+    return (factor, bar) if bar >= 0 else None

@@ -11,9 +11,7 @@ from ..analysis import Analysis, Step
 from ..errors import InputError
 from ..integrators.base import Balance, NoParameters, Scheme, State
 from ..output.units import TIME, Axis
-from ..stepping.prescribed import NoRates
-from ..stepping.solution import Solution
-from ..stepping.stepper import Stepper
+from ..stepping.stepper import NoRates, Solution, Stepper
 
 if TYPE_CHECKING:
     from ..case.schema import Case

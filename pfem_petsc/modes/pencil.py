@@ -1,12 +1,4 @@
-"""The matrices of the eigenvalue problems: stiffness of the state, of the unstressed truss, geometric stiffness, mass.
-
-Both problems are brought into the form A x = theta B x with B positive definite, of which the largest theta are wanted:
-
-- vibration, (K - lambda M) x = 0: A = M, B = K - shift M with a shift below all lambda, theta = 1/(lambda - shift);
-- buckling, (K0 + lambda Kg) x = 0: A = -Kg, B = K0, theta = 1/lambda.
-
-Held components remain in the matrices without coupling; their theta is positive and below all others, or zero.
-"""
+"""The matrices of the eigenvalue problems, with the components that supports and contact hold."""
 
 from __future__ import annotations
 
@@ -17,14 +9,200 @@ import numpy as np
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from ..errors import SimulationFailure
 from ..mechanics.mass import Inertia
+from ..parallel.agreement import agreed
 from ..solvers.matrix import HessianMatrix
-from .holds import Holds
+from ..tolerances import BEYOND, RANK
 
 if TYPE_CHECKING:
+    from ..integrators.base import State
+    from ..mechanics.supports import Directions
     from ..stepping.model import Model
 
-__all__ = ["Pencil", "StateMatrices", "buckling_bars", "join"]
+
+_LINKED = (
+    "modes: {} (contact_pair, constraint): modes of states in which nodes hold each other are not available; let the "
+    "analysis end in a state without that contact"
+)
+_PRESSES = 1e-12  # of the sum of axial stiffnesses at a node times the model's length: the smallest force that counts
+_DIFFERENCE = 1e-6  # relative to the model's length: step of the central difference of normals of curved walls
+
+
+class Holds:
+    """The directions held at this rank's nodes. Construction is collective.
+
+    Parameters
+    ----------
+    model : Model
+    state : State
+
+    Attributes
+    ----------
+    held : (owned, 3) bool, components in the local axes of each node, which are x, y, z except for nodes at walls and
+        with supports along other directions
+    number : of held components in the whole model
+    at_walls : number of nodes of the whole model in contact with walls
+    curvature : owned nodes (m,) and blocks (m, 3, 3) [N/m] that forces of curved walls add to the stiffness; None if
+        there are none
+
+    Raises
+    ------
+    SimulationFailure
+        On all ranks, for contact between nodes or with a wall with mass, which modes do not support.
+    """
+
+    def __init__(self, model: Model, state: State) -> None:
+        self._mesh, self._comm = model.mesh, model.comm
+        self.held = model.supports.fixed.copy()
+        self.curvature: tuple[np.ndarray, np.ndarray] | None = None
+        self._nodes, self._turns = np.empty(0, dtype=np.int64), np.empty((0, 3, 3))
+        if model.links:
+            _refuse_links(model)
+        walls = None
+        with agreed(model.comm):
+            walls = _Walls(model, state) if model.can_touch else None
+        if walls is not None:
+            self._take(walls)
+        self.at_walls = model.comm.allreduce(len(self._nodes))
+        if model.supports.inclined is not None:
+            self._take_directions(model.supports.inclined)
+        self.number = model.comm.allreduce(int(self.held.sum()))
+        self._turn: PETSc.Mat | None = None
+        if self.at_walls or model.supports.inclined is not None:
+            self._turn = self._turning()
+
+    def _take(self, walls: _Walls) -> None:
+        nodes = walls.nodes
+        directions = np.concatenate([walls.directions, np.einsum("mi,ij->mij", self.held[nodes], np.eye(3))], axis=1)
+        # right singular vectors: orthonormal, held ones first
+        _, values, self._turns = np.linalg.svd(directions)
+        self._nodes = nodes
+        self.held[nodes] = values > RANK * values[:, :1]
+        if model_wide(self._comm, len(walls.curved[0])):
+            self.curvature = walls.curved
+
+    def _take_directions(self, directions: Directions) -> None:
+        """Add the nodes with supports along directions that are no axes; walls do not touch them."""
+        values, turns = np.linalg.eigh(directions.free)  # held directions first
+        self._nodes = np.append(self._nodes, directions.nodes)
+        self._turns = np.concatenate([self._turns, turns.transpose(0, 2, 1)])
+        self.held[directions.nodes] = values < 0.5
+
+    def _turning(self) -> PETSc.Mat:
+        """Return the block-diagonal matrix from the local axes of nodes to x, y, z."""
+        owned, first = self._mesh.n_owned, 3 * self._mesh.first_node
+        blocks = np.broadcast_to(np.eye(3), (owned, 3, 3)).copy()
+        blocks[self._nodes] = self._turns.transpose(0, 2, 1)
+        turn = PETSc.Mat().createAIJ(((3 * owned, None), (3 * owned, None)), bsize=3, nnz=3, comm=self._comm)
+        columns = first + (3 * np.arange(owned)[:, None, None] + np.arange(3)).repeat(3, axis=1)
+        pointers = 3 * np.arange(3 * owned + 1, dtype=PETSc.IntType)
+        turn.setValuesCSR(pointers, columns.ravel().astype(PETSc.IntType), blocks.ravel())
+        turn.assemble()
+        return turn
+
+    def taken_out(self, matrix: PETSc.Mat, diagonal: float | np.ndarray) -> PETSc.Mat:
+        """Return a matrix in the local axes, with ``diagonal`` (owned,) at held components and without their coupling
+        to others; the given matrix may be changed. Collective."""
+        if self._turn is not None:
+            matrix = matrix.ptap(self._turn)
+        matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+        if self.number:
+            matrix.setOption(PETSc.Mat.Option.KEEP_NONZERO_PATTERN, True)
+            rows = np.flatnonzero(self.held) + 3 * self._mesh.first_node
+            matrix.zeroRowsColumns(rows.astype(PETSc.IntType), 0.0)
+            values = matrix.getDiagonal()
+            at = np.broadcast_to(np.reshape(diagonal, (-1, 1)), self.held.shape)
+            values.array[self.held.ravel()] = at[self.held]
+            matrix.setDiagonal(values)
+        return matrix
+
+    def to_axes(self, shapes: np.ndarray) -> np.ndarray:
+        """Transform shapes (k, owned, 3) from the local axes to x, y, z; held components are zero."""
+        shapes = np.where(self.held, 0.0, shapes)
+        shapes[:, self._nodes] = np.einsum("mij,kmi->kmj", self._turns, shapes[:, self._nodes])
+        return shapes
+
+    def to_own(self, shapes: np.ndarray) -> np.ndarray:
+        """Transform shapes to the local axes, with held components set to zero."""
+        shapes = shapes.copy()
+        shapes[:, self._nodes] = np.einsum("mij,kmj->kmi", self._turns, shapes[:, self._nodes])
+        return np.where(self.held, 0.0, shapes)
+
+
+def _refuse_links(model: Model) -> None:
+    """Collective."""
+    totals = model.comm.allreduce(np.abs(model.links.totals()).sum())
+    scale = model.comm.allreduce(float(model.nodal_stiffness.max(initial=0.0)), op=MPI.MAX) * model.length
+    if totals > _PRESSES * scale:
+        raise SimulationFailure(_LINKED.format("nodes of the truss press on each other"))
+
+
+def model_wide(comm: object, count: int) -> bool:
+    """Return whether any rank has a nonzero count. Collective."""
+    return comm.allreduce(count) > 0
+
+
+class _Walls:
+    """Nodes of this rank in contact with walls.
+
+    Attributes
+    ----------
+    nodes : (m,) ascending
+    directions : (m, walls + 3, 3) held directions, padded with zero rows
+    curved : nodes (c,) and blocks (c, 3, 3) of :attr:`Holds.curvature`
+    """
+
+    def __init__(self, model: Model, state: State) -> None:
+        contact, owned = model.contact, model.mesh.n_owned
+        weight = np.abs(state.contact).max(axis=1, initial=0.0)
+        presses = weight > _PRESSES * model.nodal_stiffness * model.length
+        tied = contact.ties.held if contact.ties.any else np.zeros(owned, dtype=bool)
+        self.nodes = nodes = np.flatnonzero(presses | tied)
+        x, displacements = state.position[nodes], contact.motion.displacements(state.time)
+        applicable = contact.applicable(nodes, x, displacements)
+        normals, offsets = contact.planes(applicable, x, displacements)
+        gaps = np.einsum("mwi,mi->mw", normals, x) - offsets
+        touched = np.abs(gaps) <= 10.0 * BEYOND * contact.size
+        unknown = nodes[~touched.any(axis=1) & ~tied[nodes]]
+        if len(unknown):
+            what = f"node {model.mesh.node_ids[unknown[0]]} has a contact force, but there is no wall"
+            raise SimulationFailure(_LINKED.format(what))
+        massive = [k for k in contact.motion.bodies.at if touched[:, k].any()]
+        if massive:
+            raise SimulationFailure(
+                f"modes: wall {contact.names[massive[0]]!r} has mass and is in contact: modes of a truss with such a "
+                "wall are not available; let the analysis end without that contact, or give the wall no mass"
+            )
+        rough = (touched & (contact.static_friction > 0.0)).any(axis=1) | tied[nodes]
+        self.directions = np.zeros((len(nodes), normals.shape[1] + 3, 3))
+        self.directions[:, :-3] = np.where(touched[:, :, None], normals, 0.0)
+        self.directions[rough, -3:] = np.eye(3)
+        self.curved = self._curved(model, state, touched & ~rough[:, None], normals)
+
+    def _curved(
+        self, model: Model, state: State, touched: np.ndarray, normals: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return minus the force times the derivative of the normal, for nodes at curved walls."""
+        contact, nodes = model.contact, self.nodes
+        displacements = contact.motion.displacements(state.time)
+        blocks = np.zeros((len(nodes), 3, 3))
+        if len(nodes) == 0 or contact.flat.all():
+            return np.empty(0, dtype=np.int64), np.empty((0, 3, 3))
+        forces = np.zeros(touched.shape)
+        for m, node in enumerate(nodes):
+            at = np.flatnonzero(touched[m])
+            # prescribed components go to the supports; the walls' forces are the rest of the contact force
+            forces[m, at] = np.linalg.lstsq(normals[m, at].T, state.contact[node], rcond=None)[0]
+        h = _DIFFERENCE * model.length
+        for k in np.flatnonzero(~contact.flat):
+            x = state.position[nodes] - displacements[k]
+            for axis in range(3):
+                shift = h * np.eye(3)[axis]
+                slope = (contact.walls[k].planes(x + shift)[0] - contact.walls[k].planes(x - shift)[0]) / (2.0 * h)
+                blocks[:, :, axis] -= forces[:, k, None] * slope
+        at = np.flatnonzero((touched & ~contact.flat).any(axis=1))
+        return nodes[at], 0.5 * (blocks + blocks.transpose(0, 2, 1))[at]
 
 
 @dataclass
@@ -176,3 +354,54 @@ def _diagonal(comm: MPI.Comm, values: np.ndarray) -> PETSc.Mat:
     matrix.assemble()
     matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
     return matrix
+
+
+class Gathered:
+    """The matrices of a pencil on rank 0 without held components. Construction is collective.
+
+    Attributes
+    ----------
+    a, b : on rank 0, rows (m,), columns (m,) and values (m,) of the matrices; None on the others
+    size : number of components
+    """
+
+    def __init__(self, pencil: Pencil) -> None:
+        self.comm = pencil.a.comm.tompi4py()
+        self._free = np.flatnonzero(~pencil.held.ravel())
+        self._owned = pencil.held.size
+        parts = self.comm.gather(~pencil.held.ravel())
+        self.size = 0
+        self.a = self.b = None
+        self._counts: list[int] = []
+        number = None
+        if parts is not None:
+            self._counts = [int(part.sum()) for part in parts]
+            free = np.concatenate(parts)
+            self.size = int(free.sum())
+            number = np.where(free, np.cumsum(free) - 1, -1)
+        self.a, self.b = self._rows(pencil.a, number), self._rows(pencil.b, number)
+
+    def _rows(self, matrix: PETSc.Mat, number: np.ndarray | None) -> tuple[np.ndarray, ...] | None:
+        parts = self.comm.gather(tuple(np.array(part) for part in matrix.getValuesCSR()))
+        if parts is None:
+            return None
+        rows = np.repeat(number, np.concatenate([np.diff(pointers) for pointers, _, _ in parts]))
+        columns = number[np.concatenate([part[1] for part in parts])]
+        values = np.concatenate([part[2] for part in parts])
+        kept = (rows >= 0) & (columns >= 0)
+        return rows[kept], columns[kept], values[kept]
+
+    def whole(self, vectors: np.ndarray) -> np.ndarray | None:
+        """Gather vectors (k, size) on rank 0 from each rank's part (k, owned); None on the others. Collective."""
+        parts = self.comm.gather(vectors[:, self._free])
+        return None if parts is None else np.concatenate(parts, axis=1)
+
+    def scattered(self, vectors: np.ndarray | None) -> np.ndarray:
+        """Return this rank's part (k, owned) of vectors (k, size) on rank 0. Collective."""
+        parts = None
+        if vectors is not None:
+            parts = np.split(vectors, np.cumsum(self._counts)[:-1], axis=1)
+        mine = self.comm.scatter(parts)
+        spread = np.zeros((len(mine), self._owned))
+        spread[:, self._free] = mine
+        return spread

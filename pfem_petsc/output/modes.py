@@ -14,10 +14,8 @@ import h5py
 import numpy as np
 from mpi4py import MPI
 
-from .digests import CHECKS, numbers_digest, snapshot_digests, stored_digest
-from .growing import chunk_rows, create_growing
-from .hdf5 import grow, set_unit, writing
-from .integrity import word_sum
+from .hdf5 import chunk_rows, create_growing, grow, set_unit, writing
+from .integrity import CHECKS, numbers_digest, snapshot_digests, stored_digest, word_sum
 
 if TYPE_CHECKING:
     from ..parallel.natural import NaturalOrder

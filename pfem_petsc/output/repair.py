@@ -13,11 +13,9 @@ import h5py
 import numpy as np
 
 from ..errors import InputError
-from .digests import CHECKS
-from .disk import fsync_all
-from .growing import is_compressed
-from .hdf5 import create_checked, dataset_names, grow, write_rows
+from .hdf5 import create_checked, dataset_names, fsync_all, grow, is_compressed, write_rows
 from .history import EVENT, check_columns
+from .integrity import CHECKS
 from .layout import (
     PER_STEP,
     complete_rows,
@@ -26,8 +24,9 @@ from .layout import (
     create_result,
     create_snapshot_checks,
     field_datasets,
+    read_attributes,
+    write_case,
 )
-from .provenance import read_attributes, write_case
 from .result import readable
 from .verify import examine
 

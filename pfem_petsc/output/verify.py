@@ -84,9 +84,9 @@ def _main(path: Path, deep: bool) -> int:
     mpi4py.rc.initialize = False
     import h5py
 
-    from .digests import CHECKS, damages
     from .hdf5 import dataset_names
-    from .provenance import read_attributes
+    from .integrity import CHECKS, damages
+    from .layout import read_attributes
     from .result import readable
 
     try:

@@ -14,21 +14,275 @@ from mpi4py import MPI
 
 from ..errors import PfemError, SimulationFailure
 from ..parallel.agreement import on_root
-from .connectivity import write_connectivity
-from .disk import require_room
-from .hdf5 import create_new, open_shared, release, require_parallel_hdf5, writing
+from .hdf5 import (
+    Growing,
+    create_new,
+    is_compressed,
+    open_shared,
+    release,
+    require_parallel_hdf5,
+    require_room,
+    write_rows,
+    writes_together,
+    writing,
+)
 from .history import RowTables
-from .layout import create_result
+from .integrity import CHECKS, gather_rows, mark_digest, mesh_digest, snapshot_digests, word_sum
+from .layout import PER_STEP, create_field, create_result, create_snapshot_checks, describe_run, field_datasets
 from .modes import prepare_modes, write_modes
-from .provenance import describe_run
 from .repair import reopen
-from .snapshot_data import SnapshotData
-from .snapshot_index import SnapshotIndex
 
 if TYPE_CHECKING:
     from ..mesh.distribution import DistributedMesh
+    from ..parallel.natural import NaturalOrder
 
-__all__ = ["ResultWriter"]
+
+_PIECE = 2**18  # number of bars whose connectivity is written at once on one rank
+
+
+def write_connectivity(file: h5py.File, comm: MPI.Comm, path: Path, mesh: DistributedMesh) -> None:
+    """Write the ends of all bars in mesh numbering, their offsets, and the digest of the mesh. Collective.
+
+    Bars that are evaluated on two ranks are written by the rank that counts them.
+    """
+    vtk, order = file["VTKHDF"], mesh.bar_order
+    first, count, together = order.first, order.count, writes_together(comm)
+    # one rank may have all bars: pieces keep the working arrays small
+    piece = count if comm.size > 1 else min(count, _PIECE)
+    total = 0
+    for start in range(0, max(count, 1), max(piece, 1)):
+        stop = min(start + piece, count)
+        if comm.size > 1:
+            ends = order.to_slab(mesh.node_ids[mesh.bars[mesh.counted]].astype(np.int64).reshape(-1, 2))
+        else:
+            ends = mesh.node_ids[mesh.bars[order.owned_rows(start, stop)]].astype(np.int64)
+        total += word_sum(ends.ravel(), 2 * (first + start))
+        with writing(comm, path):
+            write_rows(vtk["Connectivity"], 2 * (first + start), ends.ravel(), collective=together)
+        # there is one more offset than bars, which the last rank writes
+        end = first + stop + (stop == count and comm.rank == comm.size - 1)
+        with writing(comm, path):
+            write_rows(vtk["Offsets"], first + start, 2 * np.arange(first + start, end), collective=together)
+    digest = mesh_digest(comm, total & (2**64 - 1))
+    with writing(comm, path):
+        if comm.rank == 0:
+            write_rows(file[CHECKS]["mesh"], 0, digest)
+        file.flush()
+
+
+class SnapshotData:
+    """Datasets of points and fields of an open result file; the first snapshot creates them and defines their shapes.
+
+    Parameters
+    ----------
+    file : h5py.File
+        Open on all ranks.
+    comm : MPI.Comm
+    path : Path
+        For messages.
+    mesh : DistributedMesh
+    fields : names of the fields, by ``PointData`` and ``CellData``
+    precision : type of floating-point fields; points are always float64
+    """
+
+    def __init__(
+        self,
+        file: h5py.File,
+        comm: MPI.Comm,
+        path: Path,
+        mesh: DistributedMesh,
+        fields: Mapping[str, Sequence[str]],
+        precision: np.dtype,
+    ) -> None:
+        self._together = writes_together(comm)
+        # the chunks of several ranks are compressed by one of them
+        self._compressed = comm.size > 1 and is_compressed(file["VTKHDF/Points"])
+        self._vtk, self.comm, self.path = file["VTKHDF"], comm, path
+        self._fields, self._precision = fields, precision
+        self._nodes, self._bars = mesh.node_order, mesh.bar_order
+        # bars evaluated on two ranks are written by the rank that counts them
+        self._counted = _as_slice(mesh.counted)
+        self._data = self._datasets() if self._vtk["Steps"].attrs["NSteps"] else {}
+
+    @property
+    def exists(self) -> bool:
+        """Whether the datasets have been created."""
+        return bool(self._data)
+
+    def arrays(
+        self, points: np.ndarray, point_data: Mapping[str, np.ndarray], cell_data: Mapping[str, np.ndarray]
+    ) -> dict[str, np.ndarray]:
+        """Return this rank's owned rows of each dataset, by name.
+
+        Raises
+        ------
+        ValueError
+            If the fields are not those of the file, or an array has another number of rows.
+        """
+        given = {"PointData": point_data, "CellData": cell_data}
+        for kind, names in self._fields.items():
+            if sorted(given[kind]) != names:
+                raise ValueError(f"a snapshot has {kind} {names}, got {sorted(given[kind])}")
+        arrays = {"Points": points}
+        for name in self._fields["PointData"]:
+            arrays[f"PointData/{name}"] = np.asarray(point_data[name])
+        for name in self._fields["CellData"]:
+            arrays[f"CellData/{name}"] = np.asarray(cell_data[name])[self._counted]
+        for name, array in arrays.items():
+            if len(array) != self._order(name).n_owned:
+                raise ValueError(f"{name} has {len(array)} rows, expected {self._order(name).n_owned}")
+        return arrays
+
+    def n_bytes(self, arrays: Mapping[str, np.ndarray]) -> int:
+        """Return the size of a snapshot, over all ranks."""
+        return sum(
+            self._order(name).n_global
+            * self._row_type(name, array).itemsize
+            * int(np.prod(array.shape[1:], dtype=np.int64))
+            for name, array in arrays.items()
+        )
+
+    def create(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Create the datasets of the fields. Collective."""
+        for name, array in arrays.items():
+            if name != "Points":
+                kind, _, field = name.partition("/")
+                create_field(self._vtk, kind, field, array.shape[1:], self._row_type(name, array))
+        self._data = self._datasets()
+
+    def append(self, n: int, arrays: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Write the rows of snapshot n; return their digests, see
+        :func:`~pfem_petsc.output.integrity.snapshot_digests`. Collective.
+
+        One field after the other goes to mesh numbering, into its digest and into the file, while it is in the cache.
+        """
+        with writing(self.comm, self.path):
+            for name in arrays:
+                self._data[name].grow((n + 1) * self._order(name).n_global)
+        together = self._together or self._compressed
+        sums = self._write_together(n, arrays) if together else self._write_alone(n, arrays)
+        return snapshot_digests(self.comm, sums)
+
+    def _write_together(self, n: int, arrays: Mapping[str, np.ndarray]) -> dict[str, int]:
+        """Write by collective transfers, and return each rank's share of the digests."""
+        sums = {}
+        for name, array in arrays.items():
+            first, slab, sums[name] = self._slab(name, array)
+            with writing(self.comm, self.path):
+                self._data[name].write(n * self._order(name).n_global + first, slab, collective=True)
+        return sums
+
+    def _write_alone(self, n: int, arrays: Mapping[str, np.ndarray]) -> dict[str, int]:
+        """Write this rank's rows without waiting for others, and return its share of the digests."""
+        sums, failure = {}, None
+        with writing(self.comm, self.path):
+            for name, array in arrays.items():
+                first, slab, sums[name] = self._slab(name, array)
+                try:
+                    if failure is None:
+                        self._data[name].write(n * self._order(name).n_global + first, slab)
+                except (OSError, RuntimeError) as error:
+                    failure = error  # other ranks need the rows that are here for their slabs
+            if failure is not None:
+                raise failure
+        return sums
+
+    def _slab(self, name: str, array: np.ndarray) -> tuple[int, np.ndarray, int]:
+        """Return the first number of this rank's slab, the slab in the type of the file, and its sum. Collective."""
+        order = self._order(name)
+        slab = _permuted(order, array) if order.permutes else order.to_slab(array)
+        slab = slab.astype(self._row_type(name, slab), copy=False)
+        return order.first, slab, word_sum(slab, order.first)
+
+    def _datasets(self) -> dict[str, Growing]:
+        return {name: Growing(dataset) for name, dataset in field_datasets(self._vtk).items()}
+
+    def _order(self, name: str) -> NaturalOrder:
+        return self._bars if name.startswith("CellData") else self._nodes
+
+    def _row_type(self, name: str, slab: np.ndarray) -> np.dtype:
+        return self._precision if slab.dtype.kind == "f" and name != "Points" else slab.dtype
+
+
+def _as_slice(index: slice | np.ndarray) -> slice | np.ndarray:
+    """Return consecutive numbers, such as those of all bars of one rank, as a slice, which copies nothing."""
+    if isinstance(index, slice) or not len(index) or (np.diff(index) != 1).any():
+        return index
+    return slice(int(index[0]), int(index[-1]) + 1)
+
+
+def _permuted(order: NaturalOrder, array: np.ndarray) -> np.ndarray:
+    """Return what :meth:`~pfem_petsc.parallel.natural.NaturalOrder.to_slab` gives on one rank, in a compiled loop."""
+    array = np.ascontiguousarray(array)
+    slab = np.empty((order.count, *array.shape[1:]), array.dtype)
+    word, width = f"u{array.itemsize}", int(np.prod(array.shape[1:], dtype=np.int64))
+    gather_rows(
+        array.view(word).reshape(-1, width), order.owned_rows(0, order.count), slab.view(word).reshape(-1, width)
+    )
+    return slab
+
+
+class SnapshotIndex:
+    """Rows of ``/VTKHDF/Steps`` and ``/snapshots`` of an open result file, and the digests of its snapshots.
+
+    Parameters
+    ----------
+    file : h5py.File
+        Open on all ranks.
+    comm : MPI.Comm
+    path : Path
+        For messages.
+    mesh : DistributedMesh
+    """
+
+    def __init__(self, file: h5py.File, comm: MPI.Comm, path: Path, mesh: DistributedMesh) -> None:
+        self._file, self.comm, self.path = file, comm, path
+        self.n_nodes, self.n_bars = int(mesh.n_nodes), int(mesh.n_bars)
+        steps = file["VTKHDF/Steps"]
+        self._per_step = {name: Growing(steps[name]) for name in PER_STEP}
+        # one column, because there is one type of cell
+        self._wide = {name: (1, *steps[name].shape[1:]) for name in PER_STEP}
+        self._times = Growing(steps["Values"])
+        self._marks = {name: Growing(file["snapshots"][name]) for name in ("step", "time")}
+        self._n_steps = h5py.h5a.open(steps.id, b"NSteps")
+        # created with the first snapshot, which defines the fields
+        self._digests = Growing(file[CHECKS]["snapshots"]) if steps.attrs["NSteps"] else None
+
+    def create_checks(self) -> None:
+        """Create the dataset of digests, once the fields exist. Collective."""
+        self._digests = Growing(create_snapshot_checks(self._file))
+
+    def append(self, n: int, step: int, time: float, digests: np.ndarray) -> None:
+        """Write the rows of snapshot n, except its time in ``/VTKHDF``. Collective.
+
+        Parameters
+        ----------
+        n, step, time : number of the snapshot, its step and time [s]
+        digests : of its points and fields, in the order of :func:`~pfem_petsc.output.integrity.snapshot_digests`
+        """
+        with writing(self.comm, self.path):
+            for dataset in (*self._per_step.values(), *self._marks.values(), self._digests):
+                dataset.grow(n + 1)
+        rows = {"PointOffsets": n * self.n_nodes, "CellDataRows": n * self.n_bars, "NumberOfParts": 1}
+        with writing(self.comm, self.path):
+            if self.comm.rank == 0:
+                for name, dataset in self._per_step.items():
+                    dataset.write(n, np.full(self._wide[name], rows.get(name, 0)))
+                self._marks["step"].write(n, np.array([step]))
+                self._marks["time"].write(n, np.array([time]))
+                mark = np.array([mark_digest(n, step, time)], dtype=np.uint64)
+                self._digests.write(n, np.concatenate([mark, digests])[None])
+
+    def publish(self, n: int, time: float) -> None:
+        """Count snapshot n, whose data have been flushed, and then write its time [s]. Collective."""
+        with writing(self.comm, self.path):
+            self._n_steps.write(np.array(n + 1, dtype=np.int64))
+            self._file.flush()
+        with writing(self.comm, self.path):
+            self._times.grow(n + 1)
+            if self.comm.rank == 0:
+                self._times.write(n, np.array([time], dtype=np.float64))
+            self._file.flush()
 
 
 class ResultWriter:

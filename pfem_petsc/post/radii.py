@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
-from ..mechanics.sections import area_fields, bar_shapes, named_groups, section_of_bars
+from ..mechanics.bars import area_fields, bar_shapes, named_groups, section_of_bars
 from ..mesh import load_slab
 
 __all__ = ["STOUT", "drawn_radii", "radii_of"]

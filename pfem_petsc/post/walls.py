@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from ..contact.motion import WallMotion
-from ..contact.surfaces import Surface, slab
+from ..contact.wall_motion import WallMotion
+from ..contact.walls.base import Surface, slab
 from ..errors import InputError
 from ..registry import lookup
 

@@ -10,14 +10,14 @@ import numpy as np
 from mpi4py import MPI
 
 from ..files import memory_of_machine
-from ..modes.choice import describe_modes
+from ..modes.find import describe_modes
 from ..output.units import duration, engineering
 from ..solvers.linear import DIRECT
 
 if TYPE_CHECKING:
     from ..case.schema import Case
     from ..mesh.distribution import DistributedMesh
-    from ..recording.fields import Fields
+    from ..recording.recorder import Fields
     from ..stepping.model import Model
     from ..stepping.plan import Plan
 

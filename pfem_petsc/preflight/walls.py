@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from mpi4py import MPI
 
-from ..contact.piercing import distances, small_walls
+from ..contact.monitoring import distances, small_walls
 from ..output.units import engineering
 
 if TYPE_CHECKING:

@@ -1,28 +1,350 @@
-"""Writes and restores the checkpoints of a run."""
+"""Checkpoints of a run, the output folder at its start, and the changes of a case that are allowed since."""
 
 from __future__ import annotations
 
+import json
+import os
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..output.checkpoint import NAME
-from ..output.checkpoint_writer import write_checkpoint
+import numpy as np
+from mpi4py import MPI
+
+from ..case.overrides import split_key
+from ..case.toml import value_text
+from ..errors import InputError
+from ..output import result as results
+from ..output.checkpoint import (
+    NAME,
+    PREVIOUS,
+    OpenCheckpoint,
+    asked_checkpoint,
+    read_checkpoint_header,
+    write_checkpoint,
+)
+from ..output.integrity import check_seal, checksum
+from ..output.result import open_result
+from ..output.units import engineering
+from ..output.verify import examine
+from ..parallel.agreement import on_root
+from ..parallel.natural import NaturalOrder
+from ..tolerances import TIME
 from ..version import __version__
-from .compare import check_mesh_is_the_same, mesh_mark
-from .folder import Restart
 from .state import STATE_VERSION, RunState
 
 if TYPE_CHECKING:
     from ..case.schema import Case
     from ..output.checkpoint import Checkpoint
-    from ..recording.blowup import BlowUp
+    from ..recording.monitors import BlowUp
     from ..recording.recorder import Recorder
     from ..stepping.ledger import Ledger
+    from ..stepping.model import Model
     from ..stepping.plan import Plan
     from ..stepping.stepper import Stepper
 
-__all__ = ["Checkpoints"]
+
+FREE = ("title", "time.end", "static.end", "modes", "output", "solver")
+"""Keys and tables that a restart may change: they do not change what is simulated."""
+
+_OF_STAGES = re.compile(r"stage\[(\d+)\]\.(.*)")
+
+
+def changed_keys(path: Path, before: Mapping[str, Any], now: Mapping[str, Any], source: str) -> list[str]:
+    """Return the changes of a restart, ``time.end: 1.0 -> 2.0`` for every key that differs.
+
+    Parameters
+    ----------
+    path : the checkpoint
+    before, now : the case of the checkpoint and this one, as nested tables
+    source : this case's file, for the message
+
+    Raises
+    ------
+    InputError
+        If a key differs that a restart cannot change.
+    """
+    # tuples become lists, as in the checkpoint
+    old, new = (_flat(json.loads(json.dumps(case))) for case in (before, now))
+    keys = [key for key in dict.fromkeys([*old, *new]) if old.get(key) != new.get(key)]
+    lines = {key: f"{key}: {_text(old, key)} -> {_text(new, key)}" for key in keys}
+    last = len(now.get("stage", ())) - 1
+    refused = [key for key in keys if not _is_free(key, last)]
+    if refused:
+        more = f" (and {len(refused) - 5} more)" if len(refused) > 5 else ""
+        raise InputError(
+            f"{path}: belongs to a different case than {source}: {'; '.join(lines[key] for key in refused[:5])}{more}. "
+            f"A restart continues with the same model and time step, and may change {', '.join(FREE)} only: restore "
+            "the case, or start without --restart"
+        )
+    return list(lines.values())
+
+
+def _is_free(key: str, last: int) -> bool:
+    """Whether a restart may change a key; of stages, the end of the ``last`` alone."""
+    found = _OF_STAGES.match(key)
+    if found is not None:
+        key = found[2]
+        if key.endswith(".end") and int(found[1]) != last:
+            return False
+    return any(key == free or key.startswith(free + ".") for free in FREE)
+
+
+def check_version(path: Path, attributes: Mapping[str, Any]) -> None:
+    """Refuse a checkpoint with another version of the state.
+
+    Raises
+    ------
+    InputError
+    """
+    version = attributes.get("state_version")
+    if version != STATE_VERSION:
+        raise InputError(
+            f"{path}: holds version {version} of a run's state, this program reads {STATE_VERSION}: restart with the "
+            f"version of pfem_petsc that wrote it ({attributes.get('pfem_petsc', 'unknown')}), or start without "
+            "--restart"
+        )
+
+
+def check_mesh_is_the_same(path: Path, mark: int, attributes: Mapping[str, Any], source: str) -> None:
+    """Refuse a checkpoint of a mesh with other nodes or bars (the content of a mesh file may have changed).
+
+    Raises
+    ------
+    InputError
+    """
+    if attributes.get("mesh_mark") != mark:
+        raise InputError(
+            f"{path}: the mesh of {source} is not the one that it was written with (other nodes or bars): restore "
+            "the mesh, or start without --restart"
+        )
+
+
+def mesh_mark(model: Model, node_order: NaturalOrder, bar_order: NaturalOrder, counted: np.ndarray) -> int:
+    """Return a checksum of coordinates and bar ends, the same on any number of ranks. Collective."""
+    mesh = model.mesh
+    points = node_order.to_slab(mesh.points[: mesh.n_owned])
+    ends = bar_order.to_slab(mesh.node_ids[mesh.bars[counted]].astype(np.int64, copy=False).reshape(-1, 2))
+    comm: MPI.Comm = model.comm
+    return checksum(comm, points, node_order.first) ^ checksum(comm, ends, bar_order.first)
+
+
+def _flat(value: Any, prefix: str = "") -> dict[str, Any]:
+    """Flatten nested tables and lists of tables: {"wall[0].point": ...}."""
+    found: dict[str, Any] = {}
+    if isinstance(value, Mapping):
+        for key, item in value.items():
+            found |= _flat(item, f"{prefix}.{key}" if prefix else str(key))
+    elif isinstance(value, list | tuple) and value and all(isinstance(item, Mapping) for item in value):
+        for index, item in enumerate(value):
+            found |= _flat(item, f"{prefix}[{index}]")
+    else:
+        found[prefix] = list(value) if isinstance(value, tuple) else value
+    return found
+
+
+def _text(values: Mapping[str, Any], key: str) -> str:
+    if key not in values:
+        return "absent"
+    text = value_text(values[key])
+    return text if len(text) <= 60 else text[:56] + " ..."
+
+
+RESULT = "result.vtkhdf"
+ASIDE = "checkpoint-later.h5"
+
+
+@dataclass(frozen=True)
+class Restart:
+    """The checkpoint from which a run continues.
+
+    Attributes
+    ----------
+    path : the checkpoint
+    file : the open checkpoint
+    changed : keys of the case that differ, as lines
+    continues : whether the results in the output folder are continued; else they are moved aside and new ones begin
+    """
+
+    path: Path
+    file: OpenCheckpoint
+    changed: list[str]
+    continues: bool
+
+    @property
+    def scalars(self) -> dict[str, Any]:
+        """The numbers of the checkpoint."""
+        return self.file.scalars
+
+    @property
+    def attributes(self) -> dict[str, Any]:
+        """Attributes of the run that wrote the checkpoint."""
+        return self.file.attributes
+
+    @property
+    def step(self) -> int:
+        """The step after which the checkpoint was written."""
+        return int(self.scalars["step"])
+
+    @property
+    def stage(self) -> int:
+        """Number of the stage in which it was written; 0 for a case without stages."""
+        stage = self.scalars.get("stage")
+        return 0 if stage is None else int(stage["number"])
+
+    @property
+    def last(self) -> tuple[int, int]:
+        """Steps of the last snapshot and of the last history row before the checkpoint."""
+        return int(self.scalars["snapshot"]), int(self.scalars["row"]["step"])
+
+
+def find_restart(case: Case, comm: MPI.Comm, folder: Path, asked: bool | Path | None) -> Restart | str | None:
+    """Find the checkpoint for ``--restart`` in an output folder. Collective.
+
+    Returns
+    -------
+    Restart, or a message that states why the run starts from zero, or None if no restart was requested
+
+    Raises
+    ------
+    InputError
+        If a named file is missing, or a checkpoint is damaged, or belongs to another case or version.
+    """
+    if asked is None or asked is False:
+        return None
+    path = on_root(comm, asked_checkpoint, folder, asked)
+    if path is None:
+        return f"{folder}: no checkpoint to restart from: starting from zero"
+    file = OpenCheckpoint(path, comm)
+    check_version(path, file.attributes)
+    changed = changed_keys(path, file.attributes["case"], case.to_dict(), case.source)
+    continues = on_root(comm, _continues, folder, path)
+    return Restart(path, file, changed, continues)
+
+
+def finished(case: Case, comm: MPI.Comm, folder: Path, end: float | None) -> float | None:
+    """Return the last time [s] of results of this case in the folder, None if they are incomplete. Collective."""
+    return None if end is None else on_root(comm, _finished, case, folder / RESULT, end)
+
+
+def _finished(case: Case, path: Path, end: float) -> float | None:
+    if not path.is_file():
+        return None
+    try:
+        examine(path)
+        with results.open_result(path) as result:
+            reached = [float(times[-1]) for times in (result.history["time"], result.times) if len(times)]
+            before, now = result.case.to_dict(), case.to_dict()
+            changed_keys(path, before, now, case.source)
+            if case.modes is not None and (not result.n_modes or before.get("modes") != now["modes"]):
+                return None
+    except InputError:
+        # results of another case, or unreadable ones, are moved aside
+        return None
+    return max(reached) if reached and min(reached) >= end * (1.0 - TIME) else None
+
+
+def finished_message(folder: Path, reached: float, plan: Plan) -> str:
+    """Return the message about a run whose results have ``reached`` its end [s]."""
+    if not plan.end:
+        return f"{folder}: finished already: the results have the modes of the initial state"
+    axis = plan.axis
+    beyond = f", beyond {axis.key} = {engineering(plan.end, axis.unit)}" if reached > plan.end * (1.0 + TIME) else ""
+    return f"{folder}: finished already: the results have {axis.place(reached)}{beyond}"
+
+
+def _continues(folder: Path, path: Path) -> bool:
+    return (folder / RESULT).is_file() and path.resolve().parent == folder.resolve()
+
+
+def prepare_folder(comm: MPI.Comm, folder: Path, restart: Restart | None, plan: Plan) -> Path | None:
+    """Create the output folder; existing results are moved aside to a numbered name unless a restart continues them.
+
+    The caller holds the lock of the folder. ``plan`` defines the end of the run: results beyond it are not truncated.
+
+    Returns
+    -------
+    The new name of results that were moved aside, or None
+
+    Raises
+    ------
+    InputError
+        On all ranks, if the folder cannot be written, or a restart would lose results.
+    """
+    return on_root(comm, _prepare, folder, restart, plan)
+
+
+def _refuse_other(restart: Restart) -> None:
+    """Refuse a checkpoint that another run has overwritten before this one got the lock."""
+    if check_seal(restart.path) != restart.file.digest:
+        raise InputError(
+            f"{restart.path}: another run has overwritten this checkpoint while this one was set up: nothing is "
+            "changed; start again with --restart"
+        )
+
+
+def _refuse_loss(path: Path, plan: Plan) -> None:
+    """Refuse a restart that would truncate results beyond the end of the run."""
+    with results.open_result(path) as result:
+        steps, times = result.history["step"], result.history["time"]
+        snapshots = int(plan.beyond(result.steps, result.times).sum())
+    rows = int(plan.beyond(steps, times).sum())
+    if rows or snapshots:
+        reached = max([*times[-1:], *result.times[-1:]])
+        raise InputError(
+            f"{path}: the results reach {plan.axis.place(reached)}, beyond {plan.axis.key} = "
+            f"{engineering(plan.end, plan.axis.unit)}: continuing from the checkpoint up to there would remove "
+            f"{rows} rows of the history and {snapshots} snapshots; set a later end (--set "
+            f"{plan.axis.key}={reached:.6g} or more), choose another folder (-o), or start without --restart, which "
+            "moves the results aside"
+        )
+
+
+def _refuse_gap(path: Path, restart: Restart) -> None:
+    """Refuse a restart whose results end before the checkpoint."""
+    examine(path, deep=False)
+    with results.open_result(path) as result:
+        steps = result.history["step"]
+        last = int(steps[-1]) if len(steps) else -1
+    if last < restart.last[1]:
+        raise InputError(
+            f"{path}: the history ends at step {last}, before {restart.path}, written after step {restart.step}: they "
+            "belong to different runs; restart into another folder (-o), where new results begin at the checkpoint"
+        )
+
+
+def _prepare(folder: Path, restart: Restart | None, plan: Plan) -> Path | None:
+    aside = None
+    try:
+        if restart is not None and restart.continues:
+            _refuse_other(restart)
+            _refuse_gap(folder / RESULT, restart)
+            _refuse_loss(folder / RESULT, plan)
+            if restart.path.name == PREVIOUS and (folder / NAME).exists():
+                # A checkpoint later than the truncated results must not be used as the newest.
+                os.replace(folder / NAME, folder / ASIDE)
+        elif any((folder / name).exists() for name in (RESULT, NAME, PREVIOUS)):
+            if folder.resolve() in (here := Path.cwd().resolve(), *here.parents):
+                raise InputError(
+                    f"{folder}: holds results, which cannot be moved aside because the current folder is inside; "
+                    "give another with -o, or continue them with --restart"
+                )
+            number = 1
+            while (free := folder.with_name(f"{folder.name}.{number}")).exists():
+                number += 1
+            folder.rename(free)
+            aside = free
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"{folder}: cannot write the results there: {error.strerror}; choose another with -o"
+        ) from error
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise InputError(f"{folder}: cannot write the results there: permission denied; choose another with -o")
+    return aside
 
 
 class Checkpoints:
@@ -111,3 +433,42 @@ class Checkpoints:
         if restart.continues:
             self.last_step = restart.step
         return checkpoint
+
+
+def kept_overrides(name: str, folder: Path, restart: bool | Path) -> list[str]:
+    """Return the texts ``KEY=VALUE`` of the run that a restart continues. Not collective.
+
+    Parameters
+    ----------
+    name : of the case; texts of a run of another case are not kept
+    folder : of the output
+    restart : True for the newest checkpoint of the folder, else its file or folder
+
+    Raises
+    ------
+    InputError
+        If the checkpoint is missing or damaged.
+    """
+    path = asked_checkpoint(folder, restart)
+    if path is not None:
+        _, found = read_checkpoint_header(path, MPI.COMM_SELF)
+    else:
+        # the run may have finished without a checkpoint
+        try:
+            with open_result(folder / RESULT) as result:
+                found = result.attributes
+        except InputError:
+            return []
+    return [str(text) for text in found.get("overrides", [])] if found.get("name") == name else []
+
+
+def joined_overrides(kept: Iterable[str], given: Iterable[str]) -> list[str]:
+    """Return the kept texts, except for keys that are given again, followed by the given texts."""
+    given = list(given)
+    keys = {_key(text) for text in given}
+    return [*(text for text in kept if _key(text) not in keys), *given]
+
+
+def _key(text: str) -> tuple[str, ...]:
+    key = text.partition("=")[0].strip()
+    return tuple(split_key(key) or [key])

@@ -35,10 +35,10 @@ from ..mesh.exchange import Router
 from ..mesh.slab import slab_of
 from ..output.checkpoint import Checkpoint
 from ..parallel.natural import NaturalOrder
-from ..stepping.stage import StageStart
+from ..stepping.model import StageStart
 
 if TYPE_CHECKING:
-    from ..recording.blowup import BlowUp
+    from ..recording.monitors import BlowUp
     from ..recording.recorder import Recorder
     from ..stepping.ledger import Ledger
     from ..stepping.stepper import Stepper

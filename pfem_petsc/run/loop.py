@@ -9,8 +9,8 @@ from ..analysis import Step
 from ..errors import EarlyStop, InputError, PfemError
 from ..parallel.agreement import on_root
 from ..parallel.heap import returning_freed_memory
-from ..restart.folder import Restart
-from ..stepping.fused_steps import Batches
+from ..restart.checkpoints import Restart
+from ..stepping.batches import Batches
 from .outputs import Outputs
 from .stages import Stages
 from .synchroniser import Synchroniser

@@ -2,33 +2,319 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from mpi4py import MPI
 
 from ..analysis import Analysis, Step
-from ..errors import EarlyStop, SimulationFailure
+from ..case.schema import Case
+from ..errors import EarlyStop, SimulationFailure, printable
+from ..mechanics.compiled import Compilation
+from ..modes.find import Found, find_modes, weakest_member
+from ..output.modes import NAMES
 from ..output.progress import Progress
+from ..output.units import MODE
 from ..output.vtkhdf import ResultWriter
-from ..recording.checkpointing import Checkpointing
-from ..recording.events import Events
-from ..recording.fields import Fields
-from ..recording.history import History
-from ..recording.observer import Callback, Observer
-from ..recording.report import ProgressReport
-from ..recording.ruptures import RuptureReport
-from ..recording.snapshots import Snapshots
-from ..restart.checkpoints import Checkpoints
-from ..restart.folder import Restart, prepare_folder
+from ..parallel.agreement import on_root
+from ..preflight.forecast import summarise
+from ..preflight.inspection import warnings_before
+from ..preflight.values import odd_accelerations
+from ..recording.observers import (
+    Callback,
+    Checkpointing,
+    Events,
+    History,
+    Observer,
+    ProgressReport,
+    RuptureReport,
+    Snapshots,
+)
+from ..recording.recorder import Fields, Recorder
+from ..restart.checkpoints import RESULT, Checkpoints, Restart, prepare_folder
 from ..signals import early
-from ..stepping.fused_steps import Batches
-from .compilation import ReportedCompilation
-from .modes import record_modes, remove_modes
-from .opening import open_progress, open_result_file
-from .resuming import resume_observers, tell_restart
+from ..stepping.batches import Batches
+from ..stepping.model import Model
+from ..stepping.plan import Plan
 from .stages import Stages
 from .synchroniser import Synchroniser
 
-__all__ = ["Outputs"]
+if TYPE_CHECKING:
+    from ..output.checkpoint import Checkpoint
+    from ..stepping.stepper import Stepper
+
+
+def open_progress(
+    case: Case,
+    model: Model,
+    plan: Plan,
+    start: tuple[int, float],
+    folder: Path,
+    quiet: bool,
+    notes: Iterable[str],
+) -> Progress:
+    """Open the progress report and write summary, warnings and notes. Collective.
+
+    ``start``: step and time [s] from which the run continues.
+    """
+    progress = Progress(
+        model.comm,
+        printable(case.title),
+        plan.steps,
+        plan.end or 0.0,
+        quiet,
+        folder / "log.txt",
+        start_step=start[0],
+        start_time=start[1],
+        axis=plan.axis,
+    )
+    progress.summary(summarise(case, model, plan))
+    own = plan.plans[model.case.number] if case.stage else plan
+    for warning in model.warnings + odd_accelerations(case) + warnings_before(model.case, model, own):
+        progress.warning(warning)
+    if plan.scheme.notice:
+        progress.message(plan.scheme.notice)
+    for note in notes:
+        progress.message(note)
+    return progress
+
+
+def open_result_file(
+    case: Case,
+    model: Model,
+    plan: Plan,
+    history: History,
+    fields: Fields,
+    events: Mapping[str, Any],
+    folder: Path,
+    restart: Restart | None,
+    step: int,
+) -> ResultWriter:
+    """Open the result file, new or, if a restart continues it, truncated after ``step``. Collective."""
+    continues = restart is not None and restart.continues
+    return ResultWriter(
+        folder / RESULT,
+        model.comm,
+        model.mesh,
+        point_fields=fields.points,
+        cell_fields=fields.cells,
+        columns=history.columns,
+        column_types=history.types,
+        case_text=case.to_toml(),
+        attributes=_attributes(case, model, plan, history.recorder),
+        precision=case.output.precision,
+        compressed=case.output.compression == "gzip",
+        append_after_step=step if continues else None,
+        last=restart.last if continues else None,
+        modes=case.modes.kind if case.modes is not None else None,
+        events=events,
+    )
+
+
+def _attributes(case: Case, model: Model, plan: Plan, recorder: Recorder) -> dict[str, Any]:
+    attributes: dict[str, Any] = {
+        "name": case.name,
+        "folder": str(case.folder.resolve()),
+        "overrides": list(case.overrides),
+        "axis": plan.axis.symbol,
+        "time_step": plan.step,
+        "linear_solver": plan.linear.why if plan.linear is not None else "none",
+        "partitioner": model.mesh.partitioner,
+    }
+    if case.stage:
+        attributes["stages"] = [stage.name for stage in case.stage]
+    if plan.steps is not None:
+        attributes["steps"] = plan.steps
+    for name, nodes in recorder.probe_nodes.items():
+        attributes[f"probe_nodes/{name}"] = nodes.tolist()
+    return attributes | _wave_times(case, model)
+
+
+def _wave_times(case: Case, model: Model) -> dict[str, float]:
+    """Return the time [s] of a wave through the shortest bar at each wall, and at the supports, of all stages.
+
+    Collective.
+    """
+    sets: dict[str, list[str | None]] = {}
+    for stage in case.stages:
+        for wall in stage.wall:
+            sets.setdefault(f"wall/{wall.name}/force", []).append(wall.node_set)
+        for support in stage.support:
+            sets.setdefault("support_force", []).append(support.node_set)
+    mesh, bars, found = model.mesh, model.bars, {}
+    for column, names in sets.items():
+        members = np.zeros((mesh.n_local, 1))
+        for name in names:
+            members[: mesh.n_owned][slice(None) if name is None else model.nodes[name]] = 1.0
+        mesh.update_ghosts(members)
+        times = [np.inf]
+        for block in bars.blocks:
+            own = slice(block.start, block.stop)
+            near = (members[bars.ends[own], 0] > 0.0).any(axis=1)
+            if block.density > 0.0 and near.any():
+                shortest = float(bars.mesh_lengths[own][near].min())
+                times.append(shortest * float(np.sqrt(block.density / block.modulus)))
+        found[f"wave_time/{column}"] = model.comm.allreduce(min(times), op=MPI.MIN)
+    return found
+
+
+def resume_observers(
+    restart: Restart, checkpoint: Checkpoint, checkpoints: Checkpoints, history: History, snapshots: Snapshots
+) -> None:
+    """Give history and snapshots what a checkpoint holds of them. Collective."""
+    sums = history.ledger, history.recorder, history.blow_up
+    history.row = checkpoints.state.load_sums(checkpoint, *sums)
+    snapshots.load_state(restart.scalars)
+    history.contact_watch.start = history.recorder.start_energy
+    if restart.scalars.get("stage") is not None:
+        history.load_stage(restart.scalars["stage"]["history"])
+
+
+def tell_restart(restart: Restart, progress: Progress, place: str, functions: int) -> None:
+    """Report from where a run continues, what has changed, and missing functions. Collective.
+
+    Parameters
+    ----------
+    place : step and time of the checkpoint
+    functions : number of functions that give forces
+    """
+    changes = f"; changed: {'; '.join(restart.changed)}" if restart.changed else ""
+    progress.message(f"restart from {restart.path}: {place}{changes}")
+    before = int(restart.attributes.get("external_functions", 0))
+    if before != functions:
+        progress.warning(
+            f"{restart.path}: the run had {before} function{'s' * (before != 1)} for forces, and this one has "
+            f"{functions}: functions are not in checkpoints; register them by Simulation.external_force before the run"
+        )
+
+
+_PATIENCE = 2.0
+"""Time [s] of compilations up to which nothing is said."""
+
+
+class ReportedCompilation(Compilation):
+    """Reports once that loops are compiled, if that takes long, and excludes the time from the rate of steps.
+
+    Attributes
+    ----------
+    progress : the progress report of the run; None before it is open, when rank 0 prints unless it is quiet
+    """
+
+    def __init__(self, comm: MPI.Comm, quiet: bool) -> None:
+        super().__init__(self._tell, self._leave_out, _PATIENCE)
+        self.progress: Progress | None = None
+        self._speaks = comm.rank == 0 and not quiet
+
+    def _tell(self, name: str) -> None:
+        text = (
+            f"compiling loops for this machine (once, up to a minute in total): {name}, and others that this kind of "
+            "case needs; later runs load them"
+        )
+        if self.progress is not None:
+            self.progress.message(text)
+        elif self._speaks:
+            print(text, flush=True)
+
+    def _leave_out(self, seconds: float) -> None:
+        if self.progress is not None:
+            self.progress.compiled(seconds)
+
+
+MODES_FILE = "modes.vtkhdf"
+_PER_LINE = 5
+
+
+def record_modes(stepper: Stepper, writer: ResultWriter, folder: Path, progress: Progress) -> None:
+    """Find the modes of the stepper's state, write and report them. Collective.
+
+    Raises
+    ------
+    PfemError
+        On all ranks.
+    """
+    model, settings = stepper.model, stepper.model.case.modes
+    consistent = (settings.mass or model.case.mass) == "consistent"
+    found = find_modes(model, stepper.state, settings, consistent)
+    writer.write_modes(found.eigenvalues, found.values, found.shapes)
+    _write_file(stepper, found, folder)
+    for text in _told(found, settings.count):
+        progress.message(text)
+    if found.kind == "buckling":
+        _tell_members(stepper, found, progress)
+    if found.negative:
+        are = "eigenvalues are" if found.negative > 1 else "eigenvalue is"
+        progress.warning(
+            f"unstable equilibrium: {found.negative} {are} negative: such a motion grows as exp(2 pi |f| t); its "
+            "frequency is given as -|f|"
+        )
+
+
+def _tell_members(stepper: Stepper, found: Found, progress: Progress) -> None:
+    """Report the first bar that buckles as a column, which the factors of the truss do not contain. Collective."""
+    weakest = weakest_member(stepper.model, stepper.state.x)
+    if weakest is None:
+        return
+    factor, bar = weakest
+    text = (
+        f"bar {bar} is the first that buckles as a column, at the factor {factor:.6g} (pi^2 E I/(K L)^2 over its force)"
+    )
+    if not len(found.values) or factor < found.values[0]:
+        progress.warning(f"{text}, before the truss does: its factors are for bars that stay straight")
+    else:
+        progress.message(text)
+
+
+def _told(found: Found, asked: int) -> list[str]:
+    name, unit = NAMES[found.kind]
+    head = "natural frequencies" if found.kind == "vibration" else "buckling: factors of the axial forces"
+    lines = [f"modes by {found.solver}"]
+    if found.at_walls:
+        lines.append(
+            f"{found.at_walls} nodes are held by walls that press on them: along the normals, by friction and ties in "
+            "all directions"
+        )
+    zeros = int((found.eigenvalues == 0.0).sum())
+    if zeros:
+        lines.append(f"{zeros} frequencies are zero: rigid-body motions or mechanisms, which no stiffness resists")
+    if len(found.values) < asked:
+        lines.append(f"{asked} modes are requested, but the state has {len(found.values)}")
+    for first in range(0, len(found.values), _PER_LINE):
+        numbers = "  ".join(f"{value:.6g}" for value in found.values[first : first + _PER_LINE])
+        last = min(first + _PER_LINE, len(found.values))
+        which = f"{first + 1}-{last}" if last > first + 1 else f"{last}"
+        lines.append(f"{head} {which}: {numbers} {unit}".rstrip())
+    return lines
+
+
+def _write_file(stepper: Stepper, found: Found, folder: Path) -> None:
+    """Write a separate file for ParaView, with one step per mode, whose time is the number of the mode. Collective."""
+    model, state = stepper.model, stepper.state
+    name, _ = NAMES[found.kind]
+    columns = {"time": (), "step": (), name: (), "eigenvalue": ()}
+    case = model.case
+    with ResultWriter(
+        folder / MODES_FILE,
+        model.comm,
+        model.mesh,
+        point_fields=["displacement", name],
+        cell_fields=[],
+        columns=columns,
+        column_types={"step": np.int64},
+        case_text=case.to_toml(),
+        attributes={"name": case.name, "folder": str(case.folder.resolve()), "kind": found.kind, "axis": MODE.symbol},
+    ) as writer:
+        for k, (value, eigenvalue) in enumerate(zip(found.values, found.eigenvalues, strict=True)):
+            row = {"time": float(k + 1), "step": k + 1, name: value, "eigenvalue": eigenvalue}
+            writer.append_history(row if model.comm.rank == 0 else None)
+            fields = {"displacement": found.shapes[k], name: np.full(len(state.position), value)}
+            writer.write_snapshot(float(k + 1), k + 1, state.position, fields, {})
+
+
+def remove_modes(folder: Path, comm: object) -> None:
+    """Remove the file of modes of a continued run, which do not belong to its new end. Collective."""
+    on_root(comm, (folder / MODES_FILE).unlink, True)
 
 
 class Outputs:

@@ -1,4 +1,4 @@
-"""The stages of a case: planned before the first step, and begun one after the other."""
+"""The stages of a case and their analyses: planned before the first step, begun one after the other."""
 
 from __future__ import annotations
 
@@ -9,27 +9,40 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from mpi4py import MPI
 
-from ..contact.start import check_start
+from ..analysis import Analysis
+from ..contact.contact import check_start
 from ..errors import InputError, SimulationFailure
+from ..modes.find import describe_modes
+from ..modes.initial_state import InitialState
 from ..output.units import TIME as AXIS
 from ..output.units import Axis
 from ..preflight.inspection import warnings_of_stage
-from ..recording.fields import Fields
-from ..recording.recorder import Recorder
-from ..recording.stages import StageColumns
+from ..recording.recorder import Fields, Recorder, StageColumns
+from ..statics.analysis import StaticAnalysis
 from ..stepping.model import Model
+from ..stepping.plan import make_plan
 from ..stepping.stage import end_of_stage, hand_over
+from ..stepping.time_stepping import TimeStepping
 from ..tolerances import TIME
-from .analyses import make_analysis
 
 if TYPE_CHECKING:
-    from ..analysis import Analysis
     from ..case.schema import Case
     from ..integrators.base import Scheme
     from ..solvers.linear import LinearChoice
     from ..stepping.stepper import Stepper
 
-__all__ = ["StagedPlan", "Stages"]
+
+def make_analysis(model: Model, recorded: Mapping[str, Any] | None) -> Analysis:
+    """Create the analysis of a model's case. Collective.
+
+    ``recorded``: record of the plan of the continued run, None for a new run
+    """
+    describe_modes(model)  # refuses at the start modes that cannot be computed at the end
+    if model.case.static is not None:
+        return StaticAnalysis(model, recorded)
+    if model.case.time is None:
+        return InitialState(model)
+    return TimeStepping(model, make_plan(model, recorded))
 
 
 @dataclass(frozen=True)

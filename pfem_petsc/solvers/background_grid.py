@@ -1,25 +1,259 @@
-"""A grid of boxes behind the truss, whose trilinear functions are the coarse space of multigrid.
-
-Displacements of nodes are interpolated from those of the corners of their boxes. The functions depend on the positions
-of the mesh only and reproduce all fields that are linear in them, so rigid motions of the truss in any position that is
-an affine map of the mesh are among them: the grid is made once and never changes. Bars are in the order of their
-boxes, each counted on one rank; those whose ends need the corners of two boxes belong to the pair of these.
-"""
+"""A grid of boxes behind the truss, whose trilinear functions are the coarse space of multigrid."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from mpi4py import MPI
 
+from ..mechanics.compiled import inlined, kernel
 from ..mesh.exchange import GhostExchange, Router
-from .grid_kernels import bar_boxes, distinct, find, node_boxes, pair_keys, sort_by_count
-from .grid_planes import grid_coordinates, grid_planes
 
 if TYPE_CHECKING:
     from ..mesh.distribution import DistributedMesh
 
-__all__ = ["BackgroundGrid", "Elements"]
+
+_RECENT = 8192  # boxes that are remembered while bars are visited, a power of two
+
+
+@inlined
+def corner_weights(t, node, base, box, weights, first):
+    """Write the eight weights of a node in a box to ``weights`` from ``first``; z varies fastest."""
+    fx = t[node, 0] - base[box, 0]
+    fy = t[node, 1] - base[box, 1]
+    fz = t[node, 2] - base[box, 2]
+    for i in range(8):
+        w = fx if i & 4 else 1.0 - fx
+        w *= fy if i & 2 else 1.0 - fy
+        w *= fz if i & 1 else 1.0 - fz
+        weights[first + i] = w
+
+
+@inlined
+def _box(low, shape):
+    """Return the number of the box that starts at the planes ``low`` (3,)."""
+    return (low[0] * shape[1] + low[1]) * shape[2] + low[2]
+
+
+@kernel
+def node_boxes(t, shape, out):
+    """Write the box of each node."""
+    low = np.zeros(3, np.int64)
+    for k in range(len(t)):
+        for i in range(3):
+            low[i] = max(min(int(t[k, i]), shape[i] - 2), 0)
+        out[k] = _box(low, shape)
+
+
+@kernel
+def bar_boxes(t, shape, bars, start, stop, out):
+    """Write the box with all corners that have a weight at either end of each bar, -1 if there is none."""
+    low = np.zeros(3, np.int64)
+    for k in range(start, stop):
+        fits = True
+        for i in range(3):
+            p, q = t[bars[k, 0], i], t[bars[k, 1], i]
+            low[i] = max(min(int(min(p, q)), shape[i] - 2), 0)
+            fits &= max(p, q) <= low[i] + 1.0
+        out[k] = _box(low, shape) if fits else -1
+
+
+@kernel
+def distinct(values, out):
+    """Return the number of values >= 0 without those seen shortly before; write them unless ``out`` is empty."""
+    seen = np.full(_RECENT, -1, np.int64)
+    count = 0
+    for value in values:
+        if value >= 0 and seen[value % _RECENT] != value:
+            seen[value % _RECENT] = value
+            if len(out) > 0:
+                out[count] = value
+            count += 1
+    return count
+
+
+@kernel
+def find(sorted_values, values, out):
+    """Write the places of values among sorted ones, -1 for negative values."""
+    seen = np.full(_RECENT, -1, np.int64)
+    places = np.zeros(_RECENT, np.int64)
+    for k in range(len(values)):
+        value = values[k]
+        if value < 0:
+            out[k] = -1
+            continue
+        at = value % _RECENT
+        if seen[at] != value:
+            seen[at] = value
+            places[at] = np.searchsorted(sorted_values, value)
+        out[k] = places[at]
+
+
+@kernel
+def pair_keys(bars, own, boxes, n, out):
+    """Write the key of the pair of boxes of each bar that has no own one, else -1."""
+    for k in range(len(bars)):
+        out[k] = -1
+        if own[k] == -1:
+            one, other = boxes[bars[k, 0]], boxes[bars[k, 1]]
+            out[k] = min(one, other) * n + max(one, other)
+
+
+@kernel
+def sort_by_count(numbers, starts, order):
+    """Sort by counting: write the indices of numbers 0, 1, ..., without negative ones, and where each starts."""
+    for number in numbers:
+        if number >= 0:
+            starts[number + 1] += 1
+    for k in range(1, len(starts)):
+        starts[k] += starts[k - 1]
+    for k in range(len(numbers)):
+        if numbers[k] >= 0:
+            order[starts[numbers[k]]] = k
+            starts[numbers[k]] += 1
+    for k in range(len(starts) - 1, 0, -1):
+        starts[k] = starts[k - 1]
+    starts[0] = 0
+
+
+@kernel
+def interpolate(t, box, base, corners, coarse, fine):
+    """Write the values (owned, 3) of nodes from those of corners."""
+    w = np.zeros(8)
+    for k in range(len(fine)):
+        corner_weights(t, k, base, box[k], w, 0)
+        x = y = z = 0.0
+        for i in range(8):
+            at = corners[box[k], i]
+            x += w[i] * coarse[at, 0]
+            y += w[i] * coarse[at, 1]
+            z += w[i] * coarse[at, 2]
+        fine[k, 0] = x
+        fine[k, 1] = y
+        fine[k, 2] = z
+
+
+@kernel
+def restrict(t, box, base, corners, fine, coarse):
+    """Add the transpose of :func:`interpolate`."""
+    w = np.zeros(8)
+    for k in range(len(fine)):
+        corner_weights(t, k, base, box[k], w, 0)
+        for i in range(8):
+            at = corners[box[k], i]
+            coarse[at, 0] += w[i] * fine[k, 0]
+            coarse[at, 1] += w[i] * fine[k, 1]
+            coarse[at, 2] += w[i] * fine[k, 2]
+
+
+# Spacing of the planes over the mean length of the bars. Lattices of 10^5 bars, iterations to 1e-6 and time: 2 is best
+# of 1.5, 2, 2.5, 3.
+_SPACING = 2.0
+_FINEST = 4  # nodes for a box of a filled block: more boxes would make the coarse problem as large as the fine one
+_CLOSE = 1e-6  # distance of coordinates that are one layer, and of nodes that are on a plane, over the spacing
+_LAYERS = 8  # most layers between two planes
+_PIECE = 1 << 16  # bars at a time, so that temporary arrays stay small
+# A block has this extent in mean lengths of bars, and this many nodes in a cube of this length; lattices have 1.3 to 2.
+_THICK = 4.0
+_FILLED = 0.5
+
+
+def grid_planes(mesh: DistributedMesh) -> list[np.ndarray]:
+    """Return the coordinates [m] of the planes along x, y and z, ascending. Collective."""
+    low, high = _extremes(mesh)
+    spacing = max(_SPACING * _mean_length(mesh), _least(high - low, mesh.n_nodes))
+    points = mesh.points[: mesh.n_owned]
+    return [_planes(mesh.comm, points[:, axis], low[axis], high[axis], spacing) for axis in range(3)]
+
+
+def fills_block(mesh: DistributedMesh) -> bool:
+    """Whether a truss is several bars thick in all directions and has nodes everywhere between its extremes, so that
+    the functions of the grid describe its soft motions. Slender and hollow trusses bend within a box. Collective."""
+    low, high = _extremes(mesh)
+    length = _mean_length(mesh)
+    extents = high - low
+    return bool(extents.min() >= _THICK * length and mesh.n_nodes * length**3 >= _FILLED * np.prod(extents))
+
+
+def _extremes(mesh: DistributedMesh) -> tuple[np.ndarray, np.ndarray]:
+    points = mesh.points[: mesh.n_owned]
+    low, high = np.empty(3), np.empty(3)
+    mesh.comm.Allreduce(points.min(axis=0, initial=np.inf), low, op=MPI.MIN)
+    mesh.comm.Allreduce(points.max(axis=0, initial=-np.inf), high, op=MPI.MAX)
+    return low, high
+
+
+def _mean_length(mesh: DistributedMesh) -> float:
+    """Return the mean length of the bars [m], rounded, because the sum depends on the number of ranks. Collective."""
+    counted = mesh.bars[mesh.counted]
+    total = 0.0
+    for first in range(0, len(counted), _PIECE):
+        some = counted[first : first + _PIECE]
+        total += float(np.linalg.norm(mesh.points[some[:, 1]] - mesh.points[some[:, 0]], axis=1).sum())
+    return float(f"{mesh.comm.allreduce(total) / mesh.n_bars:.3g}")
+
+
+def _least(extents: np.ndarray, n_nodes: int) -> float:
+    """Return the spacing [m] with which the boxes that fill the extents are fewer than the nodes."""
+    filled = extents[extents > 0.0]
+    boxes = n_nodes / _FINEST
+    spacing = 0.0
+    if len(filled):
+        spacing = float((np.prod(filled) / boxes) ** (1.0 / len(filled)))
+        # a truss that fills little of its extents has fewer boxes than these
+        spacing *= 0.5
+    return spacing
+
+
+def _planes(comm: MPI.Comm, x: np.ndarray, low: float, high: float, spacing: float) -> np.ndarray:
+    if not high - low > _CLOSE * spacing:
+        return np.array([low])
+    count = max(int(round((high - low) / spacing)), 1)
+    even = np.linspace(low, high, count + 1)
+    layers = _layers(comm, x, low, spacing, _LAYERS * count + 1)
+    if layers is None:
+        return even
+    # the planes nearest to equidistant ones among the layers: bars of a lattice end on them and do not cross them
+    at = np.round(np.linspace(0, len(layers) - 1, min(count, len(layers) - 1) + 1)).astype(int)
+    return layers[at]
+
+
+def _layers(comm: MPI.Comm, x: np.ndarray, low: float, spacing: float, most: int) -> np.ndarray | None:
+    """Return the coordinates that nodes have, None if they are more than ``most``. Collective."""
+    close = _CLOSE * spacing
+    some = _merged(np.sort(x[: 4 * most]), close)
+    few = comm.allreduce(len(some), op=MPI.MAX) <= most
+    if not few:
+        return None
+    mine = some
+    for first in range(0, len(x), 1 << 18):
+        mine = _merged(np.unique(np.concatenate([mine, x[first : first + (1 << 18)]])), close)
+        if len(mine) > most:
+            break
+    if comm.allreduce(len(mine), op=MPI.MAX) > most:
+        return None
+    layers = _merged(np.sort(np.concatenate(comm.allgather(mine))), close)
+    return layers if len(layers) <= most else None
+
+
+def _merged(ascending: np.ndarray, close: float) -> np.ndarray:
+    """Return the first one of values that are close."""
+    return ascending[np.diff(ascending, prepend=-np.inf) > close]
+
+
+def grid_coordinates(points: np.ndarray, planes: list[np.ndarray]) -> np.ndarray:
+    """Return positions (n, 3) counted in planes: the number of the plane before a point, and the part of the way to the
+    next; whole numbers on planes."""
+    t = np.zeros_like(points)
+    for axis, at in enumerate(planes):
+        if len(at) > 1:
+            box = np.clip(np.searchsorted(at, points[:, axis], side="right") - 1, 0, len(at) - 2)
+            part = (points[:, axis] - at[box]) / (at[box + 1] - at[box])
+            whole = np.round(part)
+            t[:, axis] = box + np.where(np.abs(part - whole) < 10.0 * _CLOSE, whole, np.clip(part, 0.0, 1.0))
+    return t
+
 
 _TAG = 7500  # of the messages of corners, beside those of nodes
 
@@ -41,6 +275,20 @@ class Elements(NamedTuple):
     bar_starts: np.ndarray
     nodes: np.ndarray
     node_starts: np.ndarray
+
+
+class Summands(NamedTuple):
+    """What the coarse matrix is summed of: bars with ends ``ends`` (b, 2) at positions ``x`` (local, 3) and with the
+    numbers ``stored`` (2, b) of a product; inertia ``nodal`` (owned,); and ``place`` (local,) of nodes among those with
+    matrices ``turned`` (k, 3, 3) and further stiffness ``extra`` (k, 3, 3), -1 for others."""
+
+    ends: np.ndarray
+    x: np.ndarray
+    stored: np.ndarray
+    nodal: np.ndarray
+    place: np.ndarray
+    turned: np.ndarray
+    extra: np.ndarray
 
 
 class BackgroundGrid:
@@ -172,3 +420,174 @@ def _sorted(numbers: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     order = np.empty(int(np.count_nonzero(numbers >= 0)), np.int32)
     sort_by_count(numbers, starts, order)
     return order, starts
+
+
+@kernel
+def neighbours(corners, starts, elements, ptr, columns):
+    """Write the neighbours of each corner in its elements, ascending; return their number."""
+    seen = np.full(len(starts) - 1, -1, np.int32)
+    count = 0
+    for row in range(len(starts) - 1):
+        first = count
+        for at in range(starts[row], starts[row + 1]):
+            for column in corners[elements[at]]:
+                if column >= 0 and seen[column] != row:
+                    seen[column] = row
+                    if len(columns) > 0:
+                        columns[count] = column
+                    count += 1
+        ptr[row + 1] = count
+        if len(columns) > 0:
+            columns[first:count].sort()
+    return count
+
+
+@inlined
+def _add_square(v, factor, n, dense):
+    """Add factor v v^T."""
+    for i in range(n):
+        scaled = factor * v[i]
+        if scaled != 0.0:
+            for j in range(n):
+                dense[i, j] += scaled * v[j]
+
+
+@inlined
+def _flush(corners, element, m, dense, ptr, columns, blocks):
+    """Add the dense matrix of an element to the blocks, and clear it."""
+    for i in range(m):
+        row = corners[element, i]
+        low, high = ptr[row], ptr[row + 1]
+        for j in range(m):
+            at = low + np.searchsorted(columns[low:high], corners[element, j])
+            for p in range(3):
+                for q in range(3):
+                    blocks[at, p, q] += dense[3 * i + p, 3 * j + q]
+                    dense[3 * i + p, 3 * j + q] = 0.0
+
+
+@inlined
+def _turned_difference(difference, ends, direction, place, turned, w, v):
+    """Write to ``v`` (3 m,) how a component of the end difference of a bar depends on the corners."""
+    v[:] = 0.0
+    for end in range(2):
+        at = place[ends[end]]
+        for q in range(3):
+            part = 0.0
+            for p in range(3):
+                along = difference[p] if direction == 3 else (1.0 if p == direction else 0.0)
+                part += along * (turned[at, p, q] if at >= 0 else (1.0 if p == q else 0.0))
+            if end == 0:
+                part = -part
+            for i in range(len(v) // 3):
+                v[3 * i + q] += part * w[end, i]
+
+
+@inlined
+def _add_turned_node(extra, nodal, turn, w, dense):
+    """Add the inertia and further stiffness of a node with a matrix."""
+    inner = np.zeros((3, 3))
+    for p in range(3):
+        for q in range(3):
+            for i in range(3):
+                for j in range(3):
+                    inner[p, q] += turn[i, p] * (extra[i, j] + (nodal if i == j else 0.0)) * turn[j, q]
+    for i in range(8):
+        for j in range(8):
+            for p in range(3):
+                for q in range(3):
+                    dense[3 * i + p, 3 * j + q] += w[i] * w[j] * inner[p, q]
+
+
+@kernel
+def assemble(t, base, elements, parts, pattern, blocks):
+    """Add the Summands ``parts`` of all Elements to ``blocks``; ``pattern``: pointers and columns of these."""
+    boxes, corners, bar_order, bar_starts = elements.boxes, elements.corners, elements.bars, elements.bar_starts
+    ends, x, stored, place, turned = parts.ends, parts.x, parts.stored, parts.place, parts.turned
+    dense = np.zeros((48, 48))
+    same = np.zeros((16, 16))
+    d = np.zeros(16)
+    w = np.zeros((2, 16))
+    v = np.zeros(48)
+    difference = np.zeros(3)
+    for element in range(len(boxes)):
+        m = 8 if boxes[element, 1] < 0 else 16
+        for k in range(bar_starts[element], bar_starts[element + 1]):
+            bar = bar_order[k]
+            c, g = stored[0, bar], stored[1, bar]
+            if c == 0.0 and g == 0.0:
+                continue
+            a, b = ends[bar, 0], ends[bar, 1]
+            w[:] = 0.0
+            if m == 8:
+                corner_weights(t, a, base, boxes[element, 0], w[0], 0)
+                corner_weights(t, b, base, boxes[element, 0], w[1], 0)
+            else:
+                first = 0 if _is_inside(t, a, base, boxes[element, 0]) else 1
+                if first == 0 and not _is_inside(t, b, base, boxes[element, 1]):
+                    first = 1
+                corner_weights(t, a, base, boxes[element, first], w[0], 8 * first)
+                corner_weights(t, b, base, boxes[element, 1 - first], w[1], 8 - 8 * first)
+            difference[0] = x[b, 0] - x[a, 0]
+            difference[1] = x[b, 1] - x[a, 1]
+            difference[2] = x[b, 2] - x[a, 2]
+            if place[a] < 0 and place[b] < 0:
+                for i in range(m):
+                    d[i] = w[1, i] - w[0, i]
+                    v[3 * i] = d[i] * difference[0]
+                    v[3 * i + 1] = d[i] * difference[1]
+                    v[3 * i + 2] = d[i] * difference[2]
+                _add_square(v, c, 3 * m, dense)
+                if g != 0.0:
+                    _add_square(d, g, m, same)
+                continue
+            # in the three directions of space with g, and along the bar with c
+            for direction in range(4):
+                _turned_difference(difference, (a, b), direction, place, turned, w, v[: 3 * m])
+                _add_square(v, c if direction == 3 else g, 3 * m, dense)
+        for k in range(elements.node_starts[element], elements.node_starts[element + 1]):
+            node = elements.nodes[k]
+            w[:] = 0.0
+            corner_weights(t, node, base, boxes[element, 0], w[0], 0)
+            if place[node] < 0:
+                _add_square(w[0], parts.nodal[node], m, same)
+                continue
+            _add_turned_node(parts.extra[place[node]], parts.nodal[node], turned[place[node]], w[0], dense)
+        for i in range(m):
+            for j in range(m):
+                for p in range(3):
+                    dense[3 * i + p, 3 * j + p] += same[i, j]
+                same[i, j] = 0.0
+        _flush(corners, element, m, dense, *pattern, blocks)
+
+
+@inlined
+def _is_inside(t, node, base, box):
+    for i in range(3):
+        part = t[node, i] - base[box, i]
+        if part < 0.0 or part > 1.0:
+            return False
+    return True
+
+
+@kernel
+def arrange(blocks, slots, ptr, row_of, values):
+    """Write blocks (n, 3, 3) to the values in scalar compressed rows, each at its slot."""
+    for k in range(len(slots)):
+        slot = slots[k]
+        row = row_of[slot]
+        width = 3 * (ptr[row + 1] - ptr[row])
+        at = 6 * ptr[row] + 3 * slot
+        for i in range(3):
+            for j in range(3):
+                values[at + i * width + j] += blocks[k, i, j]
+
+
+@kernel
+def stabilise(ptr, diagonal, shift, values):
+    """Add ``shift`` of the diagonal to it; 1 where it is zero."""
+    for row in range(len(diagonal)):
+        width = 3 * (ptr[row + 1] - ptr[row])
+        for i in range(3):
+            at = 6 * ptr[row] + 3 * diagonal[row] + i * (width + 1)
+            values[at] = values[at] * (1.0 + shift) if values[at] > 0.0 else 1.0

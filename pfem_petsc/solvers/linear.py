@@ -1,15 +1,23 @@
-"""Choice of the linear solver of a Newton step, from the case and the model."""
+"""Choice of the linear solver of a Newton step, accelerations with consistent mass, and PETSc's reasons in words."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import TYPE_CHECKING
 
+import numpy as np
+from mpi4py import MPI
 from petsc4py import PETSc
 
-from ..errors import InputError
+from ..errors import InputError, SimulationFailure
+from .matrix import HessianMatrix
 
-__all__ = ["DIRECT", "LinearChoice", "choose_linear", "configure", "has_mumps", "set_preconditioner", "unsymmetric"]
+if TYPE_CHECKING:
+    from .problem import Mechanics
+
 
 DIRECT = ("lu", "mumps")
 """Direct solvers: PETSc's own factorisation, for small matrices, and MUMPS if PETSc has it."""
@@ -41,42 +49,44 @@ class LinearChoice:
         return self.preconditioner in ("gamg", "multigrid") or (self.matrix_free and self.preconditioner in DIRECT)
 
 
-def choose_linear(
-    request: str,
-    unknowns: int,
-    step_ratio: float,
-    symmetric: bool = True,
-    operator: str = "auto",
-    steps: int = _MULTIGRID_FROM,
-    impact: bool = False,
-    block: bool = False,
-) -> LinearChoice:
+@dataclass(frozen=True)
+class Demand:
+    """What the choice of a linear solver depends on besides the case's wishes.
+
+    Attributes
+    ----------
+    unknowns : of the whole model
+    step_ratio : time step relative to the critical step of central differences: stiffness relative to mass
+    symmetric : whether the matrix is symmetric; if not, GMRES and incomplete LU replace conjugate gradients and
+        Cholesky
+    steps : of the run
+    impact : whether there is contact or yielding, with which tangents change too fast for a lagged preconditioner
+    block : whether the truss fills a block, see :func:`~pfem_petsc.solvers.background_grid.fills_block`
+    """
+
+    unknowns: int
+    step_ratio: float
+    symmetric: bool = True
+    steps: int = _MULTIGRID_FROM
+    impact: bool = False
+    block: bool = False
+
+
+def choose_linear(request: str, operator: str, demand: Demand) -> LinearChoice:
     """Resolve ``solver.linear`` and ``solver.operator``.
 
     Parameters
     ----------
-    request : str
-        ``auto``, ``cg``, ``multigrid``, ``gamg`` or ``mumps``.
-    unknowns : int
-        Number of unknowns of the whole model.
-    step_ratio : float
-        Time step relative to the critical step of central differences, a measure of stiffness relative to mass.
-    symmetric : bool
-        Whether the matrix is symmetric; if not, GMRES and incomplete LU replace conjugate gradients and Cholesky.
-    operator : str
-        ``auto``, ``assembled`` or ``matrix_free``.
-    steps : int
-        Number of steps of the run.
-    impact : bool
-        Whether there is contact or yielding, with which tangents change too fast for a lagged preconditioner.
-    block : bool
-        Whether the truss fills a block, see :func:`~pfem_petsc.solvers.grid_planes.fills_block`.
+    request : ``auto``, ``cg``, ``multigrid``, ``gamg`` or ``mumps``
+    operator : ``auto``, ``assembled`` or ``matrix_free``
+    demand : Demand
 
     Raises
     ------
     InputError
         If a matrix-free operator is requested together with a method that needs a matrix, or the reverse.
     """
+    unknowns, step_ratio, symmetric, impact = demand.unknowns, demand.step_ratio, demand.symmetric, demand.impact
     _check(request, operator, symmetric)
     free = operator != "assembled" and symmetric
     krylov, method = ("cg", "conjugate gradients") if symmetric else ("gmres", "GMRES")
@@ -94,12 +104,12 @@ def choose_linear(
         return LinearChoice(krylov, "gamg", f"{words} (asked for)", free)
     ratio = f"step is {step_ratio:.3g} x the explicit limit"
     if free:
-        if request == "auto" and block and not impact and step_ratio > _JACOBI_BLOCK_UP_TO:
+        if request == "auto" and demand.block and not impact and step_ratio > _JACOBI_BLOCK_UP_TO:
             return LinearChoice(krylov, "multigrid", f"{_MULTIGRID} ({ratio})", True)
         if request == "cg" or step_ratio <= _JACOBI_FREE_UP_TO:
             return LinearChoice(krylov, "jacobi", f"{method}, Jacobi, matrix-free ({ratio})", True)
-        if impact or steps < _MULTIGRID_FROM:
-            short = "contact or yielding" if impact else f"{steps} steps"
+        if impact or demand.steps < _MULTIGRID_FROM:
+            short = "contact or yielding" if impact else f"{demand.steps} steps"
             return LinearChoice(krylov, "jacobi", f"{method}, Jacobi, matrix-free ({ratio}, {short})", True)
         return LinearChoice(krylov, "gamg", f"{words} ({ratio})", True)
     if request == "cg" or step_ratio <= _JACOBI_UP_TO:
@@ -202,3 +212,136 @@ def has_mumps() -> bool:
         pc.destroy()
         mat.destroy()
     return True
+
+
+_EXTERNAL_LIBRARY = 76  # PETSC_ERR_LIB
+
+_NEWTON = {
+    "DIVERGED_FUNCTION_DOMAIN": "the positions left the domain of the model (a collapsed bar)",
+    "DIVERGED_LINEAR_SOLVE": "a linear solve failed",
+    "DIVERGED_FNORM_NAN": "the residual is not a number (a bar collapsed or the motion diverged)",
+    "DIVERGED_FUNCTION_NANORINF": "the residual is not a number (a bar collapsed or the motion diverged)",
+    "DIVERGED_MAX_IT": "the limit of Newton iterations was reached",
+    "DIVERGED_LINE_SEARCH": "the line search found no decrease of the residual",
+    "DIVERGED_LOCAL_MIN": "the residual has a local minimum that is not zero",
+    "DIVERGED_DTOL": "the residual grew",
+    "DIVERGED_INNER": "the inner solver failed",
+}
+_LINEAR = {
+    "DIVERGED_MAX_IT": "the limit of linear iterations was reached",
+    "DIVERGED_ITS": "the limit of linear iterations was reached",
+    "DIVERGED_INDEFINITE_MAT": "the tangent is indefinite (bars in compression beyond buckling)",
+    "DIVERGED_INDEFINITE_PC": "the preconditioner is indefinite",
+    "DIVERGED_BREAKDOWN": "the Krylov method broke down",
+    "DIVERGED_NANORINF": "not-a-number in the linear solve",
+    "DIVERGED_NAN": "not-a-number in the linear solve",
+    "DIVERGED_PCSETUP_FAILED": "the preconditioner could not be set up (a singular matrix)",
+    "DIVERGED_PC_FAILED": "the preconditioner could not be set up (a singular matrix)",
+    "DIVERGED_DTOL": "the linear residual grew",
+}
+
+
+def _name(table: type, reason: int) -> str:
+    names = [name for name in dir(table) if not name.startswith("_") and getattr(table, name) == reason]
+    return next(iter(sorted(names, key=lambda name: not name.startswith(("DIVERGED", "CONVERGED")))), str(reason))
+
+
+def _words(table: type, known: dict[str, str], reason: int) -> str:
+    name = _name(table, reason)
+    return f"{known[name]} [{name}]" if name in known else name
+
+
+def newton_reason(reason: int) -> str:
+    """Describe a SNES converged reason."""
+    return _words(PETSc.SNES.ConvergedReason, _NEWTON, reason)
+
+
+def linear_reason(reason: int) -> str:
+    """Describe a KSP converged reason."""
+    return _words(PETSc.KSP.ConvergedReason, _LINEAR, reason)
+
+
+def is_failed_factorisation(error: PETSc.Error) -> bool:
+    """Return whether MUMPS could not factorise a matrix.
+
+    On several ranks PETSc 3.18 continues the solve with the incomplete factors. The solver must then be created again.
+    """
+    return error.ierr == _EXTERNAL_LIBRARY and "MUMPS" in str(error)
+
+
+_PREFIX = "pfem_mass_"
+
+
+class MassSolver:
+    """The consistent mass matrix, constant during a run, and its solver. Construction is collective.
+
+    Options: prefix ``pfem_mass_``.
+
+    Parameters
+    ----------
+    model : Mechanics
+        With consistent mass.
+    """
+
+    def __init__(self, model: Mechanics) -> None:
+        self._supports = model.supports
+        self._matrix = matrix = HessianMatrix(model.mesh, model.supports)
+
+        def add(values: np.ndarray) -> None:
+            coefficients = model.inertia.coefficients(1.0, 0.0)
+            model.bars.tangents(model.mesh.points, 0.0, coefficients, matrix.pattern, values)
+            if model.inertia.points.mass is not None:
+                matrix.add_lumped(model.inertia.points.mass, values)
+            matrix.constrain(float(model.inertia.mass.max(initial=1.0)), values)
+
+        matrix.fill(add)
+        self._right, self._left = matrix.mat.createVecs()
+        self._ksp = PETSc.KSP().create(model.comm)
+        self._ksp.setOptionsPrefix(_PREFIX)
+        self._ksp.setType("cg")
+        self._ksp.getPC().setType("pbjacobi")
+        self._ksp.setTolerances(rtol=1e-14, max_it=1000)
+        self._ksp.setOperators(matrix.mat)
+        self._ksp.setFromOptions()
+
+    def solve(self, load: np.ndarray) -> np.ndarray:
+        """Return accelerations (owned, 3) [m/s2] for forces (owned, 3) [N], zero on prescribed components. Collective.
+
+        Raises
+        ------
+        SimulationFailure
+            On all ranks, if the solver does not converge.
+        """
+        right = load.copy()
+        self._supports.clear(right)
+        self._right.array[:] = right.ravel()
+        self._ksp.solve(self._right, self._left)
+        reason = self._ksp.getConvergedReason()
+        if reason < 0:
+            raise SimulationFailure(
+                f"the initial acceleration: no convergence after {self._ksp.getIterationNumber()} iterations with the "
+                f"consistent mass matrix: {linear_reason(reason)}; check options -{_PREFIX}..., the densities and areas"
+            )
+        a = self._left.array.reshape(load.shape).copy()
+        self._supports.clear(a)
+        return a
+
+    def destroy(self) -> None:
+        """Free the PETSc objects."""
+        for thing in (self._ksp, self._right, self._left):
+            thing.destroy()
+        self._matrix.destroy()
+
+
+@contextmanager
+def reproducible_products(comm: MPI.Comm) -> Iterator[None]:
+    """Make coarse matrices by sums in an order that does not depend on when messages arrive, unless options ask for
+    another way."""
+    options = PETSc.Options()
+    ours = comm.size > 1 and not options.hasName("matptap_via")
+    if ours:
+        # PETSc's default sums contributions of other ranks in the order of arrival
+        options["matptap_via"] = "allatonce_merged"
+    yield
+    if ours:
+        options.delValue("matptap_via")

@@ -1,4 +1,4 @@
-"""The Hessian as a PETSc matrix with a fixed pattern, filled by the loops over bars through precomputed indices."""
+"""The Hessian as a PETSc matrix with a fixed pattern, filled by the loops over bars."""
 
 from __future__ import annotations
 
@@ -9,75 +9,71 @@ from typing import TYPE_CHECKING
 import numpy as np
 from petsc4py import PETSc
 
+from ..mechanics.block_pattern import BlockPattern
 from ..mechanics.compiled import kernel
-from .projection import Projection
 
 if TYPE_CHECKING:
-    from ..contact.transform import Transform
-    from ..mechanics.supports import Supports
+    from ..mechanics.supports import Directions, Supports
     from ..mesh.distribution import DistributedMesh
-    from ..stepping.problem import StepProblem
-
-__all__ = ["BlockPattern", "HessianMatrix", "expand_columns"]
-
-
-class BlockPattern:
-    """Block-compressed rows of the owned nodes, with one 3 x 3 block per node and per neighbour connected by a bar.
-
-    Attributes
-    ----------
-    ptr : (owned + 1,) int32, first block of each block row
-    columns : (blocks,) int64, PETSc node number of each block's column, ascending in a row
-    slots : (b, 4) int32, blocks (a, a), (a, b), (b, b), (b, a) of each bar, -1 if the row is not owned
-    diagonal : (owned,) int32, the diagonal block of each row
-    """
-
-    def __init__(self, mesh: DistributedMesh) -> None:
-        owned = mesh.n_owned
-        numbers = np.concatenate([mesh.first_node + np.arange(owned, dtype=np.int64), mesh.ghost_numbers])
-        a, b = mesh.bars[:, 0].astype(np.int64), mesh.bars[:, 1].astype(np.int64)
-        first, second = np.flatnonzero(a < owned), np.flatnonzero(b < owned)
-        n = max(mesh.n_nodes, 1)
-        keys = np.concatenate(
-            [
-                np.arange(owned, dtype=np.int64) * n + numbers[:owned],
-                a[first] * n + numbers[b[first]],
-                b[second] * n + numbers[a[second]],
-            ]
-        )
-        unique, place = np.unique(keys, return_inverse=True)
-        place = place.astype(np.int32)
-        rows = unique // n
-        self.columns = unique - rows * n
-        self.ptr = np.zeros(owned + 1, dtype=np.int32)
-        np.cumsum(np.bincount(rows, minlength=owned), out=self.ptr[1:])
-        self.diagonal = place[:owned].copy()
-        self.slots = np.full((len(a), 4), -1, dtype=np.int32)
-        self.slots[first, 0] = self.diagonal[a[first]]
-        self.slots[first, 1] = place[owned : owned + len(first)]
-        self.slots[second, 2] = self.diagonal[b[second]]
-        self.slots[second, 3] = place[owned + len(first) :]
-
-    def scalar_rows(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return row pointers and PETSc column numbers of the pattern in scalar compressed rows (PETSc integers)."""
-        blocks = np.repeat(np.diff(self.ptr), 3)
-        pointers = np.zeros(len(blocks) + 1, dtype=PETSc.IntType)
-        np.cumsum(3 * blocks, out=pointers[1:])
-        columns = np.empty(pointers[-1], dtype=PETSc.IntType)
-        expand_columns(self.ptr, self.columns, columns)
-        return pointers, columns
+    from .problem import Coordinates, Linearisable
 
 
 @kernel
-def expand_columns(ptr, columns, out):
-    """Write the columns of a matrix in scalar compressed rows; ``ptr``, ``columns``: of its blocks."""
+def turn_blocks(ptr, local_columns, place, left, right, values):
+    """Multiply the rows of nodes by matrices ``left`` (m, 3, 3), and their columns by ``right``, from the right.
+
+    ``ptr``, ``local_columns``, ``values``: of a :class:`~pfem_petsc.mechanics.block_pattern.BlockPattern`; ``place``
+    (local,): of a node among the m, -1 for others.
+    """
+    block = np.zeros((3, 3))
     for row in range(len(ptr) - 1):
         width = 3 * (ptr[row + 1] - ptr[row])
+        r = place[row]
         for k in range(ptr[row], ptr[row + 1]):
+            c = place[local_columns[k]]
+            if r < 0 and c < 0:
+                continue
             at = 6 * ptr[row] + 3 * k
             for i in range(3):
                 for j in range(3):
-                    out[at + i * width + j] = 3 * columns[k] + j
+                    block[i, j] = values[at + i * width + j]
+            if r >= 0:
+                for j in range(3):
+                    x, y, z = block[0, j], block[1, j], block[2, j]
+                    for i in range(3):
+                        block[i, j] = left[r, i, 0] * x + left[r, i, 1] * y + left[r, i, 2] * z
+            if c >= 0:
+                for i in range(3):
+                    x, y, z = block[i, 0], block[i, 1], block[i, 2]
+                    for j in range(3):
+                        block[i, j] = x * right[c, 0, j] + y * right[c, 1, j] + z * right[c, 2, j]
+            for i in range(3):
+                for j in range(3):
+                    values[at + i * width + j] = block[i, j]
+
+
+class Projection:
+    """Projections on the free directions of local nodes. Construction is collective.
+
+    Attributes
+    ----------
+    nodes : (m,) owned nodes; held : (m, 3, 3) projections on their prescribed directions
+    """
+
+    def __init__(self, mesh: DistributedMesh, directions: Directions) -> None:
+        self.nodes, self.held = directions.nodes, np.eye(3) - directions.free
+        shared = np.zeros((mesh.n_local, 10))
+        shared[self.nodes, 0] = 1.0
+        shared[self.nodes, 1:] = directions.free.reshape(-1, 9)
+        mesh.update_ghosts(shared)
+        nodes = np.flatnonzero(shared[:, 0])
+        self._place = np.full(mesh.n_local, -1, dtype=np.int32)
+        self._place[nodes] = np.arange(len(nodes), dtype=np.int32)
+        self._free = np.ascontiguousarray(shared[nodes, 1:]).reshape(-1, 3, 3)
+
+    def project(self, ptr: np.ndarray, local_columns: np.ndarray, values: np.ndarray) -> None:
+        """Project the values of a matrix, without its new diagonal blocks."""
+        turn_blocks(ptr, local_columns, self._place, self._free, self._free, values)
 
 
 @kernel
@@ -200,18 +196,18 @@ class HessianMatrix:
             self.bounded.setOption(PETSc.Mat.Option.SYMMETRIC, self._symmetric)
             self._chain.append((link, matrix, self.bounded))
 
-    def update(self, problem: StepProblem, w: np.ndarray) -> None:
+    def update(self, problem: Linearisable, w: np.ndarray) -> None:
         """Assemble the Hessian of a problem at ``w``. Collective."""
         self.fill(lambda values: problem.hessian(w, self, values))
         if problem.transform.bounded:
             self._change_coordinates(problem.transform)
 
-    def put(self, problem: StepProblem, bars: np.ndarray) -> None:
+    def put(self, problem: Linearisable, bars: np.ndarray) -> None:
         """Assemble at the predictor of a problem, with the stiffness (5, b) of ``Bars.linearise``. Collective."""
         problem.place(np.zeros_like(problem.u))
         self.fill(lambda values: problem.hessian_here(self, values, bars))
 
-    def _change_coordinates(self, transform: Transform) -> None:
+    def _change_coordinates(self, transform: Coordinates) -> None:
         """Compute ``bounded`` from ``mat``. Collective."""
         last = self.mat
         for link, matrix, product in self._chain:
@@ -224,7 +220,7 @@ class HessianMatrix:
             last = product
 
     def fill_held(
-        self, add: Callable[[np.ndarray], None], held: np.ndarray, scale: float, transform: Transform
+        self, add: Callable[[np.ndarray], None], held: np.ndarray, scale: float, transform: Coordinates
     ) -> PETSc.Mat:
         """Assemble in the coordinates of a transform; rows and columns of components (local nodes, 3) with nonzero
         ``held`` are replaced by ``scale`` on the diagonal. Collective."""

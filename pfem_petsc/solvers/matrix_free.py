@@ -1,27 +1,271 @@
-"""The Hessian as a matrix-free operator: the stiffness is applied bar by bar and never assembled.
-
-Two numbers per bar are stored instead of 36 matrix entries and their columns, so a product reads a tenth of the memory.
-Contact problems use the restriction of the operator to their inactive unknowns.
-"""
+"""The Hessian as a matrix-free operator: the stiffness is applied bar by bar and never assembled."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import atexit
+import itertools
+import weakref
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
 from petsc4py import PETSc
 
+from ..mechanics.compiled import inlined, kernel
 from ..mechanics.mass import consistent_product
-from .outlive import at_exit, outlive
-from .product_kernels import add_blocks, add_diagonals, add_products, drop_negative, inertia_products
-from .restricted import Context, Extension
+from ..mechanics.strips import add_stiffness_diagonals, add_stiffness_products
 
 if TYPE_CHECKING:
-    from ..stepping.model import Model
-    from ..stepping.problem import StepProblem
+    from .problem import Linearisable, Mechanics
 
-__all__ = ["MatrixFreeHessian", "full_blocks"]
+
+_NUMBERS = itertools.count()
+_ALIVE: dict[int, tuple[Callable[[weakref.ref], None], weakref.ref]] = {}
+
+
+def at_exit(function: Callable[[weakref.ref], None], thing: object) -> None:
+    """Call a function with a reference to a PETSc object when Python exits, if the object still exists then.
+
+    Unlike ``atexit.register``, it keeps nothing of an object that is gone, of which a program that makes many runs has
+    many.
+    """
+    number = next(_NUMBERS)
+    if not number:
+        atexit.register(_call_all)
+    _ALIVE[number] = function, weakref.ref(thing, lambda _: _ALIVE.pop(number, None))
+
+
+def _call_all() -> None:
+    for function, reference in reversed(list(_ALIVE.values())):
+        function(reference)
+
+
+def outlive(reference: weakref.ref) -> None:
+    """Prevent PETSc from freeing operators that are Python objects; to be called when Python exits.
+
+    Parameters
+    ----------
+    reference : to a matrix, or to a SNES, whose operators include the last restriction to inactive unknowns
+    """
+    thing = reference()
+    if not thing:
+        return
+    for matrix in thing.getKSP().getOperators() if isinstance(thing, PETSc.SNES) else (thing,):
+        if matrix and matrix.getType() == "python":
+            matrix.incRef()
+
+
+class Restriction:
+    """H restricted to some of the unknowns of each rank, the inactive set of a contact problem.
+
+    It holds no reference to its PETSc matrix, which refers to it: Python's garbage collector cannot see a cycle through
+    PETSc, so it would never be freed.
+    """
+
+    def __init__(self, whole: MatrixFreeHessian, kept: np.ndarray) -> None:
+        self.whole = whole
+        self.kept = kept.astype(np.int64)
+
+    def matrix(self) -> PETSc.Mat:
+        """Create a PETSc matrix for it. Collective."""
+        n = len(self.kept)
+        matrix = PETSc.Mat().createPython(((n, None), (n, None)), self, comm=self.whole.mesh.comm)
+        matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+        matrix.setUp()
+        return matrix
+
+    def mult(self, mat: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """Compute y = H x with zeros for the other unknowns; called by PETSc."""
+        whole = self.whole
+        u = whole._u[: whole.mesh.n_owned].reshape(-1)
+        u[:] = 0.0
+        u[self.kept] = x.getArray(readonly=True)
+        whole.apply()
+        y.setArray(whole._out[: whole.mesh.n_owned].reshape(-1)[self.kept])
+
+    def getDiagonal(self, mat: PETSc.Mat, d: PETSc.Vec) -> None:  # noqa: N802 - PETSc's name
+        """Write the diagonal of the restriction; called by PETSc."""
+        d.setArray(self.whole.diagonal().reshape(-1)[self.kept])
+
+
+class Context:
+    """Python context of an operator that owns its PETSc matrix; does not keep the operator alive."""
+
+    def __init__(self, operator: Extension | MatrixFreeHessian) -> None:
+        self.operator = weakref.ref(operator)
+
+    def mult(self, mat: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """Y = H x; called by PETSc."""
+        self.operator().mult(mat, x, y)
+
+    def getDiagonal(self, mat: PETSc.Mat, d: PETSc.Vec) -> None:  # noqa: N802 - PETSc's name
+        """Write the diagonal of H; called by PETSc."""
+        d.setArray(self.operator().diagonal().ravel())
+
+    def createSubMatrix(  # noqa: N802 - PETSc's name
+        self, mat: PETSc.Mat, rows: PETSc.IS, columns: PETSc.IS, out: PETSc.Mat | None = None
+    ) -> PETSc.Mat:
+        """Return the restriction of H to some unknowns; called by PETSc."""
+        whole = self.operator()
+        return Restriction(whole, rows.getIndices() - 3 * whole.mesh.first_node).matrix()
+
+
+class Extension:
+    """H of all unknowns, with rows and columns of active unknowns replaced by those of a scaled identity."""
+
+    def __init__(self, whole: MatrixFreeHessian) -> None:
+        self.whole = whole
+        self.kept: np.ndarray | None = None
+        local, total = 3 * whole.mesh.n_owned, 3 * whole.mesh.n_nodes
+        context = Context(self)
+        self.mat = PETSc.Mat().createPython(((local, total), (local, total)), context, comm=whole.mesh.comm)
+        self.mat.setBlockSize(3)
+        self.mat.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+        self.mat.setUp()
+        at_exit(outlive, self.mat)
+
+    def mult(self, mat: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """Y = H x; called by PETSc."""
+        if self.kept is None:
+            self.whole.mult(mat, x, y)
+            return
+        with y as out:
+            self.times(x.getArray(readonly=True).reshape(-1, 3), out.reshape(-1, 3))
+
+    def times(self, given: np.ndarray, out: np.ndarray) -> None:
+        """Compute ``out`` = H ``given``, both (owned, 3) and contiguous. Collective."""
+        whole, kept = self.whole, self.kept
+        owned = whole.mesh.n_owned
+        if kept is None:
+            whole._u[:owned] = given
+            whole.apply()
+            out[:] = whole._out[:owned]
+            return
+        u = whole._u[:owned].reshape(-1)
+        u[:] = 0.0
+        u[kept] = given.reshape(-1)[kept]
+        whole.apply()
+        np.multiply(whole.scale, given, out=out)
+        out.reshape(-1)[kept] = whole._out[:owned].reshape(-1)[kept]
+
+
+@kernel
+def inertia_products(nodal, u, out):
+    """Write the products of nodal inertia (owned,) to ``out`` (local, 3), zeros for ghosts."""
+    owned = len(nodal)
+    for k in range(owned):
+        for i in range(3):
+            out[k, i] = nodal[k] * u[k, i]
+    for k in range(owned, len(out)):
+        for i in range(3):
+            out[k, i] = 0.0
+
+
+@kernel
+def add_products(sweep, far, x, stored, u, out):
+    """Add K u to ``out``, chunk by chunk of a :class:`~pfem_petsc.mechanics.columns.Sweep`."""
+    heads, fars, starts, chunks = sweep.heads, sweep.fars, sweep.starts, sweep.chunks
+    for chunk in range(len(sweep.diagonal)):
+        if not sweep.diagonal[chunk]:
+            _stars(chunk, heads, starts, chunks, far, x, stored, u, out)
+            continue
+        for run in range(chunks[chunk], chunks[chunk + 1]):
+            at = starts[run]
+            add_stiffness_products(x, u, out, heads[run], fars[run], starts[run + 1] - at, stored[0], stored[1], at)
+
+
+@inlined
+def _stars(chunk, heads, starts, chunks, far, x, stored, u, out):
+    """Add the products of a chunk whose runs are stars."""
+    for run in range(chunks[chunk], chunks[chunk + 1]):
+        a = heads[run]
+        ax = x[a, 0]
+        ay = x[a, 1]
+        az = x[a, 2]
+        px = u[a, 0]
+        py = u[a, 1]
+        pz = u[a, 2]
+        sx = 0.0
+        sy = 0.0
+        sz = 0.0
+        for k in range(starts[run], starts[run + 1]):
+            b = far[k]
+            dx = x[b, 0] - ax
+            dy = x[b, 1] - ay
+            dz = x[b, 2] - az
+            ux = u[b, 0] - px
+            uy = u[b, 1] - py
+            uz = u[b, 2] - pz
+            c = stored[0, k] * (dx * ux + dy * uy + dz * uz)
+            g = stored[1, k]
+            fx = c * dx + g * ux
+            fy = c * dy + g * uy
+            fz = c * dz + g * uz
+            sx += fx
+            sy += fy
+            sz += fz
+            out[b, 0] += fx
+            out[b, 1] += fy
+            out[b, 2] += fz
+        out[a, 0] -= sx
+        out[a, 1] -= sy
+        out[a, 2] -= sz
+
+
+@kernel
+def add_diagonals(sweep, far, x, stored, minus, plus):
+    """Add the diagonal of K at the upper ends of bars to ``plus``, and subtract that at the lower ends from ``minus``,
+    both (local nodes, 3)."""
+    heads, fars, starts, chunks = sweep.heads, sweep.fars, sweep.starts, sweep.chunks
+    for chunk in range(len(sweep.diagonal)):
+        for run in range(chunks[chunk], chunks[chunk + 1]):
+            at = starts[run]
+            if sweep.diagonal[chunk]:
+                count = starts[run + 1] - at
+                add_stiffness_diagonals(x, minus, plus, heads[run], fars[run], count, stored[0], stored[1], at)
+                continue
+            a = heads[run]
+            for k in range(at, starts[run + 1]):
+                b = far[k]
+                for i in range(3):
+                    d = x[b, i] - x[a, i]
+                    part = stored[0, k] * (d * d) + stored[1, k]
+                    plus[b, i] += part
+                    minus[a, i] -= part
+
+
+@kernel
+def add_blocks(bars, x, stored, blocks):
+    """Add the diagonal blocks (local nodes, 6): xx, xy, xz, yy, yz, zz."""
+    for k in range(len(bars)):
+        a, b = bars[k, 0], bars[k, 1]
+        dx = x[b, 0] - x[a, 0]
+        dy = x[b, 1] - x[a, 1]
+        dz = x[b, 2] - x[a, 2]
+        c = stored[0, k]
+        g = stored[1, k]
+        for i in (a, b):
+            blocks[i, 0] += c * dx * dx + g
+            blocks[i, 1] += c * dx * dy
+            blocks[i, 2] += c * dx * dz
+            blocks[i, 3] += c * dy * dy + g
+            blocks[i, 4] += c * dy * dz
+            blocks[i, 5] += c * dz * dz + g
+
+
+@kernel
+def drop_negative(bars, x, stored):
+    """Replace negative eigenvalues of the bars' stiffness, g and c d.d + g, by zero."""
+    for k in range(len(bars)):
+        c = stored[0, k]
+        g = stored[1, k]
+        if c >= 0.0 and g >= 0.0:
+            continue
+        a, b = bars[k, 0], bars[k, 1]
+        square = (x[b, 0] - x[a, 0]) ** 2 + (x[b, 1] - x[a, 1]) ** 2 + (x[b, 2] - x[a, 2]) ** 2
+        left = max(g, 0.0)
+        stored[0, k] = (max(c * square + g, 0.0) - left) / square if square > 0.0 else 0.0
+        stored[1, k] = left
 
 
 class MatrixFreeHessian:
@@ -37,7 +281,7 @@ class MatrixFreeHessian:
 
     _extension: Extension | None = None
 
-    def __init__(self, model: Model) -> None:
+    def __init__(self, model: Mechanics) -> None:
         self.model = model
         mesh = model.mesh
         self.mesh = mesh
@@ -53,20 +297,20 @@ class MatrixFreeHessian:
         self._out = np.zeros((mesh.n_local, 3))
         self._problem = None
 
-    def update(self, problem: StepProblem, w: np.ndarray) -> None:
+    def update(self, problem: Linearisable, w: np.ndarray) -> None:
         """Linearise at ``w``. Collective."""
         problem.place(problem.increment(w))
         self.linearise(problem)
         self.mat.stateIncrease()
 
-    def linearise(self, problem: StepProblem) -> None:
+    def linearise(self, problem: Linearisable) -> None:
         """As :meth:`update`, at the current positions of the problem."""
         self._problem = problem
         self._left = problem.transform.left()
         self.x[:] = problem.x
         self.model.bars.stiffnesses(self.x, problem.balance.weight, self.stored)
 
-    def put(self, problem: StepProblem, bars: np.ndarray) -> None:
+    def put(self, problem: Linearisable, bars: np.ndarray) -> None:
         """Linearise at the predictor of a problem, with the stiffness (5, b) of ``Bars.linearise``. Collective."""
         self.update(problem, np.zeros_like(problem.u))
         self.stored[0], self.stored[1] = bars[3] / self.model.bars.lengths(self.x) ** 2, bars[4]

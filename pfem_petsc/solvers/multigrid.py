@@ -1,11 +1,4 @@
-"""Multigrid without a matrix of the truss: polynomial smoothing by products, and a coarse matrix on a background grid.
-
-One cycle from zero: Chebyshev smoothing, correction by the coarse matrix (:mod:`~pfem_petsc.solvers.grid_matrix`),
-of which PETSc's algebraic multigrid makes one cycle, and the same smoothing again. The polynomials are of the fourth
-kind (J. Lottes, "Optimal polynomial smoothers for multigrid V-cycles", Numerical Linear Algebra with Applications 30
-(2023), e2518), which need no lower bound of the spectrum. The upper one is known: with D of the 3 x 3 blocks on the
-diagonal of a sum of bars, u_a . k u_b <= (u_a . k u_a + u_b . k u_b) / 2 gives D^-1 K <= 2.
-"""
+"""Multigrid without a matrix of the truss: polynomial smoothing by products, and a coarse matrix summed bar by bar."""
 
 from __future__ import annotations
 
@@ -14,18 +7,116 @@ from typing import TYPE_CHECKING
 import numpy as np
 from petsc4py import PETSc
 
-from .background_grid import BackgroundGrid
-from .grid_kernels import interpolate, restrict
-from .grid_matrix import CoarseMatrix
+from ..mechanics.block_pattern import expand_columns
+from ..mechanics.compiled import kernel
+from ..mesh.exchange import Router
+from .background_grid import BackgroundGrid, Summands, arrange, assemble, interpolate, neighbours, restrict, stabilise
+from .linear import reproducible_products
 from .matrix_free import MatrixFreeHessian, full_blocks
-from .reproducible import reproducible_products
-from .smoothing_kernels import invert, smooth
 
 if TYPE_CHECKING:
-    from ..stepping.model import Model
-    from ..stepping.problem import StepProblem
+    from .problem import Linearisable, Mechanics
 
-__all__ = ["GridMultigrid"]
+
+_SHIFT = 1e-8  # of the diagonal: corners that few nodes depend on may have functions that depend on each other
+
+
+class CoarseMatrix:
+    """The pattern of the coarse matrix, from which :meth:`make` makes matrices. Construction is collective."""
+
+    def __init__(self, grid: BackgroundGrid) -> None:
+        self.grid = grid
+        elements, local = grid.elements, len(grid.numbers)
+        flat = elements.corners.ravel()
+        order = np.argsort(flat, kind="stable")
+        order = order[np.count_nonzero(flat < 0) :]
+        starts = np.searchsorted(flat[order], np.arange(local + 1))
+        of_corner = (order // 16).astype(np.int32)
+        self._ptr = np.zeros(local + 1, np.int64)
+        count = neighbours(elements.corners, starts, of_corner, self._ptr, np.empty(0, np.int32))
+        self._columns = np.empty(count, np.int32)
+        if count:
+            neighbours(elements.corners, starts, of_corner, self._ptr, self._columns)
+        self._agree()
+
+    def _agree(self) -> None:
+        """Send the pattern of other ranks' rows to these. Collective."""
+        grid, owned = self.grid, self.grid.n_owned
+        rows = np.repeat(np.arange(len(grid.numbers)), np.diff(self._ptr))
+        columns = grid.numbers[self._columns]
+        self._n_own = int(self._ptr[owned])
+        foreign = slice(self._n_own, None)
+        self._router = Router(grid.comm, grid.owners[rows[foreign]])
+        arrived = self._router.send(np.stack([grid.numbers[rows[foreign]], columns[foreign]], axis=1))
+        all_rows = np.concatenate([rows[: self._n_own], arrived[:, 0] - grid.first])
+        keys = all_rows * grid.total + np.concatenate([columns[: self._n_own], arrived[:, 1]])
+        unique, slots = np.unique(keys, return_inverse=True)
+        self._slots = slots.astype(np.int64)
+        self._row_of = unique // max(grid.total, 1)
+        block_columns = unique - self._row_of * grid.total
+        self._block_ptr = np.zeros(owned + 1, np.int64)
+        np.cumsum(np.bincount(self._row_of, minlength=owned), out=self._block_ptr[1:])
+        self._diagonal = np.flatnonzero(block_columns == self._row_of + grid.first)
+        widths = np.repeat(3 * np.diff(self._block_ptr), 3)
+        self._pointers = np.concatenate([[0], np.cumsum(widths)]).astype(PETSc.IntType)
+        self._scalar_columns = np.empty(int(self._pointers[-1]), PETSc.IntType)
+        expand_columns(self._block_ptr, block_columns, self._scalar_columns)
+
+    def make(self, parts: Summands) -> PETSc.Mat:
+        """Return the matrix of what it is summed of. Collective."""
+        grid = self.grid
+        blocks = np.zeros((len(self._columns), 3, 3))
+        assemble(grid.t, grid.base, grid.elements, parts, (self._ptr, self._columns), blocks)
+        arrived = self._router.send(blocks[self._n_own :].reshape(-1, 9)).reshape(-1, 3, 3)
+        values = np.zeros(len(self._scalar_columns))
+        own = self._n_own
+        arrange(blocks[:own], self._slots[:own], self._block_ptr, self._row_of, values)
+        arrange(arrived, self._slots[own:], self._block_ptr, self._row_of, values)
+        stabilise(self._block_ptr, self._diagonal, _SHIFT, values)
+        size = (3 * grid.n_owned, 3 * grid.total)
+        matrix = PETSc.Mat().createAIJ(
+            (size, size), bsize=3, csr=(self._pointers, self._scalar_columns, values), comm=grid.comm
+        )
+        matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
+        return matrix
+
+
+@kernel
+def invert(blocks):
+    """Invert symmetric matrices (n, 6): xx, xy, xz, yy, yz, zz, in place; singular ones become zero."""
+    for k in range(len(blocks)):
+        a, b, c, d, e, f = blocks[k]
+        xx, xy, xz = d * f - e * e, c * e - b * f, b * e - c * d
+        determinant = a * xx + b * xy + c * xz
+        inverse = 1.0 / determinant if determinant > 0.0 else 0.0
+        blocks[k, 0] = xx * inverse
+        blocks[k, 1] = xy * inverse
+        blocks[k, 2] = xz * inverse
+        blocks[k, 3] = (a * f - c * c) * inverse
+        blocks[k, 4] = (b * c - a * e) * inverse
+        blocks[k, 5] = (a * d - b * b) * inverse
+
+
+@kernel
+def smooth(inverse, product, of_last, of_residual, r, z, x):
+    """Subtract the product from the residual r, and make a step z of the polynomial: all (n, 3)."""
+    for k in range(len(r)):
+        r0 = r[k, 0] - product[k, 0]
+        r1 = r[k, 1] - product[k, 1]
+        r2 = r[k, 2] - product[k, 2]
+        r[k, 0] = r0
+        r[k, 1] = r1
+        r[k, 2] = r2
+        z0 = of_last * z[k, 0] + of_residual * (inverse[k, 0] * r0 + inverse[k, 1] * r1 + inverse[k, 2] * r2)
+        z1 = of_last * z[k, 1] + of_residual * (inverse[k, 1] * r0 + inverse[k, 3] * r1 + inverse[k, 4] * r2)
+        z2 = of_last * z[k, 2] + of_residual * (inverse[k, 2] * r0 + inverse[k, 4] * r1 + inverse[k, 5] * r2)
+        z[k, 0] = z0
+        z[k, 1] = z1
+        z[k, 2] = z2
+        x[k, 0] += z0
+        x[k, 1] += z1
+        x[k, 2] += z2
+
 
 _PREFIX = "pfem_coarse_"
 _DEGREE = 2  # of the polynomials; 1 takes twice as many iterations, 3 and 4 save few
@@ -46,7 +137,7 @@ class GridMultigrid:
     reduced : whether the last :meth:`make` was for such a solve
     """
 
-    def __init__(self, model: Model) -> None:
+    def __init__(self, model: Mechanics) -> None:
         self.model, self.mesh = model, model.mesh
         self.product = MatrixFreeHessian(model)
         self.grid = BackgroundGrid(model.mesh)
@@ -68,7 +159,7 @@ class GridMultigrid:
     def couple(self, links: object) -> None:
         """Do nothing: with coordinates of links the diagonal is the preconditioner."""
 
-    def make(self, problem: StepProblem, held: np.ndarray) -> None:
+    def make(self, problem: Linearisable, held: np.ndarray) -> None:
         """Set up at the positions of a problem; ``held`` (local, 3) nonzero for active unknowns, ghosts not yet up to
         date. Collective."""
         owned = self.mesh.n_owned
@@ -122,7 +213,7 @@ class GridMultigrid:
         nodes = np.flatnonzero(shared[:, 0])
         return nodes, np.ascontiguousarray(shared[nodes, 1:]).reshape(-1, 3, 3)
 
-    def _make_coarse(self, problem: StepProblem, nodes: np.ndarray, turned: np.ndarray) -> None:
+    def _make_coarse(self, problem: Linearisable, nodes: np.ndarray, turned: np.ndarray) -> None:
         mesh, product = self.mesh, self.product
         extra_nodes, extra = product.extra_blocks()
         every = np.union1d(nodes, extra_nodes)
@@ -132,13 +223,15 @@ class GridMultigrid:
         matrices[place[nodes]] = turned
         further = np.zeros((len(every), 3, 3))
         further[place[extra_nodes]] = extra
-        matrix = self.pattern.make(mesh.bars, product.x, product.stored, problem.nodal, place, matrices, further)
+        matrix = self.pattern.make(
+            Summands(mesh.bars, product.x, product.stored, problem.nodal, place, matrices, further)
+        )
         self._new_solver(matrix)
         self._solver.setCoordinates(self._positions(problem)[: self.grid.n_owned])
         with reproducible_products(mesh.comm):
             self._solver.setUp()
 
-    def _positions(self, problem: StepProblem) -> np.ndarray:
+    def _positions(self, problem: Linearisable) -> np.ndarray:
         """Return positions (local corners, 3) of the corners, moved by the affine map that fits the nodes best, with
         origin at the centre. Collective."""
         mesh, owned = self.mesh, self.mesh.n_owned

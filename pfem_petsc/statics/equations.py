@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from petsc4py import PETSc
 
-from ..contact.transform import Transform
+from ..contact.links import Transform
 from ..errors import InputError
 from ..parallel.agreement import agreed
 from ..solvers.matrix import HessianMatrix

@@ -1,4 +1,4 @@
-"""Increments of the load factor by dynamic relaxation, with the last digits by Newton's method."""
+"""Dynamic relaxation: nodes with fictitious mass move to equilibrium, the last digits come from Newton's method."""
 
 from __future__ import annotations
 
@@ -6,23 +6,397 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from mpi4py import MPI
 
 from ..contact.active_set import ActiveSet
-from ..contact.candidates import Candidates, expected_candidates
+from ..contact.contact import Candidates, expected_candidates
 from ..errors import InputError, NotConverged, SimulationFailure
 from ..integrators.base import Balance
-from ..stepping.solution import Solution
-from ..tolerances import TIME
-from .minimum import MinimumCheck
-from .pseudo_motion import PseudoMotion
+from ..mechanics.bars import StrainEnergy
+from ..mechanics.compiled import kernel
+from ..parallel.agreement import agreed
+from ..solvers.newton import Tolerance
+from ..stepping.stepper import Solution
+from ..tolerances import PROJECTED, TIME
+from .stability import MinimumCheck
 from .stepper import StaticStepper
 
 if TYPE_CHECKING:
+    from ..integrators.base import State
     from ..solvers.linear import LinearChoice
     from ..stepping.model import Model
-    from .methods.relaxation import Parameters
+    from .keys import RelaxationKeys
 
-__all__ = ["RelaxationStepper"]
+
+RESIDUAL, WEIGHTED, POWER, KINETIC, SUPPORTS, WALLS, BARS, FAILED, WIDTH = range(9)
+"""Sums over all nodes: squares of the residual [N2], the same over masses, power, twice the kinetic energy, squares of
+the forces of supports, of walls, of bars [N2], ranks that failed."""
+
+
+@kernel
+def free_residual(external, f, fixed, r):
+    """External less internal force into ``r`` (owned, 3) [N], zero on prescribed components; gives the sum of squares
+    there, which supports take [N2]."""
+    taken = 0.0
+    for i in range(len(r)):
+        for c in range(3):
+            r[i, c] = external[i, c] - f[i, c]
+            if fixed[i, c]:
+                taken += r[i, c] * r[i, c]
+                r[i, c] = 0.0
+    return taken
+
+
+@kernel
+def add_up(r, v, mass, sums):
+    """Sums of r.r [N2], r.r/m, r.v and m v.v over the nodes into ``sums`` (4,)."""
+    plain = weighted = power = kinetic = 0.0
+    for i in range(len(r)):
+        square = r[i, 0] * r[i, 0] + r[i, 1] * r[i, 1] + r[i, 2] * r[i, 2]
+        plain += square
+        weighted += square / mass[i]
+        power += r[i, 0] * v[i, 0] + r[i, 1] * v[i, 1] + r[i, 2] * v[i, 2]
+        kinetic += mass[i] * (v[i, 0] * v[i, 0] + v[i, 1] * v[i, 1] + v[i, 2] * v[i, 2])
+    sums[0], sums[1], sums[2], sums[3] = plain, weighted, power, kinetic
+
+
+@kernel
+def move_freely(r, mass, factors, reach, v, u):
+    """v = keep v + push r/m, and u = step v, both (owned, 3), with these three ``factors``; a node's u is at most
+    ``reach`` (owned,) [m]."""
+    keep, push, step = factors
+    for i in range(len(r)):
+        share = push / mass[i]
+        square = 0.0
+        for c in range(3):
+            v[i, c] = keep * v[i, c] + share * r[i, c]
+            u[i, c] = step * v[i, c]
+            square += u[i, c] * u[i, c]
+        if square > reach[i] * reach[i]:
+            factor = reach[i] / square**0.5
+            for c in range(3):
+                v[i, c] *= factor
+                u[i, c] *= factor
+
+
+@kernel
+def shortest_bars(bars, rest, share, reach):
+    """Share of the shortest bar of each node into ``reach`` (local,) [m]."""
+    for k in range(len(bars)):
+        for end in range(2):
+            i = bars[k, end]
+            reach[i] = min(reach[i], share * rest[k])
+
+
+@kernel
+def node_stiffness(x, bars, stored, axial, counted, blocks, bound):
+    """Upper bound of the eigenvalues of each node's diagonal block of the stiffness into ``bound`` (owned,) [N/m].
+
+    The largest row sum bounds them, and so does the Frobenius norm, which does not depend on the axes. A bar counts
+    with the larger of its present axial stiffness and ``axial`` (b,), that of its law at most, and with its geometric
+    stiffness N/l where it is under tension. ``stored`` (5, b) is that of ``Bars.linearise``, ``blocks`` (local, 6) is
+    workspace. Gives the sum of N.N over the bars ``counted`` here [N2].
+    """
+    blocks[:] = 0.0
+    forces = 0.0
+    for k in range(len(bars)):
+        a, b = bars[k, 0], bars[k, 1]
+        n0, n1, n2 = stored[0, k], stored[1, k], stored[2, k]
+        geometric = max(stored[4, k], 0.0)
+        along = max(stored[3, k] + stored[4, k], axial[k]) - geometric
+        along = max(along, 0.0)
+        for i in (a, b):
+            blocks[i, 0] += along * n0 * n0 + geometric
+            blocks[i, 1] += along * n1 * n1 + geometric
+            blocks[i, 2] += along * n2 * n2 + geometric
+            blocks[i, 3] += along * n0 * n1
+            blocks[i, 4] += along * n1 * n2
+            blocks[i, 5] += along * n2 * n0
+        if counted[k]:
+            square = (x[b, 0] - x[a, 0]) ** 2 + (x[b, 1] - x[a, 1]) ** 2 + (x[b, 2] - x[a, 2]) ** 2
+            forces += stored[4, k] * stored[4, k] * square
+    for i in range(len(bound)):
+        xy, yz, zx = abs(blocks[i, 3]), abs(blocks[i, 4]), abs(blocks[i, 5])
+        rows = max(blocks[i, 0] + xy + zx, blocks[i, 1] + xy + yz, blocks[i, 2] + yz + zx)
+        squares = blocks[i, 0] ** 2 + blocks[i, 1] ** 2 + blocks[i, 2] ** 2 + 2.0 * (xy * xy + yz * yz + zx * zx)
+        bound[i] = min(rows, squares**0.5)
+    return forces
+
+
+class KineticDamping:
+    """Restarts nodes from rest at peaks of the kinetic energy."""
+
+    def begin(self, motion: PseudoMotion) -> None:
+        """From rest."""
+        self._before = np.zeros_like(motion.residual)
+        self._rest()
+
+    def _rest(self) -> None:
+        self._energy, self._resting = 0.0, True
+
+    def move(self, motion: PseudoMotion) -> None:
+        """Make one pseudo-step. Velocities are those half a step before the positions."""
+        energy = motion.sums[KINETIC]
+        if energy < self._energy:
+            # x - 3/2 v + r/(2 m) of the previous step: the peak, by a parabola through three energies
+            motion.go_back(1.5 * motion.v - 0.5 * self._before / motion.mass[:, None])
+            motion.v[:] = 0.0
+            self._rest()
+            return
+        self._energy = energy
+        self._before[:] = motion.residual
+        push = 0.5 if self._resting else 1.0
+        self._resting = False
+        motion.shift(1.0, push, 1.0)
+
+
+class FireDamping:
+    """Turns velocities towards the forces; uphill motion is stopped, half a step back."""
+
+    start, grows, shrinks, fades, delay = 0.02, 1.1, 0.5, 0.99, 5
+    first, largest, smallest = 0.5, 0.9, 0.02
+
+    def begin(self, motion: PseudoMotion) -> None:
+        """From rest."""
+        self._step, self._turn, self._downhill = self.first, self.start, 0
+
+    def move(self, motion: PseudoMotion) -> None:
+        """Make one pseudo-step: semi-implicit Euler, then the turn."""
+        power, weighted, square = motion.sums[POWER], motion.sums[WEIGHTED], motion.sums[KINETIC]
+        if power > 0.0 or square == 0.0:
+            self._downhill += 1
+            if self._downhill > self.delay:
+                self._step = min(self._step * self.grows, self.largest)
+                self._turn *= self.fades
+        else:
+            motion.go_back(0.5 * self._step * motion.v)
+            motion.v[:] = 0.0
+            power = square = 0.0
+            self._downhill, self._turn = 0, self.start
+            self._step = max(self._step * self.shrinks, self.smallest)
+        h = self._step
+        square += 2.0 * h * power + h * h * weighted  # of the velocities once the forces have acted
+        keep = 1.0 - self._turn
+        push = keep * h + (self._turn * float(np.sqrt(square / weighted)) if weighted > 0.0 else 0.0)
+        motion.shift(keep, push, h)
+
+
+DAMPINGS = {"fire": FireDamping, "kinetic": KineticDamping}
+"""By the name in ``static.damping``."""
+
+
+_SAFETY = 1.1  # s of the mass: bars turn and tighten between two estimates
+_ESTIMATE_EVERY = 10  # pseudo-steps
+_REACH = 0.1  # of its shortest bar: no node moves farther in a pseudo-step, so that none passes through another
+_UNHURRIED = 10.0  # pseudo-steps in which a support moves as far as a node may in one: bars must turn out of its way
+_SELF_STRESS = 1e-6  # of bar forces: smaller loads and reactions are none, the structure stresses itself
+
+
+class PseudoMotion:
+    """Moves a copy of the positions towards an equilibrium of the model. Construction is collective.
+
+    Attributes
+    ----------
+    x : (local, 3) positions with ghosts [m]
+    f : (local, 3) internal force there [N]
+    v : (owned, 3) pseudo-velocity [m per step]
+    residual : (owned, 3) unbalanced force [N]
+    contact : (owned, 3) force of walls [N]; ``walls`` their sums, ``held`` the nodes in contact
+    mass : (owned,) [N/m]: the pseudo-step is 1
+    energy : StrainEnergy at ``x``
+    sums : (9,) see :data:`~pfem_petsc.statics.relaxation.RESIDUAL`
+    steps : pseudo-steps since :meth:`begin`
+    """
+
+    def __init__(self, model: Model, damping: str) -> None:
+        self.model = model
+        mesh = model.mesh
+        owned, local = mesh.n_owned, mesh.n_local
+        self.x, self.f = np.zeros((local, 3)), np.zeros((local, 3))
+        self.v, self.residual = np.zeros((owned, 3)), np.zeros((owned, 3))
+        self.contact, self.walls = np.zeros((owned, 3)), model.contact.nothing
+        self.held = np.empty(0, dtype=np.int64)
+        self.external = np.zeros((owned, 3))
+        self.mass = np.ones(owned)
+        self.energy = StrainEnergy()
+        self.steps = 0
+        self.time = 0.0
+        self.sums = np.zeros(WIDTH)
+        self.damping = DAMPINGS[damping]()
+        self._u = np.zeros((owned, 3))
+        self._stored = np.zeros((5, len(mesh.bars)))
+        self._axial = np.empty(len(mesh.bars))
+        for block in model.bars.blocks:
+            part = slice(block.start, block.stop)
+            self._axial[part] = block.area * block.modulus / model.bars.rest[part]
+        self._counted = np.zeros(len(mesh.bars), dtype=bool)
+        self._counted[mesh.counted] = True
+        self._blocks = np.zeros((local, 6))
+        reach = np.full(local, np.inf)
+        shortest_bars(mesh.bars, model.bars.rest, _REACH, reach)
+        self._reach = reach[:owned].copy()
+        self._tolerance = PROJECTED * model.size
+        self._failure: SimulationFailure | None = None
+        self._external_norm = 0.0
+
+    def begin(self, state: State, time: float, external: np.ndarray) -> None:
+        """Start from the positions of a state, at rest, for the loads (owned, 3) [N] of a load factor. Collective."""
+        owned, supports = self.model.mesh.n_owned, self.model.supports
+        self.x[:owned] = state.position
+        self.time, self.external, self.steps = time, external, 0
+        self._lead_supports(supports.coordinates(state.position), supports.positions(time))
+        self.v[:] = 0.0
+        self._external_norm = float(np.sqrt(self.model.comm.allreduce(float((external**2).sum()))))
+        self.damping.begin(self)
+        self._evaluate()
+
+    def _lead_supports(self, start: np.ndarray, end: np.ndarray) -> None:
+        """Move prescribed components (k,) to their positions in enough pseudo-steps to avoid crushed bars."""
+        supports = self.model.supports
+        self._start, self._end, self._arrival = start, end, 0
+        if supports.any:
+            needed = float((np.abs(end - start) / self._reach[supports.every_node]).max(initial=0.0))
+            self._arrival = int(np.ceil(_UNHURRIED * self.model.comm.allreduce(needed, op=MPI.MAX)))
+            self._place_supports()
+
+    def _place_supports(self) -> None:
+        part = min(self.steps / self._arrival, 1.0) if self._arrival else 1.0
+        places = self._end if part == 1.0 else self._start + part * (self._end - self._start)
+        self.model.supports.place(self.x[: self.model.mesh.n_owned], places)
+
+    @property
+    def load(self) -> float:
+        """Reference of the residual [N]: 2-norm of loads or reactions, or of bar forces if there are none."""
+        acting = max(self._external_norm, float(np.sqrt(self.sums[SUPPORTS] + self.sums[WALLS])))
+        bars = float(np.sqrt(self.sums[BARS]))
+        return acting if acting > _SELF_STRESS * bars else bars
+
+    @property
+    def norm(self) -> float:
+        """2-norm of the residual [N]."""
+        return float(np.sqrt(self.sums[RESIDUAL]))
+
+    def balanced(self, tolerance: float) -> bool:
+        """Return whether the residual is at most a fraction of the load, or rounding. Collective."""
+        model, required = self.model, tolerance * self.load
+        if self.norm <= required:
+            return True
+        rounding = Tolerance(required, required, model.node_rounding, model.rounding)
+        return rounding.rounded(self.norm, self.residual, 1.0, model.comm)
+
+    def relax(self, tolerance: float, most: int) -> bool:
+        """Move until the residual is ``tolerance`` of the load, or ``most`` pseudo-steps are made. Collective.
+
+        Raises
+        ------
+        SimulationFailure
+            On all ranks, for collapsed bars, infeasible walls, or positions that are not finite.
+        """
+        while self.steps < self._arrival or not self.balanced(tolerance):
+            if self.steps >= most:
+                return False
+            self.damping.move(self)
+            self.steps += 1
+            if self.steps <= self._arrival:
+                self._place_supports()
+            self._evaluate()
+        return True
+
+    def shift(self, keep: float, push: float, step: float) -> None:
+        """Compute v = keep v + push residual/m, x = x + step v, both with the constraints of walls."""
+        owned = self.model.mesh.n_owned
+        u = self._u
+        move_freely(self.residual, self.mass, (keep, push, step), self._reach, self.v, u)
+        if self.model.contact.any:
+            self._project(u)
+            np.divide(u, step, out=self.v)
+        self.x[:owned] += u
+
+    def go_back(self, u: np.ndarray) -> None:
+        """Subtract (owned, 3) from the positions [m]; the next step projects them onto the walls again."""
+        self.x[: self.model.mesh.n_owned] -= u
+
+    def _project(self, u: np.ndarray) -> None:
+        """Project increments (owned, 3) from ``x`` onto the walls, and store the forces."""
+        owned, contact = self.model.mesh.n_owned, self.model.contact
+        try:
+            self.held, force, self.walls = contact.explicit(self.x[:owned], u, self.mass, self.time, self._tolerance)
+        except SimulationFailure as failure:
+            self._failure = self._failure or failure
+            return
+        self.contact[:] = 0.0
+        self.contact[self.held] = force
+
+    def _evaluate(self) -> None:
+        """Compute forces, residual and sums at the positions."""
+        model = self.model
+        model.mesh.update_ghosts(self.x)
+        self.energy = model.bars.forces(self.x, self.f, commit=False)
+        sums = np.zeros(WIDTH)
+        if self.steps % _ESTIMATE_EVERY == 0:
+            self._estimate()
+        sums[BARS] = self._bar_forces
+        sums[SUPPORTS] = free_residual(self.external, self.f, model.supports.fixed, self.residual)
+        if model.supports.inclined is not None:
+            sums[SUPPORTS] += (model.supports.inclined.get(self.residual) ** 2).sum()
+            model.supports.inclined.clear(self.residual)
+        if model.contact.any:
+            u = self.residual / self.mass[:, None]
+            self._project(u)
+            np.multiply(u, self.mass[:, None], out=self.residual)
+            sums[WALLS] = (self.contact**2).sum()
+        add_up(self.residual, self.v, self.mass, sums[:SUPPORTS])
+        sums[FAILED] = self.energy.failed >= 0 or self._failure is not None or not np.isfinite(sums).all()
+        if model.comm.size > 1:
+            model.comm.Allreduce(MPI.IN_PLACE, sums)
+        self.sums = sums
+        if sums[FAILED]:
+            self._fail()
+
+    def _estimate(self) -> None:
+        """Compute masses at the current positions."""
+        model = self.model
+        bars = model.bars
+        bars.linearise(self.x, 1.0, self._stored)
+        self._bar_forces = node_stiffness(
+            self.x, bars.ends, self._stored, self._axial, self._counted, self._blocks, self.mass
+        )
+        self.mass *= 0.5 * _SAFETY
+        # a node without bars has no stiffness of its own
+        self.mass[self.mass == 0.0] = 1.0
+
+    def _fail(self) -> None:
+        """Raise on all ranks a failure of any rank."""
+        model, when = self.model, f"load factor {self.time:.6g}, pseudo-step {self.steps}"
+        with agreed(model.comm):
+            if self._failure is not None:
+                raise SimulationFailure(f"{when}: {self._failure}")
+            if self.energy.failed >= 0:
+                bar = model.mesh.bar_ids[self.energy.failed]
+                raise SimulationFailure(
+                    f"{when}: bar {bar} collapsed to zero length: the load crushes it; reduce the load or static.step"
+                )
+            if not np.isfinite(self.x).all() or not np.isfinite(self.f).all():
+                raise SimulationFailure(f"{when}: positions or forces are not finite; reduce static.step")
+        raise SimulationFailure(f"{when}: sums of forces overflow double precision; correct loads and stiffness")
+
+    def worst(self) -> tuple[float, int]:
+        """Return the largest residual of a node [N], and its mesh number. Collective."""
+        size = np.linalg.norm(self.residual, axis=1)
+        mine = (0.0, -1)
+        if len(size):
+            at = int(np.argmax(size))
+            mine = (float(size[at]), int(self.model.mesh.node_ids[at]))
+        return max(self.model.comm.allgather(mine))
+
+    def potential(self, x: np.ndarray, energy: StrainEnergy) -> tuple[float, float]:
+        """Return the strain energy minus the work of the loads from the current positions to ``x`` (owned, 3), and the
+        sum of their magnitudes [J]. Collective."""
+        works = self.external * (x - self.x[: len(x)])
+        sums = np.array([energy.total - works.sum(), abs(energy.total) + np.abs(works).sum()])
+        self.model.comm.Allreduce(MPI.IN_PLACE, sums)
+        return float(sums[0]), float(sums[1])
+
 
 # residuals relative to the load at which Newton's method is tried; the last one alone for large models
 _HANDOVERS = (1e-2, 1e-4, 1e-6)
@@ -47,7 +421,7 @@ class RelaxationStepper(StaticStepper):
     kept_numbers = (*StaticStepper.kept_numbers, "pseudo_steps", "residual")
     columns = (*StaticStepper.columns, "pseudo_steps", "residual")
 
-    def __init__(self, model: Model, choice: LinearChoice, parameters: Parameters) -> None:
+    def __init__(self, model: Model, choice: LinearChoice, parameters: RelaxationKeys) -> None:
         _check(model)
         super().__init__(model, choice, parameters)
         self.parameters = parameters
@@ -64,7 +438,7 @@ class RelaxationStepper(StaticStepper):
         SimulationFailure
             On all ranks, if relaxation does not converge in ``max_iterations`` pseudo-steps.
         """
-        state, end = self.state, min(self.end, self.removals.ends())
+        state, end = self.state, min(self.end, self.removals.ends(self.state.time))
         left = end - state.time
         last = left <= self.limits.step * (1.0 + TIME)
         size = left if last else self.limits.step

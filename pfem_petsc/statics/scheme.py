@@ -1,12 +1,12 @@
-"""Equilibrium in the form of an integrator's balance: no inertia, no damping, the internal force at the unknown."""
+"""Equilibrium in the form of an integrator's balance: no inertia, no damping; with the load factor known or unknown."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
 from ..integrators.base import Balance, NoParameters, Scheme, State
-
-__all__ = ["Equilibrium"]
 
 
 class Equilibrium(Scheme):
@@ -59,3 +59,31 @@ class Equilibrium(Scheme):
             state.memory["rate"] = u / h
         # the viscous force is what equilibrium lacks: the ledger books it as inertia
         state.a = self.lack[:, None] * (u * balance.eta) if balance.eta else np.zeros_like(u)
+
+
+class PathEquilibrium(Equilibrium):
+    """The balance of :class:`~.scheme.Equilibrium` for steps whose displacement and load factor are known in advance.
+
+    ``reached`` is the load factor of the next point.
+    The state's memory has ``tangent``: the displacement part of the unit tangent of the path at the state.
+    """
+
+    remembers = ("tangent",)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.reached = 0.0
+
+    def balance(self, state: State, h: float) -> Balance:
+        """Return the balance at the load factor reached; ``h`` is a length, not an increment of the load factor."""
+        return replace(super().balance(state, 0.0), time=self.reached, loads=((1.0, self.reached),))
+
+    def start(self, state: State, h: float) -> None:
+        state.memory["tangent"] = np.zeros_like(state.v)
+
+    def expected_move(self, state: State, h: float) -> np.ndarray:
+        return h * state.memory["tangent"]
+
+    def finish(self, state: State, balance: Balance, u: np.ndarray, h: float) -> None:
+        state.position[:] = balance.predictor + u
+        state.a = np.zeros_like(u)

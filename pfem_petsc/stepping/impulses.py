@@ -44,7 +44,7 @@ def fill_impulses(sums, v) -> None:
         sums[_DAMPING + c] = v[DAMPING, c]
 
 
-"""Rows of the particles: three in the order of the totals of :mod:`~pfem_petsc.stepping.book_loops`, then walls and
+"""Rows of the particles: three in the order of the totals of :mod:`~pfem_petsc.stepping.ledger_loops`, then walls and
 pairs, then the jumps of walls and pairs."""
 
 

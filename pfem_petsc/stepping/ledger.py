@@ -1,46 +1,242 @@
-"""The energy ledger: every term has its own formula, so that their balance is a check and not a definition.
-
-For a scheme whose balance holds at the ends of steps (``balance_at_endpoints``), works follow the trapezoidal rule.
-With dx = x1 - x0, the external work is (e0 + e1) dx/2 and the contact work (r0 + r1) dx/2. The numerical dissipation is
-the work of inertia and internal forces in excess of the change of their energies:
-(M a0 + M a1) dx/2 - dT + (f0 + f1) dx/2 - dU - dD + dH, with the work dH of changing temperatures and rest lengths
-(:mod:`~pfem_petsc.stepping.bar_changes`). For other schemes the forces of the single balance act over the whole step.
-Damping dissipates C dx . dx/h, which is never negative, and (C v0 + C v1) dx/2 with explicit schemes whose balance
-holds at the ends. The sum of all changes is then the work of the residual, which is zero up to the tolerance of the
-solver.
-
-The work of contact is split by formulas that are the same for all schemes and treatments. ``contact_work`` is the work
-of moving walls, F . dX by the rule above and J . V for jumps J of momentum. ``friction_dissipation`` is the work of
-friction forces on the slip used to determine them. ``impact_dissipation`` is given by :mod:`pfem_petsc.contact.impact`.
-The remaining work of contact forces on nodes is an effect of the scheme in impact and belongs to the numerical
-dissipation. Walls with mass are part of the balance, with their kinetic energy and the work of their weight.
-"""
+"""The energy ledger: every term has its own formula, so that their balance is a check and not an identity."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from mpi4py import MPI
 
 from ..contact.impact import Impacts
 from ..energies import ENERGIES
+from ..mechanics.bars import StrainEnergy, state_before_rupture
+from ..mechanics.conserving import MEASURES
+from ..mechanics.materials.base import SMALL
 from ..output.sums import HEAD
-from .bar_changes import BarChanges
-from .book_loops import TOTALS, WORKS, book_nodes
 from .impulses import Impulses, NoImpulses, wall_shares
-from .moment import Moment, balanced, moment_of
-from .sum_loops import add_totals, add_works
+from .ledger_loops import (
+    DAMPING,
+    EXTERNAL,
+    INERTIAL,
+    TOTALS,
+    WORKS,
+    NodeValues,
+    StepWorks,
+    add_totals,
+    add_works,
+    book_balance,
+    book_nodes,
+    book_row,
+    fill_works,
+    new_row_room,
+)
 
 if TYPE_CHECKING:
+    from ..mechanics.bars import BarBlock
     from .stepper import Stepper
 
-__all__ = ["Ledger"]
 
-_NOTHING = np.empty((0, 3))
+@dataclass
+class Moment:
+    """Data of the ledger at an instant; arrays (owned, 3).
+
+    With lumped mass ``momentum``, ``a`` and ``v`` are velocity, acceleration and velocity; with consistent mass they
+    are M v [kg m/s], M a and C v [N], and ``v`` also with damping over time. ``velocity`` and ``acceleration`` are
+    always velocity and acceleration.
+    """
+
+    momentum: np.ndarray
+    velocity: np.ndarray
+    acceleration: np.ndarray
+    a: np.ndarray
+    v: np.ndarray
+    internal: np.ndarray
+    external: np.ndarray
+    support: np.ndarray
+    contact: np.ndarray
+    kinetic: float = 0.0
+    energy: StrainEnergy = StrainEnergy()
+
+
+def moment_of(stepper: Stepper) -> Moment:
+    """Return the data at the present state of a stepper."""
+    state, inertia = stepper.state, stepper.model.inertia
+    owned = stepper.model.mesh.n_owned
+    a, v, momentum = state.a, state.v, state.v
+    contact = state.contact
+    if "contact_change" in state.memory:  # changes of accelerations by a treatment of impact
+        contact = contact + state.memory["contact_change"]
+    if inertia.products:
+        momentum = inertia.mass_times(state.v, np.empty_like(state.v))
+        a = inertia.mass_times(state.a, np.empty_like(state.a))
+    if inertia.products or inertia.varies:
+        v = inertia.damping_times(state.v, np.empty_like(state.v))
+    internal = state.f[:owned]
+    return Moment(
+        momentum=momentum,
+        velocity=state.v,
+        acceleration=state.a,
+        a=a,
+        v=v,
+        internal=internal if stepper.renews_forces else internal.copy(),
+        external=state.external,
+        support=state.support,
+        contact=contact,
+        energy=stepper.energy,
+    )
+
+
+def balanced(stepper: Stepper, before: Moment) -> Moment:
+    """Return the forces of the last balance, for schemes whose balance does not hold at the ends of steps."""
+    inertia, balance = stepper.model.inertia, stepper.balance
+    state, u = stepper.state, stepper.solution.u
+    owned = stepper.model.mesh.n_owned
+    a = balance.alpha * u
+    if balance.a_hat is not None:
+        a += balance.a_hat
+    v = balance.eta * u + balance.v_hat if inertia.damped else u
+    if inertia.products:
+        a = inertia.mass_times(a, np.empty_like(a))
+    if inertia.products or inertia.varies:
+        v = inertia.damping_times(v, np.empty_like(v))
+    internal = before.internal
+    if balance.weight == 1.0:
+        internal = stepper.solution.internal[:owned]
+    elif balance.weight:
+        internal = (1.0 - balance.weight) * internal + balance.weight * stepper.solution.internal[:owned]
+    return Moment(
+        before.momentum,
+        before.velocity,
+        before.acceleration,
+        a,
+        v,
+        internal,
+        state.external,
+        state.support,
+        state.contact,
+    )
+
+
+_STRAINS = {  # of arrays of stretches
+    MEASURES["engineering"]: lambda s: s - 1.0,
+    MEASURES["green"]: lambda s: 0.5 * (s * s - 1.0),
+    MEASURES["logarithmic"]: np.log,
+}
+
+
+class BarChanges:
+    """Stores the state of the bars before a step and computes the works in it."""
+
+    def __init__(self, stepper: Stepper) -> None:
+        self.stepper, self.model = stepper, stepper.model
+        self.keep()
+
+    def keep(self) -> None:
+        """Store the current stresses, internal variables, thermal strains, and with them lengths and energies."""
+        if not self.model.bars_vary:
+            return
+        bars, x = self.model.bars, self.stepper.state.x
+        self._stress = bars.fields(x)["stress"]
+        self._variables = [block.history[: len(block.law.internal)].copy() for block in bars.blocks]
+        self._thermal, self._warmth = bars.heat[0].copy(), bars.heat[1].copy()
+        self._state = bars.rupture() if bars.can_break else np.empty(0)
+        if self.model.rest_lengths.varying or any(block.law.mean_of_work for block in bars.blocks):
+            self._rest, self._lengths, self._densities = bars.rest.copy(), bars.lengths(x), bars.densities(x)
+
+    def works(self) -> tuple[float, float]:
+        """Return the works of changing temperatures and of changing rest lengths on the counted bars in the last step
+        [J]."""
+        model = self.model
+        if not model.bars_vary:
+            return 0.0, 0.0
+        before = dict(vars(self))
+        self.keep()
+        heating = stressing = 0.0
+        for k, block in enumerate(model.bars.blocks):
+            part = slice(block.start, block.counted)
+            mean = self._mean_stress(before, k, block)
+            rest = model.bars.rest[part]
+            if model.rest_lengths.varying:
+                rest = 0.5 * (before["_rest"][part] + rest)
+                stressing += self._stressing(before, block, mean, rest)
+            if model.temperatures.varying:
+                change = self._thermal[part] - before["_thermal"][part]
+                heating -= float((block.counted_area * rest * mean * change).sum())
+                if block.law.modulus is not None:
+                    heating += float((block.counted_area * rest * self._softening(before, block)).sum())
+        return heating, stressing
+
+    def _mean_stress(self, before: dict, k: int, block: BarBlock) -> np.ndarray:
+        """Return the mean stress of the counted bars of a block in the step [Pa]."""
+        counted = slice(block.counted - block.start)
+        first, last = self._ends(before, block)
+        mean = 0.5 * (first + last)
+        if block.law.mean_of_work:
+            return self._mean_of_work(before, block, mean)
+        if block.law.mean_correction is not None:
+            variables = before["_variables"][k][:, counted], self._variables[k][:, counted]
+            mean += block.law.mean_correction(block.parameters, last - first, *variables)
+        return mean
+
+    def _mean_of_work(self, before: dict, block: BarBlock, mean: np.ndarray) -> np.ndarray:
+        """Return the change of energies over that of strains of the counted bars of a block [Pa]; ``mean`` where these
+        hardly change."""
+        part, strain = slice(block.start, block.counted), _STRAINS[block.measure]
+        first, last = (
+            strain(of["_lengths"][part] / of["_rest"][part]) - (of["_thermal"][part] if len(of["_thermal"]) else 0.0)
+            for of in (before, vars(self))
+        )
+        change, work = last - first, self._densities[part] - before["_densities"][part]
+        large = np.abs(change) > SMALL * (np.abs(first) + np.abs(last))
+        return np.divide(work, change, out=mean, where=large)
+
+    def _ends(self, before: dict, block: BarBlock) -> tuple[np.ndarray, np.ndarray]:
+        """Return the stresses of the counted bars of a block at start and end of the step [Pa]."""
+        part = slice(block.start, block.counted)
+        first, last = before["_stress"][part], self._stress[part]
+        if block.law.rupture >= 0:
+            last = self._with_bars(before["_state"][part], part, last)
+        return first, last
+
+    def _softening(self, before: dict, block: BarBlock) -> np.ndarray:
+        """Return the work per volume [J/m3] that temperatures do by changing the modulus of the counted bars."""
+        part = slice(block.start, block.counted)
+        moduli = (block.law.modulus(block.parameters, at[part]) for at in (before["_warmth"], self._warmth))
+        product = np.multiply(*self._ends(before, block)) * (1.0 / next(moduli) - 1.0 / next(moduli))
+        if block.law.rupture >= 0:  # stresses are those of the share that is left
+            left = 1.0 - np.abs(before["_state"][part])
+            product = np.divide(product, left, out=np.zeros_like(product), where=left > 0.0)
+        return 0.5 * product
+
+    def _with_bars(self, state: np.ndarray, part: slice, stress: np.ndarray) -> np.ndarray:
+        """Return stresses at the end of the step [Pa] of bars that broke there as they were before."""
+        stress = stress.copy()
+        for k in np.flatnonzero(self._state[part] != state):
+            whole = state_before_rupture(self.model.bars, self.stepper.state.x, part.start + int(k))[2]
+            stress[k] = (1.0 - abs(state[k])) * whole
+        return stress
+
+    def _stressing(self, before: dict, block: BarBlock, mean: np.ndarray, rest: np.ndarray) -> float:
+        """Return the work of changing rest lengths on the counted bars of a block [J]; ``rest``: their means [m]."""
+        part, strain = slice(block.start, block.counted), _STRAINS[block.measure]
+        first, last = before["_lengths"][part], self._lengths[part]
+        rest0, rest1 = before["_rest"][part], self._rest[part]
+        whole = strain(last / rest1) - strain(first / rest0)
+        moved = strain(last / rest) - strain(first / rest)
+        density = 0.5 * (before["_densities"][part] + self._densities[part])
+        return float((block.counted_area * (rest * mean * (whole - moved) + density * (rest1 - rest0))).sum())
+
+
+_NO_FORCES = np.empty((0, 3))
 _AT = {energy.name: HEAD.first(energy.name) for energy in ENERGIES if energy.source != "derived"}
 _SUPPORT = TOTALS.index("support")
 _TOTALS = slice(HEAD.first("momentum"), HEAD["support_force"].stop)
+
+
+def _loads(moment: Moment) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the forces (owned, 3) that may be zero, in the order of :class:`NodeValues`."""
+    return moment.external, moment.support, moment.contact
 
 
 class Ledger:
@@ -117,7 +313,9 @@ class Ledger:
             of, by = WORKS.index("inertial"), WORKS.index("damping")
             self._works[of] = self._works[of] + self._works[by] - damping
             self._works[by] = damping
-        add_works(self.sums, self._works, stored, heating, impact, friction, work, given, weight, lost, jumped)
+        add_works(
+            self.sums, self._works, StepWorks(stored, heating, impact, friction, work, given, weight, lost, jumped)
+        )
         self.sums[_AT["prestress_work"]] += stressing
         self.sums[_AT["numerical_dissipation"]] += stressing
 
@@ -221,36 +419,22 @@ class Ledger:
     def _book(self, present: Moment, first: Moment, second: Moment, start: np.ndarray) -> None:
         """Add kinetic energy and totals at the present state, and the works from positions ``start`` (owned, 3)."""
         state, inertia = self.stepper.state, self.model.inertia
-        present.kinetic = book_nodes(
-            start,
-            state.position,
-            inertia.mass,
-            self._mass,
-            state.v,
-            present.momentum,
-            state.support,
-            self._damping,
-            first.a,
-            second.a,
-            first.v,
-            second.v,
-            first.internal,
-            second.internal,
-            *self._pair(first.external, second.external),
-            *self._pair(first.support, second.support),
-            *self._pair(first.contact, second.contact),
-            self._totals,
-            self._works,
-        )
+        zero, x, mass = self.stepper.zero, state.position, inertia.mass
+
+        def values(moment: Moment) -> NodeValues:
+            forces = (
+                _NO_FORCES if one is zero and other is zero else own
+                for one, other, own in zip(_loads(first), _loads(second), _loads(moment), strict=True)
+            )
+            return NodeValues(x, moment.v, moment.a, moment.internal, *forces, mass, self._damping)
+
+        here = NodeValues(x, state.v, state.a, state.f, zero, state.support, zero, mass, self._damping)
+        momenta = self._mass, present.momentum
+        present.kinetic = book_nodes(start, here, momenta, values(first), values(second), self._totals, self._works)
         self.sums[_AT["kinetic_energy"]] = present.kinetic
         if self.model.bars.springs is not None:  # reactions of the ground: the forces of bars cancel in the sum
             self._totals[_SUPPORT] -= second.internal.sum(axis=0)
         add_totals(self.sums, self._totals)
-
-    def _pair(self, first: np.ndarray, second: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return two arrays, or the placeholder for two arrays of zeros."""
-        zero = self.stepper.zero
-        return (_NOTHING, _NOTHING) if first is zero and second is zero else (first, second)
 
     def _before_jump(self, after: Moment) -> tuple[Moment, float]:
         """Return the end of the step before velocity jumps, and the energy of the jumps [J], a work of contact."""
@@ -290,3 +474,110 @@ class Ledger:
     def kinetic(self) -> float:
         """Kinetic energy of this rank's nodes [J]."""
         return self._before.kinetic
+
+
+_EXTERNAL, _DAMPING = HEAD.first("external_work"), HEAD.first("damping_dissipation")
+_IMPACT, _NUMERICAL = HEAD.first("impact_dissipation"), HEAD.first("numerical_dissipation")
+_KINETIC = HEAD.first("kinetic_energy")
+
+
+def make_ledger(stepper: Stepper) -> Ledger:
+    """Return the ledger for the steps of a run or stage, after the start of the stepper. Collective."""
+    leapfrog = stepper.scheme.leapfrog and stepper.steady and stepper.treatment is None
+    same = stepper.model.comm.allreduce(leapfrog and stepper.model.constant, op=MPI.LAND)
+    return (LeapfrogLedger if same else Ledger)(stepper)
+
+
+class LeapfrogLedger(Ledger):
+    """Accumulates works balance by balance, from the second step on.
+
+    Attributes
+    ----------
+    powers : (5,) works of all balances up to the present one, in the order of ``WORKS`` [J]; at the place of inertia is
+        the constant that continues the numerical dissipation of what came before
+    """
+
+    def __init__(self, stepper: Stepper) -> None:
+        self.powers = np.zeros(len(WORKS))
+        self.begun = False
+        super().__init__(stepper)
+        self._ends = np.zeros(len(WORKS))
+        self._room = new_row_room()
+        self._complete = True
+        # bars that are removed after a step change the forces of its end
+        self._at_once = bool(stepper.model.case.remove)
+
+    def update(self) -> None:
+        """Add the last step."""
+        stepper = self.stepper
+        if not self.begun:  # the start may have stopped nodes
+            super().update()
+            self._sum_row(self._before)
+            self._begin()
+            self._sum_balance(self._before)
+            return
+        before, self._before = self._before, moment_of(stepper)
+        self._works[:] = self.powers
+        self._sum_balance(self._before)
+        self.impulses.step(self._totals[3:])
+        impact, _ = self._dissipated(before)
+        self.sums[_IMPACT] += impact
+        self._complete = False
+        if self._at_once:
+            self.complete()
+
+    def complete(self) -> None:
+        """Compute what only rows and checkpoints need of the last step."""
+        if self._complete:
+            return
+        present, self._complete = self._before, True
+        self.sums[_KINETIC] = present.kinetic = self._sum_row(present)
+        add_totals(self.sums, self._totals)
+        self.impulses.fill(self.sums)
+        fill_works(self.sums, self._works, self._ends, present.energy.total)
+
+    def _sum_row(self, present: Moment) -> float:
+        """Return the kinetic energy [J]; compute totals and the works of half a step."""
+        return book_row(self._values(present), self.stepper.h, self._room, self._totals, self._ends)
+
+    def _sum_balance(self, present: Moment) -> None:
+        """Add the works of the present balance."""
+        book_balance(self._values(present), self.stepper.h, self._totals, self.powers)
+
+    def _values(self, present: Moment) -> NodeValues:
+        """Return the values at the state, with placeholders for arrays of zeros."""
+        state, zero = self.stepper.state, self.stepper.zero
+        loads = (_NO_FORCES if force is zero else force for force in _loads(present))
+        mass = self.model.inertia.mass
+        return NodeValues(state.position, state.v, state.a, present.internal, *loads, mass, self._damping)
+
+    def _begin(self) -> None:
+        """Continue the works of the steps before."""
+        sums, ends = self.sums, self._ends
+        self.powers[:] = -ends
+        self.powers[EXTERNAL] += sums[_EXTERNAL]
+        self.powers[DAMPING] += sums[_DAMPING]
+        self.begun = True
+        self.powers[INERTIAL] = sums[_NUMERICAL] + ends[INERTIAL] + self.stepper.energy.total + sums[_IMPACT]
+
+    def follow_removal(self) -> None:
+        """Take account of the energy of bars that were removed."""
+        self.powers[INERTIAL] += self.stepper.energy.total - self._before.energy.total
+        super().follow_removal()
+
+    def resume(self, kinetic: float) -> None:
+        """See :class:`~pfem_petsc.stepping.ledger.Ledger`."""
+        super().resume(kinetic)
+        self._complete = True
+
+    def kept(self) -> dict[str, Any]:
+        """Return this rank's share for a checkpoint: numbers that can be summed over ranks."""
+        self.complete()
+        return super().kept() | ({"powers": self.powers.tolist()} if self.begun else {})
+
+    def load_state(self, kept: dict[str, Any]) -> None:
+        """Restore this rank's share from a checkpoint, after the state."""
+        super().load_state(kept)
+        self.begun = "powers" in kept
+        if self.begun:
+            self.powers[:] = kept["powers"]

@@ -1,29 +1,28 @@
-"""The model of a case, distributed over ranks: mesh, bars, inertia, forces, supports, walls."""
+"""The model of a case, distributed over ranks: mesh, bars, inertia, forces, supports, walls, links."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from mpi4py import MPI
 
-from ..contact.contact import Contact
-from ..contact.inclined import refuse_inclined
-from ..contact.sources import make_links
-from ..contact.start import adjust_start
+from ..contact.constraint_link import ConstraintLink
+from ..contact.contact import Contact, adjust_start
+from ..contact.links import Link, Links
+from ..contact.pair_link import PairLink
+from ..contact.pairs import ContactPairs
 from ..errors import InputError
-from ..mechanics.bars import Bars
+from ..mechanics.bars import Bars, area_fields, check_areas, named_groups, section_of_bars
 from ..mechanics.compiled import kernel
-from ..mechanics.connectors import add_connectors, connected, with_connectors
 from ..mechanics.loads import ExternalForce
 from ..mechanics.mass import Inertia, PointInertia
-from ..mechanics.rest_lengths import RestLengths
+from ..mechanics.rest_lengths import RestLengths, Temperatures
 from ..mechanics.rows import bar_value
-from ..mechanics.sections import area_fields, check_areas, named_groups, section_of_bars
-from ..mechanics.springs import make_springs
+from ..mechanics.springs import add_connectors, connected, make_springs, with_connectors
 from ..mechanics.supports import Supports
-from ..mechanics.temperature import Temperatures
 from ..mesh import load_slab
 from ..mesh.distribution import distribute
 from ..mesh.node_sets import resolve_node_sets
@@ -32,9 +31,108 @@ from ..parallel.agreement import agreed
 if TYPE_CHECKING:
     from ..case.schema import Case
     from ..mesh.distribution import DistributedMesh
-    from .stage import StageStart
 
-__all__ = ["Model"]
+
+@dataclass
+class StageStart:
+    """Where a stage starts from.
+
+    Attributes
+    ----------
+    step : number of the last step before
+    time : on the axis of the results
+    position : (owned, 3) of the nodes [m]
+    force : (owned, 3) of the loads [N]
+    gravity : (3,) acceleration [m/s2]
+    wind : (3,) velocity [m/s]
+    walls : (w, 3) displacements of the walls of the stage before [m]
+    """
+
+    step: int
+    time: float
+    position: np.ndarray
+    force: np.ndarray
+    gravity: np.ndarray
+    wind: np.ndarray
+    walls: np.ndarray
+
+    ARRAYS = ("position", "force")
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Rows of owned nodes, for a checkpoint."""
+        return {name: getattr(self, name) for name in self.ARRAYS}
+
+    def scalars(self) -> dict[str, Any]:
+        """The rest of it."""
+        return {
+            "step": self.step,
+            "time": self.time,
+            "gravity": self.gravity.tolist(),
+            "wind": self.wind.tolist(),
+            "walls": self.walls.tolist(),
+        }
+
+    @classmethod
+    def restored(cls, scalars: dict[str, Any], arrays: dict[str, np.ndarray]) -> StageStart:
+        """What :meth:`scalars` and :meth:`arrays` gave."""
+        vectors = {name: np.array(scalars[name]) for name in ("gravity", "wind")}
+        walls = np.array(scalars["walls"]).reshape(-1, 3)
+        return cls(int(scalars["step"]), float(scalars["time"]), **arrays, **vectors, walls=walls)
+
+
+def make_links(
+    case: Case, nodes: dict[str, np.ndarray], mesh: DistributedMesh, fixed: np.ndarray, contact: Contact
+) -> tuple[Links, ContactPairs | None]:
+    """Create all links in the order in which a step treats them; also return the contact pairs. Collective.
+
+    Parameters
+    ----------
+    case : Case
+    nodes : owned local indices of each node set
+    mesh : Mesh
+    fixed : (owned, 3) bool, prescribed components
+    contact : Contact
+
+    Raises
+    ------
+    InputError
+        On all ranks, for nodes that cannot be paired, or a constraint with invalid keys.
+    """
+    links: list[Link] = []
+    pairs = None
+    if case.contact_pair:
+        pairs = ContactPairs(case, nodes, mesh, fixed, contact)
+        links.append(PairLink(pairs))
+    if case.constraint:
+        links.append(ConstraintLink(case, nodes, mesh, fixed, contact))
+    return Links(links), pairs
+
+
+def refuse_inclined(source: str, mesh: DistributedMesh, nodes: np.ndarray, contact: Contact, links: Links) -> None:
+    """Refuse walls, contact pairs and constraints at owned nodes (m,) with such supports. Collective.
+
+    Raises
+    ------
+    InputError
+        On all ranks.
+    """
+    numbers = mesh.node_ids[nodes]
+    with agreed(mesh.comm):
+        what = "a [[support]] prescribes a direction that is not an axis at node"
+        for k, name in enumerate(contact.names):
+            both = numbers[contact.members[nodes, k]]
+            if len(both):
+                raise InputError(
+                    f"{source}: wall {name!r}: {what} {both.min()}, which the wall could also stop: contact "
+                    "requires supports along axes; give the wall a node_set without such nodes"
+                )
+        for link in links:
+            both = np.intersect1d(numbers, link.numbers)
+            if len(both):
+                raise InputError(
+                    f"{source}: contact_pair, constraint: {what} {both[0]}, which is part of one: these require "
+                    "supports along axes"
+                )
 
 
 @kernel

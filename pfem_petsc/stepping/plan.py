@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from mpi4py import MPI
@@ -13,20 +13,103 @@ from mpi4py import MPI
 from ..case.materials import law_name, law_of
 from ..errors import InputError
 from ..integrators.base import Scheme
-from ..mechanics.connectors import viscous_rate
+from ..mechanics.springs import viscous_rate
 from ..output.units import TIME as AXIS
 from ..output.units import Axis, engineering
 from ..registry import lookup
-from ..solvers.grid_planes import fills_block
-from ..solvers.linear import LinearChoice, choose_linear
+from ..solvers.background_grid import fills_block
+from ..solvers.linear import Demand, LinearChoice, choose_linear
 from ..tolerances import TIME
-from .stability import Frequency, highest_frequency
 
 if TYPE_CHECKING:
     from ..case.schema import Case
     from .model import Model
 
-__all__ = ["Plan", "dashpot_rate", "make_plan"]
+
+_LARGEST = 1e150  # squared frequencies [rad2/s2] whose squares do not overflow
+
+
+class Frequency(NamedTuple):
+    """Bounds on the highest angular frequency [rad/s]: ``lower`` is rigorous, ``upper`` is based on Lanczos' residual.
+
+    Infinite if stiffness over mass overflows double precision.
+    """
+
+    lower: float
+    upper: float
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def highest_frequency(model: Model, x: np.ndarray, steps: int = 60, accuracy: float = 1e-4) -> Frequency:
+    """Compute the highest natural frequency at positions ``x`` by Lanczos' method on M^-1/2 K_t M^-1/2. Collective.
+
+    M is the lumped mass. The limit l/c of a single bar is a safe bound on the critical step for unstressed bars only,
+    and often too small. The largest Ritz value is a lower bound of the squared frequency, and its residual bounds the
+    distance to an eigenvalue. With consistent mass the element matrix of a bar is at least a third of its lumped one,
+    so the squared frequency is at most three times as high; it is at least the Rayleigh quotient of the Ritz vector.
+
+    Parameters
+    ----------
+    model : Model
+    x : (local, 3) positions with ghosts [m]
+    steps : maximum number of Lanczos steps
+    accuracy : relative residual at which the iteration stops
+    """
+    mesh, comm = model.mesh, model.comm
+    owned = mesh.n_owned
+    supports = model.supports
+    with np.errstate(divide="ignore"):
+        scale = np.where(supports.fixed, 0.0, 1.0 / np.sqrt(model.inertia.mass)[:, None])
+    # the start vector is a hash of node and component: independent of the number of ranks, with all wave lengths
+    ids = mesh.node_ids[:owned, None].astype(np.uint64) * np.uint64(3) + np.arange(3, dtype=np.uint64)
+    hashed = (ids + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
+    hashed ^= hashed >> np.uint64(29)
+    q = (hashed >> np.uint64(11)).astype(np.float64) / 2.0**53 - 0.5
+    supports.clear(q)
+
+    def norm(u: np.ndarray) -> float:
+        return float(np.sqrt(comm.allreduce(float((u * u).sum()))))
+
+    size = norm(q)
+    if size == 0.0:
+        return Frequency(0.0, 0.0)
+    q /= size
+    previous = np.zeros_like(q)
+    local, product = np.zeros((mesh.n_local, 3)), np.zeros((mesh.n_local, 3))
+    diagonal: list[float] = []
+    beside: list[float] = []
+    low = high = 0.0
+    basis: list[np.ndarray] = []
+    for _ in range(min(steps, 3 * mesh.n_nodes)):
+        if model.inertia.consistent:
+            basis.append(q)
+        local[:owned] = scale * q
+        mesh.update_ghosts(local)
+        model.bars.product(x, local, product)
+        w = scale * product[:owned]
+        supports.clear(w)
+        alpha = comm.allreduce(float((w * q).sum()))
+        w -= alpha * q
+        if beside:
+            w -= beside[-1] * previous
+        beta = norm(w)
+        diagonal.append(alpha)
+        matrix = np.diag(diagonal) + np.diag(beside, 1) + np.diag(beside, -1)
+        if not np.isfinite(matrix).all() or np.abs(matrix).max() > _LARGEST:
+            return Frequency(np.inf, np.inf)
+        values, vectors = np.linalg.eigh(matrix)
+        ritz, residual = values[-1], beta * abs(vectors[-1, -1])
+        low, high = max(ritz, 0.0), max(ritz + residual, 0.0)
+        if residual <= accuracy * max(ritz, 0.0) or beta <= 1e-14 * max(abs(ritz), 1e-300):
+            break
+        beside.append(beta)
+        previous, q = q, w / beta
+    if model.inertia.consistent and low > 0.0:
+        shape = scale * sum(weight * vector for weight, vector in zip(vectors[:, -1], basis))
+        low /= comm.allreduce(float((shape * model.inertia.mass_times(shape, np.empty_like(shape))).sum()))
+        high *= 3.0
+    return Frequency(float(np.sqrt(low)), float(np.sqrt(high)))
+
 
 _LEAST = 1e-6  # ratio of frequency and rate of damping below which the frequency no longer changes the stable step
 _MOST_STEPS = 2.0**53  # beyond this, consecutive steps do not have distinct times
@@ -211,7 +294,8 @@ def _linear(model: Model, scheme: Scheme, over: float, steps: int) -> LinearChoi
     solver, unknowns = case.solver, 3 * model.mesh.n_nodes
     try:
         block = solver.linear == "auto" and fills_block(model.mesh)
-        choice = choose_linear(solver.linear, unknowns, over, scheme.symmetric, solver.operator, steps, impact, block)
+        demand = Demand(unknowns, over, scheme.symmetric, steps, impact, block)
+        choice = choose_linear(solver.linear, solver.operator, demand)
     except InputError as error:
         raise InputError(f"{case.source}: {error}") from error
     if choice.preconditioner == "multigrid" and (model.links or not model.contact.symmetric):

@@ -1,32 +1,244 @@
-"""One step of a scheme: the solve for the position increment, with contact, and the update of the state."""
+"""One step of a scheme: phases, loads, prescribed motion, the solve for the position increment, and the update of
+the state.
+"""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from mpi4py import MPI
 
-from ..contact.alarm import CarriedNodes
+from ..contact.forces import WallForces
+from ..contact.initial_equilibrium import start_at_rest
+from ..contact.monitoring import CarriedNodes
 from ..errors import SimulationFailure
 from ..integrators.base import Balance, Scheme, State
-from ..mechanics.bars import StrainEnergy
-from ..tolerances import TIME
-from .collapse import tell_collapse
-from .loading import load_now
-from .massless import MasslessNodes
-from .phases import phases_of
-from .prescribed import PrescribedMotion
-from .removals import Removals
-from .ruptures import Ruptures
-from .solution import Solution
-from .start import start_at_zero, start_in_motion
+from ..mechanics.bars import StrainEnergy, release
+from ..mechanics.materials.base import EXTRAPOLATED
+from ..tolerances import BEYOND, ON_BOUND, ROUNDING, TIME
+from .bar_events import Collapse, Removals, Ruptures, collapse_message
 
 if TYPE_CHECKING:
     from .model import Model
 
-__all__ = ["Stepper"]
+
+class PrescribedMotion:
+    """Sets prescribed components in the balances and the state of a stepper.
+
+    Attributes
+    ----------
+    change : changes of velocity, acceleration and scheme memory of prescribed components (k,) relative to those of the
+        scheme in the last step, by name; empty without moving supports
+    """
+
+    def __init__(self, stepper: Stepper) -> None:
+        self.stepper, self.supports = stepper, stepper.model.supports
+        self.moving = self.supports.moving
+        self.change: dict[str, np.ndarray] = {}
+
+    def place(self, end: float) -> None:
+        """Set prescribed components of the positions to their values at a time [s]."""
+        if self.moving:
+            self.supports.place(self.stepper.state.position, self.supports.positions(end))
+
+    def prescribe(self, balance: Balance) -> None:
+        """Set exact positions, velocities and accelerations of prescribed components in a balance; their increments are
+        zero. The scheme's own formulas would derive velocities and accelerations from positions and oscillate."""
+        supports = self.supports
+        forces_hold = sum(weight * time for weight, time in balance.loads)
+        v, a = supports.rates(forces_hold, self.stepper.part)
+        self._ruled = self._by_rule(balance, a)
+        balance.predictor = balance.predictor.copy()
+        supports.place(balance.predictor, supports.positions(balance.time))
+        balance.v_hat = np.zeros_like(self.stepper.state.v) if balance.v_hat is None else balance.v_hat.copy()
+        supports.put(balance.v_hat, v)
+        balance.a_hat = np.zeros_like(self.stepper.state.v) if balance.a_hat is None else balance.a_hat.copy()
+        supports.put(balance.a_hat, a)
+
+    def _by_rule(self, balance: Balance, a: np.ndarray) -> State:
+        """Return the state of prescribed components (k, 1) if the scheme advanced them with accelerations (k,).
+
+        This is the rule by which forces become impulses.
+        """
+        supports, state = self.supports, self.stepper.state
+
+        def pick(array: np.ndarray | None) -> np.ndarray | None:
+            return None if array is None else supports.get(array)[:, None]
+
+        memory = {name: pick(state.memory[name]) for name in self.stepper.scheme.remembers if name in state.memory}
+        fields = (pick(array) for array in (state.position, state.v, state.a))
+        ruled = State(*fields, *(np.zeros((len(a), 1)) for _ in range(4)), memory=memory)
+        known = {name: pick(getattr(balance, name)) for name in ("predictor", "v_hat", "a_hat")}
+        own = replace(balance, **known)
+        u = (a[:, None] if own.a_hat is None else a[:, None] - own.a_hat) / own.alpha
+        self.stepper.scheme.finish(ruled, own, u, self.stepper.part)
+        return ruled
+
+    def take_rates(self, time: float) -> None:
+        """Set velocity, acceleration and scheme memory of prescribed components at a time [s]."""
+        supports, state = self.supports, self.stepper.state
+        for array, values in zip((state.v, state.a), supports.rates(time, self.stepper.part), strict=True):
+            supports.put(array, values)
+        self._restart()
+        if self.stepper.scheme.solves_next_position:
+            way = supports.positions(self.stepper.balance.time) - supports.positions(time)
+            supports.put(state.memory["half_velocity"], way / self.stepper.part)
+        ruled, given = self._ruled, {"v": state.v, "a": state.a, **state.memory}
+        made = {"v": ruled.v, "a": ruled.a, **ruled.memory}
+        self.change = {name: supports.get(given[name]) - array[:, 0] for name, array in made.items()}
+
+    def _restart(self) -> None:
+        """Make the memory of the scheme consistent with the new velocities and accelerations."""
+        supports, state, scheme = self.supports, self.stepper.state, self.stepper.scheme
+        if supports.inclined is None:
+            scheme.restart(state, supports.at, self.stepper.part)
+            return
+        names = [name for name in scheme.remembers if name in state.memory]
+        fields = (supports.get(array)[:, None] for array in (state.position, state.v, state.a))
+        memory = {name: supports.get(state.memory[name])[:, None] for name in names}
+        along = State(*fields, *(np.zeros((supports.number, 1)) for _ in range(4)), memory=memory)
+        scheme.restart(along, np.arange(supports.number), self.stepper.part)
+        for name in names:
+            supports.put(state.memory[name], memory[name][:, 0])
+
+
+class NoRates(PrescribedMotion):
+    """For balances without inertia, where supports prescribe positions alone: these are part of the guess."""
+
+    def __init__(self, stepper: Stepper) -> None:
+        super().__init__(stepper)
+        self.moving = False
+
+
+_ITERATIONS = 200
+_CALMER, _BOLDER = 0.7, 1.3  # factors that shorten moves while they oscillate, and lengthen them up to full moves
+_FARTHEST = 0.25  # longest single move, relative to the shortest bar of the node
+_STEEPEST = 0.05  # minimum squared cosine between bars and the normal in the stiffness
+_SOFTEST = 1e-4  # smallest accepted ratio between secant and elastic stiffness, either way; below it is rounding
+
+
+class MasslessNodes:
+    """Contact nodes whose mass is redistributed."""
+
+    def __init__(self, model: Model) -> None:
+        self.model = model
+        self.moved = model.inertia.redistribution
+        self._force = np.zeros((model.mesh.n_local, 3))
+
+    def settle(self, x: np.ndarray, time: float, now: float) -> float:
+        """Move nodes of ``x`` (local, 3), in place, along their normals into equilibrium or onto the wall.
+
+        Forces, walls and bars are those of ``time``; afterwards bars are reset to ``now`` [s]. Returns
+        the largest of the last moves, which is rounding of the model's length unless no equilibrium was found.
+        Collective.
+        """
+        model, moved = self.model, self.moved
+        owned, nodes, n = model.mesh.n_owned, moved.nodes, moved.normals
+        external = np.zeros((owned, 3))
+        if model.external.active:
+            model.external.at(time, external)
+        if model.bars_vary:
+            model.change_bars(time)
+        model.mesh.update_ghosts(x)  # a scheme predicts owned nodes alone
+        elastic, farthest = self._stiffness(x)
+        stiffness, force, step = elastic, np.full(len(nodes), np.nan), np.zeros(len(nodes))
+        part, largest = np.ones(len(nodes)), 0.0
+        for _ in range(_ITERATIONS):
+            gap = self.gaps(x[:owned], time)
+            x[nodes] -= np.minimum(gap, 0.0)[:, None] * n
+            model.mesh.update_ghosts(x)
+            model.bars.forces(x, self._force, commit=False)
+            last, force = force, np.einsum("mi,mi->m", external[nodes] - self._force[nodes], n)
+            with np.errstate(invalid="ignore", divide="ignore"):
+                secant = (last - force) / step
+            # where bars yield or rotate, the elastic stiffness would need hundreds of moves
+            stiffness = np.where((secant > _SOFTEST * elastic) & (secant < elastic / _SOFTEST), secant, elastic)
+            swings = step * force < 0.0  # massless neighbours may push each other back and forth
+            part = np.where(swings, _CALMER * part, np.minimum(_BOLDER * part, 1.0))
+            move = np.clip(part * force / stiffness, -farthest, farthest)
+            step = np.maximum(move, -np.maximum(gap, 0.0))
+            x[nodes] += step[:, None] * n
+            # with a bar perpendicular to the normal, forces within rounding may leave the position undetermined
+            open_way = np.minimum(np.abs(step), np.abs(force) / elastic)
+            largest = model.comm.allreduce(float(open_way.max(initial=0.0)), op=MPI.MAX)
+            if largest <= ROUNDING * model.size:
+                break
+        model.mesh.update_ghosts(x)
+        if model.bars_vary:
+            model.change_bars(now)
+        return largest
+
+    def gaps(self, x: np.ndarray, time: float) -> np.ndarray:
+        """Return the distances (m,) of the nodes from the wall along their vectors [m]."""
+        gaps = self.model.contact.gaps(x[self.moved.nodes], time, self.moved.nodes)
+        return gaps[np.arange(len(gaps)), self.moved.walls] / self.moved.across
+
+    def press(self, x: np.ndarray, load: np.ndarray, time: float) -> tuple[np.ndarray, WallForces]:
+        """Return wall forces (owned, 3) that balance a load on nodes at x (owned, 3), and their sums.
+
+        The residual force on a massless node in equilibrium is the force of its wall.
+        """
+        moved, contact = self.moved, self.model.contact
+        n, nodes = moved.normals, moved.nodes
+        strength = -np.einsum("mi,mi->m", load[nodes], n)
+        touching = self.gaps(x, time) <= ON_BOUND * self.model.size
+        strength = np.where(touching, np.maximum(strength, 0.0), 0.0) / moved.across
+        full = contact.normals[moved.walls]
+        force = np.zeros_like(load)
+        force[nodes] = strength[:, None] * full
+        if not len(nodes):
+            return force, contact.nothing
+        touched = np.zeros((len(nodes), len(contact.names)), dtype=bool)
+        touched[np.arange(len(nodes)), moved.walls] = strength > 0.0
+        each = touched[:, :, None] * (strength[:, None] * full)[:, None, :]
+        return force, contact.sums(nodes, each, x[nodes], touched)
+
+    def _stiffness(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return stiffness (m,) of nodes along their normals at fixed neighbours [N/m], and their longest moves [m].
+
+        A bar perpendicular to the normal has geometric stiffness only, so a minimum inclination is assumed.
+        """
+        mesh, model = self.model.mesh, self.model
+        a, b = mesh.bars.T
+        total = np.zeros(mesh.n_local)
+        shortest = np.full(mesh.n_local, np.inf)
+        normal = np.zeros((mesh.n_local, 3))
+        normal[self.moved.nodes] = self.moved.normals
+        way = x[b] - x[a]
+        length = np.linalg.norm(way, axis=1)
+        axial = np.concatenate(
+            [np.full(k.stop - k.start, k.area * k.modulus) for k in model.bars.blocks] or [np.zeros(0)]
+        )
+        for end in (a, b):
+            along = np.einsum("bi,bi->b", way, normal[end]) / length
+            np.add.at(total, end, axial / model.bars.rest * np.maximum(along * along, _STEEPEST))
+            np.minimum.at(shortest, end, model.bars.rest)
+        return total[self.moved.nodes], _FARTHEST * shortest[self.moved.nodes]
+
+
+@dataclass
+class Solution:
+    """Result of solving one balance.
+
+    Attributes
+    ----------
+    u : (owned, 3) increment from the predictor [m]
+    internal : (local, 3) internal force in the balance [N]
+    walls : forces per wall, this rank's share
+    newton, linear : numbers of iterations
+    contacts : number of this rank's nodes in contact with walls
+    """
+
+    u: np.ndarray
+    internal: np.ndarray
+    walls: WallForces
+    newton: int = 0
+    linear: int = 0
+    contacts: int = 0
 
 
 class Stepper(ABC):
@@ -57,7 +269,7 @@ class Stepper(ABC):
     velocity_solved : (owned, 3) velocity of that balance if there is damping, whose force depends on it [m/s]
     walls_at_start, links_at_start : (walls, 3), (tables of links, 3) forces at the start [N]
     renews_forces : each evaluation of the state fills another array ``state.f``, so that the last one is kept
-    steady : the loop over many steps (``stepping/fused_loop.py``) makes the same steps, where all else allows it
+    steady : the loop over many steps (``stepping/batch_loop.py``) makes the same steps, where all else allows it
     kept_numbers, kept_arrays, kept_bars : names of attributes that, with the state, determine what comes: numbers,
         arrays with a row for each owned node, and for each local bar
     columns : names of attributes, numbers, that are columns of the history
@@ -106,8 +318,8 @@ class Stepper(ABC):
         self.closed = np.zeros_like(self.touching)
         self.step_changed = False
         self.prescribed = PrescribedMotion(self)
-        self.ruptures = Ruptures(self)
-        self.removals = Removals(self)
+        self.ruptures = Ruptures(model.bars, mesh)
+        self.removals = Removals(model)
         self.support_changes = 0
         self.carried = CarriedNodes(model.contact)
         self.totals_at_start: np.ndarray | None = None
@@ -128,11 +340,78 @@ class Stepper(ABC):
 
     def start(self) -> None:
         """Initialise velocity, internal force and acceleration of the state. Collective."""
-        start_in_motion(self)
+        state, model = self.state, self.model
+        velocity = model.initial_velocity()
+        state.v = velocity if model.start is None else state.v + velocity
+        supports = model.supports
+        if supports.any:
+            supports.place(state.position, supports.positions(0.0))
+            supports.put(state.v, supports.rates(0.0, 0.0)[0])
+        if model.external.state_forces:
+            model.external.follow(state.position, state.v)
+        if self.massless is not None and self.massless.settle(state.x, 0.0, 0.0) > BEYOND * model.size:
+            self.fault = SimulationFailure(
+                "step 0, t = 0 s: contact nodes without mass found no equilibrium; use another contact.treatment"
+            )
+        self.evaluate(commit=True)
+        if model.external.active:
+            state.external = self.load_now(0.0)
+        load = state.external - state.f[: model.mesh.n_owned]
+        if model.inertia.damped:
+            load -= model.inertia.damping_times(state.v, np.zeros_like(load))
+        state.a = self._acceleration_for(load)
+        if model.can_touch and model.inertia.redistribution is None:
+            walls = start_at_rest(model, state, self._acceleration_for, load)
+            if walls is not None:
+                held = model.links.count_held(walls.nodes[walls.touching.any(axis=1)], len(state.v))
+                self.solution.walls, self.solution.contacts = walls, held
+        if self.massless is not None:
+            state.contact, self.solution.walls = self.massless.press(state.position, load, 0.0)
+            self.solution.contacts = int(self.solution.walls.touching.sum())
+        if supports.any:
+            inertial = model.inertia.mass_times(state.a, np.empty_like(state.a))
+            state.support = supports.part(inertial - load - state.contact)
+        self.totals_at_start = self.totals()
+        self.walls_at_start = self.solution.walls.force
+        self.links_at_start = model.links.totals()
+        self.scheme.start(state, self.h)
+        if model.bars.viscous and self.scheme.solves_next_position:  # the rate half a step before, to extrapolate from
+            half = self.on_all(state.memory["half_velocity"])
+            model.bars.set_rates(state.x, state.x - (0.5 * self.h) * half, (1.0 - EXTRAPOLATED) * half, 0.0)
+        motion = model.contact.motion
+        motion.start(self.h)
+        if self.scheme.solves_next_position:
+            v, speeds = state.v, motion.speeds
+            for phase in (self._set_balance, self._solve_balance, self._finish):
+                phase(state.time)
+            self.totals_solved = self.totals()
+            if model.inertia.damped:
+                self.velocity_solved = state.v
+            # nodes on a wall have not lost their velocity yet; the scheme continues from its own memory
+            state.v = v
+            motion.set_speeds(speeds)
 
     def start_without_motion(self) -> None:
         """Initialise positions, internal forces and loads at time zero, where nothing moves. Collective."""
-        start_at_zero(self)
+        state, model = self.state, self.model
+        state.v = np.zeros_like(self.zero)
+        state.a = np.zeros_like(self.zero)
+        if model.supports.any:
+            model.supports.place(state.position, model.supports.positions(0.0))
+        self.evaluate(commit=True)
+        if model.external.active:
+            state.external = model.external.at(0.0, np.empty_like(state.v))
+
+    def _acceleration_for(self, load: np.ndarray) -> np.ndarray:
+        """Return the acceleration (owned, 3) with M a = load [N], prescribed values included. Collective."""
+        supports = self.model.supports
+        if not supports.moving:
+            return self.accelerate(load)
+        carried = np.zeros_like(load)
+        supports.put(carried, supports.rates(self.state.time, 0.0)[1])
+        a = self.accelerate(load - self.model.inertia.mass_times(carried, np.empty_like(load)))
+        supports.put(a, supports.get(carried))
+        return a
 
     def acceleration(self) -> np.ndarray:
         """Acceleration (owned, 3) to record [m/s2], see :meth:`recorded`. Collective."""
@@ -150,7 +429,7 @@ class Stepper(ABC):
             return state.a, state.support
         load = -state.f[: len(state.a)]
         if model.external.active:
-            load += load_now(self, state.time)
+            load += self.load_now(state.time)
         model.inertia.change(state.time)
         if model.inertia.damped:
             load -= model.inertia.damping_times(state.v, np.empty_like(load))
@@ -212,7 +491,38 @@ class Stepper(ABC):
 
     def leave(self) -> None:
         """Remove the bars and supports that are to go at the time reached. Collective."""
-        self.removals.apply()
+        self.remove_due()
+
+    def remove_due(self) -> bool:
+        """Remove what is due at the state's time; return whether any bar or support of this rank's part changed.
+
+        Supports change on all ranks or on none.
+        """
+        changed = False
+        for entry, share, begins in self.removals.due(self.state.time, self.h):
+            changed = True
+            if entry.bars is not None:
+                self._remove_bars(self.removals.members[entry.bars], share)
+            elif begins:
+                self.removals.release(entry, self.recorded()[1], self.state.time)
+                self.supports_changed()
+        return changed
+
+    def follow_removals(self, before: Removals) -> None:
+        """Begin a stage after that of other removals: removals remain, and bars are removed entirely."""
+        for members in before.begun_bars():
+            self._remove_bars(members, 1.0)
+        if self.model.case.holds("support") and before.gone:
+            self.removals.gone = list(before.gone)
+            self.model.supports.release(before.gone)
+            self.supports_changed()
+
+    def _remove_bars(self, members: np.ndarray, share: float) -> None:
+        """Remove a share of local bars, with their energy."""
+        change = release(self.model.bars, self.state.x, members, share)
+        energies = np.array(self.energy.energies) + change
+        self.energy = self.energy._replace(energies=tuple(energies.tolist()))
+        self.bars_removed()
 
     def supports_changed(self) -> None:
         """Take account of components that are no longer prescribed, or now are. Collective."""
@@ -222,11 +532,13 @@ class Stepper(ABC):
         """Continue from a state that was restored from a checkpoint. Collective."""
         self.model.inertia.change(self.state.time)
         self.ruptures.begin()
-        self.removals.resume()
+        self.removals.resume(self.state.time)
+        if self.removals.gone:
+            self.supports_changed()
 
     @property
     def removal_times(self) -> list[float]:
-        """See :class:`~pfem_petsc.stepping.removals.Removals`, as the next two."""
+        """See :class:`~pfem_petsc.stepping.bar_events.Removals`, as the next two."""
         return self.removals.times
 
     @removal_times.setter
@@ -253,8 +565,139 @@ class Stepper(ABC):
 
     def _make_part(self, end: float) -> None:
         """Advance by ``part`` to the time ``end`` [s]."""
-        for phase in phases_of(self.scheme):
-            phase(self, end)
+        for phase in self._phases():
+            phase(end)
+
+    def _phases(self) -> tuple[Callable[[float], None], ...]:
+        """Return the phases of a step, methods of the time [s] at which its part ends, in their order."""
+        solve = self._set_balance, self._solve_balance, self._finish
+        last = self._treat, self._account, self._check
+        if self.scheme.solves_next_position:
+            return self._begin, self._move, self._evaluate_end, *solve, *last
+        return self._begin, *solve, self._place_supports, self._evaluate_end, *last
+
+    def _begin(self, end: float) -> None:
+        """Keep what later phases compare with the start of the part."""
+        state = self.state
+        if self.model.bars_vary:
+            self.model.bars.keep_start()
+        self.carried.start(state.position, state.time)
+        if self.treatment is not None:
+            self.treatment.before()
+
+    def _move(self, end: float) -> None:
+        """Move to the positions that the last balance was solved for, supports to their exact ones."""
+        self.before[:] = self.state.x
+        self.scheme.advance(self.state, self.part)
+        self.prescribed.place(end)
+
+    def _evaluate_end(self, end: float) -> None:
+        """Evaluate forces and energies at the positions reached, and keep the internal variables. Collective."""
+        model = self.model
+        if self.scheme.inertial:  # static steps are infinitely long for material laws
+            model.bars.step = self.part
+        self.state.time = end
+        if model.bars_vary:
+            model.change_bars(end)
+        self.evaluate(commit=True)
+
+    def _set_balance(self, end: float) -> None:
+        """Set up the balance of the part, with the loads, supports, dampers and walls of its times. Collective."""
+        state, model = self.state, self.model
+        self.balance = self.scheme.balance(state, self.part)
+        if self.prescribed.moving:
+            self.prescribed.prescribe(self.balance)
+        model.inertia.change(sum(weight * time for weight, time in self.balance.loads))
+        model.contact.motion.begin(state.time, self.part)
+        state.external = self.load_of(self.balance)
+        if self.scheme.inertial:
+            model.bars.step = self.balance.time - state.time
+
+    def _solve_balance(self, end: float) -> None:
+        """Solve the balance with contact and supports. Collective if the solve is."""
+        self.solution = self.solve(self.balance)
+
+    def _finish(self, end: float) -> None:
+        """Update velocities, accelerations, walls and the contact log from the solution."""
+        state, scheme, contact, found = self.state, self.scheme, self.model.contact, self.balance
+        fresh = contact.record(self.solution.walls, found.time, self.part)
+        if not scheme.solves_next_position:
+            self.before[:] = state.x
+        scheme.finish(state, found, self.solution.u, self.part)
+        if scheme.solves_next_position and self.prescribed.moving:
+            self.prescribed.take_rates(state.time)
+        contact.motion.finish(self.part, end)
+        if scheme.turns_held and self.treatment is None:
+            contact.calm(fresh, state.v, found.time, self.part)
+
+    def _place_supports(self, end: float) -> None:
+        """Give supports that move their exact positions and rates."""
+        if self.prescribed.moving:
+            self.prescribed.place(end)
+            self.prescribed.take_rates(end)
+
+    def _treat(self, end: float) -> None:
+        """Apply the treatment of impact."""
+        if self.treatment is not None:
+            self.treatment.after()
+
+    def _account(self, end: float) -> None:
+        """Update the ledger."""
+        self.booking()
+
+    def _check(self, end: float) -> None:
+        """Find nodes that supports have carried through a rectangle."""
+        if self.carried.of and self.fault is None:
+            crossing = self.carried.crossing(self.state.position, end, self.at(self.state.step + 1, end))
+            self.fault = SimulationFailure(crossing) if crossing else None
+
+    def load_of(self, balance: Balance) -> np.ndarray:
+        """Return the external force (owned, 3) [N] of a balance that is not solved yet. Collective."""
+        external = self.model.external
+        if not external.active:
+            return self.zero
+        if len(balance.loads) == 1 and balance.loads[0][0] == 1.0:
+            total = external.constant()
+            if total is not None:
+                return total
+        total = None
+        for weight, time in balance.loads:
+            if external.state_forces:
+                external.follow(*self._expected(balance, time))
+            part = external.at(time, np.empty_like(self.state.v))
+            if weight != 1.0:
+                part *= weight
+            total = part if total is None else np.add(total, part, out=total)
+        if external.failure is not None:
+            self._fail_load(self.when(balance))
+        return total
+
+    def load_now(self, time: float) -> np.ndarray:
+        """Return the external force (owned, 3) [N] at a time [s] and the present state. Collective."""
+        external = self.model.external
+        if external.state_forces:
+            external.follow(self.state.position, self.state.v)
+        force = external.at(time, np.empty_like(self.state.v))
+        if external.failure is not None:
+            self._fail_load(self.arrived())
+        return force
+
+    def _fail_load(self, where: str) -> None:
+        if self.fault is None:
+            self.fault = SimulationFailure(f"{where}: external_force: the function {self.model.external.failure}")
+
+    def _expected(self, balance: Balance, time: float) -> tuple[np.ndarray, np.ndarray]:
+        """Return positions and velocities (owned, 3) at a time [s] of a balance that is not solved yet.
+
+        The acceleration is that of the state; nodes in contact, whose acceleration may jump, are predicted without it.
+        """
+        state = self.state
+        a = np.where((state.contact != 0.0).any(axis=1)[:, None], 0.0, state.a)
+        if self.scheme.solves_next_position:  # the velocity of the state is that of the step before
+            known = 0.0 if balance.a_hat is None else balance.a_hat
+            return state.position, balance.v_hat + (balance.eta / balance.alpha) * (a - known)
+        ahead = time - state.time
+        return state.position + ahead * (state.v + (0.5 * ahead) * a), state.v + ahead * a
 
     def remarks(self) -> list[str]:
         """What users should know at the end of a run."""
@@ -285,7 +728,7 @@ class Stepper(ABC):
             bars.set_rates(self.before, state.x, self.on_all(state.v), 0.0)
         self.energy = bars.forces(state.x, state.f, commit)
         if commit and self.energy.changed:
-            self.ruptures.note()
+            self.ruptures.note(state.x, self.number + 1, self.arrived())
         failed = self.energy.failed
         if failed < 0 and self.energy.shortened:
             failed = bars.first_inverted(state.x, self.before)
@@ -301,7 +744,9 @@ class Stepper(ABC):
 
     def collapse(self, bar: int) -> str:
         """Return the message about a bar (local index) that failed in the current step."""
-        return tell_collapse(self, bar)
+        found = Collapse(bar, self.state.x, self.before, self.part, bar == self.energy.failed)
+        implicit = not self.scheme.explicit and self.scheme.inertial
+        return collapse_message(self.model, found, self.arrived(), (self.remedy, implicit))
 
     @abstractmethod
     def accelerate(self, load: np.ndarray) -> np.ndarray:

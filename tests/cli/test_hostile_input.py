@@ -13,7 +13,7 @@ from pfem_petsc.cli.launcher import _message
 from pfem_petsc.cli.main import main
 from pfem_petsc.cli.petsc_options import PREFIXES, without_effect
 from pfem_petsc.errors import InputError, printable
-from pfem_petsc.restart.folder import _prepare
+from pfem_petsc.restart.checkpoints import _prepare
 
 ROD = Path("pfem_petsc/cases/rod_impact.toml").resolve()
 

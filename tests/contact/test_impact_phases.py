@@ -9,9 +9,8 @@ import pytest
 from mpi4py import MPI
 
 from pfem_petsc import Case, Simulation
-from pfem_petsc.contact.impact_phases import SWING, Asked, scan_impacts
 from pfem_petsc.registry import lookup
-from pfem_petsc.stepping.contact_check import BOUND, contact_gain, overshoots, warn_of_gain
+from pfem_petsc.stepping.contact_check import BOUND, SWING, Asked, contact_gain, overshoots, scan_impacts, warn_of_gain
 
 ROOT = Path(__file__).parents[2]
 

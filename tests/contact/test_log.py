@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from pfem_petsc.contact import log as logs
-from pfem_petsc.contact.log import ContactLog
+from pfem_petsc.contact import forces as logs
+from pfem_petsc.contact.forces import ContactLog
 
 pytestmark = pytest.mark.parallel
 

@@ -5,7 +5,7 @@ import time
 import numpy as np
 import pytest
 
-from pfem_petsc.contact.matching import across, nearest_across, nearest_among_ranks
+from pfem_petsc.contact.row_search import across, nearest_across, nearest_among_ranks
 
 
 def looking_at_all(points, queries, normal):

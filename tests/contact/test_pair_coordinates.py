@@ -6,15 +6,15 @@ from helpers.bodies import two_lattices
 from helpers.lattices import planes
 
 from pfem_petsc import Case
-from pfem_petsc.contact.candidates import Candidates
-from pfem_petsc.contact.pair_coordinates import PairCoordinates
-from pfem_petsc.contact.transform import Transform
+from pfem_petsc.contact.contact import Candidates
+from pfem_petsc.contact.links import Transform
+from pfem_petsc.contact.pair_link import PairCoordinates
 from pfem_petsc.solvers.matrix import HessianMatrix
 from pfem_petsc.solvers.matrix_free import MatrixFreeHessian
 from pfem_petsc.stepping.model import Model
 from pfem_petsc.stepping.plan import make_plan
-from pfem_petsc.stepping.prepare import make_stepper
 from pfem_petsc.stepping.problem import StepProblem
+from pfem_petsc.stepping.time_stepping import make_stepper
 
 pytestmark = pytest.mark.parallel
 

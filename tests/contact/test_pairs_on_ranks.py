@@ -9,7 +9,7 @@ from helpers.lattices import planes, simulation
 from mpi4py import MPI
 
 from pfem_petsc import Case
-from pfem_petsc.contact.pair_coordinates import PairCoordinates
+from pfem_petsc.contact.pair_link import PairCoordinates
 from pfem_petsc.contact.pairs import ContactPairs
 from pfem_petsc.stepping.model import Model
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pfem_petsc import Case, Simulation
-from pfem_petsc.contact.piercing import distances
+from pfem_petsc.contact.monitoring import distances
 from pfem_petsc.preflight.inspection import warnings_before
 
 pytestmark = pytest.mark.parallel

@@ -9,16 +9,16 @@ import pytest
 from mpi4py import MPI
 
 from pfem_petsc import Case
+from pfem_petsc.contact.constraint_link import _pivots
 from pfem_petsc.contact.constraints.base import Constraint
 from pfem_petsc.contact.constraints.base import ConstraintKeys as Parameters
-from pfem_petsc.contact.row_coordinates import _pivots
-from pfem_petsc.contact.transform import Transform
+from pfem_petsc.contact.links import Transform
 from pfem_petsc.solvers.matrix import HessianMatrix
 from pfem_petsc.solvers.matrix_free import MatrixFreeHessian
 from pfem_petsc.stepping.model import Model
 from pfem_petsc.stepping.plan import make_plan
-from pfem_petsc.stepping.prepare import make_stepper
 from pfem_petsc.stepping.problem import StepProblem
+from pfem_petsc.stepping.time_stepping import make_stepper
 
 
 class Distances(Constraint):

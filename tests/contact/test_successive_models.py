@@ -10,7 +10,7 @@ from petsc4py import PETSc
 
 from pfem_petsc import Case, Simulation
 from pfem_petsc.errors import SimulationFailure
-from pfem_petsc.solvers import restricted
+from pfem_petsc.solvers import matrix_free as restricted
 
 pytestmark = pytest.mark.parallel
 

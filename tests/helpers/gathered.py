@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 from mpi4py import MPI
 
-from pfem_petsc.mesh.checks import check_mesh
 from pfem_petsc.mesh.slab import MeshSlab, slab_range
+from pfem_petsc.mesh.whole import check_mesh
 
 
 def whole(slab: MeshSlab, comm: MPI.Comm) -> MeshSlab:

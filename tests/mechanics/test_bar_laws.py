@@ -9,9 +9,9 @@ import pytest
 from helpers.strut_twin import Strut, solid
 
 from pfem_petsc.case.tables import Section
+from pfem_petsc.mechanics.bars import bar_shapes
 from pfem_petsc.mechanics.materials import cable, compaction, damage, strut
 from pfem_petsc.mechanics.materials.base import UnsuitableBarError
-from pfem_petsc.mechanics.sections import bar_shapes
 
 YOUNG = 200e9
 STRUTS = [Strut(YOUNG, 200e6, *rest) for rest in ((40.0, 0.0), (200.0, 0.0), (40.0, 2e-3), (160.0, 1e-3))]

@@ -14,17 +14,15 @@ import pytest
 from pfem_petsc import Case, Simulation
 from pfem_petsc.case.materials import LAWS
 from pfem_petsc.mechanics import strips
-from pfem_petsc.mechanics.code_digest import code_digest
-from pfem_petsc.mechanics.compiled import Compilation, _variant
-from pfem_petsc.mechanics.kernels import fused_parts, make_kernels
+from pfem_petsc.mechanics.bar_loops import fused_parts, make_kernels
+from pfem_petsc.mechanics.compiled import Compilation, _variant, code_digest
+from pfem_petsc.mechanics.conserving import MEASURES, engineering
 from pfem_petsc.mechanics.materials import elastic, elastoplastic
-from pfem_petsc.mechanics.materials._softening import softened
-from pfem_petsc.mechanics.materials._stiffness_damping import damped
+from pfem_petsc.mechanics.materials.base import damped, softened
 from pfem_petsc.mechanics.rupture import breakable
-from pfem_petsc.mechanics.strain import MEASURES, engineering
 from pfem_petsc.registry import choices, lookup
+from pfem_petsc.stepping.batch_loop import make_fused_loop
 from pfem_petsc.stepping.explicit import ExplicitStepper
-from pfem_petsc.stepping.fused_loop import make_fused_loop
 
 MODULE = """
 from pfem_petsc.mechanics.compiled import kernel
@@ -82,7 +80,7 @@ def test_short_compilations_are_not_reported():
 
 @pytest.mark.parametrize("patience, times", [(0.0, 1), (1e-4, 1), (600.0, 0)])
 def test_run_says_that_it_compiles(tmp_path, monkeypatch, capsys, patience, times):
-    monkeypatch.setattr("pfem_petsc.run.compilation._PATIENCE", patience)
+    monkeypatch.setattr("pfem_petsc.run.outputs._PATIENCE", patience)
     step = ExplicitStepper.step
 
     def compiling(self):
@@ -146,7 +144,7 @@ def test_every_process_finds_the_machine_code_of_another():
     """The digest of loops does not depend on the order of sets, which is another in every process."""
     program = (
         "from pfem_petsc.contact import frames, projection\n"
-        "from pfem_petsc.mechanics.code_digest import code_digest\n"
+        "from pfem_petsc.mechanics.compiled import code_digest\n"
         "print(code_digest(frames._build), code_digest(projection.project))"
     )
     digests = set()
@@ -161,10 +159,10 @@ def test_every_process_finds_the_machine_code_of_another():
 def test_every_process_finds_the_fused_loop_of_another():
     """Keys of loops that are made of other loops are the same in all processes: a start must not compile them anew."""
     program = (
-        "from pfem_petsc.mechanics.kernels import fused_parts, make_kernels\n"
+        "from pfem_petsc.mechanics.bar_loops import fused_parts, make_kernels\n"
         "from pfem_petsc.mechanics.materials.elastic import LAW\n"
-        "from pfem_petsc.mechanics.strain import engineering\n"
-        "from pfem_petsc.stepping.fused_loop import make_fused_loop\n"
+        "from pfem_petsc.mechanics.conserving import engineering\n"
+        "from pfem_petsc.stepping.batch_loop import make_fused_loop\n"
         "kernels = make_kernels(LAW, engineering)\n"
         "loop = make_fused_loop(*fused_parts(kernels))\n"
         "print(loop._cache._index_key((), loop.targetctx.codegen()), loop._cache._cache_file._source_stamp)"
@@ -202,10 +200,10 @@ def test_loops_of_a_law_with_and_without_damping_have_their_own_files():
 OF_ONE_LAW = """
 import sys
 import numpy as np
-from pfem_petsc.mechanics.kernels import make_kernels
+from pfem_petsc.mechanics.bar_loops import make_kernels
 from pfem_petsc.mechanics.materials import elastic, elastoplastic
-from pfem_petsc.mechanics.strain import engineering
-from pfem_petsc.mechanics.sweep import make_sweep
+from pfem_petsc.mechanics.conserving import engineering
+from pfem_petsc.mechanics.columns import make_sweep
 
 def energies(law, p):
     bars = np.array([[0, 1]], dtype=np.int32)

@@ -11,10 +11,9 @@ from helpers.laws import KEYS, SOFTENING, cycles, make
 
 from pfem_petsc.case.tables import Section
 from pfem_petsc.mechanics import rupture
-from pfem_petsc.mechanics.conserving import make_conserving_kernels
-from pfem_petsc.mechanics.sections import bar_shapes
-from pfem_petsc.mechanics.strain import MEASURES
-from pfem_petsc.mechanics.tangent_kernels import make_tangent_kernels
+from pfem_petsc.mechanics.bar_loops import make_tangent_kernels
+from pfem_petsc.mechanics.bars import bar_shapes
+from pfem_petsc.mechanics.conserving import MEASURES, make_conserving_kernels
 
 REST, AREA = 0.3, 2e-4
 STRUT = {"yield_stress": 200e6}

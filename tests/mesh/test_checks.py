@@ -3,7 +3,7 @@ import pytest
 from helpers.gathered import slab_from
 
 from pfem_petsc.errors import InputError
-from pfem_petsc.mesh.checks import check_mesh
+from pfem_petsc.mesh.whole import check_mesh
 
 pytestmark = pytest.mark.parallel
 

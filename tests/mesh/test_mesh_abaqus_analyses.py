@@ -7,7 +7,7 @@ from helpers.abaqus import FLAT, MESHES, written
 from pfem_petsc import Case, Truss
 from pfem_petsc.errors import InputError
 from pfem_petsc.mesh.readers import read_whole
-from pfem_petsc.mesh.skeleton import skeleton
+from pfem_petsc.mesh.whole import skeleton
 
 SECTIONS = {
     "*BEAM SECTION, SECTION=CIRC, ELSET=E, MATERIAL=M\n2.\n": {"area": 4 * np.pi, "shape": "round"},

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from mpi4py import MPI
 
 from pfem_petsc.errors import InputError
-from pfem_petsc.mesh.checks import check_mesh
 from pfem_petsc.mesh.readers import read_slab
+from pfem_petsc.mesh.whole import check_mesh
 
 ALONE = MPI.COMM_SELF
 TEXT = {version: GMSH[f"{version} ascii"].decode() for version in ("2.2", "4.1")}

@@ -13,7 +13,7 @@ from mpi4py import MPI
 from pfem_petsc import Case, Simulation
 from pfem_petsc.cli.main import main
 from pfem_petsc.errors import EarlyStop, InputError, SimulationFailure
-from pfem_petsc.modes import choice
+from pfem_petsc.modes import find as choice
 from pfem_petsc.output.result import open_result
 from pfem_petsc.output.verify import examine
 from pfem_petsc.post.modes import ModeFrames, render_modes

@@ -12,8 +12,7 @@ from helpers.launch import environment
 from mpi4py import MPI
 
 from pfem_petsc.errors import InputError, SimulationFailure
-from pfem_petsc.output.checkpoint import newest_checkpoint, read_checkpoint
-from pfem_petsc.output.checkpoint_writer import write_checkpoint
+from pfem_petsc.output.checkpoint import newest_checkpoint, read_checkpoint, write_checkpoint
 from pfem_petsc.output.integrity import checksum
 from pfem_petsc.parallel.natural import NaturalOrder
 

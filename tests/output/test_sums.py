@@ -5,9 +5,8 @@ import pytest
 from mpi4py import MPI
 
 from pfem_petsc.output import integrity
-from pfem_petsc.output.digests import RowDigests, row_digests
-from pfem_petsc.output.integrity import word_sum
-from pfem_petsc.output.snapshot_data import _permuted
+from pfem_petsc.output.integrity import RowDigests, row_digests, word_sum
+from pfem_petsc.output.vtkhdf import _permuted
 from pfem_petsc.parallel.natural import NaturalOrder
 
 

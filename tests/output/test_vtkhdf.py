@@ -10,8 +10,8 @@ from mpi4py import MPI
 from vtkmodules.util.numpy_support import vtk_to_numpy
 
 from pfem_petsc.errors import InputError
-from pfem_petsc.output import growing
-from pfem_petsc.output.digests import damages
+from pfem_petsc.output import hdf5 as growing
+from pfem_petsc.output.integrity import damages
 from pfem_petsc.output.layout import complete_snapshots
 from pfem_petsc.output.result import open_result
 from pfem_petsc.output.vtkhdf import ResultWriter

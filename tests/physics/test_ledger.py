@@ -10,9 +10,8 @@ from helpers.runs import run
 
 from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.energies import LOST, STORED, SUPPLIED
-from pfem_petsc.recording import history as recording
-from pfem_petsc.stepping.leapfrog_ledger import LeapfrogLedger
-from pfem_petsc.stepping.ledger import Ledger
+from pfem_petsc.recording import observers as recording
+from pfem_petsc.stepping.ledger import LeapfrogLedger, Ledger
 
 
 @pytest.mark.parametrize("integrator", SCHEMES)

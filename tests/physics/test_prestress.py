@@ -9,8 +9,8 @@ from helpers.stopped import everywhere
 
 from pfem_petsc import Simulation, open_result
 from pfem_petsc.case.materials import law_of
+from pfem_petsc.mechanics.conserving import MEASURES
 from pfem_petsc.mechanics.rest_lengths import stretch_of
-from pfem_petsc.mechanics.strain import MEASURES
 
 STRAINS = ["engineering", "green", "logarithmic"]
 INTEGRATORS = [

@@ -6,8 +6,7 @@ from helpers.kills import differences
 from helpers.stopped import CASES, SHORT, TWO_RODS, everywhere, simulate
 
 from pfem_petsc import Case, Simulation, open_result
-from pfem_petsc.recording.history import History
-from pfem_petsc.recording.snapshots import Snapshots
+from pfem_petsc.recording.observers import History, Snapshots
 
 
 @pytest.mark.few_sets

@@ -13,7 +13,7 @@ from helpers.rods import rod, steps
 from pfem_petsc.cli.main import main
 from pfem_petsc.errors import InputError
 from pfem_petsc.output.result import open_result
-from pfem_petsc.restart.overrides import kept_overrides
+from pfem_petsc.restart.checkpoints import kept_overrides
 
 
 @pytest.fixture(scope="module")
@@ -132,8 +132,7 @@ def test_state_of_another_version(copy, capsys):
     """A file that is whole, but whose state has another meaning."""
     from mpi4py import MPI
 
-    from pfem_petsc.output.checkpoint import read_checkpoint_header
-    from pfem_petsc.output.checkpoint_writer import write_checkpoint
+    from pfem_petsc.output.checkpoint import read_checkpoint_header, write_checkpoint
 
     scalars, attributes = read_checkpoint_header(copy / "checkpoint.h5", MPI.COMM_SELF)
     write_checkpoint(copy / "checkpoint.h5", MPI.COMM_SELF, {}, scalars, {**attributes, "state_version": 0})

@@ -11,8 +11,7 @@ import pfem_petsc.statics.stability
 from pfem_petsc import Case, Simulation, open_result
 from pfem_petsc.errors import InputError, SimulationFailure
 from pfem_petsc.solvers.linear import has_mumps
-from pfem_petsc.statics.bordered import BorderedSystem
-from pfem_petsc.statics.free_motions import _nodes
+from pfem_petsc.statics.bordered import BorderedSystem, _nodes
 
 
 def von_mises(static=None, **tables):

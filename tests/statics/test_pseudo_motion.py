@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pfem_petsc.statics.relaxation_loops import node_stiffness
+from pfem_petsc.statics.relaxation import node_stiffness
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from pfem_petsc import Case, Simulation
-from pfem_petsc.contact.transform import Transform
-from pfem_petsc.statics.minimum import is_indefinite
+from pfem_petsc.contact.links import Transform
 from pfem_petsc.statics.scheme import Equilibrium
+from pfem_petsc.statics.stability import is_indefinite
 from pfem_petsc.stepping.problem import StepProblem
 
 UNSTABLE = "the equilibrium is unstable, with"

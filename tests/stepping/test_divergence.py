@@ -6,7 +6,7 @@ import pytest
 from pfem_petsc import Case, Simulation, Truss
 from pfem_petsc.energies import ENERGIES
 from pfem_petsc.errors import SimulationFailure
-from pfem_petsc.recording.blowup import BlowUp
+from pfem_petsc.recording.monitors import BlowUp
 
 pytestmark = pytest.mark.parallel
 

@@ -20,7 +20,7 @@ from pfem_petsc.cli import sweep as verb
 from pfem_petsc.cli.main import main
 from pfem_petsc.mechanics.compiled import Compilation
 from pfem_petsc.output.table import Table
-from pfem_petsc.solvers import outlive
+from pfem_petsc.solvers import matrix_free as outlive
 from pfem_petsc.studies import pool, worker
 from pfem_petsc.studies.worker import Report, Task
 

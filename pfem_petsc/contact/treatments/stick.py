@@ -6,7 +6,7 @@ contact move together, with the normal velocity that conserves their momentum.
 On closure a node loses the kinetic energy of its approach, m v_n^2/2, an O(element length) part of the total. On
 release it starts from rest, and the wall does no work on it. At a wall with restitution e a node that closes leaves
 with e times the velocity of its approach and loses (1 - e^2) of that energy; see
-:mod:`~pfem_petsc.contact.restitution`.
+:mod:`~pfem_petsc.contact.treatments.base`.
 
 The momentum that stops a node is m v_n in all. What the force of the step falls short of it, or exceeds it by, depends
 on where in the step the impact falls; the jump makes up for it. Friction follows the momentum: a node that slips is
@@ -21,8 +21,7 @@ from mpi4py import MPI
 
 from ...integrators.base import State
 from ...tolerances import FREE_PART, RANK
-from ..restitution import STILL
-from ..restitution import Treatment as Restitution
+from .base import STILL, Restitution
 
 __all__ = ["Treatment"]
 

@@ -8,8 +8,7 @@ import numpy as np
 from pydantic import field_validator
 
 from ...case.base import PositiveFloat, Vector3
-from ..surfaces import Surface, revolved
-from .base import BaseWall, WallKeys, direction
+from .base import BaseWall, Surface, WallKeys, direction, revolved
 from .sphere import radial_planes
 
 __all__ = ["Parameters", "Wall", "surface"]

@@ -8,8 +8,7 @@ import numpy as np
 from pydantic import model_validator
 
 from ...case.base import PositiveFloat, Vector3, listed
-from ..surfaces import Surface, slab
-from .base import WallKeys, direction
+from .base import Surface, WallKeys, direction, slab
 from .plane import Wall as Plane
 
 __all__ = ["Parameters", "Wall", "surface"]

@@ -7,8 +7,7 @@ from typing import Literal
 import numpy as np
 
 from ...case.base import PositiveFloat, Vector3
-from ..surfaces import Surface, revolved
-from .base import BaseWall, WallKeys
+from .base import BaseWall, Surface, WallKeys, revolved
 
 __all__ = ["Parameters", "Wall", "surface"]
 

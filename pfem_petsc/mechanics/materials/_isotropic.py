@@ -1,30 +1,59 @@
-"""Plastic bars whose yield stress R is any function of the accumulated plastic strain a, made from this function.
-
-The yield function is f = |s - H e_p| - R(a) with the linear kinematic hardening H. The return mapping over a strain
-increment solves f(a + x) = |s_trial - H e_p| - (E + H) x - R(a + x) = 0 for the plastic strain x of the step, to
-rounding; the tangent on the yield surface is E (H + R')/(E + H + R') (Simo and Hughes, Computational Inelasticity,
-1998, section 1.5).
-
-The plastic work int(R da) + H e_p^2/2 is a function of state. In a step that yields, the stress follows the line of
-modulus E from s0 to the yield stress s_y, and the curve from there. The elastic strains of both parts and the plastic
-strain are shares w of the strain increment, with the mean stresses (s0 + s_y)/2, (s_y + s1)/2 and m, that of the yield
-stress over the plastic strain. Their mean S = sum of w times mean has the work of the path, which is the change of
-elastic energy and plastic work; dS/de1 = (s1 - S)/(e1 - e0).
-"""
+"""Plastic bars whose yield stress R is any function of the accumulated plastic strain a, made by compiled code."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
 
 from ...case.base import NonNegativeFloat, PositiveFloat
 from ..compiled import inlined, kernel
-from ._softening import Softening
-from ._solver import NOISE, make_solver
-from .base import Law, MaterialKeys
+from .base import Law, MaterialKeys, Softening
 
-__all__ = ["ENERGIES", "VARIABLES", "PlasticKeys", "isotropic_law", "yield_texts"]
+NOISE = 4.0 * 2.0**-52
+"""Residual relative to its terms below which it is rounding."""
+
+_MOST = 200  # iterations; some six are usual, and bisections alone would take a hundred
+
+
+def make_solver(residual: Callable) -> Callable:
+    """Return a compiled function ``solve(start, high, noise, data)``.
+
+    ``residual(x, data)`` returns a value and its derivative; the value is positive at 0 and not at ``high``. ``solve``
+    returns the root of (0, high], from ``start``, as soon as the residual is no larger than ``noise``, after a last
+    step of Newton's method. Flow stresses may have any slope, and an infinite one at 0. Where a step of Newton's
+    method leaves the bracket, the unknown decreases by powers that are squared each time until the residual is
+    positive, and is then the geometric mean of the bounds, so that roots of any magnitude are found in a few steps.
+    """
+
+    @inlined
+    def solve(start, high, noise, data):
+        low, x, shrink = 0.0, start, 0.0625
+        for _ in range(_MOST):
+            value, slope = residual(x, data)
+            if value > 0.0:
+                low = x
+            else:
+                high = x
+            new = x - value / slope if slope < 0.0 else -1.0
+            if abs(value) <= noise:
+                return new if low <= new <= high else x
+            if not (low < new < high):
+                if low == 0.0:
+                    new = high * shrink
+                    shrink *= shrink
+                elif high > 4.0 * low:
+                    new = math.sqrt(low) * math.sqrt(high)
+                else:
+                    new = 0.5 * (low + high)
+            if new == x or new == 0.0:
+                return new
+            x = new
+        return x
+
+    return solve
+
 
 VARIABLES = (("plastic_strain", ""), ("accumulated_plastic_strain", ""))
 ENERGIES = ("elastic_energy", "plastic_heat", "hardening_energy")

@@ -1,34 +1,15 @@
-"""Plastic bars whose flow stress Y depends on accumulated plastic strain, its rate and the temperature, made from Y.
-
-The plastic strain x of a step h is found by backward Euler:
-
-    |s_trial - H e_p| - (E + H) x = Y(a + x, x/h, T + r),
-
-with the linear kinematic hardening H and the rise r of temperature by plastic work at the end. A bar is elastic below
-the flow stress at the rate zero, Y(a, 0, T), and while no time passes. In a step of infinite length the rate is zero:
-static analyses take this limit.
-
-The stress goes from s0 along the line of modulus E to s_y, where flow begins, during the share 1 - q of the step, and
-then along a straight line to s1; a bar that flows at the start has s_y = s0. The work on this path,
-
-    S (e1 - e0) = ((1 - q) (s0 + s_y)/2 + q (s_y + s1)/2) (e1 - e0),
-
-is exactly the change of elastic energy plus (s_y + s1)/2 de_p, since s_y and s1 are E times elastic strains. The
-dissipation is defined by this product, which is positive; internal variables accumulate it.
-"""
+"""Plastic bars whose flow stress Y depends on accumulated plastic strain, its rate and the temperature."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 
+from ...case.base import NonNegativeFloat
 from ..compiled import inlined
-from ._isotropic import ENERGIES, VARIABLES
-from ._softening import DENSITIES, Softening
-from ._solver import NOISE, make_solver
-from .base import Law
-
-__all__ = ["viscous_law"]
+from ._isotropic import ENERGIES, NOISE, VARIABLES, PlasticKeys, make_solver
+from .base import DENSITIES, Law, Softening
+from .voce import curve
 
 
 def viscous_law(
@@ -42,7 +23,7 @@ def viscous_law(
         and dY/dT [Pa/K]. p[0] = E, p[1] = H [Pa]
     stored : compiled function of (a before, a after, p, work) that returns how much of the ``work`` of the isotropic
         part of the stress on the plastic strain of a step is stored [J/m3]
-    scale : see :class:`~pfem_petsc.mechanics.materials._softening.Softening`; None: no softening by a table
+    scale : see :class:`~pfem_petsc.mechanics.materials.base.Softening`; None: no softening by a table
     heating : compiled function of p that returns the rise of temperature over the work of the isotropic part of the
         stress [K m3/J], for a law with the internal variable ``temperature_rise``
     """
@@ -153,3 +134,31 @@ def viscous_law(
 def no_heating(p):
     """Return zero."""
     return 0.0
+
+
+class HardeningKeys(PlasticKeys):
+    """Keys of the yield stress at the rate zero: R(a) = s_Y + K a + Q (1 - exp(-b a))."""
+
+    isotropic_hardening: NonNegativeFloat = 0.0
+    """isotropic hardening modulus K [Pa]"""
+    saturation_stress: NonNegativeFloat = 0.0
+    """increase Q of the yield stress at saturation, as in the law voce [Pa]"""
+    saturation_rate: NonNegativeFloat = 0.0
+    """rate b of saturation over the accumulated plastic strain [-]"""
+
+    def static(self) -> tuple[float, ...]:
+        """Return (E, H, s_Y, K, Q [Pa], b)."""
+        young, kinematic, first = self.young_modulus, self.kinematic_hardening, self.yield_stress
+        return young, kinematic, first, self.isotropic_hardening, self.saturation_stress, self.saturation_rate
+
+
+@inlined
+def stored(before, after, p, work):
+    """Return the energy that isotropic hardening stores between two accumulated plastic strains [J/m3]."""
+    return curve(after, p)[3] - curve(before, p)[3]
+
+
+@inlined
+def scale(p, modulus, strength):
+    """Return the parameters at a temperature."""
+    return modulus * p[0], strength * p[1], strength * p[2], strength * p[3], strength * p[4], p[5], p[6], p[7]

@@ -1,15 +1,13 @@
-"""Base of material laws: the keys of their tables, and a :class:`Law` for the loops over bars.
-
-A module of this package is a law. It has ``Parameters``, a :class:`MaterialKeys` whose :meth:`~MaterialKeys.pack`
-returns the numbers that the law reads, and ``LAW``, a :class:`Law`. The compiled loops of explicit steps (single and
-fused), of implicit steps (assembled and matrix-free), and of the energy-momentum scheme are made from it.
+"""Base of material laws: the keys of their tables, a :class:`Law` for the loops over bars, softening and damping of
+laws.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cache
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
@@ -18,10 +16,151 @@ from pydantic import Field, field_validator
 from ...case.base import Finite, NonNegativeFloat, PositiveFloat, StrictModel, listed
 from ...case.rupture import Rupture
 from ...energies import BAR_ENERGIES
-from ._softening import Softening, softened
-from ._stiffness_damping import EXTRAPOLATED, damped
+from ..compiled import inlined
 
-__all__ = ["BarShapes", "Law", "MaterialKeys", "UnsuitableBarError"]
+
+@dataclass(frozen=True)
+class Softening:
+    """How a law softens.
+
+    Attributes
+    ----------
+    scale : compiled function of (p, factor of modulus, factor of yield stress) that returns p at a temperature; p[0] is
+        the modulus of the elastic strain
+    dissipated : compiled function of (p, q): the densities [J/m3] of all energies of the law except the elastic one, in
+        their order, if they are functions of state; None if there are none or if the law accumulates them itself
+    """
+
+    scale: Callable
+    dissipated: Callable | None = None
+
+
+@inlined
+def factors(temperature, table):
+    """Return the factors of modulus and yield stress at a temperature: linear between rows, constant outside.
+
+    ``table`` (rows, 3): temperature above reference [K] and both factors.
+    """
+    last = len(table) - 1
+    if not (temperature > table[0, 0]):  # NaN takes the first row
+        return table[0, 1], table[0, 2]
+    for k in range(last):
+        if temperature < table[k + 1, 0]:
+            share = (temperature - table[k, 0]) / (table[k + 1, 0] - table[k, 0])
+            modulus = table[k, 1] + share * (table[k + 1, 1] - table[k, 1])
+            return modulus, table[k, 2] + share * (table[k + 1, 2] - table[k, 2])
+    return table[last, 1], table[last, 2]
+
+
+@cache
+def softened(law: Law) -> Law:
+    """Return the law with p = (p of the law, table of factors); see :func:`factors`."""
+    response, mean_stress, interpolate = law.response, law.mean_stress, factors
+    scale, dissipated, n = law.softening.scale, law.softening.dissipated, len(law.internal)
+
+    @inlined
+    def at_temperature(strain, rate, step, temperature, p, q):
+        modulus, strength = interpolate(temperature, p[1])
+        return response(strain, rate, step, temperature, scale(p[0], modulus, strength), q)
+
+    @inlined
+    def accumulated(strain, rate, step, temperature, p, q):
+        modulus, strength = interpolate(temperature, p[1])
+        scaled = scale(p[0], modulus, strength)
+        before, kept = q[:n], q[n:]
+        stress, tangent, after, densities = response(strain, rate, step, temperature, scaled, before)
+        if after != before:
+            old, new = dissipated(scaled, before), dissipated(scaled, after)
+            kept = (kept[0] + (new[0] - old[0]), kept[1] + (new[1] - old[1]))
+        return stress, tangent, after + kept, (densities[0],) + kept
+
+    @inlined
+    def mean_at_temperature(stress0, strain0, strain, rate, step, temperature, p, q):
+        modulus, strength = interpolate(temperature, p[1])
+        return mean_stress(stress0, strain0, strain, rate, step, temperature, scale(p[0], modulus, strength), q)
+
+    def modulus(p: tuple, temperatures: np.ndarray) -> np.ndarray:
+        base, table = p
+        return base[0] * np.interp(temperatures, table[:, 0], table[:, 1])
+
+    elastic = not law.internal
+    return replace(
+        law,
+        response=at_temperature if dissipated is None else accumulated,
+        internal=law.internal if dissipated is None else (*law.internal, *DENSITIES),
+        smooth=False,
+        mean_stress=mean_at_temperature if elastic else None,
+        mean_correction=None,
+        mean_of_work=False,  # a change of the modulus changes energies too
+        no_mean_stress="" if elastic else _REASON,
+        modulus=modulus,
+    )
+
+
+DENSITIES = (("plastic_heat_density", "J/m³"), ("hardening_energy_density", "J/m³"))
+"""Internal variables of laws that accumulate their dissipation."""
+
+_REASON = (
+    "its stress yields at a temperature that changes within the step (softening), so its mean over a step, which this "
+    "scheme needs, has no closed form"
+)
+
+
+VARIABLES = (("viscous_dissipation_density", "J/m³"), ("viscous_stress", "Pa"), ("known_rate", "1/s"))
+"""Internal variables that follow those of the law."""
+
+EXTRAPOLATED = 1.5
+"""Factor of the mean rate over a step in the rate at its end, extrapolated from the last two steps."""
+
+
+@cache
+def damped(law: Law) -> Law:
+    """Return the law with p = (p of the law, E beta [Pa s], factor of the mean rate, data of the bar)."""
+    response, mean_stress, n, has_data = law.response, law.mean_stress, len(law.internal), bool(law.bar_data)
+
+    @inlined
+    def own(p):
+        return p[0] + p[3:] if has_data else p[0]
+
+    @inlined
+    def with_damping(strain, rate, step, temperature, p, q):
+        stress, tangent, after, densities = response(strain, rate, step, temperature, own(p), q[:n])
+        lost, viscous, known = q[n], 0.0, q[n + 2]
+        if step < math.inf:  # it is infinite in static analyses
+            viscous = p[1] * (p[2] * rate + known)
+            lost += p[1] * rate * rate * step
+        if step > 0.0:
+            tangent += p[1] * p[2] / step
+            known = (1.0 - p[2]) * rate
+        return stress + viscous, tangent, after + (lost, viscous, known), densities + (lost,)
+
+    @inlined
+    def mean_with_damping(stress0, strain0, strain, rate, step, temperature, p, q):
+        elastic = stress0 - q[n + 1]
+        mean, modulus = mean_stress(elastic, strain0, strain, rate, step, temperature, own(p), q[:n])
+        if step > 0.0:
+            modulus += p[1] / step
+        return mean + p[1] * rate, modulus
+
+    return replace(
+        law,
+        response=with_damping,
+        internal=(*law.internal, *VARIABLES),
+        energies=(*law.energies, "viscous_dissipation"),
+        rate=True,
+        mean_stress=None if mean_stress is None else mean_with_damping,
+        mean_correction=_of_own(law.mean_correction),
+        # energies are functions of strain and internal variables, unless the law itself depends on the rate
+        mean_of_work=law.mean_of_work or (not law.rate and law.modulus is None),
+        modulus=_of_own(law.modulus),
+        static_limit=law.static_limit or not law.rate,
+        known_rate=n + 2,
+    )
+
+
+def _of_own(function: Callable[..., Any] | None) -> Callable[..., Any] | None:
+    """Return a function of the parameters of the law as one of those of the damped law."""
+    return None if function is None else lambda p, *arguments: function(p[0], *arguments)
 
 
 class BarShapes(NamedTuple):
@@ -214,3 +353,29 @@ class Law:
         if scheme.discrete_gradient and self.mean_stress is None:
             return self.no_mean_stress or "it has no mean stress over a step (mean_stress), which this scheme needs"
         return None
+
+
+SMALL = 1e-6  # change of strain over strain, below which the quotient is rounding, and the trapezoidal rule is exact
+
+
+def mean_of_work(response: Callable[..., Any]) -> Callable[..., Any]:
+    """Return ``mean_stress`` of a law without rate: the change of all its energies over the change of strain.
+
+    The response must not depend on the steps in which a strain is reached: its energies are then the integral of the
+    stress over the strain.
+    """
+
+    @inlined
+    def mean_stress(stress0, strain0, strain, rate, step, temperature, p, q):
+        stress, tangent, _, after = response(strain, rate, step, temperature, p, q)
+        change = strain - strain0
+        if not abs(change) > SMALL * (abs(strain) + abs(strain0)):
+            return 0.5 * (stress0 + stress), 0.5 * tangent
+        _, _, _, before = response(strain0, 0.0, 0.0, temperature, p, q)
+        work = 0.0
+        for k in range(len(after)):
+            work += after[k] - before[k]
+        mean = work / change
+        return mean, (stress - mean) / change
+
+    return mean_stress

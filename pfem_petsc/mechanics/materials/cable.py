@@ -11,8 +11,7 @@ from typing import ClassVar
 from numba.extending import register_jitable
 
 from ...case.base import NonNegativeFloat, PositiveFloat
-from ._work import mean_of_work
-from .base import Law, MaterialKeys
+from .base import Law, MaterialKeys, mean_of_work
 
 __all__ = ["LAW", "Parameters", "response"]
 

@@ -9,8 +9,7 @@ from __future__ import annotations
 from numba.extending import register_jitable
 
 from ...case.base import NonNegativeFloat, PositiveFloat
-from ._work import mean_of_work
-from .base import Law, MaterialKeys
+from .base import Law, MaterialKeys, mean_of_work
 from .elastoplastic import response as elastoplastic
 
 __all__ = ["LAW", "Parameters", "response"]

@@ -14,8 +14,7 @@ import numpy as np
 from numba.extending import register_jitable
 
 from ...case.base import PositiveFloat
-from ._work import mean_of_work
-from .base import BarShapes, Law, MaterialKeys, UnsuitableBarError
+from .base import BarShapes, Law, MaterialKeys, UnsuitableBarError, mean_of_work
 
 __all__ = ["LAW", "Parameters", "response"]
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from numba.extending import register_jitable
 
-from ._softening import Softening
-from .base import Law
+from .base import Law, Softening
 from .base import MaterialKeys as Parameters
 
 __all__ = ["LAW", "Parameters"]

@@ -20,8 +20,7 @@ import numpy as np
 from numba.extending import register_jitable
 
 from ...case.base import NonNegativeFloat, PositiveFloat
-from ._softening import Softening
-from .base import Law, MaterialKeys
+from .base import Law, MaterialKeys, Softening
 
 __all__ = ["LAW", "Parameters", "mean_correction", "response"]
 

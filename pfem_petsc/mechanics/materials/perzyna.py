@@ -13,8 +13,7 @@ from pydantic import Field
 
 from ...case.base import PositiveFloat
 from ..compiled import inlined
-from ._hardening import HardeningKeys, scale, stored
-from ._viscous import viscous_law
+from ._viscous import HardeningKeys, scale, stored, viscous_law
 from .voce import curve
 
 __all__ = ["LAW", "Parameters", "flow_stress"]

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...tolerances import SINGULAR_PIVOT
-from ..gathered import Gathered
-from ..pencil import Pencil
+from ..pencil import Gathered, Pencil
 
 __all__ = ["Solver"]
 

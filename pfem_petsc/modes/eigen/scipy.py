@@ -9,8 +9,7 @@ import numpy as np
 from ...errors import SimulationFailure
 from ...parallel.agreement import on_root
 from ...tolerances import SINGULAR_PIVOT
-from ..gathered import Gathered
-from ..pencil import Pencil
+from ..pencil import Gathered, Pencil
 
 __all__ = ["Solver"]
 

@@ -1,0 +1,297 @@
+"""Motion of walls: prescribed displacements, and walls with mass that move under the contact forces."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from mpi4py import MPI
+
+from ..integrators.base import Balance, Scheme, State
+from ..mechanics.motion import motion_of
+
+if TYPE_CHECKING:
+    from .walls.base import WallKeys
+
+
+_ITERATIONS = 200
+_FULL_MOVES = 20  # Newton's method converges after a few active sets, or else alternates between some of them
+
+Answer = tuple[np.ndarray, np.ndarray | None]
+
+
+class FreeWalls:
+    """The walls of a case that have a mass; the same on all ranks.
+
+    Attributes
+    ----------
+    at : (f,) indices of these walls among all walls of the case
+    state : of the walls; x is the displacement from the initial position (f, 3)
+    weight : (f, 3) [N], zero where gravity does not act
+    """
+
+    def __init__(
+        self, walls: Sequence[WallKeys], scheme: Scheme, comm: MPI.Comm, gravity: tuple[float, float, float]
+    ) -> None:
+        self.at = np.array([k for k, wall in enumerate(walls) if wall.mass is not None], dtype=np.int64)
+        self.mass = np.array([walls[k].mass for k in self.at])
+        self.scheme, self.comm = scheme, comm
+        speeds = np.array([walls[k].velocity or (0.0, 0.0, 0.0) for k in self.at])
+        n = len(self.at)
+        heavy = np.array([walls[k].gravity for k in self.at], dtype=bool)
+        self.weight = np.where(heavy, self.mass, 0.0)[:, None] * np.array(gravity)
+        self.state = State(np.zeros((n, 3)), speeds, *(np.zeros((n, 3)) for _ in range(5)))
+        self._balance: Balance | None = None
+        self._u = np.zeros((n, 3))
+
+    def start(self, h: float) -> None:
+        """Initialise the acceleration and the scheme's memory."""
+        self.state.a = self.weight / self.mass[:, None]
+        self.scheme.start(self.state, h)
+
+    def begin(self, time: float, h: float) -> None:
+        """Set the balance of a step from ``time``; schemes that solve for the next position move the walls first."""
+        if self.scheme.solves_next_position and time > self.state.time:
+            self.scheme.advance(self.state, h)
+        self.state.time = time
+        self._balance = self.scheme.balance(self.state, h)
+
+    def finish(self, h: float, end: float) -> None:
+        """Complete the walls' state with the solution; ``end`` is the time of the truss then, to the last bit."""
+        self.scheme.finish(self.state, self._balance, self._u, h)
+        if not self.scheme.solves_next_position:
+            self.state.time = end
+
+    @property
+    def kinetic(self) -> float:
+        """Kinetic energy of the walls [J]."""
+        return 0.5 * float((self.mass[:, None] * self.state.v**2).sum())
+
+    @property
+    def balanced(self) -> np.ndarray:
+        """Return the accelerations (f, 3) of the last balance [m/s2]."""
+        known = 0.0 if self._balance.a_hat is None else self._balance.a_hat
+        return self._balance.alpha * self._u + known
+
+    def displacements(self, time: float) -> np.ndarray:
+        """Return displacements (f, 3) [m] at the state's time, or at the end of the step being solved."""
+        if self._balance is None or time == self.state.time:
+            return self.state.x
+        return self._balance.predictor + self._u
+
+    def unpushed(self) -> np.ndarray:
+        """Return displacements (f, 3) [m] at the end of the step being solved, without contact."""
+        balance = self._balance
+        known = 0.0 if balance.a_hat is None else balance.a_hat
+        return balance.predictor + (self.weight / self.mass[:, None] - known) / balance.alpha
+
+    def solve(self, forces: Callable[[], Answer], tolerance: float) -> bool:
+        """Solve for the walls' increments; return whether the iteration converged, equal on all ranks. Collective.
+
+        Parameters
+        ----------
+        forces : returns, for the current :meth:`displacements`, this rank's sums of the walls' forces on the truss
+            (f, 3) [N] and of their derivatives dF/du (f, 3, 3) [N/m], or None where these are not known
+        tolerance : of the walls' positions [m]
+        """
+        balance = self._balance
+        n = 3 * len(self.at)
+        weight = np.repeat(balance.alpha * self.mass, 3)
+        rest = -self.weight if balance.a_hat is None else self.mass[:, None] * balance.a_hat - self.weight
+        u = (-rest / (balance.alpha * self.mass[:, None])).ravel()
+        matrix, earlier = np.diag(weight), None
+
+        def evaluate(u: np.ndarray) -> tuple[np.ndarray, np.ndarray | None, np.ndarray]:
+            self._u = u.reshape(-1, 3)
+            force, slope = forces()
+            force = force.copy()
+            self.comm.Allreduce(MPI.IN_PLACE, force)
+            return force, slope, weight * u + rest.ravel() + force.ravel()
+
+        force, slope, residual = evaluate(u)
+        for iteration in range(_ITERATIONS):
+            if slope is not None:
+                slope = slope.copy()
+                self.comm.Allreduce(MPI.IN_PLACE, slope)
+                matrix = np.diag(weight)
+                for k in range(len(self.at)):
+                    matrix[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += slope[k]
+            elif earlier is not None:
+                # Broyden: the matrix nearest to the previous one that is consistent with the last move
+                du, dr = u - earlier[0], residual - earlier[1]
+                size = float(du @ du)
+                if size > 0.0:
+                    matrix = matrix + np.outer(dr - matrix @ du, du) / size
+            earlier = u, residual
+            move = np.linalg.solve(matrix, -residual) if n else np.zeros(0)
+            if np.abs(move).max(initial=0.0) <= tolerance:
+                break
+            u = u + move
+            force, slope, residual = evaluate(u)
+            start = -float(move @ earlier[1])
+            if iteration < _FULL_MOVES or start <= 0.0:
+                continue
+            # the active set changed within the move, where the slope no longer holds: bisect along the move
+            least, most, part = 0.0, 1.0, 1.0
+            size = np.abs(move).max()
+            while abs(along := float(move @ residual)) > 0.5 * start and not (along < 0.0 and part == 1.0):
+                least, most = (least, part) if along > 0.0 else (part, most)
+                if (most - least) * size <= tolerance:
+                    return False
+                part = 0.5 * (least + most)
+                u = earlier[0] + part * move
+                force, slope, residual = evaluate(u)
+        else:
+            return False
+        # the acceleration follows from the force and not from the position, so that momentum is conserved to rounding
+        self._u = (-force - rest) / (balance.alpha * self.mass[:, None])
+        return True
+
+    def step_changed(self, scheme: Scheme) -> None:
+        """Notify the scheme that the step size has changed."""
+        scheme.step_changed(self.state)
+
+    def kept(self) -> dict[str, Any]:
+        """Return the state for a checkpoint."""
+        state = self.state
+        memory = {name: array.tolist() for name, array in state.memory.items()}
+        return {
+            "x": state.x.tolist(),
+            "v": state.v.tolist(),
+            "a": state.a.tolist(),
+            "time": state.time,
+            "memory": memory,
+            "increment": self._u.tolist(),
+        }
+
+    def load_state(self, kept: dict[str, Any]) -> None:
+        """Restore the state from a checkpoint."""
+        shape = self.state.x.shape
+        for name in ("x", "v", "a"):
+            setattr(self.state, name, np.array(kept[name], dtype=float).reshape(shape))
+        self.state.time = kept["time"]
+        self._u = np.array(kept["increment"], dtype=float).reshape(shape)
+        for name, array in kept["memory"].items():
+            self.state.memory[name] = np.array(array, dtype=float).reshape(shape)
+
+
+class NoFreeWalls:
+    """Null object for :class:`FreeWalls` if no wall has mass."""
+
+    def __init__(self) -> None:
+        self.at = np.empty(0, dtype=np.int64)
+        self.mass = np.zeros(0)
+        self.weight = self.balanced = np.zeros((0, 3))
+        self.state = State(*(np.zeros((0, 3)) for _ in range(7)))
+        self.kinetic = 0.0
+
+    def start(self, h: float) -> None:
+        """Do nothing."""
+
+    def begin(self, time: float, h: float) -> None:
+        """Do nothing."""
+
+    def finish(self, h: float, end: float) -> None:
+        """Nothing moves."""
+
+    def step_changed(self, scheme: Scheme) -> None:
+        """Do nothing."""
+
+    def displacements(self, time: float) -> np.ndarray:
+        """Return no displacements, (0, 3)."""
+        return self.state.x
+
+    def solve(self, forces: Callable[[], Answer], tolerance: float) -> bool:
+        """Evaluate the forces once; return True."""
+        forces()
+        return True
+
+    def kept(self) -> None:
+        """Return None: a checkpoint needs nothing."""
+
+    def load_state(self, kept: None) -> None:
+        """Do nothing."""
+
+
+class WallMotion:
+    """Displacements of all walls of a case.
+
+    Attributes
+    ----------
+    moving : (w,) bool, walls that move
+    bodies : FreeWalls, the walls with mass; NoFreeWalls if there are none
+    held : (w, 3) displacements at the start of a stage [m] of walls that stay in force and rest there
+    """
+
+    def __init__(self, walls: Sequence[WallKeys], holds: bool = False) -> None:
+        self._motions = [None if holds else motion_of(wall) for wall in walls]
+        self.held = np.zeros((len(walls), 3))
+        self.bodies: FreeWalls | NoFreeWalls = NoFreeWalls()
+        self.moving = np.array(
+            [wall.velocity is not None or wall.motion is not None or wall.mass is not None for wall in walls],
+            dtype=bool,
+        )
+
+    @property
+    def free(self) -> FreeWalls | None:
+        """The walls with mass, None if there are none."""
+        return self.bodies if len(self.bodies.at) else None
+
+    @property
+    def speeds(self) -> np.ndarray:
+        """Velocities (f, 3) [m/s] of walls with mass; (0, 3) if there are none."""
+        return self.bodies.state.v
+
+    def set_speeds(self, v: np.ndarray) -> None:
+        """Set the velocities (f, 3) [m/s] of walls with mass."""
+        self.bodies.state.v = v
+
+    def start(self, h: float) -> None:
+        """Initialise the state of walls with mass for steps of ``h`` [s]."""
+        self.bodies.start(h)
+
+    def begin(self, time: float, h: float) -> None:
+        """Begin a step of ``h`` from ``time`` [s] for walls with mass."""
+        self.bodies.begin(time, h)
+
+    def finish(self, h: float, end: float) -> None:
+        """Complete the state of walls with mass after a step of ``h`` to the time ``end`` [s]."""
+        self.bodies.finish(h, end)
+
+    def step_changed(self, scheme: Scheme) -> None:
+        """Notify the scheme of the walls with mass that the step size has changed."""
+        self.bodies.step_changed(scheme)
+
+    def kept(self) -> dict[str, Any] | None:
+        """Return the state for a checkpoint, None if no wall has mass."""
+        return self.bodies.kept()
+
+    def load_state(self, kept: dict[str, Any] | None) -> None:
+        """Restore walls with mass from a checkpoint."""
+        self.bodies.load_state(kept)
+
+    def displacements(self, time: float) -> np.ndarray:
+        """Return displacements (w, 3) [m] at a time [s]."""
+        displacements = self.held.copy()
+        for k, motion in enumerate(self._motions):
+            if motion is not None:
+                displacements[k] = motion.at(time)[0]
+        displacements[self.bodies.at] = self.bodies.displacements(time)
+        return displacements
+
+    def rates(self, time: float, ahead: bool = False) -> np.ndarray:
+        """Return velocities (w, 3) [m/s] at a time [s]; at the kinks of a linear table the left limit, or the right one
+        if ``ahead``."""
+        rates = np.zeros((len(self._motions), 3))
+        for k, motion in enumerate(self._motions):
+            if motion is not None:
+                rates[k] = motion.at(time, ahead=ahead)[1]
+        rates[self.bodies.at] = self.bodies.state.v
+        return rates
+
+    def accelerations(self, time: float) -> np.ndarray:
+        """Return accelerations (w, 3) [m/s2] of walls with prescribed motion at a time [s]; zero for others."""
+        nothing = np.zeros((3, 3))
+        moved = [nothing if motion is None else motion.at(time) for motion in self._motions]
+        return np.array([each[2] for each in moved]).reshape(-1, 3)

@@ -1,0 +1,456 @@
+"""Observers act after steps: history, snapshots, checkpoints, events, ruptures and progress of a run."""
+
+from __future__ import annotations
+
+import sys
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..analysis import Analysis, Step
+from ..contact.monitoring import Piercing, check_positions
+from ..output.history import Row
+from ..output.progress import Progress
+from ..output.sums import HEAD
+from ..output.vtkhdf import ResultWriter
+from ..restart.checkpoints import Checkpoints
+from ..stepping.bar_events import MOST_TOLD, Break
+from ..stepping.ledger import make_ledger
+from .monitors import BlowUp, ContactWatch, Doubts, NoContactWatch
+from .recorder import Fields, Recorder, StageColumns, StageRows, carried_sums
+
+if TYPE_CHECKING:
+    from ..run.synchroniser import Synchroniser
+    from ..stepping.plan import Plan
+    from ..stepping.stepper import Stepper
+
+
+NEVER = sys.maxsize
+"""Number of steps before an event that never occurs."""
+
+
+class Observer(ABC):
+    """Acts after some steps. All methods are collective, and their results are the same on all ranks.
+
+    Attributes
+    ----------
+    every : due after steps whose number is a multiple of it; 0: never
+    needs_agreement : whether the ranks must agree first that none of them has a fault
+    """
+
+    every: int = 0
+    needs_agreement: bool = False
+
+    def due(self, step: int) -> bool:
+        """Return whether the observer acts after this step."""
+        return bool(self.every) and step % self.every == 0
+
+    def steps_left(self, step: int) -> int:
+        """Return the number of steps until it must act again; these may be fused into one compiled call."""
+        return self.every - step % self.every if self.every else NEVER
+
+    @abstractmethod
+    def observe(self, made: Step) -> None:
+        """Act after a step."""
+
+    def complete(self) -> None:
+        """Act after the last step of the run, unless this has been done."""
+
+    def remarks(self) -> list[str]:
+        """Return remarks for the user at the end of the run."""
+        return []
+
+
+class Callback(Observer):
+    """Calls a function with the finished step."""
+
+    def __init__(self, function: Callable[[Step], object], every: int) -> None:
+        self._function, self.every = function, every
+
+    def observe(self, made: Step) -> None:
+        """Call the function."""
+        self._function(made)
+
+
+class History(Observer):
+    """Records and checks rows. Construction is collective, after the start of the stepper.
+
+    The reduction that computes a row also communicates a fault on any rank.
+
+    Parameters
+    ----------
+    stepper : Stepper
+    plan : Plan
+    synchroniser : Synchroniser
+    warn : receives a warning
+    columns : of all stages of the case, None for a case without stages
+
+    Attributes
+    ----------
+    columns, types : of the rows
+    row : the last row
+    writer : of the result file
+    """
+
+    def __init__(
+        self,
+        stepper: Stepper,
+        plan: Plan,
+        synchroniser: Synchroniser,
+        warn: Callable[[str], None],
+        columns: StageColumns | None = None,
+    ) -> None:
+        model = stepper.model
+        self.every = model.case.output.history_every
+        self._stepper, self._synchroniser, self._model = stepper, synchroniser, model
+        self.ledger = make_ledger(stepper)
+        self.recorder = Recorder(stepper, self.ledger)
+        inertial = stepper.scheme.inertial
+        self.blow_up = BlowUp(model, inertial)
+        self.contact_watch = ContactWatch(model, warn, plan) if inertial else NoContactWatch()
+        self.row: dict[str, Any] | None = None
+        self.writer: ResultWriter | None = None
+        stepper.booking, stepper.bars_removed = self._book, self.ledger.follow_removal
+        self.rows = None if columns is None else StageRows(columns, model.case.number, self.recorder.layout)
+        self.columns, self.types = (columns or self.recorder).columns, (columns or self.recorder).types
+
+    def end_of_stage(self) -> Row:
+        """Return the row of the present state, not recorded, in the columns of all stages. Collective."""
+        return self.rows.fill(self.recorder.row())
+
+    def go_on(self, earlier: History, last: Row, kick: tuple[float, np.ndarray]) -> None:
+        """Begin a stage after the one that has ended, whose rows these continue. Collective.
+
+        ``last``: row of its end; ``kick``: work [J] and momentum (3,) [N s] of the velocities that the stage adds.
+        """
+        recorder, before = self.recorder, earlier.recorder
+        recorder.carried = carried_sums(recorder, last, kick)
+        recorder.start_energy, recorder.energy_scale = before.start_energy, before.energy_scale
+        self.rows.begin(last)
+        self.row, self.writer = last, earlier.writer
+        first = self.rows.fill(recorder.row())
+        self.blow_up.check(first, self._stepper.state)
+        self.contact_watch.check(first)
+
+    def stage(self) -> dict[str, Any] | None:
+        """What a checkpoint must hold of the stages before; None for a case without stages."""
+        if self.rows is None:
+            return None
+        carried = self.recorder.carried
+        return {
+            "carried": None if carried is None else carried.tolist(),
+            "rest": self.rows.rest.tolist(),
+            "watch": self.contact_watch.start,
+        }
+
+    def load_stage(self, kept: dict[str, Any]) -> None:
+        """Take what :meth:`stage` gave."""
+        self.recorder.carried = None if kept["carried"] is None else np.array(kept["carried"])
+        self.rows.rest[:] = kept["rest"]
+        self.contact_watch.start = kept["watch"]
+
+    def _book(self) -> None:
+        """Add energies and iterations of a step, or of each part of a bisected step."""
+        self.ledger.update()
+        self.recorder.count(self._stepper.solution.newton, self._stepper.solution.linear)
+
+    def steps_left(self, step: int) -> int:
+        """Return no limit: rows of fused steps are passed to :meth:`take`."""
+        return NEVER
+
+    def observe(self, made: Step) -> None:
+        """Record a row."""
+        self.record()
+
+    def record(self) -> None:
+        """Record a row, unless a rank has a fault, which is raised on all ranks."""
+        row = self.recorder.row(alarm=self._synchroniser.alarm)
+        if self.recorder.alarmed:
+            self._synchroniser.synchronise()
+        self.take(row)
+
+    def take_sums(self, sums: np.ndarray) -> bool:
+        """Take the row of this rank's sums (width,) at the state's step and time, unless a rank has a fault; return
+        whether none has. Collective."""
+        total = self.recorder.total(sums)
+        if self._model.comm.size > 1 and total[HEAD.first("alarm")] > 0.0:
+            return False
+        self.take(self.recorder.row_of(total))
+        return True
+
+    def take(self, row: Row) -> None:
+        """Check a row, store it and add it to the history."""
+        if self.rows is not None:
+            row = self.rows.fill(row)
+        self.blow_up.check(row, self._stepper.state)
+        self.contact_watch.check(row)
+        self.row = row
+        self.writer.append_history(row if self._model.comm.rank == 0 else None)
+
+    def complete(self) -> None:
+        """Record the row of the last step."""
+        if self.row["step"] != self._stepper.number:
+            self.record()
+
+    @property
+    def drift(self) -> float | None:
+        """Energy imbalance of the last row relative to the largest energy so far; None without energy."""
+        scale = self.recorder.energy_scale
+        return self.row["energy_imbalance"] / scale if scale > 0.0 else None
+
+    def remarks(self) -> list[str]:
+        """Return remarks about walls and pairs without contact, which may be unintended."""
+        contact = self._model.contact
+        times = contact.log.times(self._model.comm)
+        touched = np.array(times["sum"]) > 0.0
+        for flags in times["flags"]:
+            touched |= np.array(flags, dtype=bool)
+        names = np.array(contact.names, dtype=object)[~touched]
+        # impulses are those of inertial schemes, and of several stages together
+        known = self._stepper.scheme.inertial and self.rows is None
+        pairs = [pair.name for pair in self._model.case.contact_pair if known and not self._pressed(pair.name)]
+        return [
+            *(f"wall {name!r} was never touched by a node" for name in names),
+            *(f"contact pair {name!r} never carried a force" for name in pairs),
+        ]
+
+    def _pressed(self, name: str) -> bool:
+        """Return whether a pair has had a force: its forces have one direction, so that their impulses add up."""
+        return any(bool(np.any(self.row[f"pair/{name}/{kind}"])) for kind in ("impulse", "jump_impulse"))
+
+
+class Snapshots(Observer):
+    """Writes snapshots, including the start and the end of a run. Construction is collective.
+
+    Parameters
+    ----------
+    analysis : Analysis
+    fields : Fields
+    warn : receives a warning
+
+    Attributes
+    ----------
+    last : step of the last snapshot, -1 before the first
+    writer : of the result file
+    """
+
+    needs_agreement = True
+
+    def __init__(self, analysis: Analysis, fields: Fields, warn: Callable[[str], None]) -> None:
+        stepper = analysis.stepper
+        self.every = stepper.model.case.output.fields_every
+        self._analysis, self._stepper, self._fields, self._warn = analysis, stepper, fields, warn
+        self._piercing = Piercing(stepper.model)
+        self._doubts = Doubts(stepper.model, warn)
+        self.last = -1
+        self.writer: ResultWriter | None = None
+
+    def observe(self, made: Step) -> None:
+        """Write a snapshot."""
+        self.write()
+
+    def write(self) -> None:
+        """Check the nodes against the walls, then write a snapshot of the present state."""
+        state, fields = self._stepper.state, self._fields
+        if not self.every and 0 < state.step < self._analysis.last_step:
+            return
+        check_positions(self._stepper)
+        at_nodes = fields.at_nodes(state, self._stepper.acceleration)
+        number, place = self._stepper.number, self._stepper.place
+        self.writer.write_snapshot(place, number, state.position, at_nodes, fields.at_bars(state))
+        self.last = number
+        for text in self._piercing.look(state.x, state.time):
+            self._warn(text)
+        at = f"step {number}, {self._analysis.plan.axis.exact(place)}"
+        self._doubts.look(state.x, at, last=state.step >= self._analysis.last_step)
+
+    def kept(self) -> dict[str, Any]:
+        """Return what a restart and the next stage go on with: the step of the last snapshot, and counts."""
+        return {"snapshot": self.last, "doubts": self._doubts.kept()}
+
+    def load_state(self, kept: Mapping[str, Any]) -> None:
+        """Go on with what :meth:`kept` returned."""
+        self.last = int(kept["snapshot"])
+        self._doubts.load_state(kept.get("doubts", {}))
+
+    def complete(self) -> None:
+        """Write the snapshot of the last step."""
+        if self.last != self._stepper.number:
+            self.write()
+
+    def doubts(self) -> list[str]:
+        """Return what the model could not represent, for the end of the run."""
+        return self._doubts.summary()
+
+    def remarks(self) -> list[str]:
+        """Return remarks about bars across walls."""
+        return self._piercing.summary()
+
+
+class Checkpointing(Observer):
+    """Writes checkpoints at intervals of steps, and when the ranks agree that one is due by wall-clock time.
+
+    Parameters
+    ----------
+    checkpoints : Checkpoints
+    history, snapshots : from which a restart continues
+    synchroniser : Synchroniser
+    """
+
+    needs_agreement = True
+
+    def __init__(
+        self, checkpoints: Checkpoints, history: History, snapshots: Snapshots, synchroniser: Synchroniser
+    ) -> None:
+        self.every = checkpoints.case.output.checkpoint_every
+        self._checkpoints, self._history, self._snapshots = checkpoints, history, snapshots
+        self._synchroniser = synchroniser
+
+    @property
+    def last_step(self) -> int:
+        """Step of the last one."""
+        return self._checkpoints.last_step
+
+    @property
+    def at_end(self) -> bool:
+        """Whether :meth:`complete` writes one."""
+        return self._checkpoints.wanted
+
+    def due(self, step: int) -> bool:
+        """Return whether a checkpoint is due by the number of the step or by wall-clock time."""
+        return super().due(step) or self._synchroniser.checkpoint_due
+
+    def observe(self, made: Step) -> None:
+        """Write a checkpoint."""
+        self.write()
+
+    def write(self) -> None:
+        """Flush the results, from which a restart continues, then write a checkpoint."""
+        history = self._history
+        history.writer.flush_history()
+        sums = history.ledger, history.recorder, history.blow_up
+        self._checkpoints.write(*sums, history.row, self._snapshots.kept(), history.stage())
+        self._synchroniser.checkpoint_written()
+
+    def complete(self) -> None:
+        """Write the checkpoint of the last step, if the case requests checkpoints."""
+        if self._checkpoints.wanted:
+            self.write()
+
+
+class ProgressReport(Observer):
+    """Reports each step to the progress bar, or to the lines that replace it."""
+
+    every = 1
+
+    def __init__(self, progress: Progress, analysis: Analysis, history: History) -> None:
+        self._progress, self._analysis, self._history = progress, analysis, history
+
+    def steps_left(self, step: int) -> int:
+        """Return no limit: the last of fused steps is reported."""
+        return NEVER
+
+    def observe(self, made: Step) -> None:
+        """Report a step."""
+        history = self._history
+        contacts = history.row["active_contacts"]
+        self._progress.update(
+            made.step, made.time, self._analysis.step_size, made.newton, made.linear, contacts, history.drift
+        )
+
+
+class Events(Observer):
+    """Records the ``events`` that a stepper found before its last state, the same on all ranks.
+
+    Parameters
+    ----------
+    stepper : Stepper
+    tell : receives a message
+
+    Attributes
+    ----------
+    writer : of the result file
+    """
+
+    def __init__(self, stepper: Stepper, tell: Callable[[str], None]) -> None:
+        self._stepper, self._tell = stepper, tell
+        self._root = stepper.model.comm.rank == 0
+        self.writer: ResultWriter | None = None
+
+    def due(self, step: int) -> bool:
+        """Return whether the step has events."""
+        return bool(self._stepper.events)
+
+    def steps_left(self, step: int) -> int:
+        """Return no limit: steppers with events make single steps."""
+        return NEVER
+
+    def observe(self, made: Step) -> None:
+        """Record and report the events."""
+        events, self._stepper.events = self._stepper.events, []
+        for event in events:
+            self.writer.append_event(event.row() if self._root else None)
+            self._tell(str(event))
+
+    def remarks(self) -> list[str]:
+        """Return a remark about the end of the analysis, if it is not known in advance."""
+        return self._stepper.remarks()
+
+
+class RuptureReport(Observer):
+    """Gathers what the ranks know about broken bars when a row of the history shows that there are more of them.
+
+    Parameters
+    ----------
+    stepper : Stepper
+    history : History, whose rows count the broken bars of all ranks
+    tell : receives a message
+    """
+
+    def __init__(self, stepper: Stepper, history: History, tell: Callable[[str], None]) -> None:
+        self._stepper, self._history, self._tell = stepper, history, tell
+        self._comm = stepper.model.comm
+        self._reported = 0  # texts of this stage
+        self._start = self._told = self._comm.allreduce(stepper.ruptures.told) if stepper.model.bars.can_break else 0
+
+    @property
+    def _broken(self) -> int:
+        row = self._history.row
+        return int(row["broken_bars"]) if row is not None and "broken_bars" in row else self._told
+
+    def due(self, step: int) -> bool:
+        """Return whether more bars are broken in the last row than have been reported; the same on all ranks."""
+        return self._broken > self._told
+
+    def steps_left(self, step: int) -> int:
+        """Return no limit: the fused loop stops where bars break."""
+        return NEVER
+
+    def observe(self, made: Step) -> None:
+        """Report the bars that broke."""
+        self.complete()
+
+    def complete(self) -> None:
+        """Report the bars of the last row."""
+        if not self.due(0):
+            return
+        self._told = self._broken
+        parts = self._comm.allgather(self._stepper.ruptures.take())
+        for each in self._first(sorted(part for share in parts for part in share)):
+            self._tell(each.text)
+
+    def _first(self, breaks: list[Break]) -> list[Break]:
+        chosen = breaks[: max(MOST_TOLD - self._reported, 0)]
+        self._reported += len(chosen)
+        return chosen
+
+    def remarks(self) -> list[str]:
+        """Return how many bars have broken in the stage."""
+        count = self._told - self._start
+        if not count:
+            return []
+        listed = f"; the first {self._reported} are listed above" if count > self._reported else ""
+        total = self._stepper.model.mesh.n_bars
+        return [f"{count:,} of {total:,} bars broke{listed}"]

@@ -21,10 +21,9 @@ from .output.lock import FolderLock
 from .parallel.agreement import on_root
 from .parallel.heap import returning_freed_memory
 from .parallel.petsc_log import instrument, staged
-from .preflight.forecast import forecast
+from .preflight.forecast import forecast, summarise
 from .preflight.inspection import inspect, warnings_before
-from .preflight.sanity import odd_accelerations
-from .preflight.summary import summarise
+from .preflight.values import odd_accelerations
 from .recording.recorder import Recorder
 from .restart.checkpoints import Restart, find_restart, finished, finished_message
 from .run.loop import RunLoop

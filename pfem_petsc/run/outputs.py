@@ -19,9 +19,9 @@ from ..output.progress import Progress
 from ..output.units import MODE
 from ..output.vtkhdf import ResultWriter
 from ..parallel.agreement import on_root
+from ..preflight.forecast import summarise
 from ..preflight.inspection import warnings_before
-from ..preflight.sanity import odd_accelerations
-from ..preflight.summary import summarise
+from ..preflight.values import odd_accelerations
 from ..recording.observers import (
     Callback,
     Checkpointing,

@@ -7,14 +7,13 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import numpy as np
+from mpi4py import MPI
 
 from ..output.units import engineering
 
 if TYPE_CHECKING:
     from ..case.schema import Case
     from ..stepping.model import Model
-
-__all__ = ["far_points", "odd_accelerations", "odd_numbers"]
 
 _SLENDER = 1e4
 """Length over thickness of a bar beyond which one of the two is mostly in another unit: a cable of 100 m and 1 cm."""
@@ -35,7 +34,12 @@ _HINT = "case files are in SI units (m, kg, s, N, Pa)"
 
 def odd_numbers(case: Case, model: Model) -> list[str]:
     """Return one message for each suspicious value: key, value, reason. Collective."""
-    texts = [*_materials(case), *_sections(case), *_mesh(case, model), *_slender(case, model), *_weightless(case)]
+    texts = [*_materials(case), *_sections(case), *_mesh(model), *_slender(case, model)]
+    texts += [
+        f"wall {wall.name!r}: gravity = true, but the case has no [gravity], so none acts on it"
+        for wall in case.wall
+        if wall.gravity and case.gravity is None
+    ]
     texts += [
         f"node_set.{name}.nearest: {text}, more than the size of the truss"
         for name, text in _distant(case, model, model.length)
@@ -48,19 +52,17 @@ def odd_accelerations(case: Case) -> list[str]:
     texts = []
     for k, stage in enumerate(case.stages):
         where = f"stage[{k}]." if case.stage and k > 0 else ""  # tables at the top belong to the first stage
-        tables = [(f"support[{n}].acceleration", entry.acceleration) for n, entry in enumerate(stage.support)]
+        given = {f"support[{n}]": entry.acceleration for n, entry in enumerate(stage.support)}
         if stage.gravity is not None:
-            tables.append(("gravity.acceleration", stage.gravity.acceleration))
-        for key, given in tables:
-            table = key.split("[")[0].split(".")[0]
-            if given is None or (k > 0 and stage.holds(table)):
+            given["gravity"] = stage.gravity.acceleration
+        for table, rows in given.items():
+            if rows is None or (k > 0 and stage.holds(table.split("[")[0])):
                 continue
-            rows = np.atleast_2d(np.array(given, dtype=float))
-            peak = float(np.abs(rows[:, -3:]).max(initial=0.0))
+            peak = float(np.abs(np.atleast_2d(np.array(rows, dtype=float))[:, -3:]).max(initial=0.0))
             if peak > _STRONGEST:
                 texts.append(
-                    f"{case.source}: {where}{key} reaches {peak:.4g} m/s2, {peak / 9.80665:.3g} g: a record in cm/s2 "
-                    "needs scale = 0.01, lengths in mm 0.001"
+                    f"{case.source}: {where}{table}.acceleration reaches {peak:.4g} m/s2, {peak / 9.80665:.3g} g: a "
+                    "record in cm/s2 needs scale = 0.01, lengths in mm 0.001"
                 )
     return texts
 
@@ -79,11 +81,10 @@ def _materials(case: Case) -> Iterator[str]:
         if material.softening is not None and not case.temperature:
             yield f"{key}.softening: without a [[temperature]] its factors are those of the reference temperature"
         yield from material.suspicions(key, _HINT)
-        strengths = [(f"{key}.{name}", getattr(material, name, None)) for name in _STRENGTHS]
-        limits = material.rupture
-        if limits is not None:
-            strengths += [(f"{key}.rupture.{name}", getattr(limits, name)) for name in ("stress", "compressive_stress")]
-        for name, stress in strengths:
+        strengths = {f"{key}.{name}": getattr(material, name, None) for name in _STRENGTHS}
+        for name in ("stress", "compressive_stress"):
+            strengths[f"{key}.rupture.{name}"] = getattr(material.rupture, name, None)
+        for name, stress in strengths.items():
             if stress is not None and stress < _LEAST * material.young_modulus:
                 strain = stress / material.young_modulus
                 yield f"{name} = {stress:g} Pa is reached at a strain of {strain:.3g}; 220 MPa are 220e6; {_HINT}"
@@ -94,21 +95,14 @@ def _sections(case: Case) -> Iterator[str]:
         if section.area is not None and not 1e-18 <= section.area <= 10.0:
             yield f"section.{name}.area = {section.area:g} m2: no bar has that; 1 mm2 is 1e-6 m2"
         young = case.material[section.material].young_modulus
-        stiffness = {"prestress": young, "pretension": None if section.area is None else young * section.area}
-        for key, unit in (("prestress", "Pa"), ("pretension", "N")):
+        stiffness = None if section.area is None else young * section.area
+        for key, unit, hard in (("prestress", "Pa", young), ("pretension", "N", stiffness)):
             given = getattr(section, key)
-            if given is None or stiffness[key] is None:
+            if given is None or hard is None:
                 continue
             value = float(np.abs(np.atleast_2d(np.array(given, dtype=float))[:, -1]).max())
-            strain = value / stiffness[key]
-            if value and not _PRESTRAINS[0] <= strain <= _PRESTRAINS[1]:
-                yield f"section.{name}.{key} reaches {value:g} {unit}, a strain of {strain:.3g}; {_HINT}"
-
-
-def _weightless(case: Case) -> Iterator[str]:
-    for wall in case.wall:
-        if wall.gravity and case.gravity is None:
-            yield f"wall {wall.name!r}: gravity = true, but the case has no [gravity], so none acts on it"
+            if value and not _PRESTRAINS[0] <= value / hard <= _PRESTRAINS[1]:
+                yield f"section.{name}.{key} reaches {value:g} {unit}, a strain of {value / hard:.3g}; {_HINT}"
 
 
 def _slender(case: Case, model: Model) -> Iterator[str]:
@@ -133,33 +127,34 @@ def _slender(case: Case, model: Model) -> Iterator[str]:
 
 def far_points(case: Case, model: Model) -> dict[str, str]:
     """Label and text of node sets whose nearest node is far from the point. Collective."""
-    longest = max(model.comm.allgather(float(model.bars.mesh_lengths.max(initial=0.0))))
-    return {
-        f"node set {name}": f"{text}, more than the length of the longest bar"
-        for name, text in _distant(case, model, longest)
-    }
+    longest = model.comm.allreduce(float(model.bars.mesh_lengths.max(initial=0.0)), op=MPI.MAX)
+    far = _distant(case, model, longest)
+    return {f"node set {name}": f"{text}, more than the length of the longest bar" for name, text in far}
 
 
 def _distant(case: Case, model: Model, most: float) -> Iterator[tuple[str, str]]:
     """Name and text of node sets whose nearest node is farther from the point than ``most`` [m]."""
-    mesh, comm = model.mesh, model.comm
-    points = mesh.points[: mesh.n_owned]
+    mesh = model.mesh
     for name, node_set in case.node_set.items():
-        if node_set.nearest is None:
-            continue
-        away = np.linalg.norm(points - np.array(node_set.nearest), axis=1)
-        mine = int(away.argmin()) if len(away) else -1
-        here = (float(away[mine]), int(mesh.node_ids[mine])) if mine >= 0 else (np.inf, -1)
-        distance, node = min(comm.allgather(here))
-        if distance > most:
-            yield name, f"the nearest node is node {node}, {engineering(distance, 'm')} away from the point"
+        if node_set.nearest is not None:
+            away = np.linalg.norm(mesh.points[: mesh.n_owned] - np.array(node_set.nearest), axis=1)
+            distance, node = _extreme(model, -away)
+            if -distance > most:
+                yield name, f"the nearest node is node {node}, {engineering(-distance, 'm')} away from the point"
 
 
-def _mesh(case: Case, model: Model) -> Iterator[str]:
-    mesh, comm = model.mesh, model.comm
+def _extreme(model: Model, values: np.ndarray) -> tuple[float, int]:
+    """Return the largest of the values (owned,) of nodes, and the lowest mesh number of a node with it. Collective."""
+    at = int(values.argmax()) if len(values) else -1
+    mine = (-float(values[at]), int(model.mesh.node_ids[at])) if at >= 0 else (np.inf, -1)
+    least, node = min(model.comm.allgather(mine))
+    return -least, node
+
+
+def _mesh(model: Model) -> Iterator[str]:
     rest = model.bars.mesh_lengths
-    longest = max(comm.allgather(float(rest.max(initial=0.0))))
-    shortest = min(comm.allgather(float(rest.min(initial=np.inf))))
+    longest = model.comm.allreduce(float(rest.max(initial=0.0)), op=MPI.MAX)
+    shortest = model.comm.allreduce(float(rest.min(initial=np.inf)), op=MPI.MIN)
     if longest > 1e5 or shortest < 1e-9:
         yield (
             f"the bars are {engineering(shortest, 'm')} to {engineering(longest, 'm')} long, the truss "
@@ -170,11 +165,8 @@ def _mesh(case: Case, model: Model) -> Iterator[str]:
             f"the truss is {engineering(model.length, 'm')} in size and {engineering(model.reach, 'm')} away from the "
             "origin: strains lose accuracy by this ratio; move it to the origin"
         )
-    v = model.initial_velocity()
     with np.errstate(over="ignore"):  # reported below
-        speed = np.linalg.norm(v, axis=1)
-    mine = (float(speed.max()), int(mesh.node_ids[int(speed.argmax())])) if len(speed) else (0.0, -1)
-    fastest, node = max(comm.allgather(mine))
+        fastest, node = _extreme(model, np.linalg.norm(model.initial_velocity(), axis=1))
     if fastest > model.wave_speed:
         yield (
             f"node {node} starts at {engineering(fastest, 'm/s')}, faster than waves in the bars "

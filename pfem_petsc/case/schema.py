@@ -407,7 +407,8 @@ def _validated(
         problems.add((), "[time] and [static] exclude each other: give one of them")
     if not any(key in data for key in (*ANALYSES, "stage", "modes")):
         problems.add((), "the table [time] is missing, or one of [static], [[stage]], [modes], which give the analysis")
-    known = {key: value for key, value in data.items() if key in KEYS and (value is not None or key == "stage")}
+    # [[stage]] is checked by stages_of
+    known = {key: value for key, value in data.items() if key in KEYS and value is not None and key != "stage"}
     return problems.validated(CaseModel, known, reading, place)
 
 

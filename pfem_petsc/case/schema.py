@@ -241,7 +241,7 @@ class Case(_Tables):
         try:
             data = plain(data)
             if mesh is not None:
-                data["mesh"] = _with_arrays(data.get("mesh"), mesh)
+                data["mesh"] = _with_arrays(data.get("mesh"), plain(mesh))
         except RecursionError as error:
             raise InputError(f"{source}: this is not a case: its lists or tables are nested too deep") from error
         overrides, folder = tuple(overrides), Path(folder)

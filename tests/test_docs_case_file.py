@@ -15,8 +15,8 @@ from pfem_petsc.case.files import TableFile
 from pfem_petsc.case.model import ANALYSES, STAGE_TABLES
 from pfem_petsc.case.schema import Case
 from pfem_petsc.case.tables import Rupture
+from pfem_petsc.formats import read_whole
 from pfem_petsc.mechanics.materials.base import LAWS
-from pfem_petsc.mesh.readers.gmsh import read
 from pfem_petsc.registry import choices, lookup
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -72,7 +72,7 @@ def test_every_key_of_walls_is_named():
 def test_example_is_read(tmp_path):
     case = Case.from_toml(re.search(r"^```toml\n(.*?)^```$", TEXT, flags=re.MULTILINE | re.DOTALL)[1], tmp_path)
     assert [load.force for load in case.load] == [(0.0, 0.0, -5e4)]
-    mesh = read(DOCS.parent / "meshes" / case.mesh.file.name)
+    mesh = read_whole(DOCS.parent / "meshes" / case.mesh.file.name)
     assert {"left", "right"} <= set(mesh.node_groups)
     assert {"chords"} <= set(mesh.bar_groups)
     assert case.temperature[0].bars == case.section["chord"].bars == "chords"

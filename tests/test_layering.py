@@ -47,6 +47,9 @@ other. A module of a folder that is not on its floor is named ``folder.module``.
 LATER = {("output/result.py", "case")}
 """Imports that may climb: a result reads its case when it is asked for."""
 
+PARTS = {"formats": "mesh"}
+"""Folders that are parts of another one: a mesh may come from a file, and what is in a file is a mesh."""
+
 FLOOR = {name: number for number, names in enumerate(FLOORS) for name in names}
 
 
@@ -88,6 +91,7 @@ def floor_name(target: tuple[str, ...], package: Path) -> str:
     if ".".join(target[:2]) in FLOOR:
         return ".".join(target[:2])
     top = target[0] if target else "__init__"
+    top = PARTS.get(top, top)
     return top if (package / top).is_dir() or (package / f"{top}.py").exists() else "__init__"
 
 
@@ -114,7 +118,7 @@ def test_no_import_climbs():
 
 def test_every_floor_exists():
     names = {path.stem for path in PACKAGE.iterdir() if path.suffix == ".py" or (path / "__init__.py").exists()}
-    assert names == {name for name in FLOOR if "." not in name}
+    assert names == {name for name in (*FLOOR, *PARTS) if "." not in name}
     assert all((PACKAGE / f"{name.replace('.', '/')}.py").exists() for name in FLOOR if "." in name)
 
 

@@ -18,8 +18,7 @@ example:
 KINDS = {
     "integrators": "pfem_petsc.integrators",
     "mesh generators": "pfem_petsc.mesh.generators",
-    "mesh formats that are read": "pfem_petsc.mesh.readers",
-    "mesh formats that are written": "pfem_petsc.mesh.writers",
+    "mesh formats": "pfem_petsc.formats",
     "material laws": "pfem_petsc.mechanics.materials",
     "walls": "pfem_petsc.contact.walls",
     "constraints": "pfem_petsc.contact.constraints",

@@ -195,7 +195,7 @@ def test_treatment_states_what_it_goes_with(examples, comm, tmp_path):
 
 
 def test_reader_of_a_mesh_format(examples, tmp_path):
-    from pfem_petsc.mesh.readers import read_whole
+    from pfem_petsc.formats import read_whole
 
     text = "# a square\nv 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\no frame\nl 1 2 3 4 1\no brace\nl -4/1 -2/1\nf 1 2 3\n"
     (tmp_path / "square.obj").write_text(text)

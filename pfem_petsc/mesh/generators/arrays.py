@@ -12,10 +12,9 @@ from pydantic import model_validator
 from ...case.base import StrictModel
 from ...errors import InputError
 from ...parallel.agreement import agreed
-from ..readers import missing_field
 from ..slab import MeshSlab, check_size, slab_of_whole, slab_range
 from ..truss import Truss
-from ..whole import WholeMesh, scattered
+from ..whole import WholeMesh, missing_field, scattered
 
 __all__ = ["Parameters", "generate_on"]
 

@@ -12,11 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ...errors import InputError
-from ..whole import WholeMesh
-from ._text import numbers_of
-
-__all__ = ["SUFFIXES", "read"]
+from ..errors import InputError
+from ..mesh.whole import WholeMesh
+from ._numbers import numbers_of
 
 SUFFIXES = (".stl",)
 

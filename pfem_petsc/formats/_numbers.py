@@ -6,8 +6,6 @@ import warnings
 
 import numpy as np
 
-__all__ = ["numbers_of"]
-
 
 def numbers_of(text: bytes) -> np.ndarray:
     """Return all numbers of a text, separated by white space, as float64: whole numbers are exact up to 2^53.
@@ -26,3 +24,16 @@ def numbers_of(text: bytes) -> np.ndarray:
             return np.fromstring(text, dtype=np.float64, sep=" ")
         except DeprecationWarning as error:
             raise ValueError(str(error)) from None
+
+
+def number_of(text: str) -> float:
+    """Return a number, NaN for another text; Fortran's exponents (1.D+3) are known."""
+    try:
+        return float(text.upper().replace("D", "E"))
+    except ValueError:
+        return float("nan")
+
+
+def shown(text: bytes) -> str:
+    """Return the beginning of a text for messages."""
+    return text[:60].decode("utf-8", "replace")

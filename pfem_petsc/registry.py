@@ -84,6 +84,8 @@ def lookup(package: str, name: str, where: str) -> ModuleType:
     InputError
         If there is no such module; the message names the key ``where`` and the nearest known name.
     """
+    if not isinstance(name, str):  # of a case that is not checked yet
+        raise InputError(f"{where}: unknown value {name!r}{nearest(name, choices(package))}")
     if name in _own(package):
         return importlib.import_module(f"{package}.{name}")
     if name in _plugins.get(package, ()):

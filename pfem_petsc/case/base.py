@@ -83,6 +83,15 @@ class StrictModel(BaseModel):
         else:
             place.change(key, None)
 
+    def as_table(self, given: bool = False) -> dict[str, Any]:
+        """Return the keys of the table, or those that were given, with those of its scheme or generator among them."""
+        slot = getattr(type(self), "slot", "")
+        data = self.model_dump(exclude_unset=given, exclude_none=True, exclude={slot})
+        others = self.__dict__.get(slot)
+        if others is not None:
+            data |= others.table() if not given and hasattr(others, "table") else others.as_table(given)
+        return data
+
     def _take(self, **values: Any) -> None:
         """Set keys while the table is validated, as if they had been given."""
         self.__dict__.update(values)

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 from ..errors import InputError
 from .base import StrictModel
 from .model import ANALYSES, LISTS, ONE_STAGE, CaseModel, StageOutput, shape_of
-from .toml import DEEPEST, KeyPath, key_text, split_key
+from .toml import DEEPEST, KeyPath, key_text, plain, split_key
 
 if TYPE_CHECKING:
     from .schema import Case
@@ -185,16 +185,6 @@ TABLES = {key: attribute_of(key) for key, field in CaseModel.model_fields.items(
 """Attributes of a case that are tables, by top-level key."""
 
 
-def table_of(model: StrictModel, given: bool = False) -> dict[str, Any]:
-    """Return the keys of a table, or those that were given, with those of its scheme or generator among them."""
-    slot = getattr(type(model), "slot", "")
-    data = model.model_dump(exclude_unset=given, exclude_none=True, exclude={slot})
-    others = model.__dict__.get(slot)
-    if others is not None:
-        data |= others.table() if not given and hasattr(others, "table") else table_of(others, given)
-    return data
-
-
 def tables_of(case: Case, given: bool = False) -> dict[str, Any]:
     """Return the nested tables of a case with all defaults, or as they were given; without absent tables.
 
@@ -211,11 +201,11 @@ def _tables(case: Case, given: bool) -> dict[str, Any]:
     for key, attribute in TABLES.items():
         content = case.__dict__[attribute]
         if isinstance(content, dict):
-            data[key] = {name: table_of(table, given) for name, table in content.items()}
+            data[key] = {name: table.as_table(given) for name, table in content.items()}
         elif isinstance(content, list):
-            data[key] = [table_of(table, given) for table in content]
+            data[key] = [table.as_table(given) for table in content]
         elif content is not None:
-            data[key] = table_of(content, given)
+            data[key] = content.as_table(given)
     data["initial"] = _initial(data["initial"])
     if not data["output"].get("probe"):
         data["output"].pop("probe", None)
@@ -257,7 +247,7 @@ def changed_data(case: Case, changes: Iterable[tuple[KeyPath, Any]]) -> dict[str
     """
     data = tables_of(case, given=True)
     for path, value in changes:
-        value = _plain_tables(value)
+        value = plain(value)
         if path[-1:] == ("initial",) and isinstance(value, list):
             value = _initial(value)
         parts = [str(part) for part in path]
@@ -266,17 +256,6 @@ def changed_data(case: Case, changes: Iterable[tuple[KeyPath, Any]]) -> dict[str
         else:
             put(data, parts, value, f"{case.source}: {key_text(path)}")
     return data
-
-
-def _plain_tables(value: Any) -> Any:
-    """Replace models by the keys that they were given."""
-    if isinstance(value, StrictModel):
-        return table_of(value, given=True)
-    if isinstance(value, Mapping):
-        return {key: _plain_tables(item) for key, item in value.items()}
-    if isinstance(value, list | tuple) and any(isinstance(item, StrictModel | Mapping) for item in value):
-        return [_plain_tables(item) for item in value]
-    return value
 
 
 def key_path(case: Case, key: str) -> KeyPath:

@@ -9,7 +9,6 @@ Files of forces: NPZ files have the arrays ``time`` (n,) [s], ``nodes`` (m,) wit
 from __future__ import annotations
 
 import hashlib
-import math
 import re
 import zipfile
 from collections.abc import Callable
@@ -253,13 +252,8 @@ def _check(file: Columns, found: np.ndarray, names: tuple[str, ...]) -> None:
         raise InputError(
             f"{file.where(int(bad[0]))}: expected {_COUNTS[len(names)]} finite numbers {', '.join(names)}, got {shown}"
         )
-    late = np.flatnonzero(np.diff(found[0]) <= 0.0)
-    if len(late):
-        k = int(late[0])
-        raise InputError(
-            f"{file.where(k + 1)}: times must increase, but {found[0, k + 1].item()!r} follows {found[0, k].item()!r}"
-        )
-    if not len(found[0]) or not math.isfinite(found[0, 0]):
+    _checked_times(found[0], file.where)
+    if not len(found[0]):
         raise InputError("this file has no rows")
 
 

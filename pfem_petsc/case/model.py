@@ -393,7 +393,7 @@ class StageName(StrictModel):
     """The key of a stage that is no table."""
 
     name: Name
-    """name of the stage in results and messages; unique. Default: ``stage1``, ``stage2``, ..."""
+    """name of the stage in results and messages; unique; default: ``stage1`` and so on"""
 
 
 Material = Annotated[MaterialKeys, _Materials(LAWS, "law", MaterialKeys, UnknownMaterial, "the law {}")]

@@ -241,7 +241,7 @@ class Case(_Tables):
         try:
             data = plain(data)
             if mesh is not None:
-                data["mesh"] = _with_arrays(data.get("mesh"), mesh)
+                data["mesh"] = _with_arrays(data.get("mesh"), plain(mesh))
         except RecursionError as error:
             raise InputError(f"{source}: this is not a case: its lists or tables are nested too deep") from error
         overrides, folder = tuple(overrides), Path(folder)
@@ -407,7 +407,8 @@ def _validated(
         problems.add((), "[time] and [static] exclude each other: give one of them")
     if not any(key in data for key in (*ANALYSES, "stage", "modes")):
         problems.add((), "the table [time] is missing, or one of [static], [[stage]], [modes], which give the analysis")
-    known = {key: value for key, value in data.items() if key in KEYS and (value is not None or key == "stage")}
+    # [[stage]] is checked by stages_of
+    known = {key: value for key, value in data.items() if key in KEYS and value is not None and key != "stage"}
     return problems.validated(CaseModel, known, reading, place)
 
 

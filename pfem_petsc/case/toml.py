@@ -85,7 +85,7 @@ def parse_toml(text: str, source: str) -> dict[str, Any]:
 
 
 def plain(value: Any) -> Any:
-    """A copy of nested tables and lists in Python's own types, those of NumPy, tuples, ranges and paths resolved."""
+    """A copy of nested tables and lists in Python's own types; those of NumPy, tuples, ranges, paths, tables resolved."""
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple | range):
@@ -94,6 +94,8 @@ def plain(value: Any) -> Any:
         return [plain(item) for item in value]
     if hasattr(value, "tolist"):
         return value.tolist()
+    if hasattr(value, "as_table"):  # a table of a case
+        return plain(value.as_table(given=True))
     return str(value) if isinstance(value, PurePath) else value
 
 

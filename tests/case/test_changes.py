@@ -188,6 +188,9 @@ def test_case_of_tables_by_name(case, case_file):
     tables = case.to_dict()
     assert Case(tables) == Case(**tables) == case
     assert Case(tables, title="other", name="n").title == "other"
+    assert Case({**tables, "wall": list(case.wall), "time": case.time}) == case
+    arrays = {"generator": "arrays", "points": np.eye(2, 3), "bars": np.array([[0, 1]])}
+    assert Case(tables, mesh=arrays).mesh.parameters.truss.n_nodes == 2
     with pytest.raises(InputError, match="unknown key, did you mean 'material'"):
         Case(tables, meterial={})
     with pytest.raises(InputError, match="expected nested tables, got 3"):

@@ -14,9 +14,16 @@ import numpy as np
 from ..errors import InputError
 from ..registry import lookup, nearest
 from .hdf5 import HDF5_ERRORS, dataset_names
-from .history import EVENT
-from .layout import complete_rows, complete_snapshots, read_attributes
-from .modes import MODES, NAMES, complete_modes
+from .layout import (
+    EVENT,
+    MODE_VALUES,
+    MODES,
+    check_version,
+    complete_modes,
+    complete_rows,
+    complete_snapshots,
+    read_attributes,
+)
 from .table import Table, flat_columns
 from .units import AXES, TIME, Axis
 
@@ -74,7 +81,7 @@ class Modes:
 
     def __init__(self, result: Result, names: list[str]) -> None:
         self._result, self._kept = result, names
-        self.kind = next(kind for kind, (name, _) in NAMES.items() if name in names)
+        self.kind = next(kind for kind, (name, _) in MODE_VALUES.items() if name in names)
 
     def __len__(self) -> int:
         return self._result.n_modes
@@ -97,7 +104,7 @@ class Modes:
     @property
     def values(self) -> np.ndarray:
         """(modes,) :attr:`frequency` or :attr:`load_factor`."""
-        return self._read(NAMES[self.kind][0])
+        return self._read(MODE_VALUES[self.kind][0])
 
     @property
     def shape(self) -> np.ndarray:
@@ -106,7 +113,7 @@ class Modes:
 
     def label(self, k: int) -> str:
         """Text of mode k, from 0: ``"mode 3: 149.4 Hz"``."""
-        name, unit = NAMES[self.kind]
+        name, unit = MODE_VALUES[self.kind]
         text = f"{self.values[k]:.6g} {unit}".rstrip()
         return f"mode {k + 1}: {text}" if unit else f"mode {k + 1}: {name.replace('_', ' ')} {text}"
 
@@ -187,6 +194,7 @@ class Result:
         self._patiently(self._look)
 
     def _look(self, file: h5py.File) -> None:
+        check_version(file, self.path)
         vtk = file["VTKHDF"]
         n = complete_snapshots(file)
         self.times: np.ndarray = file["snapshots/time"][:n]

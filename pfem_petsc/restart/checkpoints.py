@@ -7,11 +7,9 @@ import os
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from mpi4py import MPI
 
 from ..case.overrides import split_key
@@ -23,28 +21,19 @@ from ..output.checkpoint import (
     PREVIOUS,
     OpenCheckpoint,
     asked_checkpoint,
+    check_seal,
     read_checkpoint_header,
-    write_checkpoint,
 )
-from ..output.integrity import check_seal, checksum
 from ..output.result import open_result
 from ..output.units import engineering
 from ..output.verify import examine
 from ..parallel.agreement import on_root
-from ..parallel.natural import NaturalOrder
 from ..tolerances import TIME
-from ..version import __version__
-from .state import STATE_VERSION, RunState
+from .state import STATE_VERSION
 
 if TYPE_CHECKING:
     from ..case.schema import Case
-    from ..output.checkpoint import Checkpoint
-    from ..recording.monitors import BlowUp
-    from ..recording.recorder import Recorder
-    from ..stepping.ledger import Ledger
-    from ..stepping.model import Model
     from ..stepping.plan import Plan
-    from ..stepping.stepper import Stepper
 
 
 FREE = ("title", "time.end", "static.end", "modes", "output", "solver")
@@ -107,29 +96,6 @@ def check_version(path: Path, attributes: Mapping[str, Any]) -> None:
             f"version of pfem_petsc that wrote it ({attributes.get('pfem_petsc', 'unknown')}), or start without "
             "--restart"
         )
-
-
-def check_mesh_is_the_same(path: Path, mark: int, attributes: Mapping[str, Any], source: str) -> None:
-    """Refuse a checkpoint of a mesh with other nodes or bars (the content of a mesh file may have changed).
-
-    Raises
-    ------
-    InputError
-    """
-    if attributes.get("mesh_mark") != mark:
-        raise InputError(
-            f"{path}: the mesh of {source} is not the one that it was written with (other nodes or bars): restore "
-            "the mesh, or start without --restart"
-        )
-
-
-def mesh_mark(model: Model, node_order: NaturalOrder, bar_order: NaturalOrder, counted: np.ndarray) -> int:
-    """Return a checksum of coordinates and bar ends, the same on any number of ranks. Collective."""
-    mesh = model.mesh
-    points = node_order.to_slab(mesh.points[: mesh.n_owned])
-    ends = bar_order.to_slab(mesh.node_ids[mesh.bars[counted]].astype(np.int64, copy=False).reshape(-1, 2))
-    comm: MPI.Comm = model.comm
-    return checksum(comm, points, node_order.first) ^ checksum(comm, ends, bar_order.first)
 
 
 def _flat(value: Any, prefix: str = "") -> dict[str, Any]:
@@ -345,94 +311,6 @@ def _prepare(folder: Path, restart: Restart | None, plan: Plan) -> Path | None:
     if not os.access(folder, os.W_OK | os.X_OK):
         raise InputError(f"{folder}: cannot write the results there: permission denied; choose another with -o")
     return aside
-
-
-class Checkpoints:
-    """Checkpoints of one run, in its output folder. Construction is collective.
-
-    Parameters
-    ----------
-    case : Case
-    stepper : Stepper
-    plan : Plan
-    folder : Path
-    """
-
-    def __init__(self, case: Case, stepper: Stepper, plan: Plan, folder: Path) -> None:
-        self.case, self.plan, self.path = case, plan, folder / NAME
-        self.stage = stepper.model.case.number
-        self.comm = stepper.model.comm
-        self.state = RunState(stepper)
-        self.last_step = -1
-        self._model = stepper.model
-
-    @cached_property
-    def _mark(self) -> int:
-        """Checksum of the mesh, which runs without checkpoints do not need. Collective at first use."""
-        state = self.state
-        return mesh_mark(self._model, state.node_order, state.bar_order, state.counted)
-
-    @property
-    def wanted(self) -> bool:
-        """Whether the case requests checkpoints."""
-        return bool(self.case.output.checkpoint_every or self.case.output.checkpoint_minutes)
-
-    def due(self, step: int) -> bool:
-        """Return whether the case requests a checkpoint after this step."""
-        every = self.case.output.checkpoint_every
-        return bool(every) and step % every == 0
-
-    def write(
-        self,
-        ledger: Ledger,
-        recorder: Recorder,
-        blow_up: BlowUp,
-        row: dict[str, Any],
-        snapshots: dict[str, Any],
-        stage: dict[str, Any] | None = None,
-    ) -> None:
-        """Write a checkpoint with the last history row and what is kept of the snapshots. Collective.
-
-        ``stage``: what the history keeps of the stages before, None for a case without stages.
-
-        Raises
-        ------
-        SimulationFailure
-            On all ranks; earlier checkpoints are kept.
-        """
-        scalars = self.state.scalars(ledger, recorder, blow_up, row, snapshots)
-        if stage is not None:
-            scalars["stage"] = {"number": self.stage, "history": stage, "start": self.state.stage_start()}
-        if scalars["step"] == self.last_step:
-            return
-        attributes = {
-            "state_version": STATE_VERSION,
-            "pfem_petsc": __version__,
-            "name": self.case.name,
-            "overrides": list(self.case.overrides),
-            "case": self.case.to_dict(),
-            "plan": self.plan.record(),
-            "mesh_mark": self._mark,
-            "external_functions": self.state.model.external.functions,
-        }
-        write_checkpoint(self.path, self.comm, self.state.arrays(), scalars, attributes)
-        self.last_step = scalars["step"]
-
-    def restore(self, restart: Restart) -> Checkpoint:
-        """Restore the stepper from a checkpoint, instead of starting it; return the checkpoint. Collective.
-
-        Raises
-        ------
-        InputError
-            On all ranks, if the checkpoint is damaged or belongs to another mesh.
-        """
-        check_mesh_is_the_same(restart.path, self._mark, restart.attributes, self.case.source)
-        checkpoint = restart.file.read(self.state.orders(restart.scalars))
-        restart.file.close()
-        self.state.load_state(checkpoint)
-        if restart.continues:
-            self.last_step = restart.step
-        return checkpoint
 
 
 def kept_overrides(name: str, folder: Path, restart: bool | Path) -> list[str]:

@@ -26,24 +26,23 @@ on wall-clock time (synchronisation, progress, wall time) start from scratch in 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..errors import InputError
 from ..mechanics.bars import StrainEnergy
 from ..mesh.exchange import Router
 from ..mesh.slab import slab_of
-from ..output.checkpoint import Checkpoint
+from ..output.checkpoint import Checkpoint, OpenCheckpoint
+from ..output.integrity import checksum
 from ..parallel.natural import NaturalOrder
 from ..stepping.stage import StageStart
 
 if TYPE_CHECKING:
-    from ..recording.monitors import BlowUp
-    from ..recording.recorder import Recorder
-    from ..stepping.ledger import Ledger
     from ..stepping.stepper import Stepper
-
-__all__ = ["STATE_VERSION", "RunState"]
 
 STATE_VERSION = 7
 """Changed with the meaning of what is saved."""
@@ -90,12 +89,12 @@ class RunState:
         return {**nodes, **bars, **self.model.links.arrays()}
 
     def scalars(
-        self, ledger: Ledger, recorder: Recorder, blow_up: BlowUp, row: dict[str, Any], snapshots: dict[str, Any]
+        self, ledger: Mapping[str, Any], history: Mapping[str, Any], snapshots: Mapping[str, Any]
     ) -> dict[str, Any]:
-        """Return the numbers, including the last history row and what is kept of the snapshots. Collective."""
+        """Return the numbers, with what this rank's ledger, the history and the snapshots keep. Collective."""
         stepper, energy, walls = self.stepper, self.stepper.energy, self.stepper.solution.walls
         mine = {
-            "ledger": ledger.kept(),
+            "ledger": ledger,
             "energy": list(energy.energies),
             "walls": {name: getattr(walls, name).tolist() for name in walls.sums},
             "contact_log": self.model.contact.log.share(),
@@ -106,13 +105,10 @@ class RunState:
             "step": stepper.number,
             "time": stepper.state.time,
             "stepper": {name: getattr(stepper, name) for name in stepper.kept_numbers},
-            "iterations": list(recorder.iterations),
-            "start_energy": recorder.start_energy,
-            "energy_scale": recorder.energy_scale,
-            "blow_up": blow_up.kept(),
+            **{name: kept for name, kept in history.items() if name != "row"},
             "free_walls": self.model.contact.motion.kept(),
             "contact_times": self.model.contact.log.times(self.comm),
-            "row": {name: float(row[name]) for name in ("energy_imbalance", "active_contacts", "step")},
+            "row": history["row"],
             **snapshots,
             "node_arrays": sorted(set().union(*self.comm.allgather(set(self._node_arrays())))),
             "memories": memories,
@@ -124,6 +120,36 @@ class RunState:
         """The numbers of what the stage starts from; its arrays are among those of nodes. None for a first stage."""
         return None if self.model.start is None else self.model.start.scalars()
 
+    @cached_property
+    def mesh_mark(self) -> int:
+        """Checksum of coordinates and bar ends, the same on any number of ranks. Collective at first use."""
+        mesh = self.model.mesh
+        points = self.node_order.to_slab(mesh.points[: mesh.n_owned])
+        ends = self.bar_order.to_slab(
+            mesh.node_ids[mesh.bars[self.counted]].astype(np.int64, copy=False).reshape(-1, 2)
+        )
+        return checksum(self.comm, points, self.node_order.first) ^ checksum(self.comm, ends, self.bar_order.first)
+
+    def restore(self, file: OpenCheckpoint, source: str) -> None:
+        """Restore the stepper from a checkpoint, instead of its ``start``, and close the file. Collective.
+
+        ``source``: the case's file, for the message
+
+        Raises
+        ------
+        InputError
+            On all ranks, if the checkpoint is damaged or belongs to another mesh: the content of a mesh file may have
+            changed.
+        """
+        if file.attributes.get("mesh_mark") != self.mesh_mark:
+            raise InputError(
+                f"{file.path}: the mesh of {source} is not the one that it was written with (other nodes or bars): "
+                "restore the mesh, or start without --restart"
+            )
+        checkpoint = file.read(self.orders(file.scalars))
+        file.close()
+        self._load_state(checkpoint)
+
     def orders(self, scalars: dict[str, Any]) -> dict[str, NaturalOrder]:
         """Return the orders of the arrays of a checkpoint with these numbers: nodal rows by owner, bars in slabs."""
         slab = np.arange(self.bar_order.first, self.bar_order.first + self.bar_order.count)
@@ -131,8 +157,7 @@ class RunState:
         orders = dict.fromkeys(scalars["node_arrays"], self.node_order) | dict.fromkeys(scalars["bar_arrays"], bars)
         return orders | {name: order for name, (order, _) in self.model.links.arrays().items()}
 
-    def load_state(self, checkpoint: Checkpoint) -> None:
-        """Restore the stepper from a checkpoint, instead of its ``start``. Collective."""
+    def _load_state(self, checkpoint: Checkpoint) -> None:
         stepper, state, owned = self.stepper, self.stepper.state, self.model.mesh.n_owned
         scalars = checkpoint.scalars
         if scalars.get("stage") is not None and scalars["stage"]["start"] is not None:
@@ -160,7 +185,7 @@ class RunState:
         state.step, state.time = int(scalars["step"]) - self.model.first_step, float(scalars["time"])
         for name, value in scalars["stepper"].items():
             setattr(stepper, name, value)
-        mine = self._share(scalars["ranks"])
+        mine = self.share(scalars["ranks"])
         stepper.energy = StrainEnergy(tuple(float(value) for value in mine["energy"]))
         walls = stepper.solution.walls
         like = {name: getattr(walls, name) for name in mine["walls"]}
@@ -172,17 +197,7 @@ class RunState:
         self.model.contact.log.load_state(mine["contact_log"], scalars["contact_times"], stepper.touching)
         stepper.resume()
 
-    def load_sums(self, checkpoint: Checkpoint, ledger: Ledger, recorder: Recorder, blow_up: BlowUp) -> dict[str, Any]:
-        """Restore ledger, recorder and divergence check, created after :meth:`load_state`; return the last row."""
-        scalars = checkpoint.scalars
-        ledger.load_state(self._share(scalars["ranks"])["ledger"])
-        recorder.iterations = [int(n) for n in scalars["iterations"]]
-        recorder.start_energy = scalars["start_energy"]
-        recorder.energy_scale = scalars["energy_scale"]
-        blow_up.load_state(scalars["blow_up"])
-        return dict(scalars["row"])
-
-    def _share(self, ranks: list[dict[str, Any]]) -> dict[str, Any]:
+    def share(self, ranks: list[dict[str, Any]]) -> dict[str, Any]:
         """Return this rank's share of the sums: its own on the same number of ranks, else all on rank 0."""
         if len(ranks) == self.comm.size:
             return ranks[self.comm.rank]

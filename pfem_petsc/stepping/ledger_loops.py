@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..energies import BAR_ENERGIES
+from ..columns import BAR_ENERGIES, HEAD, PAIR, WALL
 from ..mechanics.compiled import inlined, kernel
-from ..output.sums import HEAD, PAIR, WALL
 from .impulses import WALLS
 
 WORKS = ("external", "contact", "damping", "inertial", "internal")
@@ -235,7 +234,7 @@ def add_works(sums, works, stored, heating, impact, friction, work, given, weigh
 
     Parameters
     ----------
-    sums : (HEAD.width,) in the layout of :data:`~pfem_petsc.output.sums.HEAD`
+    sums : (HEAD.width,) in the layout of :data:`~pfem_petsc.columns.HEAD`
     works : (5,) see :data:`~pfem_petsc.stepping.book_loops.WORKS`
     stored : change of the energies of nodes and bars; heating : work of changing temperatures
     impact, friction : dissipations

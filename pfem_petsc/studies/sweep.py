@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..case.schema import Case
-from ..energies import LOST, STORED, SUPPLIED
+from ..columns import LOST, STORED, SUPPLIED
 from ..errors import InputError
 from ..output.peaks import peak_force, touch_impulse
 from ..output.result import Result, open_result

@@ -134,12 +134,10 @@ def test_files_are_as_large_as_forecast(comm, shared_tmp_path, name, overrides):
     case = Case.load(name, [*overrides, "output.checkpoint_every=100"])
     simulation = Simulation(case, comm, output=shared_tmp_path / "out", quiet=True)
     from pfem_petsc.preflight.forecast import result_bytes
-    from pfem_petsc.recording.recorder import Recorder
+    from pfem_petsc.run.recorder import Recorder
 
-    recorder, fields = Recorder(simulation.stepper, None), simulation.outputs.fields
-    forecast = result_bytes(
-        case, simulation.mesh, simulation.plan.steps, fields.points, fields.cells, recorder.columns, recorder.types
-    )
+    columns, fields = Recorder(simulation.stepper).columns, simulation.outputs.fields
+    forecast = result_bytes(case, simulation.mesh, simulation.plan.steps, fields.points, fields.cells, columns)
     assert simulation.run() == 0
     comm.Barrier()
     assert (shared_tmp_path / "out" / "result.vtkhdf").stat().st_size == pytest.approx(forecast, rel=0.25)

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..columns import STORED, SUPPLIED
 from ..contact.monitoring import CrossingBars
-from ..energies import STORED, SUPPLIED
 from ..errors import SimulationFailure
 
 if TYPE_CHECKING:
@@ -221,15 +221,6 @@ class ContactWatch:
         found += ["supports move"] if self.moves else []
         *most, last = found or [""]
         return f" ({', '.join(most)}{' and ' if most else ''}{last})" if found else ""
-
-
-class NoContactWatch:
-    """For equilibria: works over their increments are quadratures, whose error is no energy that something has made."""
-
-    start: float | None = None
-
-    def check(self, row: dict[str, Any]) -> None:
-        """Nothing to see."""
 
 
 # Number of bars up to which those that cross are searched at each snapshot, and of searches times bars beyond it after

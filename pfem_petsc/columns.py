@@ -26,8 +26,8 @@ class Column(NamedTuple):
     source : of an energy, see :func:`energy`
     side : of an energy, of the balance: stored + lost - supplied is constant; ``part`` of another column
     parts : columns that a derived energy sums
-    value : this rank's share of a term of the source ``state`` [J], from a
-        :class:`~pfem_petsc.stepping.stepper.Stepper`; None if the ledger computes it
+    value : its value at the time of a row from a :class:`~pfem_petsc.stepping.stepper.Stepper`, this rank's share if it
+        is summed over ranks; None if the ledger, the contact log or the recorder has it
     stages : what a stage does with the value of the stage before: it goes on with a ``summed`` one, keeps a ``lasting``
         one that it does not have itself, and forgets others
     exists : whether the column is recorded, from a :class:`~pfem_petsc.stepping.model.Model`
@@ -93,16 +93,26 @@ STORED, LOST, SUPPLIED = (tuple(e.name for e in ENERGIES if e.side == side) for 
 BAR_ENERGIES = tuple(one.name for one in ENERGIES if one.source == "bars")
 """Energies whose densities material laws return, in the order of their sums."""
 
-OF_RUN = (Column("time", "s"), Column("step", kind=np.int64), Column("step_size", "s"))
+OF_RUN = (
+    Column("time", "s", value=lambda now: now.place),
+    Column("step", kind=np.int64, value=lambda now: now.number),
+    Column("step_size", "s", value=lambda now: now.smallest),
+)
+"""Equal on all ranks."""
 STAGE = Column("stage", kind=np.int64)
 """Number of the stage, from 0, of cases with stages."""
 OF_ANALYSES = (Column("load_factor", stages=LASTING), Column("pseudo_steps"), Column("residual"))
 """Those that steppers name in their ``columns``."""
 ITERATIONS = (Column("newton_iterations", kind=np.int64), Column("linear_iterations", kind=np.int64))
 COUNTS = (
-    Column("active_contacts", kind=np.int64),
-    Column("slack_bars", kind=np.int64, exists=lambda model: model.bars.slackens),
-    Column("broken_bars", kind=np.int64),
+    Column("active_contacts", kind=np.int64, value=lambda now: now.solution.contacts),
+    Column(
+        "slack_bars",
+        kind=np.int64,
+        value=lambda now: now.model.bars.slack_count(),
+        exists=lambda model: model.bars.slackens,
+    ),
+    Column("broken_bars", kind=np.int64, value=lambda now: now.ruptures.count),
 )
 IMBALANCE = Column("energy_imbalance", "J")
 VECTORS = (

@@ -14,7 +14,7 @@ import pytest
 PACKAGE = Path(__file__).resolve().parent.parent / "pfem_petsc"
 
 FLOORS = (
-    ("energies", "errors", "fields", "files", "signals", "tolerances", "version"),
+    ("columns", "errors", "fields", "files", "signals", "tolerances", "version"),
     ("registry",),
     ("parallel",),
     ("case", "cases"),
@@ -29,7 +29,6 @@ FLOORS = (
     ("statics", "modes"),
     ("restart",),
     ("preflight",),
-    ("recording",),
     ("run",),
     ("simulation",),
     ("__init__",),  # the public interface

@@ -41,10 +41,12 @@ class Observer(ABC):
     Attributes
     ----------
     every : due after steps whose number is a multiple of it; 0: never
+    fuses : whether steps after which it is due may be fused into one compiled call
     needs_agreement : whether the ranks must agree first that none of them has a fault
     """
 
     every: int = 0
+    fuses: bool = False
     needs_agreement: bool = False
 
     def due(self, step: int) -> bool:
@@ -53,7 +55,7 @@ class Observer(ABC):
 
     def steps_left(self, step: int) -> int:
         """Return the number of steps until it must act again; these may be fused into one compiled call."""
-        return self.every - step % self.every if self.every else NEVER
+        return NEVER if self.fuses or not self.every else self.every - step % self.every
 
     @abstractmethod
     def observe(self, made: Step) -> None:
@@ -96,6 +98,8 @@ class History(Observer):
     row : the last row
     writer : of the result file
     """
+
+    fuses = True  # rows of fused steps are passed to :meth:`take_sums`
 
     def __init__(
         self,
@@ -165,10 +169,6 @@ class History(Observer):
         """Add energies and iterations of a step, or of each part of a bisected step."""
         self.ledger.update()
         self.recorder.count(self._stepper.solution.newton, self._stepper.solution.linear)
-
-    def steps_left(self, step: int) -> int:
-        """Return no limit: rows of fused steps are passed to :meth:`take`."""
-        return NEVER
 
     def observe(self, made: Step) -> None:
         """Record a row."""
@@ -380,16 +380,12 @@ class Checkpointing(Observer):
 
 
 class ProgressReport(Observer):
-    """Reports each step to the progress bar, or to the lines that replace it."""
+    """Reports each step, the last one of fused steps, to the progress bar, or to the lines that replace it."""
 
-    every = 1
+    every, fuses = 1, True
 
     def __init__(self, progress: Progress, analysis: Analysis, history: History) -> None:
         self._progress, self._analysis, self._history = progress, analysis, history
-
-    def steps_left(self, step: int) -> int:
-        """Return no limit: the last of fused steps is reported."""
-        return NEVER
 
     def observe(self, made: Step) -> None:
         """Report a step."""
@@ -421,10 +417,6 @@ class Events(Observer):
     def due(self, step: int) -> bool:
         """Return whether the step has events."""
         return bool(self._stepper.events)
-
-    def steps_left(self, step: int) -> int:
-        """Return no limit: steppers with events make single steps."""
-        return NEVER
 
     def observe(self, made: Step) -> None:
         """Record and report the events."""
@@ -462,10 +454,6 @@ class RuptureReport(Observer):
     def due(self, step: int) -> bool:
         """Return whether more bars are broken in the last row than have been reported; the same on all ranks."""
         return self._broken > self._told
-
-    def steps_left(self, step: int) -> int:
-        """Return no limit: the fused loop stops where bars break."""
-        return NEVER
 
     def observe(self, made: Step) -> None:
         """Report the bars that broke."""

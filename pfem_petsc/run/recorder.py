@@ -105,7 +105,6 @@ class Probes:
             at = end
 
 
-_STATE = [one for one in ENERGIES if one.value is not None]
 _ADDED = [one for one in ENERGIES if one.source != "derived"]
 _SIDES = {one.name: one.side for one in ENERGIES} | {part: one.side for one in ENERGIES for part in one.parts}
 _SIGNS = np.array([{"supplied": -1.0, "part": 0.0}.get(_SIDES[one.name], 1.0) for one in _ADDED])
@@ -183,6 +182,8 @@ class Recorder:
         sums = Layout({name: declared(name).dtype for name in names})
         recorded = [name for name in names if name in layout.places]
         self._from, self._to = sums.indices(recorded), layout.indices(recorded)
+        at_state = [one for one in (*ENERGIES, *VECTORS, *COUNTS) if one.value is not None and one.exists(self.model)]
+        self._state = [(HEAD.first(one.name), one.value) for one in at_state]
         # where the sums of links and probes begin
         self._links = sums.width - PAIR.width * len(tables)
         self._probed = sums.width
@@ -242,16 +243,13 @@ class Recorder:
     def _fill(self, sums: np.ndarray, alarm: bool) -> None:
         """Write this rank's share of a row."""
         stepper, state, ledger, contact = self.stepper, self.stepper.state, self.ledger, self.model.contact
-        energy, solution = stepper.energy, stepper.solution
+        solution = stepper.solution
         ledger.complete()
         sums[: HEAD.width] = ledger.sums
-        sums[_BARS] = energy.energies
-        for term in _STATE:
-            sums[HEAD.first(term.name)] = term.value(stepper)
-        sums[HEAD.first("active_contacts")], sums[HEAD.first("alarm")] = solution.contacts, alarm
-        sums[HEAD.first("broken_bars")] = stepper.ruptures.count
-        if self.model.bars.slackens:
-            sums[HEAD.first("slack_bars")] = self.model.bars.slack_count()
+        sums[_BARS] = stepper.energy.energies
+        sums[HEAD.first("alarm")] = alarm
+        for first, value in self._state:
+            sums[first] = value(stepper)
         if contact.any:
             sums[_CHANGES], walls = contact.log.changes, self._of_walls(sums)
             walls[:, WALL["force"]] = solution.walls.force
@@ -274,11 +272,8 @@ class Recorder:
         vector, at = np.empty(layout.width), layout.first
         vector[self._to] = sums[self._from]
         vector[layout.width - self._probes.width :] = sums[self._probed :]
-        vector[at("time")], vector[at("step")], vector[at("step_size")] = (
-            stepper.place,
-            stepper.number,
-            stepper.smallest,
-        )
+        for column in OF_RUN:
+            vector[at(column.name)] = column.value(stepper)
         for name in stepper.columns:
             vector[at(name)] = getattr(stepper, name)
         vector[at("newton_iterations")], vector[at("linear_iterations")] = self.iterations

@@ -10,9 +10,8 @@ import time
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Self
 
 import h5py
 import numpy as np
@@ -46,26 +45,7 @@ _BLOCK = 1 << 18  # number of bytes read at a time
 _ATTEMPTS = 20  # to open a file between two replacements
 
 
-@dataclass(frozen=True)
 class Checkpoint:
-    """Contents of a checkpoint.
-
-    Attributes
-    ----------
-    path : Path
-    arrays : dict of name to this rank's owned rows (n_owned, ...), in the types in which they were written
-    scalars : dict
-        As written; float64 exact to the last bit.
-    attributes : dict
-    """
-
-    path: Path
-    arrays: dict[str, np.ndarray]
-    scalars: dict[str, Any]
-    attributes: dict[str, Any]
-
-
-class OpenCheckpoint:
     """A checkpoint opened for reading: the same file on all ranks, unchanged between header and last array.
 
     Every rank opens the file once and reads it through that descriptor, even if a run replaces the checkpoint
@@ -78,7 +58,7 @@ class OpenCheckpoint:
 
     Attributes
     ----------
-    scalars, attributes : dicts, as they were written
+    scalars, attributes : dicts, as they were written; float64 exact to the last bit
     digest : of everything except the values of the arrays, whose checksums are part of it
 
     Raises
@@ -114,6 +94,12 @@ class OpenCheckpoint:
         if raw is not None:
             raw.close()
 
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
     def _header(self) -> tuple[dict[str, Any], dict[str, Any]]:
         with _sound(self.path), h5py.File(self._raw, "r") as file:
             state = file["state"][()]
@@ -122,8 +108,9 @@ class OpenCheckpoint:
         state = json.loads(state)
         return state["scalars"], state["attributes"]
 
-    def read(self, orders: Mapping[str, NaturalOrder]) -> Checkpoint:
-        """Read arrays, on any number of ranks. Collective.
+    def read(self, orders: Mapping[str, NaturalOrder]) -> dict[str, np.ndarray]:
+        """Return this rank's owned rows (n_owned, ...) of arrays, in the types of the file, by name, on any number of
+        ranks. Collective.
 
         Parameters
         ----------
@@ -136,8 +123,7 @@ class OpenCheckpoint:
             On all ranks, if the file is damaged, lacks one of the arrays, or has another number of rows.
         """
         path = self.path
-        slabs: dict[str, np.ndarray] = {}
-        expected: dict[str, int] = {}
+        slabs: dict[str, tuple[np.ndarray, int]] = {}
         # Reading needs no collective transfers: every rank reads its slab independently.
         with agreed(self.comm), _sound(path), h5py.File(self._raw, "r") as file:
             for name, order in orders.items():
@@ -152,29 +138,11 @@ class OpenCheckpoint:
                         f"{path}: {name} has {len(dataset)} rows, the case needs {order.n_global}: it belongs to "
                         "another mesh; restart the case it was written by"
                     )
-                slabs[name] = dataset[order.first : order.first + order.count]
-                expected[name] = int(dataset.attrs["checksum"])
-        for name, slab in slabs.items():
-            if checksum(self.comm, slab, orders[name].first) != expected[name]:
+                slabs[name] = dataset[order.first : order.first + order.count], int(dataset.attrs["checksum"])
+        for name, (slab, expected) in slabs.items():
+            if checksum(self.comm, slab, orders[name].first) != expected:
                 raise InputError(f"{path}: damaged: the values of {name} do not match their checksum; {_remedy(path)}")
-        arrays = {name: orders[name].from_slab(slab) for name, slab in slabs.items()}
-        return Checkpoint(path, arrays, self.scalars, self.attributes)
-
-
-def read_checkpoint(path: Path | str, comm: MPI.Comm, orders: Mapping[str, NaturalOrder]) -> Checkpoint:
-    """Open, read and close a checkpoint; see :class:`OpenCheckpoint`. Collective."""
-    file = OpenCheckpoint(path, comm)
-    try:
-        return file.read(orders)
-    finally:
-        file.close()
-
-
-def read_checkpoint_header(path: Path | str, comm: MPI.Comm) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return scalars and attributes of a checkpoint on all ranks; raises as :class:`OpenCheckpoint`. Collective."""
-    file = OpenCheckpoint(path, comm)
-    file.close()
-    return file.scalars, file.attributes
+        return {name: orders[name].from_slab(slab) for name, (slab, _) in slabs.items()}
 
 
 def newest_checkpoint(folder: Path | str) -> Path | None:

@@ -54,43 +54,48 @@ def repair(path: Path | str, kept: Kept | None = None) -> tuple[int, int]:
     """
     path = Path(path)
     with readable(path), h5py.File(path, "r+", locking=False) as file:
-        n_snapshots, n_rows, n_events = _counts(file, kept)
-        vtk, steps, history = file["VTKHDF"], file["VTKHDF/Steps"], file["history"]
+        counts = _counts(file, kept)
+        n_snapshots, vtk, steps = counts[0], file["VTKHDF"], file["VTKHDF/Steps"]
         # A kill in between must leave a file that VTK can read: VTK crashes on more times than steps, so the times are
         # removed first; it shows nothing for steps without data, so the data are removed last.
-        if len(steps["Values"]) > n_snapshots:
-            grow(steps["Values"], n_snapshots)
-        write_rows(steps["Values"], 0, file["snapshots/time"][: len(steps["Values"])])
+        grow(steps["Values"], n_snapshots)
+        write_rows(steps["Values"], 0, file["snapshots/time"][:n_snapshots])
         file.flush()
-        steps.attrs.modify("NSteps", np.int64(n_snapshots))
-        history.attrs.modify("rows", np.int64(n_rows))
+        _count(file, counts)
         file.flush()
-        for name in PER_STEP:
-            grow(steps[name], n_snapshots)
-        for name in ("step", "time"):
-            grow(file["snapshots"][name], n_snapshots)
         if n_snapshots == 0:
             # The first snapshot creates the fields, possibly not all of them.
             file[CHECKS].pop("snapshots", None)
-            for kind in ("PointData", "CellData"):
-                for name in list(vtk[kind]):
-                    del vtk[kind][name]
-                for name in list(steps[kind + "Offsets"]):
-                    del steps[kind + "Offsets"][name]
-        for name, dataset in field_datasets(vtk).items():
-            n = int(vtk["NumberOfCells" if name.startswith("CellData") else "NumberOfPoints"][0])
-            grow(dataset, n_snapshots * n)
-        for name in dataset_names(history):
-            grow(history[name], n_rows)
-        grow(file[CHECKS]["history"], n_rows)
-        if EVENT in file:
-            file[EVENT].attrs.modify("rows", np.int64(n_events))
-            for dataset in (*file[EVENT].values(), file[CHECKS][EVENT]):
-                grow(dataset, n_events)
-        if n_snapshots:
-            grow(file[CHECKS]["snapshots"], n_snapshots)
+            for group in (vtk["PointData"], vtk["CellData"], steps["PointDataOffsets"], steps["CellDataOffsets"]):
+                for name in list(group):
+                    del group[name]
+        for name, n in _extents(file, counts).items():
+            grow(file[name], n)
     fsync_all(path)
-    return n_snapshots, n_rows
+    return counts[:2]
+
+
+def _count(file: h5py.File, counts: tuple[int, int, int]) -> None:
+    """Set the numbers of snapshots, history rows and events that a file counts as complete."""
+    file["VTKHDF/Steps"].attrs.modify("NSteps", np.int64(counts[0]))
+    for table, n in (("history", counts[1]), (EVENT, counts[2])):
+        if table in file:
+            file[table].attrs.modify("rows", np.int64(n))
+
+
+def _extents(file: h5py.File, counts: tuple[int, int, int]) -> dict[str, int]:
+    """Return the numbers of rows of all growing datasets, but those of modes, for these numbers of snapshots, history
+    rows and events."""
+    n_snapshots, vtk = counts[0], file["VTKHDF"]
+    n_nodes, n_bars = int(vtk["NumberOfPoints"][0]), int(vtk["NumberOfCells"][0])
+    rows = {f"VTKHDF/Steps/{name}": n_snapshots for name in (*PER_STEP, "Values")}
+    rows |= {f"snapshots/{name}": n_snapshots for name in ("step", "time")}
+    for name in field_datasets(vtk):
+        rows[f"VTKHDF/{name}"] = n_snapshots * (n_bars if name.startswith("CellData") else n_nodes)
+    for table, n in (("history", counts[1]), (EVENT, counts[2])):
+        if table in file:
+            rows |= {f"{table}/{name}": n for name in dataset_names(file[table])} | {f"{CHECKS}/{table}": n}
+    return rows | ({f"{CHECKS}/snapshots": n_snapshots} if n_snapshots else {})
 
 
 def reopen(path: Path, sizes: tuple[int, int], contents: Contents, kept: Kept) -> None:
@@ -176,26 +181,20 @@ def _rebuild(target: h5py.File, source: h5py.File, counts: tuple[int, int, int],
 
     ``counts``: snapshots, history rows and events
     """
-    n_snapshots, n_rows, n_events = counts
     vtk, history = source["VTKHDF"], source["history"]
     n_nodes, n_bars = int(vtk["NumberOfPoints"][0]), int(vtk["NumberOfCells"][0])
     columns = {name: row_type(history[name]) for name in dataset_names(history)}
     events = {name: dataset.dtype for name, dataset in source[EVENT].items()} if EVENT in source else {}
     compressed = is_compressed(vtk["Points"])
     create_result(target, n_nodes, n_bars, contents._replace(columns=columns, events=events, compressed=compressed))
-    rows: dict[str, int] = {"VTKHDF/Connectivity": 2 * n_bars, "VTKHDF/Offsets": n_bars + 1, f"{CHECKS}/mesh": 1}
-    rows |= {f"VTKHDF/Steps/{name}": n_snapshots for name in (*PER_STEP, "Values")}
-    rows |= {f"snapshots/{name}": n_snapshots for name in ("step", "time")}
-    rows |= {f"history/{name}": n_rows for name in columns} | {f"{CHECKS}/history": n_rows}
-    rows |= {f"{EVENT}/{name}": n_events for name in events} | ({f"{CHECKS}/{EVENT}": n_events} if events else {})
-    if n_snapshots:
+    if counts[0]:
         for name, dataset in field_datasets(vtk).items():
             kind, _, field = name.partition("/")
             if field:
                 create_field(target["VTKHDF"], kind, field, dataset.shape[1:], dataset.dtype)
-            rows[f"VTKHDF/{name}"] = n_snapshots * (n_bars if kind == "CellData" else n_nodes)
         create_snapshot_checks(target)
-        rows[f"{CHECKS}/snapshots"] = n_snapshots
+    rows = {"VTKHDF/Connectivity": 2 * n_bars, "VTKHDF/Offsets": n_bars + 1, f"{CHECKS}/mesh": 1}
+    rows |= _extents(target, counts)
     for name, n in rows.items():
         old, new = source[name], target[name]
         if new.maxshape[0] is None:
@@ -205,10 +204,7 @@ def _rebuild(target: h5py.File, source: h5py.File, counts: tuple[int, int, int],
             piece = max(1, piece // new.chunks[0]) * new.chunks[0]
         for first in range(0, n, piece):
             write_rows(new, first, old[first : min(first + piece, n)])
-    target["VTKHDF/Steps"].attrs.modify("NSteps", np.int64(n_snapshots))
-    target["history"].attrs.modify("rows", np.int64(n_rows))
-    if events:
-        target[EVENT].attrs.modify("rows", np.int64(n_events))
+    _count(target, counts)
 
 
 def _counts(file: h5py.File, kept: Kept | None) -> tuple[int, int, int]:

@@ -19,10 +19,9 @@ from ..output import result as results
 from ..output.checkpoint import (
     NAME,
     PREVIOUS,
-    OpenCheckpoint,
+    Checkpoint,
     asked_checkpoint,
     check_seal,
-    read_checkpoint_header,
 )
 from ..output.result import open_result
 from ..output.units import engineering
@@ -136,7 +135,7 @@ class Restart:
     """
 
     path: Path
-    file: OpenCheckpoint
+    file: Checkpoint
     changed: list[str]
     continues: bool
 
@@ -184,7 +183,7 @@ def find_restart(case: Case, comm: MPI.Comm, folder: Path, asked: bool | Path | 
     path = on_root(comm, asked_checkpoint, folder, asked)
     if path is None:
         return f"{folder}: no checkpoint to restart from: starting from zero"
-    file = OpenCheckpoint(path, comm)
+    file = Checkpoint(path, comm)
     check_version(path, file.attributes)
     changed = changed_keys(path, file.attributes["case"], case.to_dict(), case.source)
     continues = on_root(comm, _continues, folder, path)
@@ -329,7 +328,8 @@ def kept_overrides(name: str, folder: Path, restart: bool | Path) -> list[str]:
     """
     path = asked_checkpoint(folder, restart)
     if path is not None:
-        _, found = read_checkpoint_header(path, MPI.COMM_SELF)
+        with Checkpoint(path, MPI.COMM_SELF) as checkpoint:
+            found = checkpoint.attributes
     else:
         # the run may have finished without a checkpoint
         try:

@@ -36,7 +36,7 @@ from ..errors import InputError
 from ..mechanics.bars import StrainEnergy
 from ..mesh.exchange import Router
 from ..mesh.slab import slab_of
-from ..output.checkpoint import Checkpoint, OpenCheckpoint
+from ..output.checkpoint import Checkpoint
 from ..output.integrity import checksum
 from ..parallel.natural import NaturalOrder
 from ..stepping.stage import StageStart
@@ -64,15 +64,7 @@ class RunState:
     def __init__(self, stepper: Stepper) -> None:
         self.stepper = stepper
         self.model = stepper.model
-        mesh, comm = self.model.mesh, self.model.comm
-        self.comm = comm
-        self.counted = mesh.counted
-        self.node_order = mesh.node_order
-
-    @property
-    def bar_order(self) -> NaturalOrder:
-        """Order of the bars, created at the first checkpoint to save memory."""
-        return self.model.mesh.bar_order
+        self.comm, self.mesh = self.model.comm, self.model.mesh
 
     def arrays(self) -> dict[str, tuple[NaturalOrder, np.ndarray]]:
         """Return name to (order, rows owned by this rank) of all arrays; the same names on all ranks."""
@@ -83,9 +75,9 @@ class RunState:
             kinds |= other
         for name in kinds.keys() - own.keys():
             shape, kind = kinds[name]
-            own[name] = np.zeros((self.model.mesh.n_owned, *shape), dtype=kind)
-        nodes = {name: (self.node_order, own[name]) for name in sorted(kinds)}
-        bars = {name: (self.bar_order, array[self.counted]) for name, array in self._bar_arrays().items()}
+            own[name] = np.zeros((self.mesh.n_owned, *shape), dtype=kind)
+        nodes = {name: (self.mesh.node_order, own[name]) for name in sorted(kinds)}
+        bars = {name: (self.mesh.bar_order, array[self.mesh.counted]) for name, array in self._bar_arrays().items()}
         return {**nodes, **bars, **self.model.links.arrays()}
 
     def scalars(
@@ -116,21 +108,15 @@ class RunState:
             "ranks": self.comm.allgather(mine),
         }
 
-    def stage_start(self) -> dict[str, Any] | None:
-        """The numbers of what the stage starts from; its arrays are among those of nodes. None for a first stage."""
-        return None if self.model.start is None else self.model.start.scalars()
-
     @cached_property
     def mesh_mark(self) -> int:
         """Checksum of coordinates and bar ends, the same on any number of ranks. Collective at first use."""
-        mesh = self.model.mesh
-        points = self.node_order.to_slab(mesh.points[: mesh.n_owned])
-        ends = self.bar_order.to_slab(
-            mesh.node_ids[mesh.bars[self.counted]].astype(np.int64, copy=False).reshape(-1, 2)
-        )
-        return checksum(self.comm, points, self.node_order.first) ^ checksum(self.comm, ends, self.bar_order.first)
+        mesh, nodes, bars = self.mesh, self.mesh.node_order, self.mesh.bar_order
+        points = nodes.to_slab(mesh.points[: mesh.n_owned])
+        ends = mesh.node_ids[mesh.bars[mesh.counted]].astype(np.int64, copy=False).reshape(-1, 2)
+        return checksum(self.comm, points, nodes.first) ^ checksum(self.comm, bars.to_slab(ends), bars.first)
 
-    def restore(self, file: OpenCheckpoint, source: str) -> None:
+    def restore(self, file: Checkpoint, source: str) -> None:
         """Restore the stepper from a checkpoint, instead of its ``start``, and close the file. Collective.
 
         ``source``: the case's file, for the message
@@ -146,25 +132,25 @@ class RunState:
                 f"{file.path}: the mesh of {source} is not the one that it was written with (other nodes or bars): "
                 "restore the mesh, or start without --restart"
             )
-        checkpoint = file.read(self.orders(file.scalars))
+        arrays = file.read(self.orders(file.scalars))
         file.close()
-        self._load_state(checkpoint)
+        self._load_state(file.scalars, arrays)
 
     def orders(self, scalars: dict[str, Any]) -> dict[str, NaturalOrder]:
         """Return the orders of the arrays of a checkpoint with these numbers: nodal rows by owner, bars in slabs."""
-        slab = np.arange(self.bar_order.first, self.bar_order.first + self.bar_order.count)
-        bars = NaturalOrder(self.comm, slab, self.model.mesh.n_bars)
-        orders = dict.fromkeys(scalars["node_arrays"], self.node_order) | dict.fromkeys(scalars["bar_arrays"], bars)
+        mine = self.mesh.bar_order
+        bars = NaturalOrder(self.comm, np.arange(mine.first, mine.first + mine.count), self.mesh.n_bars)
+        orders = dict.fromkeys(scalars["node_arrays"], self.mesh.node_order)
+        orders |= dict.fromkeys(scalars["bar_arrays"], bars)
         return orders | {name: order for name, (order, _) in self.model.links.arrays().items()}
 
-    def _load_state(self, checkpoint: Checkpoint) -> None:
-        stepper, state, owned = self.stepper, self.stepper.state, self.model.mesh.n_owned
-        scalars = checkpoint.scalars
+    def _load_state(self, scalars: dict[str, Any], arrays: dict[str, np.ndarray]) -> None:
+        stepper, state, owned = self.stepper, self.stepper.state, self.mesh.n_owned
         if scalars.get("stage") is not None and scalars["stage"]["start"] is not None:
-            held = {name.removeprefix(_STAGE): a for name, a in checkpoint.arrays.items() if name.startswith(_STAGE)}
+            held = {name.removeprefix(_STAGE): a for name, a in arrays.items() if name.startswith(_STAGE)}
             self.model.begin_stage(StageStart.restored(scalars["stage"]["start"], held))
         for name in scalars["node_arrays"]:
-            values = checkpoint.arrays[name]
+            values = arrays[name]
             if name.startswith(_STAGE):
                 continue
             if name.startswith(_MEMORY):
@@ -180,8 +166,8 @@ class RunState:
         if len(scalars["memories"]) == self.comm.size:
             mine = scalars["memories"][self.comm.rank]
             state.memory = {name: array for name, array in state.memory.items() if name in mine}
-        self.model.mesh.update_ghosts(state.x)
-        self._load_bars(checkpoint)
+        self.mesh.update_ghosts(state.x)
+        self._load_bars({name: arrays[name] for name in scalars["bar_arrays"]})
         state.step, state.time = int(scalars["step"]) - self.model.first_step, float(scalars["time"])
         for name, value in scalars["stepper"].items():
             setattr(stepper, name, value)
@@ -193,7 +179,7 @@ class RunState:
         stepper.solution.walls = dataclasses.replace(walls, **sums)
         stepper.solution.contacts = int(mine["contacts"])
         self.model.contact.motion.load_state(scalars["free_walls"])
-        self.model.links.load_state(checkpoint.arrays)
+        self.model.links.load_state(arrays)
         self.model.contact.log.load_state(mine["contact_log"], scalars["contact_times"], stepper.touching)
         stepper.resume()
 
@@ -205,14 +191,12 @@ class RunState:
 
     def _node_arrays(self) -> dict[str, np.ndarray]:
         """Return the rows of owned nodes, by name, of every array of the state, including any added later."""
-        state, owned = self.stepper.state, self.model.mesh.n_owned
-        found = {}
-        for item in dataclasses.fields(state):
-            value = getattr(state, item.name)
-            if isinstance(value, np.ndarray):
-                found[item.name] = value[:owned]
+        state, owned = self.stepper.state, self.mesh.n_owned
+        fields = {item.name: getattr(state, item.name) for item in dataclasses.fields(state)}
+        found = {name: value[:owned] for name, value in fields.items() if isinstance(value, np.ndarray)}
         found |= {_MEMORY + name: array for name, array in state.memory.items()}
-        found |= {_KEPT + name: _numbers(getattr(self.stepper, name)) for name in self.stepper.kept_arrays}
+        kept = {name: getattr(self.stepper, name) for name in self.stepper.kept_arrays}
+        found |= {_KEPT + name: a.astype(np.uint8) if a.dtype == bool else a for name, a in kept.items()}
         if self.model.start is not None:
             found |= {_STAGE + name: array for name, array in self.model.start.arrays().items()}
         # a case without walls has no columns for them
@@ -231,14 +215,14 @@ class RunState:
         kept = {_KEPT + name: getattr(self.stepper, name) for name in self.stepper.kept_bars}
         return found | {name: array for name, array in kept.items() if array.shape[1]}
 
-    def _load_bars(self, checkpoint: Checkpoint) -> None:
+    def _load_bars(self, arrays: dict[str, np.ndarray]) -> None:
         """Restore the bar arrays; bars evaluated on two ranks get the same values on both."""
-        mesh, bars = self.model.mesh, self.model.bars
+        mesh, bars = self.mesh, self.model.bars
         asking = Router(self.comm, slab_of(mesh.bar_ids, mesh.n_bars, self.comm.size))
-        asked = asking.send(mesh.bar_ids) - self.bar_order.first
+        asked = asking.send(mesh.bar_ids) - self.mesh.bar_order.first
         history = bars.history()
-        for name in checkpoint.scalars["bar_arrays"]:
-            values = asking.reply(checkpoint.arrays[name][asked])
+        for name, array in arrays.items():
+            values = asking.reply(array[asked])
             if name.startswith(_LAW):
                 history[:, bars.kept_names.index(name.removeprefix(_LAW))] = values
             elif name.startswith(_KEPT):
@@ -255,7 +239,3 @@ def _summed(shares: list[Any], factor: float = 1.0) -> Any:
     if isinstance(shares[0], dict):
         return {name: _summed([share[name] for share in shares], factor) for name in shares[0]}
     return factor * sum(np.array(share) for share in shares)
-
-
-def _numbers(array: np.ndarray) -> np.ndarray:
-    return array.astype(np.uint8) if array.dtype == bool else array

@@ -356,8 +356,10 @@ class Checkpointing(Observer):
         history.writer.flush_history()
         scalars = state.scalars(history.ledger.kept(), history.kept(), self._snapshots.kept())
         if case.stage:
-            start = state.stage_start()
-            scalars["stage"] = {"number": self._stages.number, "history": history.stage(), "start": start}
+            # the arrays of what the stage starts from are among those of nodes
+            start = self._stages.model.start
+            numbers = None if start is None else start.scalars()
+            scalars["stage"] = {"number": self._stages.number, "history": history.stage(), "start": numbers}
         if scalars["step"] != self.last_step:
             attributes = {
                 "state_version": STATE_VERSION,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,7 +16,6 @@ from ..fields import Fields
 from ..modes.find import describe_modes
 from ..modes.initial_state import InitialState
 from ..output.units import TIME as AXIS
-from ..output.units import Axis
 from ..preflight.inspection import warnings_of_stage
 from ..statics.analysis import StaticAnalysis
 from ..stepping.model import Model
@@ -29,8 +27,6 @@ from .recorder import Recorder
 
 if TYPE_CHECKING:
     from ..case.schema import Case
-    from ..integrators.base import Scheme
-    from ..solvers.linear import LinearChoice
     from ..stepping.stepper import Stepper
 
 
@@ -47,50 +43,24 @@ def _make_analysis(model: Model, recorded: Mapping[str, Any] | None) -> Analysis
     return TimeStepping(model, make_plan(model, recorded))
 
 
-@dataclass(frozen=True)
 class StagedPlan:
     """The plans of all stages on one axis; see :class:`~pfem_petsc.stepping.plan.Plan`.
 
     Attributes
     ----------
-    plans : of the stages
-    names : of the stages
+    plans, names : of the stages
+    scheme, linear, step : of the first stage
+    steps, end : of all stages together; None where that of one is not known before
+    axis : time [s]; a static stage takes as much of it as its load factor or points count
     """
 
-    plans: tuple[Any, ...]
-    names: tuple[str, ...]
-
-    @property
-    def scheme(self) -> Scheme:
-        """Of the first stage."""
-        return self.plans[0].scheme
-
-    @property
-    def linear(self) -> LinearChoice | None:
-        """Of the first stage."""
-        return self.plans[0].linear
-
-    @property
-    def step(self) -> float:
-        """Of the first stage."""
-        return self.plans[0].step
-
-    @property
-    def steps(self) -> int | None:
-        """Steps of all stages, None where that of one is not known before."""
-        counts = [plan.steps for plan in self.plans]
-        return None if None in counts else sum(counts)
-
-    @property
-    def end(self) -> float | None:
-        """Where the last stage ends, None where that is not known before."""
-        ends = [plan.end for plan in self.plans]
-        return None if None in ends else sum(ends)
-
-    @property
-    def axis(self) -> Axis:
-        """Time [s]; a static stage takes as much of it as its load factor or points count."""
-        return AXIS._replace(key=f"stage[{len(self.plans) - 1}].{self.plans[-1].axis.key}")
+    def __init__(self, plans: tuple[Any, ...], names: tuple[str, ...]) -> None:
+        self.plans, self.names = plans, names
+        self.scheme, self.linear, self.step = plans[0].scheme, plans[0].linear, plans[0].step
+        counts, ends = [plan.steps for plan in plans], [plan.end for plan in plans]
+        self.steps: int | None = None if None in counts else sum(counts)
+        self.end: float | None = None if None in ends else sum(ends)
+        self.axis = AXIS._replace(key=f"stage[{len(plans) - 1}].{plans[-1].axis.key}")
 
     def beyond(self, steps: np.ndarray, times: np.ndarray) -> np.ndarray:
         """Return which of the recorded steps and times are beyond the end."""
@@ -98,11 +68,9 @@ class StagedPlan:
 
     def entries(self, case: Case) -> dict[str, str]:
         """Label and text of what a user checks before a run."""
-        found = {}
-        for name, plan, stage in zip(self.names, self.plans, case.stages, strict=True):
-            texts = plan.entries(stage)
-            found[f"stage {name}"] = "; ".join(f"{label}: {text}" for label, text in texts.items())
-        return found
+        texts = [plan.entries(stage) for plan, stage in zip(self.plans, case.stages, strict=True)]
+        lines = ["; ".join(f"{label}: {text}" for label, text in each.items()) for each in texts]
+        return {f"stage {name}": line for name, line in zip(self.names, lines, strict=True)}
 
     def record(self) -> dict[str, Any]:
         """Choices that a restart must keep."""

@@ -24,7 +24,7 @@ from .preflight.forecast import forecast
 from .preflight.inspection import inspect, warnings_before
 from .preflight.sanity import odd_accelerations
 from .preflight.summary import summarise
-from .restart.checkpoints import Restart, find_restart, finished, finished_message
+from .restart.checkpoints import find_restart, finished, finished_message
 from .run.outputs import Outputs, ReportedCompilation
 from .run.recorder import Recorder
 from .run.stages import Stages
@@ -97,9 +97,8 @@ class Simulation(WithEquations):
         if not check_only:
             # a large model takes minutes to set up
             on_root(self.comm, lock.check)
-        found = find_restart(case, self.comm, self.folder, None if check_only else restart)
-        self.restart = found if isinstance(found, Restart) else None
-        self.notes = [found] if isinstance(found, str) else []
+        asked = None if check_only else restart
+        self.restart, self.notes = find_restart(case, self.comm, self.folder, asked)
         # PETSc and what it is linked to are loaded by now
         with self._compilation, returning_freed_memory():
             self._prepare(stop, lock)
@@ -117,7 +116,7 @@ class Simulation(WithEquations):
             check_start(self.model.contact, self.mesh.points[: self.mesh.n_owned], self.model.size)
         minutes = case.output.checkpoint_minutes
         interval = 60.0 * minutes if minutes else None
-        self._synchroniser = Synchroniser(self.comm, self.analysis, stop, lock, interval)
+        self._synchroniser = Synchroniser(self._stages, stop, lock, interval)
         self.outputs = Outputs(self._stages, self._synchroniser, self.folder, self.quiet, self._compilation)
         self._started = self._closed = False
 

@@ -17,7 +17,7 @@ import numpy as np
 from ..columns import LOST, STORED, SUPPLIED
 from ..errors import InputError
 from ..output.layout import EVENT, MODE_VALUES
-from ..output.peaks import peak_force, touch_impulse
+from ..output.result import peak_force, touch_impulse
 from ..output.units import engineering, prefix_for
 from .columns import balance_error
 from .plot import plot

@@ -15,7 +15,6 @@ from mpi4py import MPI
 from ..case.overrides import split_key
 from ..case.toml import value_text
 from ..errors import InputError
-from ..output import result as results
 from ..output.checkpoint import (
     NAME,
     PREVIOUS,
@@ -166,12 +165,14 @@ class Restart:
         return int(self.scalars["snapshot"]), int(self.scalars["row"]["step"])
 
 
-def find_restart(case: Case, comm: MPI.Comm, folder: Path, asked: bool | Path | None) -> Restart | str | None:
+def find_restart(
+    case: Case, comm: MPI.Comm, folder: Path, asked: bool | Path | None
+) -> tuple[Restart | None, list[str]]:
     """Find the checkpoint for ``--restart`` in an output folder. Collective.
 
     Returns
     -------
-    Restart, or a message that states why the run starts from zero, or None if no restart was requested
+    Restart or None, and messages: why a run that should go on starts from zero
 
     Raises
     ------
@@ -179,15 +180,15 @@ def find_restart(case: Case, comm: MPI.Comm, folder: Path, asked: bool | Path | 
         If a named file is missing, or a checkpoint is damaged, or belongs to another case or version.
     """
     if asked is None or asked is False:
-        return None
+        return None, []
     path = on_root(comm, asked_checkpoint, folder, asked)
     if path is None:
-        return f"{folder}: no checkpoint to restart from: starting from zero"
+        return None, [f"{folder}: no checkpoint to restart from: starting from zero"]
     file = Checkpoint(path, comm)
     check_version(path, file.attributes)
     changed = changed_keys(path, file.attributes["case"], case.to_dict(), case.source)
     continues = on_root(comm, _continues, folder, path)
-    return Restart(path, file, changed, continues)
+    return Restart(path, file, changed, continues), []
 
 
 def finished(case: Case, comm: MPI.Comm, folder: Path, end: float | None) -> float | None:
@@ -200,7 +201,7 @@ def _finished(case: Case, path: Path, end: float) -> float | None:
         return None
     try:
         examine(path)
-        with results.open_result(path) as result:
+        with open_result(path) as result:
             reached = [float(times[-1]) for times in (result.history["time"], result.times) if len(times)]
             before, now = result.case.to_dict(), case.to_dict()
             changed_keys(path, before, now, case.source)
@@ -253,7 +254,7 @@ def _refuse_other(restart: Restart) -> None:
 
 def _refuse_loss(path: Path, plan: Plan) -> None:
     """Refuse a restart that would truncate results beyond the end of the run."""
-    with results.open_result(path) as result:
+    with open_result(path) as result:
         steps, times = result.history["step"], result.history["time"]
         snapshots = int(plan.beyond(result.steps, result.times).sum())
     rows = int(plan.beyond(steps, times).sum())
@@ -271,7 +272,7 @@ def _refuse_loss(path: Path, plan: Plan) -> None:
 def _refuse_gap(path: Path, restart: Restart) -> None:
     """Refuse a restart whose results end before the checkpoint."""
     examine(path, deep=False)
-    with results.open_result(path) as result:
+    with open_result(path) as result:
         steps = result.history["step"]
         last = int(steps[-1]) if len(steps) else -1
     if last < restart.last[1]:

@@ -27,7 +27,6 @@ from .stages import Stages
 from .synchroniser import Synchroniser
 
 if TYPE_CHECKING:
-    from ..stepping.plan import Plan
     from ..stepping.stepper import Stepper
 
 
@@ -87,11 +86,9 @@ class History(Observer):
 
     Parameters
     ----------
-    stepper : Stepper
-    plan : Plan
+    stages : Stages
     synchroniser : Synchroniser
     warn : receives a warning
-    columns : of all stages of the case, None for a case without stages
 
     Attributes
     ----------
@@ -101,23 +98,16 @@ class History(Observer):
 
     fuses = True  # rows of fused steps are passed to :meth:`take_sums`
 
-    def __init__(
-        self,
-        stepper: Stepper,
-        plan: Plan,
-        synchroniser: Synchroniser,
-        warn: Callable[[str], None],
-        columns: Mapping[str, np.dtype] | None = None,
-    ) -> None:
-        model = stepper.model
+    def __init__(self, stages: Stages, synchroniser: Synchroniser, warn: Callable[[str], None]) -> None:
+        stepper, model = stages.analysis.stepper, stages.model
         self.every = model.case.output.history_every
         self._stepper, self._synchroniser, self._model = stepper, synchroniser, model
         self.ledger = make_ledger(stepper)
-        self.recorder = Recorder(stepper, self.ledger, columns)
+        self.recorder = Recorder(stepper, self.ledger, stages.columns)
         inertial = stepper.scheme.inertial
         self.blow_up = BlowUp(model, inertial)
         # works over the increments of equilibria are quadratures, whose error is no energy that something has made
-        self._contact_watch = ContactWatch(model, warn, plan) if inertial else None
+        self._contact_watch = ContactWatch(model, warn, stages.analysis.plan) if inertial else None
         self.row: Mapping[str, Any] | None = None
         self.writer: ResultWriter | None = None
         stepper.booking, stepper.bars_removed = self._book, self.ledger.follow_removal

@@ -354,7 +354,7 @@ class Outputs:
         """Make the observers of the present stage. Collective."""
         stages, analysis, warn, tell = self._stages, self._analysis, self.progress.warning, self.progress.message
         stepper = analysis.stepper
-        self.history = History(stepper, analysis.plan, self._synchroniser, warn, stages.columns)
+        self.history = History(stages, self._synchroniser, warn)
         if hasattr(stepper, "message"):
             stepper.message = warn
         self.events = Events(stepper, tell)
@@ -382,7 +382,6 @@ class Outputs:
             f"stage {stages.model.case.name!r} ({stages.number + 1} of {len(stages.case.stage)}) begins after step "
             f"{stepper.number}, {stages.plan.axis.place(stepper.place)}"
         )
-        self._synchroniser.follow(stages.analysis)
         self.fields = Fields(stages.model, stages.fields)
         self._observe(RunState(stepper))
         self.checkpointing.last_step = last_step

@@ -17,8 +17,8 @@ import numpy as np
 from integrator_tables import ROWS, radius
 
 from pfem_petsc import Case, Simulation, open_result
+from pfem_petsc.columns import LOST, STORED, SUPPLIED
 from pfem_petsc.contact.projection import project
-from pfem_petsc.energies import LOST, STORED, SUPPLIED
 from pfem_petsc.mechanics.conserving import MEASURES
 
 __all__ = ["FOLDER", "bar", "contact", "energies", "integrators", "main", "nearest", "strain", "two_bar_load"]

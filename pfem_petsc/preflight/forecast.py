@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import resource
 from collections.abc import Collection, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from mpi4py import MPI
@@ -16,8 +16,8 @@ from ..solvers.linear import DIRECT
 
 if TYPE_CHECKING:
     from ..case.schema import Case
+    from ..fields import Fields
     from ..mesh.distribution import DistributedMesh
-    from ..recording.recorder import Fields
     from ..stepping.model import Model
     from ..stepping.plan import Plan
 
@@ -49,14 +49,13 @@ def forecast(
     model: Model,
     plan: Plan,
     fields: Fields,
-    columns: Mapping[str, tuple[int, ...]],
-    types: Mapping[str, Any],
+    columns: Mapping[str, np.dtype],
 ) -> dict[str, str]:
     """Return label and text of the estimates of memory and, if the steps are known, of time and disk. Collective."""
     held = model.comm.allreduce(_needed(model, plan))
     entries = {"memory needed": f"about {engineering(held, 'B', 3)} on all ranks"}
     if plan.steps is not None:
-        size = result_bytes(case, model.mesh, plan.steps, fields.points, fields.cells, columns, types)
+        size = result_bytes(case, model.mesh, plan.steps, fields.points, fields.cells, columns)
         entries["run time"] = (
             f"about {duration(_seconds(model, plan))} of steps on idle cores, within a factor of 3; start, "
             "compilation and output are extra"
@@ -74,8 +73,7 @@ def result_bytes(
     steps: int,
     point_fields: Collection[str],
     cell_fields: Collection[str],
-    columns: Mapping[str, tuple[int, ...]],
-    types: Mapping[str, Any],
+    columns: Mapping[str, np.dtype],
 ) -> float:
     """Return the size of the result file [B]: snapshots, history rows, and the structure of the file."""
     output = case.output
@@ -83,7 +81,7 @@ def result_bytes(
     snapshots = 2 + (steps - 1) // output.fields_every if output.fields_every else 2
     rows = 2 + (steps - 1) // output.history_every
     a_snapshot = mesh.n_nodes * (24 + 3 * item * len(point_fields)) + mesh.n_bars * item * len(cell_fields)
-    a_row = sum(int(np.prod(shape)) * np.dtype(types.get(name, float)).itemsize for name, shape in columns.items())
+    a_row = sum(dtype.itemsize for dtype in columns.values())
     # a chunk of the history is allocated as a whole
     chunks = -(-rows // 512) * 512
     return 1e5 + 33.0 * mesh.n_bars + snapshots * (a_snapshot + 80.0) + chunks * a_row

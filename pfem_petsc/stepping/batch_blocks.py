@@ -9,6 +9,7 @@ from llvmlite import ir
 from numba.core import types
 from numba.extending import intrinsic
 
+from ..columns import HEAD
 from ..contact.explicit import find_beyond, press_nodes
 from ..contact.fixed_rows import close_rows, solve_rows
 from ..contact.impact import join_nodes, plane_gaps, stop_nodes, unpressed
@@ -16,7 +17,6 @@ from ..integrators._leapfrog import advance, advance_loaded, centre, kick, move
 from ..mechanics.columns import join_planes, split_planes
 from ..mechanics.compiled import borrowing, kernel
 from ..mesh.ordering import NODE_BLOCK
-from ..output.sums import HEAD
 from .explicit import accelerations, explicit_increments, hold_still
 from .impulses import WALLS, fill_impulses
 from .ledger_loops import (

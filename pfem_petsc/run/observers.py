@@ -5,25 +5,28 @@ from __future__ import annotations
 import sys
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..analysis import Analysis, Step
+from ..columns import HEAD, Row
 from ..contact.monitoring import Piercing, check_positions
-from ..output.history import Row
+from ..fields import Fields, Snapshot
+from ..output.checkpoint import write_checkpoint
 from ..output.progress import Progress
-from ..output.sums import HEAD
 from ..output.vtkhdf import ResultWriter
-from ..restart.checkpoints import Checkpoints
-from ..stepping.bar_events import MOST_TOLD, Break
+from ..restart.state import STATE_VERSION, RunState
+from ..stepping.bar_events import MOST_TOLD
 from ..stepping.ledger import make_ledger
-from .monitors import BlowUp, ContactWatch, Doubts, NoContactWatch
-from .recorder import Fields, Recorder, StageColumns, StageRows, carried_sums
+from ..version import __version__
+from .monitors import BlowUp, ContactWatch, Doubts
+from .recorder import Recorder
+from .stages import Stages
+from .synchroniser import Synchroniser
 
 if TYPE_CHECKING:
-    from ..run.synchroniser import Synchroniser
-    from ..stepping.plan import Plan
     from ..stepping.stepper import Stepper
 
 
@@ -37,10 +40,12 @@ class Observer(ABC):
     Attributes
     ----------
     every : due after steps whose number is a multiple of it; 0: never
+    fuses : whether steps after which it is due may be fused into one compiled call
     needs_agreement : whether the ranks must agree first that none of them has a fault
     """
 
     every: int = 0
+    fuses: bool = False
     needs_agreement: bool = False
 
     def due(self, step: int) -> bool:
@@ -49,7 +54,7 @@ class Observer(ABC):
 
     def steps_left(self, step: int) -> int:
         """Return the number of steps until it must act again; these may be fused into one compiled call."""
-        return self.every - step % self.every if self.every else NEVER
+        return NEVER if self.fuses or not self.every else self.every - step % self.every
 
     @abstractmethod
     def observe(self, made: Step) -> None:
@@ -81,84 +86,79 @@ class History(Observer):
 
     Parameters
     ----------
-    stepper : Stepper
-    plan : Plan
+    stages : Stages
     synchroniser : Synchroniser
     warn : receives a warning
-    columns : of all stages of the case, None for a case without stages
 
     Attributes
     ----------
-    columns, types : of the rows
     row : the last row
     writer : of the result file
     """
 
-    def __init__(
-        self,
-        stepper: Stepper,
-        plan: Plan,
-        synchroniser: Synchroniser,
-        warn: Callable[[str], None],
-        columns: StageColumns | None = None,
-    ) -> None:
-        model = stepper.model
+    fuses = True  # rows of fused steps are passed to :meth:`take_sums`
+
+    def __init__(self, stages: Stages, synchroniser: Synchroniser, warn: Callable[[str], None]) -> None:
+        stepper, model = stages.analysis.stepper, stages.model
         self.every = model.case.output.history_every
         self._stepper, self._synchroniser, self._model = stepper, synchroniser, model
         self.ledger = make_ledger(stepper)
-        self.recorder = Recorder(stepper, self.ledger)
+        self.recorder = Recorder(stepper, self.ledger, stages.columns)
         inertial = stepper.scheme.inertial
         self.blow_up = BlowUp(model, inertial)
-        self.contact_watch = ContactWatch(model, warn, plan) if inertial else NoContactWatch()
-        self.row: dict[str, Any] | None = None
+        # works over the increments of equilibria are quadratures, whose error is no energy that something has made
+        self._contact_watch = ContactWatch(model, warn, stages.analysis.plan) if inertial else None
+        self.row: Mapping[str, Any] | None = None
         self.writer: ResultWriter | None = None
         stepper.booking, stepper.bars_removed = self._book, self.ledger.follow_removal
-        self.rows = None if columns is None else StageRows(columns, model.case.number, self.recorder.layout)
-        self.columns, self.types = (columns or self.recorder).columns, (columns or self.recorder).types
 
-    def end_of_stage(self) -> Row:
-        """Return the row of the present state, not recorded, in the columns of all stages. Collective."""
-        return self.rows.fill(self.recorder.row())
-
-    def go_on(self, earlier: History, last: Row, kick: tuple[float, np.ndarray]) -> None:
-        """Begin a stage after the one that has ended, whose rows these continue. Collective.
+    def begin_stage(self, earlier: History, last: Row, kick: tuple[float, np.ndarray]) -> None:
+        """Go on with the rows of the stage that has ended. Collective.
 
         ``last``: row of its end; ``kick``: work [J] and momentum (3,) [N s] of the velocities that the stage adds.
         """
-        recorder, before = self.recorder, earlier.recorder
-        recorder.carried = carried_sums(recorder, last, kick)
-        recorder.start_energy, recorder.energy_scale = before.start_energy, before.energy_scale
-        self.rows.begin(last)
         self.row, self.writer = last, earlier.writer
-        first = self.rows.fill(recorder.row())
-        self.blow_up.check(first, self._stepper.state)
-        self.contact_watch.check(first)
+        self._check(self.recorder.begin_stage(earlier.recorder, last, kick))
 
-    def stage(self) -> dict[str, Any] | None:
-        """What a checkpoint must hold of the stages before; None for a case without stages."""
-        if self.rows is None:
-            return None
-        carried = self.recorder.carried
+    def kept(self) -> dict[str, Any]:
+        """Return what a restart goes on with, besides the ledger."""
+        recorder = self.recorder
         return {
-            "carried": None if carried is None else carried.tolist(),
-            "rest": self.rows.rest.tolist(),
-            "watch": self.contact_watch.start,
+            "iterations": list(recorder.iterations),
+            "start_energy": recorder.start_energy,
+            "energy_scale": recorder.energy_scale,
+            "blow_up": self.blow_up.kept(),
+            "row": {name: float(self.row[name]) for name in ("energy_imbalance", "active_contacts", "step")},
         }
 
-    def load_stage(self, kept: dict[str, Any]) -> None:
-        """Take what :meth:`stage` gave."""
-        self.recorder.carried = None if kept["carried"] is None else np.array(kept["carried"])
-        self.rows.rest[:] = kept["rest"]
-        self.contact_watch.start = kept["watch"]
+    def load_state(self, kept: Mapping[str, Any]) -> None:
+        """Take what :meth:`kept` gave; for a case with stages, under ``stage``, also what :meth:`stage` gave."""
+        recorder = self.recorder
+        recorder.iterations = [int(n) for n in kept["iterations"]]
+        recorder.start_energy, recorder.energy_scale = kept["start_energy"], kept["energy_scale"]
+        self.blow_up.load_state(kept["blow_up"])
+        self.row = dict(kept["row"])
+        start, stage = recorder.start_energy, kept.get("stage")
+        if stage is not None:
+            before = stage["history"]
+            recorder.carried = None if before["carried"] is None else np.array(before["carried"])
+            recorder.rest[:], start = before["rest"], before["watch"]
+        if self._contact_watch is not None:
+            self._contact_watch.start = start
+
+    def stage(self) -> dict[str, Any]:
+        """Return what a checkpoint must hold of the stages before."""
+        carried, watch = self.recorder.carried, self._contact_watch
+        return {
+            "carried": None if carried is None else carried.tolist(),
+            "rest": self.recorder.rest.tolist(),
+            "watch": None if watch is None else watch.start,
+        }
 
     def _book(self) -> None:
         """Add energies and iterations of a step, or of each part of a bisected step."""
         self.ledger.update()
         self.recorder.count(self._stepper.solution.newton, self._stepper.solution.linear)
-
-    def steps_left(self, step: int) -> int:
-        """Return no limit: rows of fused steps are passed to :meth:`take`."""
-        return NEVER
 
     def observe(self, made: Step) -> None:
         """Record a row."""
@@ -182,12 +182,14 @@ class History(Observer):
 
     def take(self, row: Row) -> None:
         """Check a row, store it and add it to the history."""
-        if self.rows is not None:
-            row = self.rows.fill(row)
-        self.blow_up.check(row, self._stepper.state)
-        self.contact_watch.check(row)
+        self._check(row)
         self.row = row
         self.writer.append_history(row if self._model.comm.rank == 0 else None)
+
+    def _check(self, row: Row) -> None:
+        self.blow_up.check(row, self._stepper.state)
+        if self._contact_watch is not None:
+            self._contact_watch.check(row)
 
     def complete(self) -> None:
         """Record the row of the last step."""
@@ -209,7 +211,7 @@ class History(Observer):
             touched |= np.array(flags, dtype=bool)
         names = np.array(contact.names, dtype=object)[~touched]
         # impulses are those of inertial schemes, and of several stages together
-        known = self._stepper.scheme.inertial and self.rows is None
+        known = self._stepper.scheme.inertial and self.recorder.rest is None
         pairs = [pair.name for pair in self._model.case.contact_pair if known and not self._pressed(pair.name)]
         return [
             *(f"wall {name!r} was never touched by a node" for name in names),
@@ -257,9 +259,9 @@ class Snapshots(Observer):
         if not self.every and 0 < state.step < self._analysis.last_step:
             return
         check_positions(self._stepper)
-        at_nodes = fields.at_nodes(state, self._stepper.acceleration)
         number, place = self._stepper.number, self._stepper.place
-        self.writer.write_snapshot(place, number, state.position, at_nodes, fields.at_bars(state))
+        now = Snapshot(self._stepper.model, state, self._stepper.acceleration)
+        self.writer.write_snapshot(place, number, state.position, fields.at("nodes", now), fields.at("bars", now))
         self.last = number
         for text in self._piercing.look(state.x, state.time):
             self._warn(text)
@@ -294,29 +296,35 @@ class Checkpointing(Observer):
 
     Parameters
     ----------
-    checkpoints : Checkpoints
+    stages : Stages
+    path : the file
+    state : RunState, of the present stage
     history, snapshots : from which a restart continues
     synchroniser : Synchroniser
+
+    Attributes
+    ----------
+    last_step : step of the last one, -1 before the first
+    at_end : whether :meth:`complete` writes one: the case requests checkpoints
     """
 
     needs_agreement = True
 
     def __init__(
-        self, checkpoints: Checkpoints, history: History, snapshots: Snapshots, synchroniser: Synchroniser
+        self,
+        stages: Stages,
+        path: Path,
+        state: RunState,
+        history: History,
+        snapshots: Snapshots,
+        synchroniser: Synchroniser,
     ) -> None:
-        self.every = checkpoints.case.output.checkpoint_every
-        self._checkpoints, self._history, self._snapshots = checkpoints, history, snapshots
-        self._synchroniser = synchroniser
-
-    @property
-    def last_step(self) -> int:
-        """Step of the last one."""
-        return self._checkpoints.last_step
-
-    @property
-    def at_end(self) -> bool:
-        """Whether :meth:`complete` writes one."""
-        return self._checkpoints.wanted
+        output = stages.case.output
+        self.every = output.checkpoint_every
+        self.at_end = bool(output.checkpoint_every or output.checkpoint_minutes)
+        self.last_step = -1
+        self._stages, self._path, self._state = stages, path, state
+        self._history, self._snapshots, self._synchroniser = history, snapshots, synchroniser
 
     def due(self, step: int) -> bool:
         """Return whether a checkpoint is due by the number of the step or by wall-clock time."""
@@ -327,30 +335,49 @@ class Checkpointing(Observer):
         self.write()
 
     def write(self) -> None:
-        """Flush the results, from which a restart continues, then write a checkpoint."""
-        history = self._history
+        """Flush the results, from which a restart continues, then write a checkpoint, unless the step has one.
+
+        Raises
+        ------
+        SimulationFailure
+            On all ranks; earlier checkpoints are kept.
+        """
+        history, state, case = self._history, self._state, self._stages.case
         history.writer.flush_history()
-        sums = history.ledger, history.recorder, history.blow_up
-        self._checkpoints.write(*sums, history.row, self._snapshots.kept(), history.stage())
+        scalars = state.scalars(history.ledger.kept(), history.kept(), self._snapshots.kept())
+        if case.stage:
+            # the arrays of what the stage starts from are among those of nodes
+            start = self._stages.model.start
+            numbers = None if start is None else start.scalars()
+            scalars["stage"] = {"number": self._stages.number, "history": history.stage(), "start": numbers}
+        if scalars["step"] != self.last_step:
+            attributes = {
+                "state_version": STATE_VERSION,
+                "pfem_petsc": __version__,
+                "name": case.name,
+                "overrides": list(case.overrides),
+                "case": case.to_dict(),
+                "plan": self._stages.plan.record(),
+                "mesh_mark": state.mesh_mark,
+                "external_functions": self._stages.model.external.functions,
+            }
+            write_checkpoint(self._path, self._stages.comm, state.arrays(), scalars, attributes)
+            self.last_step = scalars["step"]
         self._synchroniser.checkpoint_written()
 
     def complete(self) -> None:
         """Write the checkpoint of the last step, if the case requests checkpoints."""
-        if self._checkpoints.wanted:
+        if self.at_end:
             self.write()
 
 
 class ProgressReport(Observer):
-    """Reports each step to the progress bar, or to the lines that replace it."""
+    """Reports each step, the last one of fused steps, to the progress bar, or to the lines that replace it."""
 
-    every = 1
+    every, fuses = 1, True
 
     def __init__(self, progress: Progress, analysis: Analysis, history: History) -> None:
         self._progress, self._analysis, self._history = progress, analysis, history
-
-    def steps_left(self, step: int) -> int:
-        """Return no limit: the last of fused steps is reported."""
-        return NEVER
 
     def observe(self, made: Step) -> None:
         """Report a step."""
@@ -382,10 +409,6 @@ class Events(Observer):
     def due(self, step: int) -> bool:
         """Return whether the step has events."""
         return bool(self._stepper.events)
-
-    def steps_left(self, step: int) -> int:
-        """Return no limit: steppers with events make single steps."""
-        return NEVER
 
     def observe(self, made: Step) -> None:
         """Record and report the events."""
@@ -424,10 +447,6 @@ class RuptureReport(Observer):
         """Return whether more bars are broken in the last row than have been reported; the same on all ranks."""
         return self._broken > self._told
 
-    def steps_left(self, step: int) -> int:
-        """Return no limit: the fused loop stops where bars break."""
-        return NEVER
-
     def observe(self, made: Step) -> None:
         """Report the bars that broke."""
         self.complete()
@@ -438,13 +457,10 @@ class RuptureReport(Observer):
             return
         self._told = self._broken
         parts = self._comm.allgather(self._stepper.ruptures.take())
-        for each in self._first(sorted(part for share in parts for part in share)):
+        breaks = sorted(part for share in parts for part in share)
+        for each in breaks[: max(MOST_TOLD - self._reported, 0)]:
+            self._reported += 1
             self._tell(each.text)
-
-    def _first(self, breaks: list[Break]) -> list[Break]:
-        chosen = breaks[: max(MOST_TOLD - self._reported, 0)]
-        self._reported += len(chosen)
-        return chosen
 
     def remarks(self) -> list[str]:
         """Return how many bars have broken in the stage."""

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..columns import STORED, SUPPLIED
 from ..contact.monitoring import CrossingBars
-from ..energies import STORED, SUPPLIED
 from ..errors import SimulationFailure
 
 if TYPE_CHECKING:
@@ -40,24 +41,18 @@ class BlowUp:
 
     def __init__(self, model: Model, inertial: bool = True) -> None:
         self.model, self.inertial = model, inertial
-        self._strange = 0
-        self._most = model.rounding * model.length  # [J]: what is at rest has no other energy
-        self._start: dict[str, float] = {}
-        self._lowest: dict[str, float] = {}  # works
-        self._lost = 0.0
-        self._limit = _CREATED
+        # number of consecutive suspicious rows, energy input, the largest numerical dissipation [J], the factor of the
+        # input up to which rows are not suspicious, energies of the first row, and lowest works
+        self._kept: dict[str, Any] = {"strange": 0, "most": model.rounding * model.length, "lost": 0.0}
+        self._kept |= {"limit": _CREATED, "start": {}, "lowest": {}}
 
     def kept(self) -> dict[str, Any]:
-        """Return the state for a checkpoint: number of consecutive suspicious rows, energy input, the energies of the
-        first row, lowest works, and the largest numerical dissipation [J]."""
-        kept = {"strange": self._strange, "most": self._most, "lost": self._lost, "limit": self._limit}
-        return kept | {"start": dict(self._start), "lowest": dict(self._lowest)}
+        """Return the state for a checkpoint."""
+        return copy.deepcopy(self._kept)
 
     def load_state(self, kept: dict[str, Any]) -> None:
         """Restore the state from a checkpoint."""
-        self._strange, self._most = int(kept["strange"]), float(kept["most"])
-        self._start, self._lost = dict(kept["start"]), float(kept["lost"])
-        self._lowest, self._limit = dict(kept["lowest"]), float(kept["limit"])
+        self._kept = copy.deepcopy(kept)
 
     def check(self, row: dict[str, Any], state: State) -> None:
         """Check a row.
@@ -80,27 +75,28 @@ class BlowUp:
             )
         if not self.inertial:
             return
-        lost = float(row["numerical_dissipation"])
-        if not self._start:
-            self._start = {name: float(row[name]) for name in _BARS}
+        kept, lost = self._kept, float(row["numerical_dissipation"])
+        start, lowest = kept["start"], kept["lowest"]
+        if not start:
+            start |= {name: float(row[name]) for name in _BARS}
             # walls with mass as well: a truss at rest has no other energy than that of what hits it
-            self._most += float(row["kinetic_energy"] + row["wall_kinetic_energy"])
-            self._lost = lost
-        released = sum(self._start[name] - float(row[name]) for name in _BARS)
+            kept["most"] += float(row["kinetic_energy"] + row["wall_kinetic_energy"])
+            kept["lost"] = lost
+        released = sum(start[name] - float(row[name]) for name in _BARS)
         # rises only: what a force has taken away, as drag does, it need not give back
         for name in SUPPLIED:
-            self._lowest[name] = min(self._lowest.get(name, np.inf), float(row[name]))
-        rises = [float(row[name]) - self._lowest[name] for name in SUPPLIED]
-        self._most = max(self._most, released, *rises)
-        self._lost = max(self._lost, lost)
+            lowest[name] = min(lowest.get(name, np.inf), float(row[name]))
+        rises = [float(row[name]) - lowest[name] for name in SUPPLIED]
+        kept["most"] = max(kept["most"], released, *rises)
+        kept["lost"] = max(kept["lost"], lost)
         held = float(row["kinetic_energy"] + row["wall_kinetic_energy"]) - released
-        created = min(self._lost - lost, held)
+        created = min(kept["lost"] - lost, held)
         if row["active_contacts"] > 0:
-            self._limit = _IN_CONTACT
-        self._strange = self._strange + 1 if created > self._limit * self._most else 0
-        if self._strange >= _DIVERGENCE_ROWS:
+            kept["limit"] = _IN_CONTACT
+        kept["strange"] = kept["strange"] + 1 if created > kept["limit"] * kept["most"] else 0
+        if kept["strange"] >= _DIVERGENCE_ROWS:
             raise SimulationFailure(
-                f"{when}: the integration has created {created:.3g} J, but only {self._most:.3g} J were supplied: "
+                f"{when}: the integration has created {created:.3g} J, but only {kept['most']:.3g} J were supplied: "
                 f"the motion is unstable and fastest at {self._fastest(state)}; reduce time.step"
             )
 
@@ -221,15 +217,6 @@ class ContactWatch:
         found += ["supports move"] if self.moves else []
         *most, last = found or [""]
         return f" ({', '.join(most)}{' and ' if most else ''}{last})" if found else ""
-
-
-class NoContactWatch:
-    """For equilibria: works over their increments are quadratures, whose error is no energy that something has made."""
-
-    start: float | None = None
-
-    def check(self, row: dict[str, Any]) -> None:
-        """Nothing to see."""
 
 
 # Number of bars up to which those that cross are searched at each snapshot, and of searches times bars beyond it after

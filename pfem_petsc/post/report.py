@@ -14,11 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from ..columns import LOST, STORED, SUPPLIED, balance_error
+from ..columns import LOST, STORED, SUPPLIED
 from ..errors import InputError
 from ..output.layout import EVENT, MODE_VALUES
 from ..output.result import peak_force, touch_impulse
 from ..output.units import engineering, prefix_for
+from .energies import balance_error
 from .plot import plot
 
 __all__ = ["write_report"]

@@ -12,8 +12,7 @@ from typing import Any
 from pages import DOCS, insert, markdown
 from pydantic_core import PydanticUndefined
 
-from pfem_petsc.case.materials import LAWS
-from pfem_petsc.mechanics.materials.base import MaterialKeys
+from pfem_petsc.mechanics.materials.base import LAWS, MaterialKeys
 from pfem_petsc.registry import choices, lookup
 
 FILE = DOCS / "case_file.md"

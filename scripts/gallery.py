@@ -18,8 +18,8 @@ from typing import Any
 from pages import DOCS, program, save
 
 from pfem_petsc import open_result
-from pfem_petsc.case.builtin import built_in_path, read_text
 from pfem_petsc.case.schema import Case
+from pfem_petsc.case.toml import built_in_path, read_text
 from pfem_petsc.output.units import prefix_for
 
 DATA = DOCS / "gallery.toml"

@@ -17,8 +17,8 @@ from integrator_tables import ROWS, radius
 from pages import DOCS, finished
 
 from pfem_petsc import Case
+from pfem_petsc.columns import LOST, STORED, SUPPLIED
 from pfem_petsc.contact.projection import project
-from pfem_petsc.energies import LOST, STORED, SUPPLIED
 from pfem_petsc.mechanics.conserving import MEASURES
 
 FOLDER = DOCS / "images" / "theory"

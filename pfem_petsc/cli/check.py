@@ -6,7 +6,7 @@ import argparse
 from typing import TYPE_CHECKING
 
 from ..errors import InputError, printable
-from .parser import PROGRAM, add_case
+from .parser import PROGRAM, add_case, add_plugins
 from .run import load_case
 
 if TYPE_CHECKING:
@@ -25,6 +25,7 @@ exit status: 0 it can run, 2 invalid input, or something that runs need is missi
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Options of the verb."""
     add_case(parser, optional=True)
+    add_plugins(parser)
     parser.add_argument(
         "--env",
         action="store_true",

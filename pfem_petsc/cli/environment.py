@@ -23,6 +23,7 @@ PACKAGES = {  # distribution: module, and what it is for
     "numba": ("numba", "compiled loops"),
     "pydantic": ("pydantic", "case files"),
     "rich": ("rich", "progress"),
+    "shtab": ("shtab", "completion in shells"),
     "matplotlib": ("matplotlib", "curves"),
     "Pillow": ("PIL", "pictures"),
     "vtk": ("vtkmodules", "pictures"),

@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
-from ..energies import LOST, STORED, SUPPLIED
+from ..columns import LOST, STORED, SUPPLIED
 from ..errors import printable
 from .parser import PROGRAM, add_result, surviving
 
@@ -67,9 +67,9 @@ def describe(result: Result) -> list[str]:
 
 def _modes(modes: Modes) -> list[str]:
     """The frequencies or load factors, some in a line."""
-    from ..output.modes import NAMES
+    from ..output.layout import MODE_VALUES
 
-    name, unit = NAMES[modes.kind]
+    name, unit = MODE_VALUES[modes.kind]
     values = [f"{value:.6g}" for value in modes.values]
     heading = f"modes of {modes.kind}, {name.replace('_', ' ')}{f' [{unit}]' if unit else ''}:"
     return [heading, *("  " + "  ".join(values[k : k + 8]) for k in range(0, len(values), 8))]

@@ -14,7 +14,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING
 
-from ..case.builtin import built_in_cases
+from ..case.toml import built_in_cases
 from ..errors import InputError
 from ..signals import give_back_early
 from .launcher import collectively, launched_rank, on_first_rank, refuse
@@ -50,6 +50,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     debug = "--debug" in words[:cut]
     # overflows are reported by their consequences
     warnings.filterwarnings("default" if debug else "ignore", category=RuntimeWarning)
+    warnings.formatwarning = lambda message, *_, **__: f"warning: {message}\n"
     try:
         arguments, verb = _parse(words[:cut], words[cut + 1 :])
     except InputError as error:

@@ -52,6 +52,19 @@ def add_case(parser: argparse.ArgumentParser, optional: bool = False) -> None:
     )
 
 
+def add_plugins(parser: argparse.ArgumentParser) -> None:
+    """Add --plugin."""
+    parser.add_argument(
+        "--plugin",
+        dest="plugins",
+        metavar="FILE",
+        nargs="+",
+        action="extend",
+        default=[],
+        help="files with laws, integrators, walls and so on of your own, as the key plugins of a case",
+    )
+
+
 def add_result(parser: argparse.ArgumentParser) -> None:
     """Add RESULT."""
     parser.add_argument("result", metavar="RESULT", help="result file, or its folder")

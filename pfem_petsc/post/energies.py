@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..energies import LOST, STORED, SUPPLIED
+from ..columns import LOST, STORED, SUPPLIED
 from ..output.units import engineering
 from .chart import COLOURS, REFERENCE, Chart, thinned
 from .closed_forms import ClosedForm

@@ -73,7 +73,7 @@ def figure_of_history(result: Result, names: list[str] | None = None) -> Figure:
     """Return curves of columns of the history over time; default: the energies that occur."""
     import matplotlib
 
-    from ..energies import ENERGIES
+    from ..columns import ENERGIES
     from ..output.units import unit_of
     from .chart import Chart
 

@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 
 from ..case.schema import Case
-from ..energies import LOST, STORED, SUPPLIED
+from ..columns import LOST, STORED, SUPPLIED
 from ..errors import InputError
-from ..output.peaks import peak_force, touch_impulse
-from ..output.result import Result, open_result
+from ..output.result import Result, open_result, peak_force, touch_impulse
 from ..output.table import Table, flat_columns
 from ..output.units import duration
 from .pool import Report, Task, performed

@@ -12,7 +12,7 @@ from helpers.truss import Truss, options, write
 from mpi4py import MPI
 
 from pfem_petsc.errors import InputError
-from pfem_petsc.output.integrity import damages
+from pfem_petsc.output.damage import damages
 from pfem_petsc.output.result import open_result
 from pfem_petsc.output.verify import examine
 from pfem_petsc.output.vtkhdf import ResultWriter

@@ -17,7 +17,7 @@ from random_trusses.schemes import EXACT, MARGIN, _compare, judge_schemes
 from random_trusses.work import check_case, judge_ranks
 
 from pfem_petsc import Case
-from pfem_petsc.recording.observers import Snapshots
+from pfem_petsc.run.observers import Snapshots
 
 COUNTED = ("energy balance above 1e-9", "chaotic: ")
 """What is no fault: rounding, and motions that part whatever is done."""

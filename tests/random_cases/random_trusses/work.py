@@ -118,7 +118,7 @@ def work(mode: str, seeds: Iterable[int], folder: Path, every_restart: int, sour
 
 
 def _table(text: str) -> dict:
-    from pfem_petsc.case.parsing import parse_toml
+    from pfem_petsc.case.toml import parse_toml
 
     return parse_toml(text, "case")
 
